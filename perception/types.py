@@ -1,0 +1,87 @@
+"""Plain data shared by all layers. Transforms are named a_from_b; pixel centres lie at +0.5; quaternions are wxyz."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Lens:
+    """The camera that took a photo, as COLMAP names it: model (e.g. "OPENCV"), params in COLMAP's order.
+
+    width, height: size in pixels of the photo after EXIF rotation.
+    """
+
+    model: str
+    params: tuple[float, ...]
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class View:
+    """One posed photo, seen through an ideal pinhole camera (K, width, height) obtained by undistorting `lens`.
+
+    name: file name of the photo relative to its folder, unique in the scene ("a/0001.jpg").
+    photo: where the photo lies. lens: None when the photo is already a pinhole image of size width × height.
+    K: [3, 3] float64, pixels. camera_from_world: [4, 4] float64, OpenCV axes (x right, y down, z forward).
+    """
+
+    name: str
+    photo: Path
+    K: np.ndarray
+    width: int
+    height: int
+    camera_from_world: np.ndarray
+    lens: Lens | None = None
+
+
+@dataclass
+class Scene:
+    """What the mapper starts from: posed views (sorted by name) and a sparse cloud.
+
+    points: [P, 3] float64 in the world frame; point_colors: [P, 3] uint8; both may be empty.
+    metric: True when the unit is known to be the metre. report: JSON-able facts about how the scene came about
+    (registered, left out and why, reprojection error, warnings, seconds by stage).
+    """
+
+    views: list[View]
+    points: np.ndarray
+    point_colors: np.ndarray
+    metric: bool = False
+    frame: str = "map"
+    report: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class OrientedBox:
+    """center [3], rotation [3, 3] (rows are the box axes in the map frame), extent [3] full side lengths."""
+
+    center: np.ndarray
+    rotation: np.ndarray
+    extent: np.ndarray
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "center": [float(x) for x in self.center],
+            "rotation": [[float(x) for x in row] for row in self.rotation],
+            "extent": [float(x) for x in self.extent],
+        }
+
+
+@dataclass
+class PointCloud:
+    """Points as read, order kept. points [P, 3] float32 or float64; the rest may be None.
+
+    colors [P, 3] uint8, normals [P, 3] float32, faces [F, 3] int32 (mesh), labels: named per-point int32 arrays.
+    """
+
+    points: np.ndarray
+    colors: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    faces: np.ndarray | None = None
+    labels: dict[str, np.ndarray] = field(default_factory=dict)
