@@ -1,0 +1,169 @@
+// Binds the training operations as _core.training: arrays in place, shapes checked, GIL released.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <optional>
+#include <stdexcept>
+
+#include "levels.h"
+#include "training.h"
+
+namespace nb = nanobind;
+namespace pt = perception::training;
+using namespace nb::literals;
+
+namespace {
+
+template <class T, size_t N>
+using In = nb::ndarray<const T, nb::ndim<N>, nb::c_contig, nb::device::cpu>;
+template <class T, size_t N>
+using Out = nb::ndarray<T, nb::ndim<N>, nb::c_contig, nb::device::cpu>;
+
+void require(bool fine, const char *message) {
+  if (!fine) throw std::invalid_argument(message);
+}
+
+template <class A, class B>
+bool same_shape(const A &a, const B &b) {
+  if (a.ndim() != b.ndim()) return false;
+  for (size_t i = 0; i < a.ndim(); ++i)
+    if (a.shape(i) != b.shape(i)) return false;
+  return true;
+}
+
+template <class T, class Target>
+auto photometric(In<T, 3> render, In<Target, 3> target, std::optional<In<T, 2>> weight, Out<T, 3> gradient,
+                 double beta, int threads, const std::string &level) {
+  require(same_shape(render, target) && same_shape(render, gradient), "photometric: shapes differ");
+  require(!weight || (weight->shape(0) == render.shape(0) && weight->shape(1) == render.shape(1)),
+          "photometric: weight must be [H, W]");
+  pt::PhotometricArguments<T> a{};
+  a.render = render.data();
+  if constexpr (std::is_same_v<Target, uint8_t>) a.target8 = target.data();
+  else a.target = target.data();
+  a.weight = weight ? weight->data() : nullptr;
+  a.gradient = gradient.data();
+  a.height = static_cast<int>(render.shape(0));
+  a.width = static_cast<int>(render.shape(1));
+  a.channels = static_cast<int>(render.shape(2));
+  a.beta = beta;
+  pt::PhotometricResult result;
+  {
+    nb::gil_scoped_release release;
+    result = pt::photometric(a, {threads, level});
+  }
+  return nb::make_tuple(result.loss, result.l1, result.ssim);
+}
+
+auto assign(In<int32_t, 1> labels, double fraction, uint64_t seed, Out<int32_t, 1> slots) {
+  require(same_shape(labels, slots), "assign: shapes differ");
+  pt::Assignment out;
+  {
+    nb::gil_scoped_release release;
+    out = pt::assign(labels.data(), static_cast<int64_t>(labels.size()), fraction, seed, slots.data());
+  }
+  return nb::make_tuple(out.ids, out.counts, out.first);
+}
+
+void check_slots(const int32_t *slots, size_t pixels, size_t labels) {
+  for (size_t p = 0; p < pixels; ++p)
+    require(slots[p] < static_cast<int64_t>(labels), "slots: an index lies outside the labels");
+}
+
+template <class T>
+void prototypes(In<T, 2> features, In<int32_t, 1> slots, In<int64_t, 1> counts, In<int64_t, 1> first,
+                Out<double, 2> means, Out<double, 1> scatter, int threads, const std::string &level) {
+  const size_t labels = counts.shape(0);
+  require(features.shape(0) == slots.shape(0), "prototypes: features [P, D] and slots [P] differ");
+  require(first.shape(0) == labels && scatter.shape(0) == labels && means.shape(0) == labels &&
+              means.shape(1) == features.shape(1), "prototypes: outputs do not fit the labels");
+  nb::gil_scoped_release release;
+  check_slots(slots.data(), slots.shape(0), labels);
+  for (size_t i = 0; i < labels; ++i)
+    require(first.data()[i] >= 0 && first.data()[i] < static_cast<int64_t>(features.shape(0)) && counts.data()[i] > 0,
+            "prototypes: every label needs a pixel");
+  pt::prototypes(features.data(), slots.data(), features.shape(0), features.shape(1), counts.data(), first.data(),
+                 labels, means.data(), scatter.data(), {threads, level});
+}
+
+template <class T>
+void spread(In<T, 2> features, In<int32_t, 1> slots, In<double, 2> means, In<double, 1> pull, In<double, 2> push,
+            Out<T, 2> out, int threads, const std::string &level) {
+  require(features.shape(0) == slots.shape(0) && same_shape(features, out), "spread: shapes differ");
+  require(same_shape(means, push) && means.shape(0) == pull.shape(0) && means.shape(1) == features.shape(1),
+          "spread: means, pull and push differ");
+  nb::gil_scoped_release release;
+  check_slots(slots.data(), slots.shape(0), means.shape(0));
+  pt::spread(features.data(), slots.data(), features.shape(0), features.shape(1), means.data(), pull.data(),
+             push.data(), out.data(), {threads, level});
+}
+
+double separation(In<double, 2> a, std::optional<In<double, 2>> b, double margin, bool squared, Out<double, 2> grad_a,
+                  std::optional<Out<double, 2>> grad_b) {
+  require(same_shape(a, grad_a) && b.has_value() == grad_b.has_value(), "separation: gradients do not fit");
+  require(!b || (same_shape(*b, *grad_b) && b->shape(1) == a.shape(1)), "separation: widths differ");
+  nb::gil_scoped_release release;
+  return pt::separation(a.data(), a.shape(0), b ? b->data() : nullptr, b ? static_cast<int64_t>(b->shape(0)) : -1, a.shape(1), margin,
+                        squared, grad_a.data(), grad_b ? grad_b->data() : nullptr);
+}
+
+template <class T>
+double sum(In<T, 1> values, bool squared, int threads, const std::string &level) {
+  nb::gil_scoped_release release;
+  return pt::sum(values.data(), static_cast<int64_t>(values.size()), squared, {threads, level});
+}
+
+template <class T>
+auto adam(Out<T, 2> param, In<T, 2> grad, Out<T, 2> first, Out<T, 2> second,
+          std::optional<In<uint8_t, 1>> visible, In<double, 1> rate, int64_t step, double beta1, double beta2,
+          double eps, int threads, const std::string &level) {
+  require(same_shape(param, grad) && same_shape(param, first) && same_shape(param, second), "adam: shapes differ");
+  require(!visible || visible->shape(0) == param.shape(0), "adam: visible must be [N]");
+  require(rate.shape(0) == param.shape(1) && step >= 1, "adam: rate must be [K] and step >= 1");
+  pt::AdamResult result;
+  {
+    nb::gil_scoped_release release;
+    result = pt::adam(pt::AdamArguments<T>{param.data(), first.data(), second.data(), grad.data(),
+                                           visible ? visible->data() : nullptr, rate.data(),
+                                           static_cast<int64_t>(param.shape(0)), static_cast<int64_t>(param.shape(1)),
+                                           step, beta1, beta2, eps},
+                      {threads, level});
+  }
+  return nb::make_tuple(result.updated, result.skipped);
+}
+
+template <class T>
+void bind_precision(nb::module_ &m) {
+  const auto arg = [](const char *name) { return nb::arg(name).noconvert(); };
+  m.def("photometric", &photometric<T, T>, arg("render"), arg("target"), arg("weight").none(), arg("gradient"), "beta"_a,
+        "threads"_a = 0, "level"_a = "auto");
+  m.def("photometric", &photometric<T, uint8_t>, arg("render"), arg("target"), arg("weight").none(), arg("gradient"),
+        "beta"_a, "threads"_a = 0, "level"_a = "auto",
+        "(loss, l1, ssim) of images [H, W, C] and d loss / d render into gradient.");
+  m.def("prototypes", &prototypes<T>, arg("features"), arg("slots"), arg("counts"), arg("first"), arg("means"),
+        arg("scatter"), "threads"_a = 0, "level"_a = "auto",
+        "Mean feature per slot [M, D] and sum of squared distances to it [M].");
+  m.def("spread", &spread<T>, arg("features"), arg("slots"), arg("means"), arg("pull"), arg("push"), arg("out"),
+        "threads"_a = 0, "level"_a = "auto", "out = pull[slot] (F - means[slot]) + push[slot].");
+  m.def("sum", &sum<T>, arg("values"), "squared"_a, "threads"_a = 0, "level"_a = "auto");
+  m.def("adam", &adam<T>, arg("param"), arg("grad"), arg("first"), arg("second"), arg("visible").none(), arg("rate"),
+        "step"_a, "beta1"_a, "beta2"_a, "eps"_a, "threads"_a = 0, "level"_a = "auto",
+        "One Adam step in place on the visible rows; (rows updated, rows skipped for a non-finite gradient).");
+}
+
+}  // namespace
+
+void bind_training(nb::module_ &parent) {
+  nb::module_ m = parent.def_submodule("training", "Fused losses and the optimiser; float32 and float64.");
+  m.def("levels", &pt::supported_levels, "Instruction sets this processor supports, narrowest first.");
+  m.def("assign", &assign, nb::arg("labels").noconvert(), "fraction"_a, "seed"_a, nb::arg("slots").noconvert(),
+        "(ids, counts, first pixel) of the labels in use; slots gets each pixel's index into ids, or -1.");
+  m.def("separation", &separation, nb::arg("a").noconvert(), nb::arg("b").noconvert().none(), "margin"_a, "squared"_a,
+        nb::arg("grad_a").noconvert(), nb::arg("grad_b").noconvert().none(),
+        "Mean relu(margin - distance) over pairs within a, or between a and b.");
+  bind_precision<float>(m);
+  bind_precision<double>(m);
+}

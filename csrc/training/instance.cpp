@@ -1,0 +1,147 @@
+#include <cmath>
+#include <stdexcept>
+
+#include "levels.h"
+#include "parallel.h"
+#include "training.h"
+
+namespace perception::training {
+namespace {
+
+uint64_t mix(uint64_t x) {  // splitmix64 finaliser
+  x += 0x9e3779b97f4a7c15ull;
+  x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9ull;
+  x = (x ^ (x >> 27)) * 0x94d049bb133111ebull;
+  return x ^ (x >> 31);
+}
+
+// Labels in use, ascending. Dense ids go through a table, wild ones through a sort.
+constexpr int32_t kTableLimit = 1 << 20;
+
+std::vector<int32_t> used_labels(const int32_t *slots, int64_t pixels, int32_t largest) {
+  std::vector<int32_t> ids;
+  if (largest < kTableLimit) {
+    std::vector<uint8_t> used(int64_t(largest) + 1);
+    for (int64_t p = 0; p < pixels; ++p) used[slots[p]] = 1;
+    for (int32_t id = 1; id <= largest; ++id)
+      if (used[id]) ids.push_back(id);
+    return ids;
+  }
+  for (int64_t p = 0; p < pixels; ++p)
+    if (slots[p] && (p == 0 || slots[p] != slots[p - 1])) ids.push_back(slots[p]);
+  std::sort(ids.begin(), ids.end());
+  ids.erase(std::unique(ids.begin(), ids.end()), ids.end());
+  return ids;
+}
+
+}  // namespace
+
+Assignment assign(const int32_t *labels, int64_t pixels, double fraction, uint64_t seed, int32_t *slots) {
+  const uint64_t offset = mix(seed);
+  int32_t largest = 0;
+  for (int64_t p = 0; p < pixels; ++p) {
+    const int32_t label = labels[p];
+    if (label < 0) throw std::invalid_argument("labels must be >= 0 (0 = unlabelled), found " + std::to_string(label));
+    const bool keep = fraction >= 1 || (mix(offset ^ uint64_t(p)) >> 11) * 0x1p-53 < fraction;
+    slots[p] = keep ? label : 0;
+    largest = std::max(largest, slots[p]);
+  }
+  Assignment out;
+  out.ids = used_labels(slots, pixels, largest);
+  out.counts.assign(out.ids.size(), 0);
+  out.first.assign(out.ids.size(), -1);
+  std::vector<int32_t> table;
+  if (largest < kTableLimit) {
+    table.assign(int64_t(largest) + 1, -1);
+    for (size_t i = 0; i < out.ids.size(); ++i) table[out.ids[i]] = static_cast<int32_t>(i);
+  }
+  for (int64_t p = 0; p < pixels; ++p) {
+    const int32_t label = slots[p];
+    int32_t slot = -1;
+    if (label && !table.empty()) slot = table[label];
+    else if (label) slot = static_cast<int32_t>(std::lower_bound(out.ids.begin(), out.ids.end(), label) - out.ids.begin());
+    slots[p] = slot;
+    if (slot >= 0 && out.counts[slot]++ == 0) out.first[slot] = p;
+  }
+  return out;
+}
+
+template <class T>
+void prototypes(const T *features, const int32_t *slots, int64_t pixels, int64_t width, const int64_t *counts,
+                const int64_t *first, int64_t labels, double *means, double *scatter, const Execution &how) {
+  if (labels == 0) return;
+  const auto &table = kernels<T>(how.level);
+  // Sums are taken about a pixel of the label itself, so that features far from zero do not cancel.
+  std::vector<T> reference(labels * width);
+  for (int64_t i = 0; i < labels; ++i)
+    std::copy_n(features + first[i] * width, width, reference.begin() + i * width);
+  const Pieces pieces(pixels, 8192, labels * width > 100000 ? 4 : 16);
+  const int64_t stride = labels * 2 * width;
+  std::vector<double> sums(pieces.count * stride);
+  parallel_for(pieces.count, how.threads, [&](int64_t i, int) {
+    table.accumulate(features, slots, reference.data(), pieces.begin(i), pieces.end(i), width, &sums[i * stride]);
+  });
+  for (int64_t i = 1; i < pieces.count; ++i)
+    for (int64_t k = 0; k < stride; ++k) sums[k] += sums[i * stride + k];
+  for (int64_t i = 0; i < labels; ++i) {
+    const double *sum = &sums[i * 2 * width], *squares = sum + width, n = static_cast<double>(counts[i]);
+    scatter[i] = 0;
+    for (int64_t k = 0; k < width; ++k) {
+      means[i * width + k] = double(reference[i * width + k]) + sum[k] / n;
+      scatter[i] += std::max(0.0, squares[k] - sum[k] * sum[k] / n);
+    }
+  }
+}
+
+template <class T>
+void spread(const T *features, const int32_t *slots, int64_t pixels, int64_t width, const double *means,
+            const double *pull, const double *push, T *out, const Execution &how) {
+  const auto &table = kernels<T>(how.level);
+  const Pieces pieces(pixels);
+  parallel_for(pieces.count, how.threads, [&](int64_t i, int) {
+    table.spread(features, slots, means, pull, push, pieces.begin(i), pieces.end(i), width, out);
+  });
+}
+
+double separation(const double *a, int64_t rows, const double *b, int64_t others, int64_t width, double margin,
+                  bool squared, double *grad_a, double *grad_b) {
+  const bool within = others < 0;  // an empty b is another matter: its pointer may be null
+  const double *right = within ? a : b;
+  double *grad_right = within ? grad_a : grad_b;
+  const double pairs = within ? 0.5 * rows * (rows - 1) : double(rows) * others;
+  std::fill_n(grad_a, rows * width, 0.0);
+  if (!within) std::fill_n(grad_b, others * width, 0.0);
+  if (pairs < 1) return 0;
+  double total = 0;
+  std::vector<double> difference(width);
+  for (int64_t i = 0; i < rows; ++i) {
+    for (int64_t j = within ? i + 1 : 0; j < (within ? rows : others); ++j) {
+      double square = 0;
+      for (int64_t k = 0; k < width; ++k) {
+        difference[k] = a[i * width + k] - right[j * width + k];
+        square += difference[k] * difference[k];
+      }
+      const double distance = squared ? square : std::sqrt(square);
+      if (!(distance < margin)) continue;
+      total += margin - distance;
+      const double slope = squared ? 2 : distance > 0 ? 1 / distance : 0;
+      for (int64_t k = 0; k < width; ++k) {
+        const double g = slope * difference[k] / pairs;
+        grad_a[i * width + k] -= g;
+        grad_right[j * width + k] += g;
+      }
+    }
+  }
+  return total / pairs;
+}
+
+template void prototypes(const float *, const int32_t *, int64_t, int64_t, const int64_t *, const int64_t *, int64_t,
+                         double *, double *, const Execution &);
+template void prototypes(const double *, const int32_t *, int64_t, int64_t, const int64_t *, const int64_t *, int64_t,
+                         double *, double *, const Execution &);
+template void spread(const float *, const int32_t *, int64_t, int64_t, const double *, const double *, const double *,
+                     float *, const Execution &);
+template void spread(const double *, const int32_t *, int64_t, int64_t, const double *, const double *, const double *,
+                     double *, const Execution &);
+
+}  // namespace perception::training

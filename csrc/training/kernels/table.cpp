@@ -1,0 +1,18 @@
+// Compiled once per instruction set, see CMakeLists.txt.
+#include "table.h"
+
+#include "adam.h"
+#include "instance.h"
+#include "photometric.h"
+#include "vector.h"
+
+namespace perception::training::PERCEPTION_LEVEL {
+
+template <class T>
+constexpr Kernels<T> kTable = {photometric_tile<T>, absolute_row<T>,   accumulate<T>,    spread<T>,
+                               sum_row<T, false>,   sum_row<T, true>, adam<T>};
+
+const Kernels<float> *table_float() { return &kTable<float>; }
+const Kernels<double> *table_double() { return &kTable<double>; }
+
+}  // namespace perception::training::PERCEPTION_LEVEL

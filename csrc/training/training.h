@@ -1,0 +1,76 @@
+// Losses with their gradients, and Adam. Every function gives the same bits for any number of threads.
+// threads 0: all processors. level: see levels.h. Invalid arguments throw std::invalid_argument.
+#pragma once
+#include <cstdint>
+#include <string>
+#include <vector>
+
+namespace perception::training {
+
+struct Execution {
+  int threads = 0;
+  std::string level = "auto";
+};
+
+template <class T>
+struct PhotometricArguments {
+  const T *render;           // [height, width, channels]
+  const T *target;           // same shape; null when target8 is given
+  const uint8_t *target8;    // same shape, unit 1/255
+  const T *weight;           // [height, width] >= 0 or null
+  T *gradient;               // out [height, width, channels]: d loss / d render
+  int height, width, channels;
+  double beta;
+};
+
+struct PhotometricResult {
+  double loss, l1, ssim;     // ssim is NaN when beta == 0: it is not computed
+};
+
+template <class T>
+PhotometricResult photometric(const PhotometricArguments<T> &, const Execution &);
+
+// Labels in use, ascending, and for every pixel the index of its label (-1 for label 0 and for pixels left out).
+struct Assignment {
+  std::vector<int32_t> ids;
+  std::vector<int64_t> counts, first;  // pixels per label; first pixel of each label
+};
+// Keeps each pixel with probability `fraction`, decided by a hash of (seed, pixel).
+Assignment assign(const int32_t *labels, int64_t pixels, double fraction, uint64_t seed, int32_t *slots);
+
+// means [slots, width] and scatter [slots] = sum over the label's pixels of |F - mean|^2.
+template <class T>
+void prototypes(const T *features, const int32_t *slots, int64_t pixels, int64_t width, const int64_t *counts,
+                const int64_t *first, int64_t labels, double *means, double *scatter, const Execution &);
+
+// out [pixels, width] = pull[slot] (F - mean[slot]) + push[slot]; 0 for slot -1.
+template <class T>
+void spread(const T *features, const int32_t *slots, int64_t pixels, int64_t width, const double *means,
+            const double *pull, const double *push, T *out, const Execution &);
+
+// Mean over pairs of relu(margin - distance), distance = |a - b|^2 or |a - b|; pairs i < j within a (others < 0), or all
+// pairs of a and b. Gradients are written; that of |a - b| at 0 is taken as 0. No pair: value 0.
+double separation(const double *a, int64_t rows, const double *b, int64_t others, int64_t width, double margin,
+                  bool squared, double *grad_a, double *grad_b);
+
+template <class T>
+double sum(const T *values, int64_t n, bool squared, const Execution &);
+
+struct AdamResult {
+  int64_t updated, skipped;  // rows
+};
+
+template <class T>
+struct AdamArguments {
+  T *param, *first, *second;  // [rows, width], in place
+  const T *grad;              // [rows, width]
+  const uint8_t *visible;     // [rows] or null
+  const double *rate;         // [width]
+  int64_t rows, width, step;  // step counts from 1
+  double beta1, beta2, eps;
+};
+
+template <class T>
+AdamResult adam(const AdamArguments<T> &, const Execution &);
+
+}  // namespace perception::training

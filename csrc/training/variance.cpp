@@ -1,0 +1,24 @@
+#include "levels.h"
+#include "parallel.h"
+#include "training.h"
+
+namespace perception::training {
+
+template <class T>
+double sum(const T *values, int64_t n, bool squared, const Execution &how) {
+  const auto &table = kernels<T>(how.level);
+  const auto run = squared ? table.sum_squares : table.sum;
+  const Pieces pieces(n, 65536);
+  std::vector<double> partial(pieces.count);
+  parallel_for(pieces.count, how.threads, [&](int64_t i, int) {
+    partial[i] = run(values + pieces.begin(i), pieces.end(i) - pieces.begin(i));
+  });
+  double total = 0;
+  for (double part : partial) total += part;
+  return total;
+}
+
+template double sum(const float *, int64_t, bool, const Execution &);
+template double sum(const double *, int64_t, bool, const Execution &);
+
+}  // namespace perception::training

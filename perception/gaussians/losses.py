@@ -1,0 +1,304 @@
+"""The paper's training losses with their gradients, computed by compiled kernels (OpenSplat3D, section 3).
+
+    L = L_RGB + λ_inst2D (w_p L_pos + w_n L_neg) + λ_var L_var
+
+All take CPU tensors, float32 or float64, and are differentiable once. The value is summed in float64 and the bits do
+not depend on the number of threads (torch.get_num_threads()).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from perception import _core
+from perception.errors import InputError
+
+_kernels = _core.training  # type: ignore[attr-defined]
+VarianceForm = Literal["paper", "channels", "plain"]
+
+
+def _ready(name: str, tensor: Tensor) -> Tensor:
+    """`tensor` as the kernels read it: CPU, float32 or float64, C order, outside the graph."""
+    if tensor.device.type != "cpu" or tensor.dtype not in (torch.float32, torch.float64):
+        found = f"{tensor.dtype} on {tensor.device}"
+        raise InputError(f"{name}: found {found}, expected float32 or float64 on the CPU")
+    return tensor.detach().contiguous()
+
+
+# ---------------------------------------------------------------------------------------------------- photometric
+
+
+@dataclass(frozen=True)
+class PhotometricLoss:
+    """value: differentiable scalar (1 − β) L1 + β (1 − SSIM). ssim is NaN when β = 0 (not computed)."""
+
+    value: Tensor
+    l1: float
+    ssim: float
+
+
+class _Photometric(Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        render: Tensor,
+        target: Tensor | np.ndarray,
+        beta: float,
+        weight: Tensor | None,
+        report: list[float],
+    ) -> Tensor:
+        gradient = torch.empty_like(render)
+        threads = torch.get_num_threads()
+        loss, *parts = _kernels.photometric(render.detach(), target, weight, gradient, beta, threads)
+        report.extend(parts)
+        ctx.save_for_backward(gradient)
+        return render.new_tensor(loss)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
+        (gradient,) = ctx.saved_tensors
+        return (gradient if grad == 1 else gradient * grad), None, None, None, None
+
+
+def photometric(
+    render: Tensor, target: Tensor | np.ndarray, beta: float = 0.2, weight: Tensor | None = None
+) -> PhotometricLoss:
+    """L_RGB = (1 − β) L1 + β (1 − SSIM): the value with its parts.
+
+    render: [H, W, C] in [0, 1]. target: same shape, of render's dtype in [0, 1], or uint8 (read as x / 255).
+    weight: [H, W] ≥ 0; the loss is the weighted mean over pixels of |x − y| and 1 − SSIM (a masked pixel still lies in
+    its neighbours' windows). All weights 0: loss 0, gradient 0.
+
+    SSIM (Wang et al. 2004): 11 × 11 Gaussian window, σ = 1.5, C1 = .01², C2 = .03², biased moments, zero padding to the
+    input's size and mean over all pixels and channels, as 3DGS has it. With β = 0 SSIM is skipped.
+    """
+    image = target if isinstance(target, Tensor) else torch.from_numpy(np.ascontiguousarray(target))
+    if render.ndim != 3 or render.shape != image.shape:
+        found = f"{list(render.shape)} and {list(image.shape)}"
+        raise InputError(
+            f"photometric loss: render and target have shapes {found}, expected one shape [H, W, C]"
+        )
+    if not 0 <= beta <= 1:
+        raise InputError(f"photometric loss: beta is {beta}, expected 0 to 1")
+    _ready("render", render)
+    if image.dtype != torch.uint8:
+        image = _ready("target", image).to(render.dtype)
+    if weight is not None:
+        if weight.shape != render.shape[:2]:
+            raise InputError(f"photometric loss: weight has shape {list(weight.shape)}, expected [H, W]")
+        weight = weight.detach().to(render.dtype).contiguous()
+    parts: list[float] = []
+    value = _Photometric.apply(render.contiguous(), image.contiguous(), float(beta), weight, parts)
+    return PhotometricLoss(value, *parts)
+
+
+def photometric_loss(
+    render: Tensor, target: Tensor | np.ndarray, beta: float = 0.2, weight: Tensor | None = None
+) -> Tensor:
+    """The differentiable scalar of `photometric`."""
+    return photometric(render, target, beta, weight).value
+
+
+# ------------------------------------------------------------------------------------------------------- instance
+
+
+@dataclass(frozen=True)
+class LabelAssignment:
+    """The labels of one photo, ready for the kernels; worth keeping between iterations when no pixels are drawn.
+
+    ids: [M] int32 ascending, 0 left out. counts: [M] int64 pixels. first: [M] int64 a pixel of each label.
+    slots: [P] int32, each pixel's index into ids or −1. shape: (H, W).
+    """
+
+    ids: Tensor
+    counts: Tensor
+    first: Tensor
+    slots: Tensor
+    shape: tuple[int, ...]
+
+
+def assign_labels(labels: Tensor | np.ndarray, fraction: float = 1.0, seed: int = 0) -> LabelAssignment:
+    """Reads label image `labels` [H, W] of any integer type (0 = unlabelled, ids need not be dense).
+
+    fraction: each pixel is kept with this probability, decided by a hash of (seed, pixel); M_i then means the kept
+    pixels, and a label without any drops out.
+    """
+    image = labels if isinstance(labels, Tensor) else torch.from_numpy(np.asarray(labels).astype(np.int32))
+    if image.is_floating_point() or image.dtype == torch.bool:
+        raise InputError(f"labels: found {image.dtype}, expected integers (0 = unlabelled)")
+    if image.numel() and int(image.min()) < 0:
+        raise InputError(f"labels: found {int(image.min())}, expected ids >= 0 (0 = unlabelled)")
+    if not 0 < fraction <= 1:
+        raise InputError(f"labels: fraction is {fraction}, expected above 0 and at most 1")
+    flat = image.detach().to(torch.int32).contiguous().reshape(-1)
+    slots = torch.empty_like(flat)
+    ids, counts, first = _kernels.assign(flat, float(fraction), int(seed), slots)
+    long = torch.int64
+    return LabelAssignment(
+        torch.tensor(ids, dtype=torch.int32),
+        torch.tensor(counts, dtype=long),
+        torch.tensor(first, dtype=long),
+        slots,
+        tuple(image.shape),
+    )
+
+
+class _Prototypes(Function):
+    """features [P, D] -> (L_pos, prototypes [M, D])."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, features: Tensor, labels: LabelAssignment, per_pixel: bool
+    ) -> tuple[Tensor, Tensor]:
+        count, width = len(labels.ids), features.shape[1]
+        means = torch.empty(count, width, dtype=torch.float64)
+        scatter = torch.empty(count, dtype=torch.float64)
+        _kernels.prototypes(
+            features, labels.slots, labels.counts, labels.first, means, scatter, torch.get_num_threads()
+        )
+        pixels = labels.counts.to(torch.float64)
+        shares = 1 / pixels.sum().expand(count) if per_pixel else 1 / (count * pixels)
+        ctx.save_for_backward(features, means, shares)
+        ctx.labels = labels
+        return features.new_tensor(float((shares * scatter).sum())), means.to(features.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_pos: Tensor, grad_means: Tensor) -> tuple[Tensor, None, None]:
+        # d L_pos / d F(p) = 2 share (F(p) − z): the part through z vanishes, as Σ_p (F(p) − z) = 0.
+        features, means, shares = ctx.saved_tensors
+        labels = ctx.labels
+        pull = 2 * shares * grad_pos.double()
+        push = grad_means.double() / labels.counts[:, None]
+        out = torch.empty_like(features)
+        _kernels.spread(features, labels.slots, means, pull, push, out, torch.get_num_threads())
+        return out, None, None
+
+
+class _Separation(Function):
+    @staticmethod
+    def forward(ctx: Any, z: Tensor, others: Tensor | None, margin: float, squared: bool) -> Tensor:
+        a = z.detach().double().contiguous()
+        b = None if others is None else others.detach().double().contiguous()
+        grad_a, grad_b = torch.empty_like(a), None if b is None else torch.empty_like(b)
+        value = _kernels.separation(a, b, margin, squared, grad_a, grad_b)
+        ctx.gradients = (grad_a.to(z.dtype), None if grad_b is None else grad_b.to(z.dtype))
+        return z.new_tensor(value)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor | None, None, None]:
+        grad_a, grad_b = ctx.gradients
+        return grad_a * grad, None if grad_b is None else grad_b * grad, None, None
+
+
+def separation_loss(
+    prototypes: Tensor, others: Tensor | None = None, margin: float = 1.0, squared: bool = True
+) -> Tensor:
+    """L_neg: mean over pairs of ReLU(γ − ‖z_i − z_j‖²), or of ReLU(γ − ‖z_i − z_j‖) with squared=False.
+
+    prototypes: [M, D]; the pairs are i < j. With others [K, D] (say, prototypes remembered from other views) they are
+    all M·K pairs between the two, differentiable in both. No pair: 0. The gradient of ‖z‖ at 0 is taken as 0.
+    """
+    if prototypes.ndim != 2 or (others is not None and others.shape[1:] != prototypes.shape[1:]):
+        raise InputError(
+            f"separation loss: prototypes are {list(prototypes.shape)}, expected [M, D] of one width D"
+        )
+    return _Separation.apply(prototypes, others, float(margin), bool(squared))
+
+
+@dataclass(frozen=True)
+class InstanceLoss:
+    """value = w_pos pos + w_neg neg, all differentiable; so is prototypes [M, D], for further losses on them.
+
+    labels: [M] int32 ids of the prototypes, ascending. counts: [M] int64 pixels each was averaged over.
+    """
+
+    value: Tensor
+    pos: Tensor
+    neg: Tensor
+    prototypes: Tensor
+    labels: Tensor
+    counts: Tensor
+
+
+def instance_loss(
+    features: Tensor,
+    labels: Tensor | np.ndarray | LabelAssignment,
+    *,
+    margin: float = 1.0,
+    w_pos: float = 1.0,
+    w_neg: float = 1.0,
+    per_pixel: bool = False,
+    squared: bool = True,
+    fraction: float = 1.0,
+    seed: int = 0,
+) -> InstanceLoss:
+    """L_inst2D = w_p L_pos + w_n L_neg on a rendered feature map, as in the paper.
+
+        z_i   = 1/|M_i| Σ_{p ∈ M_i} F(p)
+        L_pos = 1/N Σ_i 1/|M_i| Σ_{p ∈ M_i} ‖F(p) − z_i‖²
+        L_neg = 2/(N (N − 1)) Σ_{i<j} ReLU(γ − ‖z_i − z_j‖²)
+
+    features: [H, W, D] F. labels: [H, W] integers, 0 = unlabelled, or what `assign_labels` made of them.
+    The authors' released code differs: per_pixel=True averages L_pos over all labelled pixels instead of per mask,
+    squared=False takes the distance unsquared in L_neg. fraction, seed: see `assign_labels`.
+    """
+    if features.ndim != 3 or features.shape[2] < 1:
+        raise InputError(f"instance loss: features are {list(features.shape)}, expected [H, W, D]")
+    if not isinstance(labels, LabelAssignment):
+        labels = assign_labels(labels, fraction, seed)
+    if labels.shape != tuple(features.shape[:2]):
+        found = f"{list(labels.shape)} and {list(features.shape)}"
+        raise InputError(
+            f"instance loss: labels and features have shapes {found}, expected [H, W] and [H, W, D]"
+        )
+    _ready("features", features)
+    flat = features.reshape(-1, features.shape[2]).contiguous()
+    pos, prototypes = _Prototypes.apply(flat, labels, per_pixel)
+    neg = separation_loss(prototypes, None, margin, squared)
+    return InstanceLoss(w_pos * pos + w_neg * neg, pos, neg, prototypes, labels.ids, labels.counts)
+
+
+# ------------------------------------------------------------------------------------------------------- variance
+
+
+class _Variance(Function):
+    @staticmethod
+    def forward(ctx: Any, variance: Tensor, squared: bool, count: int) -> Tensor:
+        total = _kernels.sum(variance.detach().reshape(-1), squared, torch.get_num_threads())
+        ctx.save_for_backward(variance)
+        ctx.squared, ctx.count = squared, count
+        return variance.new_tensor(total / count if count else 0.0)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        (variance,) = ctx.saved_tensors
+        scale = float(grad) / max(1, ctx.count)
+        out = variance * (2 * scale) if ctx.squared else torch.full_like(variance, scale)
+        return out, None, None
+
+
+def variance_loss(feature_variance: Tensor, form: VarianceForm = "paper") -> Tensor:
+    """L_var = 1/|I| Σ_p ‖Var(F(p))‖² of the rendered per-pixel variance, feature_variance [H, W, D].
+
+    form "paper": as above, summed over channels. "channels": the authors' released code, also averaged over the D
+    channels. "plain": the mean of Var itself, over pixels and channels.
+    """
+    if feature_variance.ndim != 3:
+        raise InputError(f"variance loss: found {list(feature_variance.shape)}, expected [H, W, D]")
+    if form not in ("paper", "channels", "plain"):
+        raise InputError(f"variance loss: form is '{form}', expected paper, channels or plain")
+    _ready("feature_variance", feature_variance)
+    height, width, channels = feature_variance.shape
+    count = height * width * (1 if form == "paper" else channels)
+    return _Variance.apply(feature_variance.contiguous(), form != "plain", count)

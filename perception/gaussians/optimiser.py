@@ -1,0 +1,169 @@
+"""Adam over the visible Gaussians only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from perception import _core
+from perception.errors import InputError
+
+_kernels = _core.training  # type: ignore[attr-defined]
+Rate = float | Tensor
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """Rows of each tensor that were updated, and rows skipped because their gradient held NaN or infinity."""
+
+    updated: dict[str, int]
+    skipped: dict[str, int]
+
+
+class SparseAdam:
+    """Adam (Kingma & Ba 2015) on the rows a mask selects, for tensors that grow and shrink together.
+
+    params: name -> [N, ...] float32 or float64 leaf tensors on the CPU, all with the same N; updated in place.
+    rates: name -> learning rate, or a tensor of one rate per column, shaped like a row ([...]), so that for example
+    the DC and the higher spherical harmonics may share one tensor and still learn at different speeds.
+
+    What "sparse" means, exactly:
+    - A selected row is updated as dense Adam would, also when its gradient is 0: its moments decay and it moves on.
+    - A row not selected is untouched: its moments do not decay, it does not move (as in Taming 3DGS and gsplat).
+    - The bias correction uses the global step count, common to all rows, as in 3DGS. So a row of zero state that
+      enters late takes up to (1 − β1)/√(1 − β2) ≈ 3.2 times the rate at its first step.
+    - A selected row whose gradient holds a NaN or an infinity is left untouched in that tensor, and counted.
+
+    With every row selected and every gradient finite this is torch.optim.Adam(eps=1e-15), to rounding.
+    """
+
+    def __init__(
+        self,
+        params: Mapping[str, Tensor],
+        rates: Mapping[str, Rate],
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-15,
+    ) -> None:
+        if set(params) != set(rates):
+            raise InputError(
+                f"SparseAdam: params {sorted(params)} and rates {sorted(rates)} name different tensors"
+            )
+        self.params = {name: _checked(name, tensor) for name, tensor in params.items()}
+        self.rates: dict[str, Rate] = dict(rates)
+        self.betas, self.eps, self.steps = betas, eps, 0
+        self._first = {name: torch.zeros_like(t, requires_grad=False) for name, t in self.params.items()}
+        self._second = {name: torch.zeros_like(t, requires_grad=False) for name, t in self.params.items()}
+        self._check_rows()
+
+    def __len__(self) -> int:
+        """N, the number of rows."""
+        return len(next(iter(self.params.values()))) if self.params else 0
+
+    def step(self, visible: Tensor | None = None, grads: Mapping[str, Tensor] | None = None) -> StepReport:
+        """One step. visible: [N] bool or uint8, None for all. grads: name -> [N, ...], by default each .grad.
+
+        Tensors without a gradient are left alone; the global step count rises by one for all.
+        """
+        if visible is not None:
+            if visible.shape != (len(self),):
+                raise InputError(
+                    f"SparseAdam: visible has shape {list(visible.shape)}, expected [{len(self)}]"
+                )
+            visible = visible.detach().to(torch.uint8).contiguous()
+        self.steps += 1
+        updated, skipped = {}, {}
+        for name, param in self.params.items():
+            grad = param.grad if grads is None else grads.get(name)
+            if grad is not None:
+                updated[name], skipped[name] = self._step_one(name, param, grad, visible)
+        return StepReport(updated, skipped)
+
+    def _step_one(self, name: str, param: Tensor, grad: Tensor, visible: Tensor | None) -> tuple[int, int]:
+        if grad.shape != param.shape or grad.dtype != param.dtype:
+            found = f"{list(grad.shape)} {grad.dtype}"
+            raise InputError(
+                f"SparseAdam: gradient of {name} is {found}, expected {list(param.shape)} {param.dtype}"
+            )
+        if not param.numel():
+            return 0, 0
+        rows = (len(param), -1)
+        flat = [t.detach().view(rows) for t in (param, self._first[name], self._second[name])]
+        gradient = grad.detach().contiguous().view(rows)
+        rate = torch.as_tensor(self.rates[name], dtype=torch.float64).reshape(-1)
+        rate = rate.expand(flat[0].shape[1]).contiguous()
+        param, first, second = flat
+        threads = torch.get_num_threads()
+        return _kernels.adam(
+            param, gradient, first, second, visible, rate, self.steps, *self.betas, self.eps, threads
+        )
+
+    def zero_grad(self) -> None:
+        """Drops all gradients."""
+        for param in self.params.values():
+            param.grad = None
+
+    def keep(self, index: Tensor) -> None:
+        """Keeps the rows `index` selects, in its order: [N] bool, or int64 row numbers (repeats allowed)."""
+        for table in (self.params, self._first, self._second):
+            for name, tensor in table.items():
+                table[name] = _leaf_like(tensor, tensor.detach()[index].contiguous())
+
+    def append(self, rows: Mapping[str, Tensor]) -> None:
+        """Appends rows (name -> [M, ...], the same M for all) with zero state."""
+        if set(rows) != set(self.params):
+            raise InputError(f"SparseAdam: append got {sorted(rows)}, expected {sorted(self.params)}")
+        for name, new in rows.items():
+            old = self.params[name]
+            new = new.detach().to(old.dtype)
+            self.params[name] = _leaf_like(old, torch.cat([old.detach(), new]))
+            for table in (self._first, self._second):
+                table[name] = torch.cat([table[name], torch.zeros_like(new)])
+        self._check_rows()
+
+    def reset_state(self, name: str, index: Tensor | None = None) -> None:
+        """Zeroes the moments of a tensor (of rows `index`), for example after an opacity reset."""
+        where = slice(None) if index is None else index
+        self._first[name][where] = 0
+        self._second[name][where] = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on: copies of params and moments, rates, step count."""
+        tables = {"params": self.params, "first": self._first, "second": self._second}
+        copies: dict[str, Any] = {k: {n: t.detach().clone() for n, t in d.items()} for k, d in tables.items()}
+        return copies | {"rates": dict(self.rates), "betas": self.betas, "eps": self.eps, "steps": self.steps}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Takes over a `state_dict`; the number of rows may differ from the present one."""
+        if set(state["params"]) != set(self.params):
+            raise InputError(
+                f"SparseAdam: state has {sorted(state['params'])}, expected {sorted(self.params)}"
+            )
+        for table, key in ((self.params, "params"), (self._first, "first"), (self._second, "second")):
+            for name, tensor in state[key].items():
+                table[name] = _leaf_like(table[name], tensor.detach().clone().contiguous())
+        self.rates = dict(state["rates"])
+        self.betas, self.eps, self.steps = tuple(state["betas"]), state["eps"], state["steps"]
+        self._check_rows()
+
+    def _check_rows(self) -> None:
+        rows = {name: len(tensor) for name, tensor in self.params.items()}
+        if len(set(rows.values())) > 1:
+            raise InputError(f"SparseAdam: tensors differ in their number of rows: {rows}")
+
+
+def _leaf_like(old: Tensor, new: Tensor) -> Tensor:
+    return new.requires_grad_(old.requires_grad)
+
+
+def _checked(name: str, tensor: Tensor) -> Tensor:
+    fine = tensor.is_leaf and tensor.device.type == "cpu" and tensor.dtype in (torch.float32, torch.float64)
+    if not fine or tensor.ndim < 1 or not tensor.is_contiguous():
+        found = f"{tensor.dtype} {list(tensor.shape)} on {tensor.device}, leaf={tensor.is_leaf}"
+        raise InputError(
+            f"SparseAdam: {name} is {found}, expected a contiguous float leaf [N, ...] on the CPU"
+        )
+    return tensor

@@ -1,0 +1,170 @@
+"""SparseAdam against torch.optim.Adam, and its promises about rows."""
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("perception._core")
+from perception import _core
+from perception.errors import InputError
+from perception.gaussians.optimiser import SparseAdam
+
+SHAPES = {"means": (3,), "quats": (4,), "opacities": (), "sh": (16, 3), "features": (8,)}
+RATES = {"means": 1.6e-4, "quats": 1e-3, "opacities": 0.05, "sh": 2.5e-3, "features": 1e-2}
+
+
+def tensors(rows, seed=0, dtype=torch.float64, scale=1.0):
+    random = np.random.default_rng(seed)
+    return {n: torch.from_numpy(random.normal(size=(rows, *s)) * scale).to(dtype) for n, s in SHAPES.items()}
+
+
+def leaves(rows, **options):
+    return {n: t.requires_grad_() for n, t in tensors(rows, **options).items()}
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-13), (torch.float32, 2e-6)])
+def test_all_rows_is_torch_adam(dtype, tolerance):
+    ours = SparseAdam(leaves(700, dtype=dtype), RATES)
+    reference = leaves(700, dtype=dtype)
+    theirs = torch.optim.Adam([{"params": [p], "lr": RATES[n]} for n, p in reference.items()], eps=1e-15)
+    for step in range(5):
+        grads = tensors(700, seed=step + 1, dtype=dtype, scale=1e-3)
+        ours.step(None, grads)
+        for name, param in reference.items():
+            param.grad = grads[name]
+        theirs.step()
+    for name, param in reference.items():
+        assert (param - ours.params[name]).abs().max() < tolerance
+
+
+@pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 0.97])
+def test_only_visible_rows_change_and_they_change_as_if_alone(share):
+    rows = 3000
+    visible = torch.from_numpy(np.random.default_rng(9).random(rows) < share)
+    sparse, alone = SparseAdam(leaves(rows), RATES), SparseAdam(leaves(rows), RATES)
+    alone.keep(visible)
+    before = {n: p.detach().clone() for n, p in sparse.params.items()}
+    for step in range(3):
+        grads = tensors(rows, seed=step + 1)
+        report = sparse.step(visible, grads)
+        alone.step(None, {n: g[visible] for n, g in grads.items()})
+        assert report.updated["sh"] == int(visible.sum()) and report.skipped["sh"] == 0
+    for name, param in sparse.params.items():
+        assert torch.equal(param[~visible], before[name][~visible])
+        assert torch.allclose(param[visible], alone.params[name], rtol=1e-14, atol=1e-15)
+
+
+def test_one_rate_per_column():
+    rates = torch.full((16, 3), 2.5e-3 / 20)
+    rates[0] = 2.5e-3
+    ours = SparseAdam({"sh": tensors(50)["sh"]}, {"sh": rates})
+    grads = tensors(50, seed=2)["sh"]
+    dc = SparseAdam({"x": tensors(50)["sh"][:, :1].contiguous()}, {"x": float(rates[0, 0])})
+    rest = SparseAdam({"x": tensors(50)["sh"][:, 1:].contiguous()}, {"x": float(rates[1, 0])})
+    ours.step(None, {"sh": grads})
+    dc.step(None, {"x": grads[:, :1]})
+    rest.step(None, {"x": grads[:, 1:]})
+    assert torch.allclose(ours.params["sh"], torch.cat([dc.params["x"], rest.params["x"]], 1), rtol=1e-15)
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("inf"), -float("inf")])
+def test_a_gradient_that_is_not_finite_is_skipped_and_counted(poison):
+    ours, clean = SparseAdam(leaves(400), RATES), SparseAdam(leaves(400), RATES)
+    good = torch.ones(400, dtype=torch.bool)
+    good[[0, 17, 399]] = False
+    grads = tensors(400, seed=1)
+    poisoned = {n: g.clone() for n, g in grads.items()}
+    poisoned["sh"][~good, 3, 1] = poison
+    report = ours.step(None, poisoned)
+    clean.step(good, grads)
+    assert report.skipped == {"means": 0, "quats": 0, "opacities": 0, "sh": 3, "features": 0}
+    assert torch.equal(ours.params["sh"], clean.params["sh"])
+    assert all(torch.isfinite(t).all() for t in ours.state_dict()["second"].values())
+
+
+def test_zero_gradient_moves_on_by_momentum():
+    ours = SparseAdam({"x": torch.zeros(2, 1, dtype=torch.float64)}, {"x": 0.1})
+    ours.step(None, {"x": torch.ones(2, 1, dtype=torch.float64)})
+    ours.step(torch.tensor([True, False]), {"x": torch.zeros(2, 1, dtype=torch.float64)})
+    m, v = 0.9 * 0.1 / (1 - 0.81), 0.999 * 0.001 / (1 - 0.999**2)
+    assert abs(ours.params["x"][0].item() - (-0.1 - 0.1 * m / v**0.5)) < 1e-12
+    assert abs(ours.params["x"][1].item() + 0.1) < 1e-12
+
+
+def test_keep_and_append_carry_the_state():
+    ours, long = SparseAdam(leaves(30), RATES), SparseAdam(leaves(30), RATES)
+    grads = tensors(30, seed=1)
+    ours.step(None, grads)
+    long.step(None, grads)
+    order = torch.tensor([5, 5, 29, 0])
+    ours.keep(order)
+    ours.append(tensors(2, seed=8))
+    assert len(ours) == 6 and all(p.requires_grad and p.is_leaf for p in ours.params.values())
+    more = tensors(30, seed=2)
+    long.step(None, more)
+    ours.step(
+        None, {n: torch.cat([g[order], torch.ones(2, *SHAPES[n], dtype=g.dtype)]) for n, g in more.items()}
+    )
+    for name, param in ours.params.items():
+        assert torch.equal(param[:4], long.params[name][order])
+    # Zero state at global step 2, unit gradient: m = .1 / (1 − .9²), v = .001 / (1 − .999²).
+    moved = tensors(2, seed=8)["means"] - ours.params["means"][4:].detach()
+    assert torch.allclose(
+        moved, torch.full_like(moved, 1.6e-4 * (0.1 / 0.19) / (0.001 / (1 - 0.999**2)) ** 0.5)
+    )
+
+
+def test_resume_goes_on_with_the_same_bits():
+    whole = SparseAdam(leaves(100), RATES)
+    for step in range(4):
+        if step == 2:
+            state = whole.state_dict()
+        whole.step(None, tensors(100, seed=step))
+    resumed = SparseAdam(leaves(3), RATES)
+    resumed.load_state_dict(state)
+    for step in (2, 3):
+        resumed.step(None, tensors(100, seed=step))
+    assert all(torch.equal(p, resumed.params[n]) for n, p in whole.params.items())
+
+
+def test_reset_state_forgets_rows():
+    ours = SparseAdam(leaves(10), RATES)
+    ours.step(None, tensors(10, seed=1))
+    ours.reset_state("means", torch.tensor([2, 3]))
+    state = ours.state_dict()
+    assert state["first"]["means"][2:4].abs().max() == 0 and state["first"]["means"][4].abs().min() > 0
+    ours.reset_state("quats")
+    assert ours.state_dict()["second"]["quats"].abs().max() == 0
+
+
+def run_kernel(threads, level, width):
+    random = np.random.default_rng(3)
+    p, g, m, v = (torch.from_numpy(random.random((5000, width))).float() for _ in range(4))
+    visible = torch.from_numpy((random.random(5000) < 0.6).astype(np.uint8))
+    rate = torch.full((width,), 1e-2, dtype=torch.float64)
+    _core.training.adam(p, g, m, v, visible, rate, 7, 0.9, 0.999, 1e-15, threads, level)
+    return p, m, v
+
+
+@pytest.mark.parametrize("width", [1, 3, 48])
+def test_threads_same_bits_and_instruction_sets_agree(width):
+    reference = run_kernel(1, "base", width)
+    for level in _core.training.levels():
+        one = run_kernel(1, level, width)
+        for threads in (2, 16):
+            assert all(torch.equal(a, b) for a, b in zip(one, run_kernel(threads, level, width), strict=True))
+        assert all((a - b).abs().max() < 3e-7 for a, b in zip(one, reference, strict=True))
+
+
+def test_empty_and_bad_input():
+    empty = SparseAdam(leaves(0), RATES)
+    assert empty.step(None, tensors(0)).updated["sh"] == 0
+    with pytest.raises(InputError, match="number of rows"):
+        SparseAdam({"a": torch.zeros(2, 1), "b": torch.zeros(3, 1)}, {"a": 1e-3, "b": 1e-3})
+    ours = SparseAdam(leaves(4), RATES)
+    with pytest.raises(InputError, match="visible"):
+        ours.step(torch.ones(3, dtype=torch.bool), tensors(4))
+    with pytest.raises(InputError, match="gradient of means"):
+        ours.step(None, {"means": torch.zeros(5, 3)})
+    with pytest.raises(InputError, match="append"):
+        ours.append({"means": torch.zeros(1, 3)})

@@ -1,0 +1,198 @@
+"""Instance and variance losses against plain torch, written here from the paper's equations."""
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("perception._core")
+from perception import _core
+from perception.errors import InputError
+from perception.gaussians.losses import assign_labels, instance_loss, separation_loss, variance_loss
+
+
+def torch_instance(features, labels, margin=1.0, per_pixel=False, squared=True):
+    ids = [int(i) for i in torch.unique(labels) if i != 0]
+    if not ids:
+        return features.sum() * 0, features.sum() * 0, features.new_zeros(0, features.shape[2])
+    masks = [features[labels == i] for i in ids]
+    z = torch.stack([m.mean(0) for m in masks])
+    scatter = [((m - c) ** 2).sum(1) for m, c in zip(masks, z, strict=True)]
+    pos = torch.cat(scatter).mean() if per_pixel else torch.stack([s.mean() for s in scatter]).mean()
+    neg, count = features.sum() * 0, len(ids)
+    for i in range(count):
+        for j in range(i + 1, count):
+            square = ((z[i] - z[j]) ** 2).sum()
+            neg = neg + torch.relu(margin - (square if squared else square.sqrt()))
+    return pos, neg * (2 / (count * (count - 1)) if count > 1 else 0), z
+
+
+def scene(height=17, width=23, depth=8, count=6, seed=0, scale=0.4):
+    random = np.random.default_rng(seed)
+    features = torch.from_numpy(random.normal(size=(height, width, depth)) * scale).requires_grad_()
+    return features, torch.from_numpy(random.integers(0, count + 1, (height, width)).astype(np.int32))
+
+
+def compare(features, labels, tolerance=1e-12, **options):
+    ours = instance_loss(features, labels, **options)
+    pos, neg, z = torch_instance(features, labels, **options)
+    assert abs(ours.pos.item() - pos.item()) < tolerance and abs(ours.neg.item() - neg.item()) < tolerance
+    assert (ours.prototypes - z).abs().max() < tolerance if len(z) else len(ours.prototypes) == 0
+    gradient = torch.autograd.grad(ours.value, features)[0]
+    expected = torch.autograd.grad(pos + neg, features)[0]
+    assert (gradient - expected).abs().max() <= tolerance
+    return ours
+
+
+@pytest.mark.parametrize("per_pixel", [False, True])
+@pytest.mark.parametrize("squared", [False, True])
+@pytest.mark.parametrize("depth", [1, 3, 8, 16, 32])
+def test_matches_the_equations(depth, per_pixel, squared):
+    features, labels = scene(depth=depth)
+    compare(features, labels, per_pixel=per_pixel, squared=squared, margin=1.5)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_none_one_and_two_labels(count):
+    features, labels = scene(count=count)
+    ours = compare(features, labels)
+    assert len(ours.labels) == count
+    if count < 2:
+        assert ours.neg.item() == 0
+
+
+def test_all_one_label_and_one_pixel():
+    features, _ = scene()
+    compare(features, torch.full((17, 23), 7, dtype=torch.int32))
+    pixel = torch.ones(1, 1, 4, dtype=torch.float64, requires_grad=True)
+    loss = instance_loss(pixel, torch.ones(1, 1, dtype=torch.int32))
+    assert loss.value.item() == 0 and torch.equal(loss.prototypes[0], pixel[0, 0])
+
+
+def test_300_labels():
+    features, labels = scene(40, 60, 8, 300)
+    assert len(compare(features, labels).labels) == 300
+
+
+def test_ids_need_not_be_dense():
+    features, labels = scene()
+    names = torch.tensor([0, 5, 40_000, 3, 2_000_000_000, 12, 70_000], dtype=torch.int32)
+    plain, wild = instance_loss(features, labels), instance_loss(features, names[labels.long()])
+    assert wild.labels.tolist() == sorted(names[1:].tolist())
+    assert abs(plain.value.item() - wild.value.item()) < 1e-13
+
+
+def test_features_far_from_zero_do_not_cancel():
+    random = np.random.default_rng(3)
+    labels = torch.from_numpy(random.integers(1, 4, (60, 80)).astype(np.int32))
+    features = torch.from_numpy(100 + 1e-3 * random.normal(size=(60, 80, 8))).float().requires_grad_()
+    ours = instance_loss(features, labels)
+    exact = features.detach().double().requires_grad_()
+    pos, neg, _ = torch_instance(exact, labels)
+    assert abs(ours.pos.item() / pos.item() - 1) < 1e-6
+    gradient = torch.autograd.grad(ours.pos, features)[0]
+    expected = torch.autograd.grad(pos, exact)[0]
+    assert (gradient - expected).abs().max() < 1e-5 * expected.abs().max()
+
+
+@pytest.mark.parametrize("squared", [False, True])
+def test_equal_prototypes_have_a_finite_gradient(squared):
+    features = torch.ones(4, 6, 3, dtype=torch.float64, requires_grad=True)
+    labels = torch.arange(24).reshape(4, 6) % 2 + 1
+    loss = instance_loss(features, labels, squared=squared)
+    assert loss.neg.item() == 1
+    assert torch.autograd.grad(loss.value, features)[0].abs().max() == 0
+
+
+def test_gradcheck_through_value_and_prototypes():
+    features, labels = scene(5, 6, 3, 3)
+
+    def run(f):
+        loss = instance_loss(f, labels, margin=2.0, w_pos=0.7, w_neg=1.3)
+        return loss.value + (loss.prototypes**3).sum()
+
+    assert torch.autograd.gradcheck(run, (features,), eps=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("squared", [False, True])
+def test_separation_from_a_memory_of_other_views(squared):
+    random = np.random.default_rng(4)
+    z = torch.from_numpy(random.normal(size=(5, 8)) * 0.3).requires_grad_()
+    memory = torch.from_numpy(random.normal(size=(9, 8)) * 0.3).requires_grad_()
+    run = lambda a, b: separation_loss(a, b, 1.2, squared)  # noqa: E731
+    distance = torch.cdist(z, memory)
+    expected = torch.relu(1.2 - (distance**2 if squared else distance)).mean()
+    assert abs(run(z, memory).item() - expected.item()) < 1e-13
+    assert torch.autograd.gradcheck(run, (z, memory), eps=1e-6, atol=1e-8)
+    assert separation_loss(z, memory[:0]).item() == 0 and separation_loss(z[:0]).item() == 0
+
+
+def test_drawn_pixels_are_a_fair_reproducible_share():
+    features, labels = scene(200, 150, 4, 9)
+    whole, drawn = assign_labels(labels), assign_labels(labels, 0.25, seed=5)
+    share = int((drawn.slots >= 0).sum()) / int((whole.slots >= 0).sum())
+    assert abs(share - 0.25) < 0.02
+    assert torch.equal(drawn.slots, assign_labels(labels, 0.25, seed=5).slots)
+    assert not torch.equal(drawn.slots, assign_labels(labels, 0.25, seed=6).slots)
+    kept = torch.where((drawn.slots >= 0).reshape(labels.shape), labels, 0)
+    compared = instance_loss(features, labels, fraction=0.25, seed=5)
+    assert abs(compared.value.item() - sum(torch_instance(features, kept)[:2]).item()) < 1e-12
+
+
+def test_same_bits_for_any_thread_count():
+    features, labels = scene(120, 331, 8, 40)
+    features = features.detach().float().reshape(-1, 8)
+    a = assign_labels(labels)
+    outputs = []
+    for threads in (1, 2, 5, 16):
+        means, scatter = torch.empty(40, 8, dtype=torch.float64), torch.empty(40, dtype=torch.float64)
+        _core.training.prototypes(features, a.slots, a.counts, a.first, means, scatter, threads)
+        out = torch.empty_like(features)
+        _core.training.spread(features, a.slots, means, scatter, means, out, threads)
+        outputs.append((means, scatter, out, _core.training.sum(features.reshape(-1), True, threads)))
+    for other in outputs[1:]:
+        assert all(torch.equal(x, y) for x, y in zip(outputs[0][:3], other[:3], strict=True))
+        assert outputs[0][3] == other[3]
+
+
+def test_instruction_sets_agree():
+    features, labels = scene(50, 60, 8, 5)
+    features = features.detach().float().reshape(-1, 8)
+    a = assign_labels(labels)
+    reference = None
+    for level in _core.training.levels():
+        means, scatter = torch.empty(5, 8, dtype=torch.float64), torch.empty(5, dtype=torch.float64)
+        _core.training.prototypes(features, a.slots, a.counts, a.first, means, scatter, 1, level)
+        reference = reference or (means, scatter)
+        assert (means - reference[0]).abs().max() < 1e-14
+        assert (scatter / reference[1] - 1).abs().max() < 1e-13
+
+
+FORMS = {
+    "paper": lambda v: (v**2).sum(2).mean(),
+    "channels": lambda v: (v**2).mean(),
+    "plain": lambda v: v.mean(),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("shape", [(1, 1, 1), (7, 9, 1), (33, 41, 8), (5, 3, 32)])
+def test_variance_loss(form, shape):
+    variance = torch.from_numpy(np.random.default_rng(7).random(shape)).requires_grad_()
+    ours, expected = variance_loss(variance, form), FORMS[form](variance)
+    assert abs(ours.item() - expected.item()) < 1e-13
+    a, b = torch.autograd.grad(2 * ours, variance)[0], torch.autograd.grad(2 * expected, variance)[0]
+    assert (a - b).abs().max() < 1e-15
+
+
+def test_bad_input_is_told():
+    features, labels = scene()
+    with pytest.raises(InputError, match=">= 0"):
+        instance_loss(features, labels - 5)
+    with pytest.raises(InputError, match="shapes"):
+        instance_loss(features, labels[:3])
+    with pytest.raises(InputError, match="integers"):
+        instance_loss(features, labels.double())
+    with pytest.raises(InputError, match="fraction"):
+        instance_loss(features, labels, fraction=0)
+    with pytest.raises(InputError, match="form"):
+        variance_loss(features, "other")
