@@ -1,0 +1,134 @@
+"""Where Gaussians are added and removed: growth by screen-space gradient under a hard budget, pruning of the unneeded.
+
+The rules are those of Kerbl et al. 2023 §5.2 (clone the small, split the large), with three changes that hold a budget:
+candidates are ranked and only the best fill the schedule's room; a clone's opacities are corrected so that the picture
+does not jump (Rota Bulò et al. 2024, eq. 11); opacities decay a little instead of being reset.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from perception.config import DensifyConfig
+from perception.gaussians.model import Gaussians
+
+SPLIT_SHRINK = 1.6
+"""Scales of the two halves of a split Gaussian are divided by this (Kerbl et al. 2023)."""
+
+
+@dataclass
+class Statistics:
+    """Sums since the last densification, all [N]: gradient norms of the 2D mean (in units of half the image's long
+    side), how often a Gaussian was seen, and its largest radius as a share of the image's long side."""
+
+    gradient: torch.Tensor
+    seen: torch.Tensor
+    radius: torch.Tensor
+
+    @staticmethod
+    def zeros(count: int) -> Statistics:
+        return Statistics(torch.zeros(count), torch.zeros(count), torch.zeros(count))
+
+    def add(self, gradient_px: torch.Tensor, radius_px: torch.Tensor, visible: torch.Tensor, long_side: int) -> None:
+        """One view's figures: gradient_px [N] per pixel, radius_px [N] pixels, visible [N] bool."""
+        self.gradient += torch.where(visible, gradient_px * (0.5 * long_side), 0.0)
+        self.seen += visible
+        self.radius = torch.maximum(self.radius, torch.where(visible, radius_px / long_side, 0.0))
+
+    def mean_gradient(self) -> torch.Tensor:
+        return self.gradient / self.seen.clamp(min=1)
+
+
+@dataclass(frozen=True)
+class Change:
+    """keep: indices [K] of rows that stay, in order; born: new Gaussians appended after them."""
+
+    keep: torch.Tensor
+    born: Gaussians
+
+
+def target_count(progress: float, initial: int, budget: int, config: DensifyConfig) -> int:
+    """Gaussians allowed at `progress` in [0, 1]: a straight ramp from the initial count to the budget."""
+    share = (progress - config.start) / max(config.stop - config.start, 1e-9)
+    return int(initial + (budget - initial) * min(1.0, max(0.0, share)))
+
+
+def densify(
+    gaussians: Gaussians, statistics: Statistics, allowed: int, extent: float, config: DensifyConfig, seed: int
+) -> Change:
+    """Prunes, then clones or splits the best candidates while there are at most `allowed` Gaussians.
+
+    extent: scene size in world units. The result depends on the arguments alone, not on global random state.
+    """
+    needed = _needed(gaussians, statistics, config)
+    room = max(0, allowed - int(needed.sum()))
+    score = statistics.mean_gradient()
+    candidates = torch.nonzero(needed & (score > config.grad_threshold)).flatten()
+    if len(candidates) > room:
+        best = torch.argsort(score[candidates], descending=True, stable=True)[:room]
+        candidates = candidates[best].sort().values
+    large = gaussians.log_scales[candidates].max(dim=1).values.exp() > config.percent_dense * extent
+    split, clone = candidates[large], candidates[~large]
+
+    # A clone and its original share the light: o' = 1 − sqrt(1 − o) keeps what both show together.
+    halved = _halved_logit(gaussians.opacity_logits[clone])
+    gaussians.opacity_logits[clone] = halved
+    needed[split] = False
+    generator = torch.Generator().manual_seed(seed)
+    born = _concatenate([_rows(gaussians, clone), *_halves(gaussians, split, generator)])
+    return Change(torch.nonzero(needed).flatten(), born)
+
+
+def decay_opacities(gaussians: Gaussians, share: float) -> None:
+    """Multiplies every opacity by 1 − share: what no photo holds up fades and is pruned."""
+    opacities = gaussians.opacities * (1 - share)
+    gaussians.opacity_logits.copy_(torch.logit(opacities.clamp(1e-6, 1 - 1e-6)))
+
+
+def _needed(gaussians: Gaussians, statistics: Statistics, config: DensifyConfig) -> torch.Tensor:
+    unseen = statistics.seen == 0
+    if bool(unseen.all()):  # no statistics yet
+        unseen = torch.zeros_like(unseen)
+    finite = torch.isfinite(gaussians.means).all(dim=1) & torch.isfinite(gaussians.log_scales).all(dim=1)
+    return (gaussians.opacities >= config.prune_opacity) & ~unseen & finite
+
+
+def _halved_logit(logits: torch.Tensor) -> torch.Tensor:
+    opacities = 1 - torch.sqrt(1 - logits.sigmoid().clamp(max=1 - 1e-6))
+    return torch.logit(opacities.clamp(1e-6, 1 - 1e-6))
+
+
+def _rows(gaussians: Gaussians, index: torch.Tensor) -> Gaussians:
+    return Gaussians(**{name: tensor[index].clone() for name, tensor in vars(gaussians).items()})
+
+
+def _concatenate(parts: list[Gaussians]) -> Gaussians:
+    return Gaussians(**{name: torch.cat([vars(part)[name] for part in parts]) for name in vars(parts[0])})
+
+
+def _halves(gaussians: Gaussians, index: torch.Tensor, generator: torch.Generator) -> list[Gaussians]:
+    """Two children of each Gaussian in `index`, drawn from it and shrunk."""
+    rotations = rotation_matrices(gaussians.quats[index])
+    children = []
+    for _ in range(2):
+        child = _rows(gaussians, index)
+        offset = torch.randn(len(index), 3, generator=generator) * child.scales
+        child.means += torch.einsum("nij,nj->ni", rotations, offset)
+        child.log_scales -= torch.log(torch.tensor(SPLIT_SHRINK))
+        children.append(child)
+    return children
+
+
+def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
+    """[N, 4] wxyz of any norm -> [N, 3, 3]; a zero quaternion gives the identity."""
+    norm = quats.norm(dim=1, keepdim=True)
+    identity = torch.tensor([1.0, 0, 0, 0], dtype=quats.dtype)
+    w, x, y, z = torch.where(norm > 0, quats / norm.clamp(min=1e-30), identity).unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=1).reshape(-1, 3, 3)

@@ -1,0 +1,82 @@
+"""The trainable Gaussians: tensors named for what they store, properties for what they mean."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+SH_C0 = 0.28209479177387814
+"""Zeroth real spherical harmonic, 1 / (2 sqrt(pi))."""
+
+
+@dataclass
+class Gaussians:
+    """N Gaussians in the world frame, float32.
+
+    means [N, 3]; quats [N, 4] wxyz, any norm; log_scales [N, 3]; opacity_logits [N]; sh [N, K, 3] spherical-harmonic
+    coefficients (K = (degree + 1)², constant term first); features [N, D] instance features.
+    """
+
+    means: torch.Tensor
+    quats: torch.Tensor
+    log_scales: torch.Tensor
+    opacity_logits: torch.Tensor
+    sh: torch.Tensor
+    features: torch.Tensor
+
+    def __len__(self) -> int:
+        return int(self.means.shape[0])
+
+    @property
+    def scales(self) -> torch.Tensor:
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> torch.Tensor:
+        return self.opacity_logits.sigmoid()
+
+    @property
+    def sh_degree(self) -> int:
+        return math.isqrt(self.sh.shape[1]) - 1
+
+    @property
+    def base_colors(self) -> torch.Tensor:
+        """[N, 3] RGB in about [0, 1] as seen without view dependence."""
+        return self.sh[:, 0] * SH_C0 + 0.5
+
+
+def from_points(
+    points: np.ndarray, colors: np.ndarray, *, feature_dim: int, seed: int, opacity: float = 0.1
+) -> Gaussians:
+    """One isotropic Gaussian a point, as wide as the mean distance to its 3 neighbours (Kerbl et al. 2023, §5.1).
+
+    points [P, 3] float; colors [P, 3] uint8. Coincident points get a scale from the cloud's median spacing.
+    """
+    from scipy.spatial import cKDTree
+
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    neighbours = min(4, len(points))
+    if neighbours > 1:
+        distances, _ = cKDTree(points).query(points, k=neighbours, workers=-1)
+        spacing = np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1))
+    else:
+        spacing = np.ones(len(points))
+    positive = spacing[spacing > 0]
+    typical = float(np.median(positive)) if len(positive) else 1.0
+    spacing = np.clip(np.where(spacing > 0, spacing, typical), 1e-3 * typical, 10 * typical)
+
+    generator = torch.Generator().manual_seed(seed)
+    count = len(points)
+    quats = torch.zeros(count, 4)
+    quats[:, 0] = 1.0
+    return Gaussians(
+        means=torch.from_numpy(points.astype(np.float32)),
+        quats=quats,
+        log_scales=torch.from_numpy(np.log(spacing).astype(np.float32))[:, None].repeat(1, 3),
+        opacity_logits=torch.full((count,), math.log(opacity / (1 - opacity))),
+        sh=((torch.from_numpy(np.ascontiguousarray(colors)).float() / 255 - 0.5) / SH_C0)[:, None, :],
+        features=torch.rand(count, feature_dim, generator=generator) - 0.5,
+    )

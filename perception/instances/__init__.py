@@ -1,0 +1,1 @@
+"""From Gaussians with features to instances: cluster, tell apart, score, see."""

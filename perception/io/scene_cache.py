@@ -1,0 +1,58 @@
+"""A scene kept on disk, so that a resumed run starts from exactly the poses and points the interrupted one had."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.io.atomic import atomic_directory
+from perception.types import Lens, Scene, View
+
+
+def save_scene(folder: Path, scene: Scene) -> None:
+    """Writes `scene` to `folder`, whole or not at all; photos stay where they are."""
+    views = [_view_json(view) for view in scene.views]
+    facts = {"views": views, "metric": scene.metric, "frame": scene.frame, "report": scene.report}
+    with atomic_directory(folder) as aside:
+        (aside / "scene.json").write_text(json.dumps(facts, default=str), encoding="utf-8")
+        np.savez(aside / "points.npz", points=scene.points, colors=scene.point_colors)
+
+
+def load_saved_scene(folder: Path) -> Scene | None:
+    """The scene kept in `folder`; None when there is none."""
+    if not (folder / "scene.json").is_file():
+        return None
+    facts = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
+    with np.load(folder / "points.npz") as arrays:
+        points, colors = arrays["points"], arrays["colors"]
+    views = [_view_from_json(entry) for entry in facts["views"]]
+    return Scene(views, points, colors, facts["metric"], facts["frame"], facts["report"])
+
+
+def _view_json(view: View) -> dict[str, Any]:
+    lens = view.lens
+    return {
+        "name": view.name,
+        "photo": str(view.photo),
+        "K": view.K.tolist(),
+        "width": view.width,
+        "height": view.height,
+        "camera_from_world": view.camera_from_world.tolist(),
+        "lens": None if lens is None else [lens.model, list(lens.params), lens.width, lens.height],
+    }
+
+
+def _view_from_json(entry: dict[str, Any]) -> View:
+    lens = entry["lens"]
+    return View(
+        entry["name"],
+        Path(entry["photo"]),
+        np.array(entry["K"]),
+        entry["width"],
+        entry["height"],
+        np.array(entry["camera_from_world"]),
+        None if lens is None else Lens(lens[0], tuple(lens[1]), lens[2], lens[3]),
+    )

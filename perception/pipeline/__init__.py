@@ -1,0 +1,1 @@
+"""Composes the stages of mapping, resumes them, and writes the run record."""

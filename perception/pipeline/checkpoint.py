@@ -1,0 +1,43 @@
+"""Training state on disk, written whole or not at all, and refused when the settings have changed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from perception.config import MapConfig
+from perception.errors import InputError
+from perception.io.atomic import atomic_file
+
+
+def fingerprint(source: Path, config: MapConfig) -> str:
+    """What a checkpoint depends on. The time limit is left out: giving more time to a stopped run is the point."""
+    settings = config.to_json()
+    del settings["train"]["time_limit"], settings["train"]["checkpoint_seconds"]
+    text = json.dumps([str(source.resolve()), settings], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def save_checkpoint(path: Path, state: dict[str, Any], mark: str) -> None:
+    """Writes `state` under the settings' fingerprint `mark`."""
+    import torch
+
+    with atomic_file(path) as aside:
+        torch.save({"mark": mark, "state": state}, aside)
+
+
+def load_checkpoint(path: Path, mark: str) -> dict[str, Any] | None:
+    """The state kept at `path`; None when there is none. InputError when it belongs to other settings."""
+    import torch
+
+    if not path.is_file():
+        return None
+    held = torch.load(path, weights_only=True)
+    if held["mark"] != mark:
+        raise InputError(
+            f"{path}: was made with other settings or another input; repeat the first command with --resume, "
+            f"or delete {path.parent} to start over"
+        )
+    return held["state"]

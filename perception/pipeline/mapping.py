@@ -1,0 +1,283 @@
+"""From an input to a map on disk: poses, masks, training, instances, language. Every stage skips what is done."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.config import MapConfig
+from perception.errors import InputError
+from perception.gaussians.model import Gaussians, from_points
+from perception.gaussians.train import Trainer, TrainingView, render_view, psnr
+from perception.io.inputs import load_scene
+from perception.io.photos import load_photo
+from perception.io.scene_cache import load_saved_scene, save_scene
+from perception.io.store import GaussianMap, write_map
+from perception.masks import compute_masks, make_source
+from perception.pipeline.checkpoint import fingerprint, load_checkpoint, save_checkpoint
+from perception.pipeline.instances import find_instances
+from perception.pipeline.photos import load_all, split_views
+from perception.pipeline.record import Stages, peak_memory_mib, versions
+from perception.progress import Progress
+from perception.types import Scene, View
+
+WORK_SUFFIX = ".work"
+
+
+def work_folder(output: Path) -> Path:
+    """Where an unfinished run keeps what it has done: a sibling of the map."""
+    return output.with_name(output.name + WORK_SUFFIX)
+
+
+def build_map(
+    source: Path, output: Path, config: MapConfig, *, resume: bool = False, progress: Progress | None = None
+) -> GaussianMap:
+    """Builds a map from photos, a COLMAP workspace or a transforms.json, and writes it to `output`.
+
+    Raises InputError for bad input. What was done is kept in `work_folder(output)` until the map is written; with
+    `resume` a run goes on from there.
+    """
+    progress = progress or Progress(quiet=True)
+    if config.device == "cuda":
+        raise InputError("--device cuda: this build has no CUDA rasterizer; use --device cpu or auto")
+    work = _prepare(source, output, resume)
+    stages = Stages()
+    started = time.monotonic()
+
+    with stages("poses"):
+        scene = _scene(source, work, config, progress)
+    _tell_scene(scene, progress)
+    training, held_out = split_views(scene.views, config.photos.holdout)
+
+    with stages("masks"):
+        mask_report = _masks(training, work, config, progress)
+    with stages("photos"):
+        views = _photos(training, config, work / "masks", progress)
+        held = _photos(held_out, config, None, progress)
+    with stages("train"):
+        trainer = _train(scene, views, held, work, fingerprint(source, config), config, progress)
+    gaussians = trainer.gaussians
+    with stages("instances"):
+        found = find_instances(gaussians, views, scene, config, progress)
+    with stages("score"):
+        quality = score_views(gaussians, held)
+
+    record = {
+        "frame": scene.frame,
+        "metric": scene.metric,
+        "source": str(source),
+        "seed": config.seed,
+        "config": config.to_json(),
+        "versions": versions(),
+        "scene": scene.report,
+        "masks": mask_report,
+        "training": vars(trainer.record),
+        "instances": found.report,
+        "quality": quality,
+        "seconds": {**stages.seconds, "total": round(time.monotonic() - started, 2)},
+        "peak_memory_mib": peak_memory_mib(),
+    }
+    gmap = _assemble(gaussians, found, scene, held_out, record)
+    write_map(output, gmap)
+    shutil.rmtree(work, ignore_errors=True)
+    _tell_result(gmap, output, progress)
+    return gmap
+
+
+# ----------------------------------------------------------------------- stages
+
+
+def _prepare(source: Path, output: Path, resume: bool) -> Path:
+    if not source.exists():
+        raise InputError(f"{source}: does not exist; give a folder of photos, a COLMAP workspace or a transforms.json")
+    if output.exists():
+        raise InputError(f"{output}: exists already; choose another -o or remove it first")
+    work = work_folder(output)
+    if work.exists() and not resume:
+        raise InputError(f"{work}: an unfinished run lies there; go on with --resume or remove the folder")
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{work}: cannot be made ({error.strerror}); choose a writable -o") from error
+    return work
+
+
+def _scene(source: Path, work: Path, config: MapConfig, progress: Progress) -> Scene:
+    scene = load_saved_scene(work / "scene")
+    if scene is None:
+        camera = Path(config.photos.camera) if config.photos.camera else None
+        scene = load_scene(
+            source, work / "sfm", camera_file=camera, progress=_stage(progress, "poses"), seed=config.seed
+        )
+        save_scene(work / "scene", scene)
+    return scene
+
+
+def _masks(views: list[View], work: Path, config: MapConfig, progress: Progress) -> dict[str, Any]:
+    source = make_source(config.masks, cache_dir=work)
+    report = compute_masks(
+        views,
+        source,
+        lambda view: load_photo(view, config.photos.max_side),
+        work / "masks",
+        _stage(progress, f"masks ({source.name})"),
+    )
+    for warning in report["warnings"]:
+        progress.log(f"warning: {warning}")
+    return report
+
+
+def _photos(views: list[View], config: MapConfig, labels: Path | None, progress: Progress) -> list[TrainingView]:
+    return load_all(views, config.photos.max_side, labels, _stage(progress, "photos"))
+
+
+def _train(
+    scene: Scene,
+    views: list[TrainingView],
+    held_out: list[TrainingView],
+    work: Path,
+    mark: str,
+    config: MapConfig,
+    progress: Progress,
+) -> Trainer:
+    trainer = Trainer(_initial(scene, config), views, config, held_out)
+    path = work / "checkpoint.pt"
+    state = load_checkpoint(path, mark)
+    if state is not None:
+        trainer.load(state)
+        progress.log(f"resuming at iteration {trainer.iteration}")
+    watch = _Watch(path, mark, config, progress)
+    try:
+        trainer.run(watch)
+    except KeyboardInterrupt:
+        save_checkpoint(path, trainer.state(), mark)
+        raise
+    save_checkpoint(path, trainer.state(), mark)
+    return trainer
+
+
+def _initial(scene: Scene, config: MapConfig) -> Gaussians:
+    points, colors = scene.points, scene.point_colors
+    if len(points) > config.train.budget:
+        keep = np.random.default_rng(config.seed).choice(len(points), config.train.budget, replace=False)
+        points, colors = points[np.sort(keep)], colors[np.sort(keep)]
+    return from_points(points, colors, feature_dim=config.losses.feature_dim, seed=config.seed)
+
+
+class _Watch:
+    """Called after every step: draws progress now and then, keeps a checkpoint now and then."""
+
+    def __init__(self, path: Path, mark: str, config: MapConfig, progress: Progress):
+        self.path, self.mark, self.config, self.progress = path, mark, config, progress
+        self.saved = self.drawn = time.monotonic()
+        self.loss: float | None = None
+        self.first: tuple[float, int] | None = None
+
+    def __call__(self, trainer: Trainer, figures: dict[str, float]) -> None:
+        now = time.monotonic()
+        self.loss = figures["loss"] if self.loss is None else 0.95 * self.loss + 0.05 * figures["loss"]
+        self.first = self.first or (now, trainer.iteration)
+        if now - self.drawn > 0.5 or trainer.progress >= 1:
+            self.drawn = now
+            self._draw(trainer, now)
+        if now - self.saved > self.config.train.checkpoint_seconds:
+            save_checkpoint(self.path, trainer.state(), self.mark)
+            self.saved = time.monotonic()
+
+    def _draw(self, trainer: Trainer, now: float) -> None:
+        assert self.first is not None
+        speed = (trainer.iteration - self.first[1]) / max(now - self.first[0], 1e-6)
+        total = self.config.train.iterations
+        if trainer.progress > trainer.iteration / total:  # the clock rules: say how far it lets us come
+            total = max(trainer.iteration, round(trainer.iteration / max(trainer.progress, 1e-6)))
+        curve = trainer.record.curve
+        self.progress.update(
+            "train",
+            trainer.iteration,
+            total,
+            loss=f"{self.loss:.4f}",
+            psnr=f"{curve[-1]['psnr']:.2f}" if curve else "-",
+            gaussians=len(trainer.gaussians),
+            it_s=f"{speed:.1f}",
+            left_s=round((total - trainer.iteration) / max(speed, 1e-6)),
+        )
+
+
+def score_views(gaussians: Gaussians, views: list[TrainingView]) -> dict[str, Any]:
+    """PSNR and SSIM of each view (none: empty), and their means."""
+    from perception.evaluate.images import ssim
+
+    per_view = {}
+    for view in views:
+        image = render_view(gaussians, view)
+        similarity = ssim(image.numpy().astype(np.float64), view.photo.numpy().astype(np.float64) / 255)
+        per_view[view.name] = {"psnr": psnr(image, view.photo), "ssim": float(similarity)}
+    if not per_view:
+        return {"views": {}}
+    means = {name: float(np.mean([entry[name] for entry in per_view.values()])) for name in ("psnr", "ssim")}
+    return {**means, "views": per_view}
+
+
+def _assemble(
+    gaussians: Gaussians, found: Any, scene: Scene, held_out: list[View], record: dict[str, Any]
+) -> GaussianMap:
+    held = {view.name for view in held_out}
+    cameras = {
+        "names": np.array([view.name for view in scene.views]),
+        "photos": np.array([str(view.photo) for view in scene.views]),
+        "K": np.stack([view.K for view in scene.views]),
+        "sizes": np.array([[view.width, view.height] for view in scene.views]),
+        "camera_from_world": np.stack([view.camera_from_world for view in scene.views]),
+        "held_out": np.array([view.name in held for view in scene.views]),
+    }
+    arrays = {name: tensor.detach().numpy() for name, tensor in vars(gaussians).items()}
+    arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)
+    return GaussianMap(
+        **arrays,
+        instance_ids=found.ids,
+        membership=found.membership,
+        instances=found.instances,
+        info=record,
+        cameras=cameras,
+        language=found.language,
+    )
+
+
+# ----------------------------------------------------------------------- words
+
+
+def _stage(progress: Progress, name: str) -> Callable[..., None]:
+    """An adapter for stages that report (done, total), or (text, done, total)."""
+
+    def tell(*values: Any) -> None:
+        if len(values) == 3:
+            progress.update(f"{name}: {values[0]}", int(values[1]), int(values[2]))
+        else:
+            progress.update(name, int(values[0]), int(values[1]))
+
+    return tell
+
+
+def _tell_scene(scene: Scene, progress: Progress) -> None:
+    report = scene.report
+    progress.log(f"{len(scene.views)} posed photos, {len(scene.points)} points")
+    for name, reason in dict(report.get("left_out", {})).items():
+        progress.log(f"left out: {name} ({reason})")
+    for warning in report.get("warnings", []):
+        progress.log(f"warning: {warning}")
+
+
+def _tell_result(gmap: GaussianMap, output: Path, progress: Progress) -> None:
+    info = gmap.info
+    quality = info["quality"]
+    scored = f", held-out PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.3f}" if "psnr" in quality else ""
+    progress.log(
+        f"{output}: {len(gmap)} Gaussians, {len(gmap.instances)} instances{scored}, "
+        f"{info['seconds']['total']:.0f} s, peak {info['peak_memory_mib']:.0f} MiB"
+    )
+

@@ -1,0 +1,49 @@
+"""Posed photos and their label images as the trainer wants them: decoded once, at training size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from perception.gaussians.train import TrainingView
+from perception.io.photos import load_photo, scaled_K
+from perception.masks.store import load_labels
+from perception.types import View
+
+
+def split_views(views: list[View], holdout: int) -> tuple[list[View], list[View]]:
+    """(training, held out): sorted by name, index % holdout == 0 is held out; holdout 0 or 1 view trains on all."""
+    if holdout <= 1 or len(views) < 4:
+        return list(views), []
+    held = [view for i, view in enumerate(views) if i % holdout == 0]
+    return [view for i, view in enumerate(views) if i % holdout != 0], held
+
+
+def training_view(view: View, max_side: int, labels_folder: Path | None = None) -> TrainingView:
+    """Decodes one photo, and its label image when `labels_folder` is given."""
+    photo = load_photo(view, max_side)
+    height, width = photo.shape[:2]
+    labels = None
+    if labels_folder is not None:
+        labels = torch.from_numpy(np.ascontiguousarray(load_labels(labels_folder, view), dtype=np.int32))
+    return TrainingView(
+        view.name,
+        torch.from_numpy(photo),
+        labels,
+        torch.from_numpy(scaled_K(view, width, height).astype(np.float32)),
+        torch.from_numpy(view.camera_from_world.astype(np.float32)),
+    )
+
+
+def load_all(
+    views: list[View], max_side: int, labels_folder: Path | None, progress: Callable[[int, int], None]
+) -> list[TrainingView]:
+    """All of `views`, decoded; memory is 3 bytes a pixel, and 4 more with labels."""
+    loaded = []
+    for done, view in enumerate(views, start=1):
+        loaded.append(training_view(view, max_side, labels_folder))
+        progress(done, len(views))
+    return loaded
