@@ -101,9 +101,7 @@ def test_agrees_with_a_plain_implementation_on_200_cases(block):
         kinds = gt_classes if by_class else dict.fromkeys(range(-1, 14), 1)
         thresholds = [*np.arange(0.5, 0.95, 0.05), 0.25]
         chosen = classes if by_class else np.ones(len(masks), int)
-        want = [
-            [slow_ap(masks, scores, chosen, gt_ids, kinds, c, t, 40) for t in thresholds] for c in labels
-        ]
+        want = [[slow_ap(masks, scores, chosen, gt_ids, kinds, c, t, 40) for t in thresholds] for c in labels]
         want = np.array(want)[~np.isnan(np.array(want)[:, 0])]
         assert got["ap"] == pytest.approx(want[:, :9].mean(), abs=1e-9)
         assert got["ap50"] == pytest.approx(want[:, 0].mean(), abs=1e-9)
@@ -127,7 +125,9 @@ def test_truth_against_itself_is_perfect_and_ids_do_not_matter():
     renamed = np.array([0, 70000000, 3, 9, 4, 0])[gt]
     result = evaluate(renamed, None, gt)
     assert (result["ap"], result["ap50"], result["ap25"]) == (1.0, 1.0, 1.0)
-    assert {(m["gt"], m["pred"]) for m in result["matches_at_50"]} == {(i, v) for i, v in enumerate([70000000, 3, 9, 4, 0], 1)}
+    assert {(m["gt"], m["pred"]) for m in result["matches_at_50"]} == {
+        (i, v) for i, v in enumerate([70000000, 3, 9, 4, 0], 1)
+    }
 
 
 def test_closed_form_one_hit_one_miss_one_false_positive():
@@ -150,7 +150,18 @@ def test_iou_equal_to_the_threshold_is_no_match():
 def test_nine_thresholds():
     gt = np.repeat([1, 2], 200)
     result = evaluate(gt, None, gt)
-    assert [round(row["iou"], 2) for row in result["per_threshold"]] == [.5, .55, .6, .65, .7, .75, .8, .85, .9, .25]
+    assert [round(row["iou"], 2) for row in result["per_threshold"]] == [
+        0.5,
+        0.55,
+        0.6,
+        0.65,
+        0.7,
+        0.75,
+        0.8,
+        0.85,
+        0.9,
+        0.25,
+    ]
 
 
 def test_ignored_points_are_removed_by_scannetpp_and_void_elsewhere():
@@ -167,7 +178,9 @@ def test_confidence_order_matters_and_segment3d_drops_it():
     low_first = evaluate(pred, {0: 0.1, 2: 0.9, 3: 0.9, 4: 0.9, 5: 0.9}, gt)["ap50"]
     high_first = evaluate(pred, {0: 0.9, 2: 0.1, 3: 0.1, 4: 0.1, 5: 0.1}, gt)["ap50"]
     assert high_first > low_first
-    flat = [evaluate(pred, {0: s, 2: .5, 3: .5, 4: .5, 5: .5}, gt, "segment3d")["ap50"] for s in (0.1, 0.9)]
+    flat = [
+        evaluate(pred, {0: s, 2: 0.5, 3: 0.5, 4: 0.5, 5: 0.5}, gt, "segment3d")["ap50"] for s in (0.1, 0.9)
+    ]
     assert flat[0] == flat[1]
 
 

@@ -82,7 +82,9 @@ def compact(ids: np.ndarray, void_ids: Sequence[int] = ()) -> tuple[np.ndarray, 
     if ids.ndim != 1 or ids.dtype.kind not in "iu":
         raise InputError(f"instance ids must be whole numbers [N]; found {ids.dtype} {list(ids.shape)}")
     ids = ids.astype(np.int64)
-    if len(ids) and 0 <= (high := int(ids.max())) < max(4 * len(ids), 1 << 16):  # no sorting: mark what occurs
+    if len(ids) and 0 <= (high := int(ids.max())) < max(
+        4 * len(ids), 1 << 16
+    ):  # no sorting: mark what occurs
         seen = np.zeros(high + 2, bool)  # the last cell stands for all negative ids
         seen[np.where(ids < 0, high + 1, ids)] = True
         seen[[v for v in void_ids if 0 <= v <= high] + [high + 1]] = False
@@ -123,7 +125,9 @@ def overlap_of_ids(
     table = np.bincount(both[both >= 0], minlength=len(ids) * (g + 1)).reshape(len(ids), g + 1)
     missing = [i for i in ids.tolist() if pred_scores is not None and i not in pred_scores]
     if missing:
-        raise InputError(f"prediction: no score for instance {missing[0]} ({len(missing)} such); give one for each")
+        raise InputError(
+            f"prediction: no score for instance {missing[0]} ({len(missing)} such); give one for each"
+        )
     scores = [1.0 if pred_scores is None else pred_scores[i] for i in ids.tolist()]
     classes = [OBJECT if pred_classes is None else pred_classes[i] for i in ids.tolist()]
     return _overlap(ids, scores, classes, table, truth)
@@ -134,7 +138,9 @@ def overlap_of_masks(
 ) -> Overlap:
     """Overlap of P masks, each bool [N] or an array of point indices; masks may overlap each other, order is kept."""
     if len(scores) != len(masks) or (classes is not None and len(classes) != len(masks)):
-        raise InputError(f"prediction: {len(masks)} masks, {len(scores)} scores; one score (and class) per mask is needed")
+        raise InputError(
+            f"prediction: {len(masks)} masks, {len(scores)} scores; one score (and class) per mask is needed"
+        )
     g = len(truth.ids)
     target = np.where(truth.index >= 0, truth.index, g)
     table = np.zeros((len(masks), g + 1), np.int64)
@@ -149,7 +155,9 @@ def overlap_of_masks(
 
 def _same_length(predicted: int, true: int) -> None:
     if predicted != true:
-        raise InputError(f"prediction has {predicted} points, truth has {true}; both must be the same points in order")
+        raise InputError(
+            f"prediction has {predicted} points, truth has {true}; both must be the same points in order"
+        )
 
 
 def _overlap(
@@ -157,7 +165,9 @@ def _overlap(
 ) -> Overlap:
     scores = np.asarray(scores, np.float64).reshape(len(ids))
     if not np.isfinite(scores).all():
-        raise InputError(f"prediction: score of instance {ids[~np.isfinite(scores)][0]} is not a finite number")
+        raise InputError(
+            f"prediction: score of instance {ids[~np.isfinite(scores)][0]} is not a finite number"
+        )
     return Overlap(
         pred_ids=ids,
         pred_scores=scores,

@@ -29,7 +29,9 @@ def read_cloud(path: str | Path) -> PointCloud:
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise InputError(f"{path}: unknown point cloud format '{path.suffix}'; expected {', '.join(_READERS)}")
+        raise InputError(
+            f"{path}: unknown point cloud format '{path.suffix}'; expected {', '.join(_READERS)}"
+        )
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; expected a point cloud")
     cloud = reader(path)
@@ -62,7 +64,9 @@ def to_int32(values: np.ndarray, where: str) -> np.ndarray:
         if values.dtype.kind == "f":
             fits &= values == np.floor(values)
     if not fits.all():
-        raise InputError(f"{where}: value {values[~fits][0]} at index {int(np.argmin(fits))} is not a 32-bit whole number")
+        raise InputError(
+            f"{where}: value {values[~fits][0]} at index {int(np.argmin(fits))} is not a 32-bit whole number"
+        )
     return values.astype(np.int32)
 
 

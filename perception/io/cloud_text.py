@@ -45,7 +45,9 @@ def _table(path: Path) -> np.ndarray:
     try:
         return np.array(b" ".join(lines).split(), dtype=np.float64).reshape(len(lines), width)
     except ValueError as error:
-        raise InputError(f"{path}: expected {width} numbers in each of {len(lines)} rows ({error})") from error
+        raise InputError(
+            f"{path}: expected {width} numbers in each of {len(lines)} rows ({error})"
+        ) from error
 
 
 def _looks_like_color(triple: np.ndarray) -> bool:
