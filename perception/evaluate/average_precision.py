@@ -1,0 +1,103 @@
+"""Instance average precision as ScanNet defines it, on contingency tables pooled over scenes.
+
+Rules (ScanNet benchmark, 3D semantic instance evaluation): strict IoU > threshold; the truth is walked in order, and
+predictions in input order; the first match uses a prediction up, later ones are false positives at the lower score;
+an unmatched prediction is a false positive unless its share of void and too-small truth exceeds the threshold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perception.evaluate.overlap import Overlap
+
+
+@dataclass
+class Matches:
+    """What one class at one threshold yields: scored true/false positives, misses, and the matched pairs."""
+
+    scores: list[float] = field(default_factory=list)
+    positive: list[bool] = field(default_factory=list)
+    misses: int = 0
+    has_truth: bool = False
+    has_prediction: bool = False
+    pairs: list[dict] = field(default_factory=list)
+
+
+def match(scenes: Sequence[Overlap], label: int, threshold: float, min_region: int) -> Matches:
+    """Greedy matching of the predictions and truths of one class at one IoU threshold, over all scenes."""
+    result = Matches()
+    for number, scene in enumerate(scenes):
+        preds = np.flatnonzero((scene.pred_classes == label) & (scene.pred_sizes >= max(min_region, 1)))
+        truths = np.flatnonzero(scene.gt_classes == label)
+        big = truths[scene.gt_sizes[truths] >= min_region]
+        result.has_truth |= len(big) > 0
+        result.has_prediction |= len(preds) > 0
+        hit = scene.iou > threshold
+        _match_truth(scene, preds, big, hit, number, result)
+        _unmatched(scene, preds, truths, hit, threshold, min_region, result)
+    return result
+
+
+def _match_truth(
+    scene: Overlap, preds: np.ndarray, truths: np.ndarray, hit: np.ndarray, number: int, result: Matches
+) -> None:
+    used: set[int] = set()
+    for g in truths.tolist():
+        candidates = [p for p in preds[hit[preds, g]].tolist() if p not in used]
+        if not candidates:
+            result.misses += 1
+            continue
+        used.add(candidates[0])  # only the first is used up: a duplicate may still match another truth
+        best = float(scene.pred_scores[candidates[0]])
+        for p in candidates[1:]:
+            score = float(scene.pred_scores[p])
+            result.scores.append(min(best, score))
+            result.positive.append(False)
+            best = max(best, score)
+        result.scores.append(best)
+        result.positive.append(True)
+        pair = {"scene": number, "pred": int(scene.pred_ids[candidates[0]]), "gt": int(scene.gt_ids[g])}
+        result.pairs.append(pair | {"iou": float(scene.iou[candidates[0], g])})
+
+
+def _unmatched(
+    scene: Overlap,
+    preds: np.ndarray,
+    truths: np.ndarray,
+    hit: np.ndarray,
+    threshold: float,
+    min_region: int,
+    result: Matches,
+) -> None:
+    """Predictions that meet no truth of their class, not even a small one, are false positives unless ignored."""
+    small = truths[scene.gt_sizes[truths] < min_region]
+    for p in preds[~hit[np.ix_(preds, truths)].any(axis=1)].tolist():
+        ignored = scene.pred_void[p] + scene.intersections[p, small].sum()
+        if ignored / scene.pred_sizes[p] <= threshold:
+            result.scores.append(float(scene.pred_scores[p]))
+            result.positive.append(False)
+
+
+def average_precision(matches: Matches) -> float:
+    """Area under the precision-recall curve: one point per distinct score, closed by (recall 0, precision 1).
+
+    NaN without truth, 0 without predictions or when all of them are ignored.
+    """
+    if not matches.has_truth:
+        return float("nan")
+    if not matches.has_prediction or not matches.scores:
+        return 0.0
+    scores = np.array(matches.scores)
+    order = np.argsort(scores, kind="stable")
+    positive = np.array(matches.positive, float)[order]
+    first = np.unique(scores[order], return_index=True)[1]  # of each distinct score, ascending
+    true_above = positive.sum() - np.concatenate(([0.0], np.cumsum(positive)))[first]
+    precision = np.append(true_above / (len(scores) - first), 1.0)
+    recall = np.append(true_above / (positive.sum() + matches.misses), 0.0)
+    padded = np.concatenate((recall[:1], recall, [0.0]))
+    widths = np.convolve(padded, [-0.5, 0.0, 0.5], "valid")
+    return float(precision @ widths)

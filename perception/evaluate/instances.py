@@ -1,0 +1,236 @@
+"""Instance AP of point labellings and masks: ScanNet's rules and the variations the field uses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.evaluate.average_precision import average_precision, match
+from perception.evaluate.overlap import (
+    Overlap,
+    Truth,
+    mode_by_group,
+    overlap_of_ids,
+    overlap_of_masks,
+    read_truth,
+)
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Every switch that moves a figure; printed with each result.
+
+    thresholds: the IoU thresholds averaged into AP; extra_thresholds are reported beside (AP25).
+    constant_score: all confidences 1.0 (Segment3D). remove_ignored: points marked "ignore" (truth ids below −1, or a
+    mask) leave truth and prediction before anything is counted (ScanNet++); elsewhere they are void.
+    """
+
+    name: str
+    thresholds: tuple[float, ...] = tuple(np.arange(0.5, 0.95, 0.05).tolist())
+    extra_thresholds: tuple[float, ...] = (0.25,)
+    min_region: int = 100
+    void_ids: tuple[int, ...] = (0,)
+    constant_score: bool = False
+    remove_ignored: bool = False
+    by_class: bool = False
+    valid_classes: tuple[int, ...] | None = None
+
+    def describe(self) -> dict[str, Any]:
+        """JSON-able, with the rules that have no switch named too."""
+        rules = {
+            "matching": "greedy in truth order, strict IoU > threshold, duplicates are false positives",
+            "unmatched": "false positive unless the share of void and too-small truth exceeds the threshold",
+            "void": "truth ids < 0, void_ids, classes outside valid_classes",
+            "all_predictions_ignored": "AP 0 (ScanNet's original script stops with an error)",
+            "classes_without_truth": "left out of the mean",
+        }
+        return asdict(self) | {"rules": rules}
+
+
+PROTOCOLS = {
+    "scannet": Protocol("scannet"),
+    "mask3d": Protocol("mask3d"),
+    "segment3d": Protocol("segment3d", constant_score=True),
+    "scannetpp": Protocol("scannetpp", remove_ignored=True),
+}
+
+
+def get_protocol(protocol: str | Protocol, **changes: Any) -> Protocol:
+    """A protocol by name ("scannet", "mask3d", "segment3d", "scannetpp"), with switches changed where given."""
+    if isinstance(protocol, str):
+        if protocol not in PROTOCOLS:
+            raise InputError(f"protocol '{protocol}' is unknown; expected one of {', '.join(PROTOCOLS)}")
+        protocol = PROTOCOLS[protocol]
+    return replace(protocol, **changes)
+
+
+def evaluate(
+    pred_ids: np.ndarray,
+    pred_scores: Mapping[int, float] | None,
+    gt_ids: np.ndarray,
+    protocol: str | Protocol = "scannet",
+    *,
+    pred_semantics: np.ndarray | None = None,
+    gt_semantics: np.ndarray | None = None,
+    ignore: np.ndarray | None = None,
+    **changes: Any,
+) -> dict[str, Any]:
+    """AP of a labelling against the truth, both [N] int over the same points; negative prediction = no instance.
+
+    pred_scores: confidence by id (None: all 1). *_semantics [N] int are needed for by_class and valid_classes; a
+    prediction's class is the most frequent semantic id of its points. ignore [N] bool. changes: switches of Protocol.
+    """
+    rules = get_protocol(protocol, **changes)
+    pred_ids, gt_ids = np.asarray(pred_ids), np.asarray(gt_ids)
+    if len(pred_ids) != len(gt_ids):
+        raise InputError(
+            f"prediction has {len(pred_ids)} points, truth has {len(gt_ids)}; both must be the same points in order"
+        )
+    keep, truth = _truth(rules, gt_ids, gt_semantics, ignore)
+    pred_ids = pred_ids[keep]
+    classes = None
+    if rules.by_class:
+        if pred_semantics is None:
+            raise InputError("evaluation by class needs semantic ids in the prediction; there are none")
+        values, index = np.unique(pred_ids, return_inverse=True)
+        modes = mode_by_group(index, np.asarray(pred_semantics)[keep], len(values))
+        classes = dict(zip(values.tolist(), modes.tolist(), strict=True))
+    scores = (
+        None if rules.constant_score or pred_scores is None else {int(k): v for k, v in pred_scores.items()}
+    )
+    return evaluate_overlaps([overlap_of_ids(pred_ids, scores, truth, classes)], rules)
+
+
+def evaluate_masks(
+    masks: Sequence[np.ndarray],
+    scores: Sequence[float],
+    gt_ids: np.ndarray,
+    protocol: str | Protocol = "scannet",
+    *,
+    classes: Sequence[int] | None = None,
+    gt_semantics: np.ndarray | None = None,
+    ignore: np.ndarray | None = None,
+    **changes: Any,
+) -> dict[str, Any]:
+    """AP of masks (each bool [N]; they may overlap) against the truth ids [N]; the masks' order is the input order."""
+    rules = get_protocol(protocol, **changes)
+    return evaluate_overlaps(
+        [_mask_overlap(rules, masks, scores, gt_ids, classes, gt_semantics, ignore)], rules
+    )
+
+
+def _mask_overlap(
+    rules: Protocol,
+    masks: Sequence[np.ndarray],
+    scores: Sequence[float],
+    gt_ids: np.ndarray,
+    classes: Sequence[int] | None,
+    gt_semantics: np.ndarray | None,
+    ignore: np.ndarray | None,
+) -> Overlap:
+    for i, mask in enumerate(masks):
+        if len(mask) != len(gt_ids):
+            raise InputError(
+                f"prediction mask {i} has {len(mask)} points, truth has {len(gt_ids)}; they must agree"
+            )
+    keep, truth = _truth(rules, np.asarray(gt_ids), gt_semantics, ignore)
+    kept = [np.asarray(mask, bool)[keep] for mask in masks]
+    if rules.by_class and classes is None:
+        raise InputError("evaluation by class needs a class for each predicted mask; there are none")
+    return overlap_of_masks(
+        kept,
+        [1.0] * len(kept) if rules.constant_score else scores,
+        truth,
+        classes if rules.by_class else None,
+    )
+
+
+def _truth(
+    rules: Protocol, gt_ids: np.ndarray, gt_semantics: np.ndarray | None, ignore: np.ndarray | None
+) -> tuple[np.ndarray | slice, Truth]:
+    """(points that are judged, truth of those points)."""
+    keep: np.ndarray | slice = slice(None)
+    if rules.remove_ignored:
+        keep = gt_ids >= -1
+        if ignore is not None:
+            keep &= ~np.asarray(ignore, bool)
+    elif ignore is not None:
+        gt_ids = np.where(np.asarray(ignore, bool), -1, gt_ids)
+    semantics = None if gt_semantics is None else np.asarray(gt_semantics)[keep]
+    truth = read_truth(
+        gt_ids[keep],
+        semantics,
+        void_ids=rules.void_ids,
+        valid_classes=rules.valid_classes,
+        by_class=rules.by_class,
+    )
+    return keep, truth
+
+
+def evaluate_overlaps(scenes: Sequence[Overlap], rules: Protocol) -> dict[str, Any]:
+    """AP over scenes pooled as the benchmarks pool them. NaN (no truth of a class) becomes null in the result."""
+    thresholds = [*rules.thresholds, *rules.extra_thresholds]
+    labels = sorted({int(c) for scene in scenes for c in scene.gt_classes})
+    table = np.full((len(labels), len(thresholds)), np.nan)
+    pairs: list[dict] = []
+    for i, label in enumerate(labels):
+        for j, threshold in enumerate(thresholds):
+            matches = match(scenes, label, threshold, rules.min_region)
+            table[i, j] = average_precision(matches)
+            if np.isclose(threshold, 0.5):
+                pairs += matches.pairs
+    mean = _nanmean(table, axis=0)
+    result: dict[str, Any] = _summary(mean, thresholds, len(rules.thresholds))
+    result["per_threshold"] = [
+        {"iou": round(t, 10), "ap": _number(a)} for t, a in zip(thresholds, mean, strict=True)
+    ]
+    if rules.by_class:
+        rows = {
+            str(c): _summary(row, thresholds, len(rules.thresholds))
+            for c, row in zip(labels, table, strict=True)
+        }
+        result["classes"] = rows
+    result["matches_at_50"] = pairs
+    result["truth"] = [row for number, scene in enumerate(scenes) for row in _best(scene, number)]
+    result["num_truth"] = sum(int((s.gt_sizes >= rules.min_region).sum()) for s in scenes)
+    result["num_predictions"] = sum(int((s.pred_sizes >= max(rules.min_region, 1)).sum()) for s in scenes)
+    result["protocol"] = rules.describe()
+    return result
+
+
+def _summary(ap: np.ndarray, thresholds: Sequence[float], averaged: int) -> dict[str, float | None]:
+    at = {
+        name: [i for i, t in enumerate(thresholds) if np.isclose(t, iou)]
+        for name, iou in (("ap50", 0.5), ("ap25", 0.25))
+    }
+    return {"ap": _number(_nanmean(ap[:averaged]))} | {
+        k: _number(ap[v[0]]) if v else None for k, v in at.items()
+    }
+
+
+def _nanmean(values: np.ndarray, axis: int | None = None) -> Any:
+    counts = (~np.isnan(values)).sum(axis=axis)
+    total = np.nansum(values, axis=axis)
+    return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
+
+
+def _number(value: Any) -> float | None:
+    return None if np.isnan(value) else float(value)
+
+
+def _best(scene: Overlap, number: int) -> list[dict[str, Any]]:
+    """For each true instance the prediction that overlaps it best, class left aside."""
+    iou = scene.iou
+    rows = []
+    for g, gt_id in enumerate(scene.gt_ids.tolist()):
+        row: dict[str, Any] = {"scene": number, "gt": gt_id, "class": int(scene.gt_classes[g])}
+        row |= {"num_points": int(scene.gt_sizes[g]), "pred": None, "iou": 0.0}
+        if len(iou) and iou[:, g].max() > 0:
+            p = int(iou[:, g].argmax())
+            row |= {"pred": int(scene.pred_ids[p]), "iou": float(iou[p, g])}
+        rows.append(row)
+    return rows

@@ -1,0 +1,181 @@
+"""The contingency table between predicted and true instances, from which all overlap figures follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from perception.errors import InputError
+
+OBJECT = 1  # the one class of class-agnostic evaluation
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Sizes and intersections in points; P predictions in input order, G true instances in ascending id.
+
+    pred_ids, pred_classes, pred_sizes, pred_void [P] int64; pred_scores [P] float64; gt_ids, gt_classes, gt_sizes [G]
+    int64; intersections [P, G] int64. pred_void counts a prediction's points that the truth leaves void.
+    """
+
+    pred_ids: np.ndarray
+    pred_scores: np.ndarray
+    pred_classes: np.ndarray
+    pred_sizes: np.ndarray
+    pred_void: np.ndarray
+    gt_ids: np.ndarray
+    gt_classes: np.ndarray
+    gt_sizes: np.ndarray
+    intersections: np.ndarray
+
+    @property
+    def iou(self) -> np.ndarray:
+        """[P, G] float64: |intersection| / |union|."""
+        union = self.pred_sizes[:, None] + self.gt_sizes[None] - self.intersections
+        return self.intersections / np.maximum(union, 1)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Per-point truth in compact form: index [N] into ids (−1 = void), classes and sizes per instance."""
+
+    index: np.ndarray
+    ids: np.ndarray
+    classes: np.ndarray
+    sizes: np.ndarray
+
+
+def read_truth(
+    gt_ids: np.ndarray,
+    gt_semantics: np.ndarray | None = None,
+    *,
+    void_ids: Sequence[int] = (0,),
+    valid_classes: Sequence[int] | None = None,
+    by_class: bool = False,
+) -> Truth:
+    """Compact the truth ids [N] int. Void: negative ids, `void_ids`, and points of a class outside `valid_classes`.
+
+    With `by_class` an instance's class is its points' semantic id (the most frequent one); else all are OBJECT.
+    """
+    index, ids = compact(gt_ids, void_ids)
+    semantics = None if gt_semantics is None else np.asarray(gt_semantics, np.int64)
+    if valid_classes is not None:
+        if semantics is None:
+            raise InputError("valid classes are given, but the truth carries no semantic ids")
+        index = np.where(np.isin(semantics, list(valid_classes)), index, -1)
+    sizes = np.bincount(index[index >= 0], minlength=len(ids))
+    classes = np.full(len(ids), OBJECT, np.int64)
+    if by_class:
+        if semantics is None:
+            raise InputError("evaluation by class needs semantic ids in the truth; there are none")
+        classes = mode_by_group(index, semantics, len(ids))
+    kept = sizes > 0
+    renumber = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
+    return Truth(renumber[index], ids[kept], classes[kept], sizes[kept])
+
+
+def compact(ids: np.ndarray, void_ids: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
+    """(index [N] int64 into the ascending ids that occur, those ids); −1 where the id is negative or in `void_ids`."""
+    ids = np.asarray(ids)
+    if ids.ndim != 1 or ids.dtype.kind not in "iu":
+        raise InputError(f"instance ids must be whole numbers [N]; found {ids.dtype} {list(ids.shape)}")
+    ids = ids.astype(np.int64)
+    if len(ids) and 0 <= (high := int(ids.max())) < max(
+        4 * len(ids), 1 << 16
+    ):  # no sorting: mark what occurs
+        seen = np.zeros(high + 2, bool)  # the last cell stands for all negative ids
+        seen[np.where(ids < 0, high + 1, ids)] = True
+        seen[[v for v in void_ids if 0 <= v <= high] + [high + 1]] = False
+        values = np.flatnonzero(seen)
+        lookup = np.full(high + 2, -1, np.int64)
+        lookup[values] = np.arange(len(values))
+        return lookup[np.where(ids < 0, high + 1, ids)], values
+    values, index = np.unique(ids, return_inverse=True)
+    valid = (values >= 0) & ~np.isin(values, list(void_ids))
+    return np.where(valid, np.cumsum(valid) - 1, -1)[index], values[valid]
+
+
+def mode_by_group(group: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """The most frequent value of each group 0..count−1 [count]; ties go to the smallest value; group −1 is left out."""
+    inside = group >= 0
+    distinct, index = np.unique(values[inside], return_inverse=True)
+    if len(distinct) == 0:
+        return np.zeros(count, np.int64)
+    table = np.zeros((count, len(distinct)), np.int64)
+    np.add.at(table, (group[inside], index), 1)
+    return distinct[table.argmax(axis=1)].astype(np.int64)
+
+
+def overlap_of_ids(
+    pred_ids: np.ndarray,
+    pred_scores: dict[int, float] | None,
+    truth: Truth,
+    pred_classes: dict[int, int] | None = None,
+) -> Overlap:
+    """Overlap of a labelling: pred_ids [N] int, negative = none. Predictions stand in ascending id.
+
+    pred_scores and pred_classes: by id; None gives every prediction the score 1, the class OBJECT.
+    """
+    _same_length(len(pred_ids), len(truth.index))
+    index, ids = compact(pred_ids)
+    g = len(truth.ids)
+    both = np.where(index >= 0, index * (g + 1) + np.where(truth.index >= 0, truth.index, g), -1)
+    table = np.bincount(both[both >= 0], minlength=len(ids) * (g + 1)).reshape(len(ids), g + 1)
+    missing = [i for i in ids.tolist() if pred_scores is not None and i not in pred_scores]
+    if missing:
+        raise InputError(
+            f"prediction: no score for instance {missing[0]} ({len(missing)} such); give one for each"
+        )
+    scores = [1.0 if pred_scores is None else pred_scores[i] for i in ids.tolist()]
+    classes = [OBJECT if pred_classes is None else pred_classes[i] for i in ids.tolist()]
+    return _overlap(ids, scores, classes, table, truth)
+
+
+def overlap_of_masks(
+    masks: Sequence[np.ndarray], scores: Sequence[float], truth: Truth, classes: Sequence[int] | None = None
+) -> Overlap:
+    """Overlap of P masks, each bool [N] or an array of point indices; masks may overlap each other, order is kept."""
+    if len(scores) != len(masks) or (classes is not None and len(classes) != len(masks)):
+        raise InputError(
+            f"prediction: {len(masks)} masks, {len(scores)} scores; one score (and class) per mask is needed"
+        )
+    g = len(truth.ids)
+    target = np.where(truth.index >= 0, truth.index, g)
+    table = np.zeros((len(masks), g + 1), np.int64)
+    for row, mask in zip(table, masks, strict=True):
+        mask = np.asarray(mask)
+        if mask.dtype == bool:
+            _same_length(len(mask), len(truth.index))
+        row += np.bincount(target[mask], minlength=g + 1)
+    ids = np.arange(len(masks))
+    return _overlap(ids, scores, [OBJECT] * len(masks) if classes is None else classes, table, truth)
+
+
+def _same_length(predicted: int, true: int) -> None:
+    if predicted != true:
+        raise InputError(
+            f"prediction has {predicted} points, truth has {true}; both must be the same points in order"
+        )
+
+
+def _overlap(
+    ids: np.ndarray, scores: Sequence[float], classes: Sequence[int], table: np.ndarray, truth: Truth
+) -> Overlap:
+    scores = np.asarray(scores, np.float64).reshape(len(ids))
+    if not np.isfinite(scores).all():
+        raise InputError(
+            f"prediction: score of instance {ids[~np.isfinite(scores)][0]} is not a finite number"
+        )
+    return Overlap(
+        pred_ids=ids,
+        pred_scores=scores,
+        pred_classes=np.asarray(classes, np.int64).reshape(len(ids)),
+        pred_sizes=table.sum(axis=1),
+        pred_void=table[:, -1],
+        gt_ids=truth.ids,
+        gt_classes=truth.classes,
+        gt_sizes=truth.sizes,
+        intersections=table[:, :-1],
+    )

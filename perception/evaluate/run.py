@@ -1,0 +1,107 @@
+"""From paths to a JSON-able result and a table to print; the command line calls these."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from perception.errors import InputError
+from perception.evaluate.images import evaluate_images
+from perception.evaluate.instances import evaluate, get_protocol
+from perception.io.cloud import read_cloud
+from perception.types import PointCloud
+
+_ID_NAMES = ("instance_id", "instance", "inst_id", "label")
+
+
+def run_instances(
+    prediction: str | Path,
+    truth: str | Path,
+    protocol: str = "scannet",
+    *,
+    by_class: bool = False,
+    scores: str | Path | None = None,
+    **changes: Any,
+) -> tuple[dict[str, Any], str]:
+    """Instance AP of a labelled cloud against the truth: (result, table).
+
+    Confidences come from `scores` or the sidecar JSON beside the prediction; without either all are 1, and the result
+    says so. A truth property `ignore` marks points by a non-zero value.
+    """
+    pred, gt = read_cloud(prediction), read_cloud(truth)
+    pred_ids, gt_ids = _ids(pred, prediction), _ids(gt, truth)
+    if len(pred_ids) != len(gt_ids):
+        raise InputError(
+            f"{prediction}: has {len(pred_ids)} points, the truth {truth} has {len(gt_ids)}; "
+            "both must be the same points in the same order"
+        )
+    rules = get_protocol(protocol, by_class=by_class, **changes)
+    source = Path(scores) if scores is not None else Path(prediction).with_suffix(".json")
+    confidence = read_scores(source) if scores is not None or source.is_file() else None
+    ignore = gt.labels.get("ignore")
+    result = evaluate(
+        pred_ids,
+        confidence,
+        gt_ids,
+        rules,
+        pred_semantics=pred.labels.get("semantic_id"),
+        gt_semantics=gt.labels.get("semantic_id"),
+        ignore=None if ignore is None else ignore != 0,
+    )
+    constant = rules.constant_score or confidence is None
+    result["protocol"]["confidence"] = "constant 1.0" if constant else str(source)
+    return result, instances_table(result)
+
+
+def read_scores(path: str | Path) -> dict[int, float]:
+    """Confidence by instance id from an export's sidecar, {"instances": {"<id>": {"score": s}}}."""
+    path = Path(path)
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))["instances"]
+        return {int(key): float(row["score"]) for key, row in rows.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f'{path}: expected {{"instances": {{"<id>": {{"score": number}}}}}} ({type(error).__name__}: {error})'
+        ) from error
+
+
+def _ids(cloud: PointCloud, path: str | Path) -> Any:
+    for name in _ID_NAMES:
+        if name in cloud.labels:
+            return cloud.labels[name]
+    found = ", ".join(cloud.labels) or "none"
+    raise InputError(f"{path}: has no whole-number property 'instance_id' (found: {found})")
+
+
+def instances_table(result: dict[str, Any]) -> str:
+    """AP, AP50, AP25, by class where asked for, and the protocol's switches."""
+    rules = result["protocol"]
+    lines = [f"{'':<12}{'AP':>8}{'AP50':>8}{'AP25':>8}"]
+    lines += [_row(f"class {name}", row) for name, row in result.get("classes", {}).items()]
+    lines.append(_row("all", result))
+    lines.append(f"{result['num_predictions']} predictions, {result['num_truth']} true instances")
+    lines.append(
+        f"protocol {rules['name']}: IoU {rules['thresholds'][0]:.2f}-{rules['thresholds'][-1]:.2f} "
+        f"({len(rules['thresholds'])} thresholds), at least {rules['min_region']} points, "
+        f"{'by class' if rules['by_class'] else 'class-agnostic'}, confidence {rules.get('confidence', 'given')}, "
+        f"ignored points {'removed' if rules['remove_ignored'] else 'void'}, void ids < 0 and {list(rules['void_ids'])}"
+    )
+    return "\n".join(lines)
+
+
+def _row(name: str, row: dict[str, Any]) -> str:
+    cells = ["-" if row[key] is None else f"{row[key]:.4f}" for key in ("ap", "ap50", "ap25")]
+    return f"{name:<12}" + "".join(f"{cell:>8}" for cell in cells)
+
+
+def run_images(prediction_dir: str | Path, truth_dir: str | Path) -> tuple[dict[str, Any], str]:
+    """PSNR and SSIM of a folder of renders against the true pictures: (result, table)."""
+    result = evaluate_images(prediction_dir, truth_dir)
+    width = max([len(name) for name in result["views"]] + [4]) + 2
+    lines = [f"{'view':<{width}}{'PSNR':>8}{'SSIM':>8}"]
+    for name, view in result["views"].items():
+        note = "  missing" if view["missing"] else ""
+        lines.append(f"{name:<{width}}{view['psnr']:>8.2f}{view['ssim']:>8.4f}{note}")
+    lines.append(f"{'mean':<{width}}{result['psnr']:>8.2f}{result['ssim']:>8.4f}")
+    return result, "\n".join(lines)

@@ -1,0 +1,42 @@
+"""Which Gaussian a point belongs to: the paper's nearest mean, streamed over clouds of any size."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.export.neighbors import Neighbors
+
+CHUNK = 1 << 20  # points at a time: 24 MiB of working memory
+
+
+def nearest_gaussian(
+    points: np.ndarray, means: np.ndarray, *, chunk: int = CHUNK, max_distance: float | None = None
+) -> np.ndarray:
+    """Index [P] int64 of the nearest of means [N, 3] for each of points [P, 3] (OpenSplat3D, point cloud transfer).
+
+    −1 for points that are not finite or farther than max_distance from every mean. Equal distances go to the smaller
+    index. Means that are not finite take no part.
+    """
+    points = _checked(points, "points")
+    means = _checked(means, "means")
+    finite = np.flatnonzero(np.isfinite(means).all(axis=1))
+    result = np.full(len(points), -1, np.int64)
+    if len(finite) == 0:
+        return result
+    if max_distance is not None and not max_distance >= 0:
+        raise InputError(f"max_distance is {max_distance}; expected a length that is not negative")
+    tree = Neighbors(means if len(finite) == len(means) else means[finite])
+    for begin in range(0, len(points), chunk):
+        found = tree.query(
+            points[begin : begin + chunk], 1, np.inf if max_distance is None else max_distance
+        )[0][:, 0]
+        result[begin : begin + chunk] = np.where(found >= 0, finite[found], -1)
+    return result
+
+
+def _checked(points: np.ndarray, name: str) -> np.ndarray:
+    points = np.asarray(points)
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
+        raise InputError(f"{name}: expected floats [N, 3], found {points.dtype} {list(points.shape)}")
+    return points

@@ -1,0 +1,123 @@
+"""Graphs over the points of a cloud or mesh, and ScanNet's edge weights."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.export.neighbors import Neighbors
+
+
+def mesh_edges(faces: np.ndarray, num_points: int) -> np.ndarray:
+    """Edges [E, 2] int32 of triangles [F, 3], three per face as ScanNet's segmentator lists them: 12, 13, 32.
+
+    Faces that name a corner twice contribute their proper edges only.
+    """
+    if faces.size and (faces.min() < 0 or faces.max() >= num_points):
+        raise InputError(f"a face names vertex {faces.max()}, but there are {num_points} vertices")
+    edges = np.stack([faces[:, [0, 1]], faces[:, [0, 2]], faces[:, [2, 1]]], axis=1).reshape(-1, 2)
+    return np.ascontiguousarray(edges[edges[:, 0] != edges[:, 1]], dtype=np.int32)
+
+
+def knn_edges(points: np.ndarray, k: int = 8) -> np.ndarray:
+    """Edges [E, 2] int32, each once with a < b: the k nearest neighbours of every finite point, either way round."""
+    return _unique_edges(*_neighbors(points, k, np.inf))
+
+
+def radius_edges(points: np.ndarray, radius: float, max_neighbors: int = 32) -> np.ndarray:
+    """Edges [E, 2] int32 between points within `radius`, of each point at most the `max_neighbors` nearest."""
+    if not radius > 0:
+        raise InputError(f"radius is {radius}; expected a positive length")
+    return _unique_edges(*_neighbors(points, max_neighbors, radius))
+
+
+def spacing(points: np.ndarray, sample: int = 20000) -> float:
+    """Median distance from a point to its nearest other point, over an even sample of the finite points."""
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < 2:
+        return 0.0
+    chosen = points[:: max(len(points) // sample, 1)]
+    distances = Neighbors(points).query(chosen, 2)[1][:, 1]
+    positive = distances[distances > 0]
+    return float(np.median(positive)) if len(positive) else 0.0
+
+
+def _neighbors(points: np.ndarray, k: int, max_distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """(a [M], b [M]) of every neighbour pair a -> b, the point itself left out."""
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1)).astype(np.int32)
+    if len(finite) == 0:
+        return np.empty(0, np.int32), np.empty(0, np.int32)
+    inside = points if len(finite) == len(points) else points[finite]
+    found = Neighbors(inside).query(inside, min(k + 1, len(finite), 1024), max_distance)[0]
+    a = np.broadcast_to(np.arange(len(finite), dtype=np.int32)[:, None], found.shape)
+    real = (found >= 0) & (found != a)
+    return finite[a[real]], finite[found[real]]
+
+
+def _unique_edges(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    order = np.sort((low.astype(np.int64) << 32) | high)
+    kept = order[np.concatenate(([True], order[1:] != order[:-1]))] if len(order) else order
+    return np.stack([kept >> 32, kept & 0xFFFFFFFF], axis=1).astype(np.int32)
+
+
+def mesh_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Vertex normals [P, 3] float32, faces weighted by area; zero where a vertex has no proper face."""
+    corners = points[faces].astype(np.float64)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros((len(points), 3))
+    for axis in range(3):
+        for corner in range(3):
+            total[:, axis] += np.bincount(faces[:, corner], normal[:, axis], len(points))
+    return _unit(total)
+
+
+def estimate_normals(points: np.ndarray, k: int = 12) -> np.ndarray:
+    """Normals [P, 3] float32 of a bare cloud: least variance direction of the k nearest neighbours.
+
+    The sign is arbitrary: weights of such normals must not tell the two directions apart. Zero at lone points.
+    """
+    normals = np.zeros((len(points), 3), np.float32)
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    if len(finite) < 3:
+        return normals
+    inside = points[finite]
+    tree = Neighbors(inside)
+    local = (inside - tree.center).astype(np.float32)
+    k = min(k, len(inside))
+    for begin in range(0, len(inside), 1 << 18):
+        block = slice(begin, begin + (1 << 18))
+        offsets = local[tree.query(inside[block], k)[0]] - local[block, None]
+        offsets -= offsets.mean(axis=1, keepdims=True)
+        normals[finite[block]] = _least_direction(offsets)
+    return normals
+
+
+def _least_direction(offsets: np.ndarray) -> np.ndarray:
+    """Eigenvector [B, 3] of the smallest eigenvalue of each neighbourhood [B, k, 3]; zero when there is no plane."""
+    covariance = np.einsum("bki,bkj->bij", offsets, offsets).astype(np.float64)
+    values, vectors = np.linalg.eigh(covariance)
+    flat = values[:, 1] > 1e-12 * np.maximum(values[:, 2], 1e-300)
+    return np.where(flat[:, None], vectors[:, :, 0], 0).astype(np.float32)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(length > 0, vectors / np.maximum(length, 1e-300), 0).astype(np.float32)
+
+
+def scannet_weights(
+    points: np.ndarray, normals: np.ndarray, edges: np.ndarray, *, oriented: bool = True
+) -> np.ndarray:
+    """Weights [E] float32 of edges (a, b): 1 − n_a·n_b, squared when the pair is convex, n_b·(p_b − p_a) > 0.
+
+    Not oriented: normals of unknown sign; 1 − |n_a·n_b| and no convexity. A missing (zero) normal weighs 1.
+    """
+    a, b = edges[:, 0], edges[:, 1]
+    cosine = np.einsum("ei,ei->e", normals[a], normals[b])
+    if not oriented:
+        return np.maximum(1 - np.abs(cosine), 0).astype(np.float32)
+    weights = 1 - cosine
+    direction = (points[b] - points[a]).astype(np.float32)
+    convex = np.einsum("ei,ei->e", normals[b], direction) > 0
+    return np.where(convex, weights * weights, weights).astype(np.float32)

@@ -1,0 +1,123 @@
+"""Superpoint smoothing: segment the cloud by shape (Felzenszwalb-Huttenlocher), then each segment takes one label."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from perception import _core
+from perception.errors import InputError
+from perception.export.graph import (
+    estimate_normals,
+    knn_edges,
+    mesh_edges,
+    mesh_normals,
+    radius_edges,
+    scannet_weights,
+    spacing,
+)
+from perception.types import PointCloud
+
+
+@dataclass(frozen=True)
+class SmoothOptions:
+    """k_threshold, min_size: ScanNet's kThresh .01 and segMinVerts 20.
+
+    graph: "auto" (mesh edges when there are faces, else kNN), "mesh", "knn" or "radius". neighbors: of each point in
+    the kNN graph. radius: length in the cloud's unit; None means three times the cloud's spacing. color_weight: added
+    weight of a colour difference, per unit of RGB distance in [0, √3].
+    """
+
+    k_threshold: float = 0.01
+    min_size: int = 20
+    graph: str = "auto"
+    neighbors: int = 8
+    radius: float | None = None
+    color_weight: float = 0.0
+
+
+def felzenszwalb(
+    edges: np.ndarray, weights: np.ndarray, num_nodes: int, k_threshold: float = 0.01, min_size: int = 20
+) -> np.ndarray:
+    """Segment [num_nodes] int32 of each node of a graph, numbered in order of appearance (IJCV 2004).
+
+    edges [E, 2] int32, weights [E]; equal weights are taken in the order of their nodes, not of their position.
+    """
+    labels = np.empty(num_nodes, np.int32)
+    edges = np.ascontiguousarray(edges, np.int32)
+    _core.felzenszwalb(edges, np.ascontiguousarray(weights, np.float32), k_threshold, min_size, labels)
+    return labels
+
+
+def segment_cloud(cloud: PointCloud, options: SmoothOptions | None = None) -> np.ndarray:
+    """Superpoints [P] int32 of a cloud or mesh. Points that are not finite become segments of their own."""
+    options = options or SmoothOptions()
+    points = cloud.points
+    faces = cloud.faces if cloud.faces is not None and len(cloud.faces) else None
+    kind = ("mesh" if faces is not None else "knn") if options.graph == "auto" else options.graph
+    if kind == "mesh":
+        if faces is None:
+            raise InputError(
+                "smoothing over mesh edges was asked for, but the cloud has no faces; use graph knn"
+            )
+        edges = mesh_edges(faces, len(points))
+    elif kind == "knn":
+        edges = knn_edges(points, options.neighbors)
+    elif kind == "radius":
+        edges = radius_edges(points, options.radius or 3 * spacing(points) or 1.0)
+    else:
+        raise InputError(f"graph '{kind}' is unknown; expected auto, mesh, knn or radius")
+    normals, oriented = _normals(cloud, faces)
+    weights = scannet_weights(points, normals, edges, oriented=oriented)
+    if options.color_weight and cloud.colors is not None:
+        difference = cloud.colors[edges[:, 0]].astype(np.float32) - cloud.colors[edges[:, 1]]
+        weights += options.color_weight / 255 * np.linalg.norm(difference, axis=1)
+    weights = np.nan_to_num(weights, nan=np.float32(2), copy=False)
+    return felzenszwalb(edges, weights, len(points), options.k_threshold, options.min_size)
+
+
+def _normals(cloud: PointCloud, faces: np.ndarray | None) -> tuple[np.ndarray, bool]:
+    if cloud.normals is not None:
+        return np.nan_to_num(cloud.normals), True
+    if faces is not None:
+        return mesh_normals(cloud.points, faces), True
+    return estimate_normals(cloud.points), False
+
+
+def vote(labels: np.ndarray, segments: np.ndarray) -> np.ndarray:
+    """Each segment's most frequent label, for all its points [P] int32; ties go to the smallest label.
+
+    labels [P] int32 (−1 = none), segments [P] int32 >= 0. "None" has a vote like any other label.
+    """
+    if len(labels) != len(segments):
+        raise InputError(
+            f"{len(segments)} segment ids for {len(labels)} points; they must be the same points in order"
+        )
+    if len(labels) == 0:
+        return labels.astype(np.int32)
+    key = np.sort((segments.astype(np.int64) << 32) | (labels.astype(np.int64) + (1 << 31)))
+    first = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1])))
+    counts = np.diff(np.append(first, len(key)))
+    segment, label = key[first] >> 32, (key[first] & 0xFFFFFFFF) - (1 << 31)
+    order = np.lexsort((label, -counts, segment))
+    winner = order[np.concatenate(([True], np.diff(segment[order]) != 0))]
+    chosen = np.zeros(int(segment.max()) + 1, np.int32)
+    chosen[segment[winner]] = label[winner]
+    return chosen[segments]
+
+
+def read_segments(path: str | Path, num_points: int) -> np.ndarray:
+    """Segments [P] int32 from a ScanNet `*.segs.json` (its list "segIndices"), one for each vertex in order."""
+    path = Path(path)
+    try:
+        values = np.asarray(json.loads(path.read_text(encoding="utf-8"))["segIndices"], np.int64)
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
+        raise InputError(
+            f"{path}: is no segmentation file: expected JSON with a list 'segIndices' ({error})"
+        ) from error
+    if values.shape != (num_points,):
+        raise InputError(f"{path}: lists {values.size} segments, the cloud has {num_points} points")
+    return np.unique(values, return_inverse=True)[1].astype(np.int32)

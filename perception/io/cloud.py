@@ -1,0 +1,183 @@
+"""Point clouds and meshes from and to files, the format told by the file's extension. Order and count are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.cloud_atomic import replacing
+from perception.io.cloud_las import read_las
+from perception.io.cloud_pcd import read_pcd, write_pcd
+from perception.io.cloud_text import read_obj, read_xyz, write_xyz
+from perception.io.ply import read_ply, write_ply
+from perception.types import PointCloud
+
+_COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+_FACE_NAMES = ("vertex_indices", "vertex_index")
+_NOT_LABELS = {"alpha", "diffuse_alpha", "a"}
+
+
+def read_cloud(path: str | Path) -> PointCloud:
+    """Read .ply (cloud or mesh), .pcd, .xyz/.txt/.pts, .npz, .obj, .las or .laz.
+
+    points are float64 where the file stores doubles, else float32; integer columns besides the colours become `labels`;
+    faces of more than three corners are split into fans. NaN and infinite points are kept in place.
+    """
+    path = Path(path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(
+            f"{path}: unknown point cloud format '{path.suffix}'; expected {', '.join(_READERS)}"
+        )
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; expected a point cloud")
+    cloud = reader(path)
+    if len(cloud.points) == 0:
+        raise InputError(f"{path}: holds no points")
+    if cloud.faces is not None and len(cloud.faces):
+        low, high = int(cloud.faces.min()), int(cloud.faces.max())
+        if low < 0 or high >= len(cloud.points):
+            bad = low if low < 0 else high
+            raise InputError(f"{path}: a face names vertex {bad}, but there are {len(cloud.points)} vertices")
+    return cloud
+
+
+def write_cloud(path: str | Path, cloud: PointCloud) -> None:
+    """Write .ply (binary), .pcd (binary), .npz or .xyz: points, and colours, normals, faces and labels the format has."""
+    path = Path(path)
+    writer = _WRITERS.get(path.suffix.lower())
+    if writer is None:
+        raise InputError(f"{path}: cannot write the format '{path.suffix}'; expected {', '.join(_WRITERS)}")
+    writer(path, cloud)
+
+
+def to_int32(values: np.ndarray, where: str) -> np.ndarray:
+    """Label column as int32; values that do not fit (or are no whole numbers) are an InputError naming `where`."""
+    if values.dtype == np.int32:
+        return values
+    limits = np.iinfo(np.int32)
+    with np.errstate(invalid="ignore"):
+        fits = (values >= limits.min) & (values <= limits.max)
+        if values.dtype.kind == "f":
+            fits &= values == np.floor(values)
+    if not fits.all():
+        raise InputError(
+            f"{where}: value {values[~fits][0]} at index {int(np.argmin(fits))} is not a 32-bit whole number"
+        )
+    return values.astype(np.int32)
+
+
+def _read_ply_cloud(path: Path) -> PointCloud:
+    elements = read_ply(path)
+    vertex = elements.get("vertex")
+    if vertex is None or not {"x", "y", "z"} <= vertex.keys():
+        raise InputError(f"{path}: PLY has no element 'vertex' with x, y and z")
+    cloud = PointCloud(np.stack([vertex[axis] for axis in "xyz"], axis=1))
+    if cloud.points.dtype != np.float64:
+        cloud.points = cloud.points.astype(np.float32)
+    used = {"x", "y", "z", "nx", "ny", "nz"} | _NOT_LABELS
+    for names in _COLOR_NAMES:
+        if set(names) <= vertex.keys():
+            cloud.colors = to_uint8(np.stack([vertex[name] for name in names], axis=1))
+            used |= set(names)
+            break
+    if {"nx", "ny", "nz"} <= vertex.keys():
+        cloud.normals = np.stack([vertex[axis] for axis in ("nx", "ny", "nz")], axis=1).astype(np.float32)
+    for name, values in vertex.items():
+        is_id = values.dtype.kind in "iu" or (values.dtype.kind == "f" and name.endswith(("_id", "label")))
+        if name not in used and is_id and values.ndim == 1:
+            cloud.labels[name] = to_int32(values, f"{path}: property '{name}'")
+    face = elements.get("face", {})
+    for name in _FACE_NAMES:
+        if name in face:
+            cloud.faces = _triangles(face[name], path)
+    return cloud
+
+
+def to_uint8(colors: np.ndarray) -> np.ndarray:
+    """Colours [P, 3] as uint8: floats in [0, 1] are scaled by 255, 16-bit values by 1/257, bytes are taken as they are."""
+    if colors.dtype == np.uint8:
+        return colors
+    if colors.dtype.kind == "f":
+        clean = np.nan_to_num(colors)
+        scale = 255.0 if clean.max(initial=0) <= 1.0 else 1.0
+        return np.clip(np.round(clean * scale), 0, 255).astype(np.uint8)
+    if colors.max(initial=0) > 255:
+        return np.clip(np.round(colors / 257.0), 0, 255).astype(np.uint8)
+    return np.clip(colors, 0, 255).astype(np.uint8)
+
+
+def _triangles(faces: np.ndarray, path: Path) -> np.ndarray:
+    if faces.dtype != object:
+        if len(faces) == 0 or faces.shape[1] < 3:
+            return np.empty((0, 3), np.int32)
+        corners = [faces[:, [0, i, i + 1]] for i in range(1, faces.shape[1] - 1)]
+        return np.stack(corners, axis=1).reshape(-1, 3).astype(np.int32)
+    fans = [(f[0], f[i], f[i + 1]) for f in faces for i in range(1, len(f) - 1)]
+    return np.array(fans, np.int32).reshape(-1, 3)
+
+
+def _write_ply_cloud(path: Path, cloud: PointCloud) -> None:
+    points = cloud.points if cloud.points.dtype == np.float64 else cloud.points.astype(np.float32)
+    vertex = {axis: points[:, i] for i, axis in enumerate("xyz")}
+    if cloud.normals is not None:
+        vertex |= {axis: cloud.normals[:, i].astype(np.float32) for i, axis in enumerate(("nx", "ny", "nz"))}
+    if cloud.colors is not None:
+        vertex |= {name: cloud.colors[:, i].astype(np.uint8) for i, name in enumerate(_COLOR_NAMES[0])}
+    vertex |= {name: values.astype(np.int32) for name, values in cloud.labels.items()}
+    elements = {"vertex": vertex}
+    if cloud.faces is not None:
+        elements["face"] = {"vertex_indices": cloud.faces.astype(np.int32)}
+    write_ply(path, elements)
+
+
+def _read_npz(path: Path) -> PointCloud:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: is not a readable NPZ file ({error})") from error
+    points = next((arrays.pop(n) for n in ("points", "xyz", "positions") if n in arrays), None)
+    if points is None or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+        found = "none" if points is None else f"{points.dtype} {list(points.shape)}"
+        raise InputError(f"{path}: expected an array 'points' [P, 3], found {found}")
+    cloud = PointCloud(points if points.dtype == np.float64 else points.astype(np.float32))
+    for name, values in arrays.items():
+        if name == "colors" and values.shape == points.shape:
+            cloud.colors = to_uint8(values)
+        elif name == "normals" and values.shape == points.shape:
+            cloud.normals = values.astype(np.float32)
+        elif name == "faces" and values.ndim == 2 and values.shape[1] == 3:
+            cloud.faces = values.astype(np.int32)
+        elif values.shape == (len(points),) and values.dtype.kind in "iu":
+            cloud.labels[name] = to_int32(values, f"{path}: array '{name}'")
+    return cloud
+
+
+def _write_npz(path: Path, cloud: PointCloud) -> None:
+    parts = {"points": cloud.points, "colors": cloud.colors, "normals": cloud.normals, "faces": cloud.faces}
+    arrays = {name: values for name, values in parts.items() if values is not None}
+    with replacing(path) as file:
+        np.savez(file, **arrays, **cloud.labels)
+
+
+_READERS: dict[str, Callable[[Path], PointCloud]] = {
+    ".ply": _read_ply_cloud,
+    ".pcd": read_pcd,
+    ".npz": _read_npz,
+    ".obj": read_obj,
+    ".xyz": read_xyz,
+    ".txt": read_xyz,
+    ".pts": read_xyz,
+    ".las": read_las,
+    ".laz": read_las,
+}
+_WRITERS: dict[str, Callable[[Path, PointCloud], None]] = {
+    ".ply": _write_ply_cloud,
+    ".pcd": write_pcd,
+    ".npz": _write_npz,
+    ".xyz": write_xyz,
+}
