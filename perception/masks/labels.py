@@ -1,0 +1,135 @@
+"""`labels:DIR`: label images made elsewhere, one PNG per photo, in the geometry of the original photo."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.types import View
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGB with alpha"}
+
+
+class LabelFolder:
+    """Label images read from a folder: `a/0001.jpg` is labelled by `a/0001.png`, or by `0001.png`.
+
+    The second form is taken only while no two photos share a stem. 8 or 16 bit grey, or an 8-bit palette
+    whose index is the label; 0 = unlabelled.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise InputError(f"labels:{folder}: no such folder; expected one PNG per photo in it")
+        self.name = "labels"
+        self.folder = folder
+        self.identity = f"labels {_fingerprint(folder)}"
+        self._files: dict[str, Path] = {}
+
+    def check(self, views: list[View]) -> list[str]:
+        """Every view must have a label image of its photo's size; one without a view is a warning."""
+        self._files = {view.name: file for view in views if (file := self._find(view, views)) is not None}
+        missing = [view.name for view in views if view.name not in self._files]
+        if missing:
+            raise InputError(
+                f"labels:{self.folder}: {_some(missing)} without a label image; expected a PNG of the same "
+                "stem for each photo (all zero where nothing is labelled)"
+            )
+        for view in views:
+            _check_header(self._files[view.name], *_photo_size(view))
+        used = set(self._files.values())
+        extra = [str(file.relative_to(self.folder)) for file in _pngs(self.folder) if file not in used]
+        if extra:
+            return [f"labels:{self.folder}: {_some(extra)} belong to no photo of the map and are ignored"]
+        return []
+
+    def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
+        """photo: [h, w, 3] undistorted; only its size is used. Returns [h, w] int32."""
+        from perception.io.photos import warp_labels
+
+        file = self._files.get(view.name) or self._find(view, [view])
+        if file is None:
+            raise InputError(f"labels:{self.folder}: no label image for photo {view.name}")
+        _check_header(file, *_photo_size(view))
+        height, width = photo.shape[:2]
+        return warp_labels(view, _read(file), width, height)
+
+    def _find(self, view: View, views: list[View]) -> Path | None:
+        stem = PurePosixPath(view.name).with_suffix(".png")
+        if (self.folder / stem).is_file():
+            return self.folder / stem
+        flat = self.folder / stem.name
+        sharing = sum(PurePosixPath(other.name).stem == stem.stem for other in views)
+        return flat if sharing == 1 and flat.is_file() else None
+
+
+@dataclass(frozen=True)
+class PngHeader:
+    """The IHDR chunk: size in pixels, bits per sample, colour type as PNG numbers it."""
+
+    width: int
+    height: int
+    bits: int
+    colour_type: int
+
+
+def read_png_header(file: Path) -> PngHeader:
+    """Reads 26 bytes, so thousands of label images are checked in an instant."""
+    with file.open("rb") as stream:
+        head = stream.read(26)
+    if len(head) < 26 or not head.startswith(_SIGNATURE):
+        raise InputError(f"{file}: not a PNG; label images are PNG, 8 or 16 bit, one channel")
+    return PngHeader(*struct.unpack(">IIBB", head[16:26]))
+
+
+def _check_header(file: Path, width: int, height: int) -> None:
+    header = read_png_header(file)
+    kind = _COLOUR_TYPES.get(header.colour_type, f"colour type {header.colour_type}")
+    if kind not in ("grey", "palette") or header.bits not in (8, 16):
+        raise InputError(
+            f"{file}: a {header.bits}-bit {kind} image; a label image has one channel of 8 or 16 bit"
+        )
+    if (header.width, header.height) != (width, height):
+        raise InputError(
+            f"{file}: {header.width}×{header.height} pixels, but its photo has {width}×{height}; "
+            "label images have the size of the original photo"
+        )
+
+
+def _read(file: Path) -> np.ndarray:
+    """[H, W] int32. Pillow keeps palette indices, where OpenCV would turn them into colours."""
+    from PIL import Image
+
+    try:
+        with Image.open(file) as image:
+            return np.asarray(image).astype(np.int32)
+    except (OSError, SyntaxError) as error:
+        raise InputError(f"{file}: cannot be read ({error}); the PNG is damaged or cut short") from error
+
+
+def _photo_size(view: View) -> tuple[int, int]:
+    if view.lens is None:
+        return view.width, view.height
+    return view.lens.width, view.lens.height
+
+
+def _pngs(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.rglob("*") if file.suffix.lower() == ".png")
+
+
+def _fingerprint(folder: Path) -> str:
+    digest = hashlib.sha256()
+    for file in _pngs(folder):
+        status = file.stat()
+        digest.update(f"{file.relative_to(folder)} {status.st_size} {status.st_mtime_ns}\n".encode())
+    return digest.hexdigest()[:16]
+
+
+def _some(names: list[str]) -> str:
+    shown = ", ".join(names[:3])
+    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"

@@ -1,0 +1,82 @@
+"""What a mask source is, and how the text of `--masks` becomes one."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.types import View
+
+
+class MaskSource(Protocol):
+    """Gives every photo a label image of its own; ids need not agree between photos.
+
+    name: short, for messages. identity: changes whenever the label images could (the key of the cache).
+    """
+
+    name: str
+    identity: str
+
+    def check(self, views: list[View]) -> list[str]:
+        """Validates everything that can be told up front. Raises InputError; returns warnings."""
+        ...
+
+    def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
+        """photo: [h, w, 3] uint8 RGB, undistorted. Returns [h, w] int32, 0 = unlabelled."""
+        ...
+
+
+def make_source(spec: str, *, cache_dir: Path | None = None) -> MaskSource:
+    """`auto`, `builtin`, `labels:DIR`, or `sam:PATH` (folder, encoder file, or `ENCODER,DECODER`).
+
+    `auto` takes the SAM named by the environment variable PERCEPTION_SAM or by `masks.sam` in the user's
+    configuration (`perception/config.toml` under XDG_CONFIG_HOME), else the built-in segmentation.
+    cache_dir: where a source may keep derived files; no source needs it today.
+    """
+    kind, _, argument = spec.partition(":")
+    if kind == "auto" and not argument:
+        configured = configured_sam()
+        kind, argument = ("builtin", "") if configured is None else ("sam", configured)
+    if kind == "builtin" and not argument:
+        from perception.masks.builtin import BuiltinSegmentation
+
+        return BuiltinSegmentation()
+    if kind == "labels" and argument:
+        from perception.masks.labels import LabelFolder
+
+        return LabelFolder(Path(argument))
+    if kind == "sam" and argument:
+        from perception.masks.sam import SamSource
+
+        return SamSource(argument)
+    raise InputError(f"--masks {spec}: expected auto, builtin, sam:PATH or labels:DIR")
+
+
+def configured_sam() -> str | None:
+    """The path of the user's SAM, or None."""
+    from_environment = os.environ.get("PERCEPTION_SAM", "").strip()
+    if from_environment:
+        return from_environment
+    home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+    file = home / "perception" / "config.toml"
+    if not file.is_file():
+        return None
+    value = _read_toml(file).get("masks", {}).get("sam")
+    if value is not None and not isinstance(value, str):
+        raise InputError(f"{file}: masks.sam is {value!r}, expected the path of a SAM model as text")
+    return value
+
+
+def _read_toml(file: Path) -> dict:
+    try:
+        import tomllib as toml
+    except ModuleNotFoundError:  # Python 3.10
+        import tomli as toml  # type: ignore[no-redef]
+    try:
+        return toml.loads(file.read_text(encoding="utf-8"))
+    except (toml.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: not valid TOML ({error})") from error

@@ -1,0 +1,131 @@
+"""Label images on disk: one compressed 16-bit PNG per photo, each written whole or not at all.
+
+A PNG carries the key of what made it (source, photo, undistortion), so a second run skips exactly the photos
+whose label image would come out the same.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.masks.source import MaskSource
+from perception.types import View
+
+_KEY = "perception-masks"
+
+
+def compute_masks(
+    views: list[View],
+    source: MaskSource,
+    load_photo: Callable[[View], np.ndarray],
+    folder: Path,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Writes the label image of every view below `folder`, skipping those already there; returns a report.
+
+    load_photo: view -> [h, w, 3] uint8 RGB, undistorted. progress(done, total) is called after every photo.
+    Report: source, identity, photos, skipped, seconds, masks (mean per photo), empty (names), warnings.
+    """
+    warnings = source.check(views)
+    start, skipped, empty, counts = perf_counter(), 0, [], []
+    for done, view in enumerate(views, start=1):
+        key, file = _key(view, source), label_file(folder, view)
+        if stored_key(file) == key:
+            labels = load_labels(folder, view)
+            skipped += 1
+        else:
+            labels = source.label_image(view, load_photo(view))
+            write_labels(file, labels, key)
+        counts.append(len(np.setdiff1d(labels, [0])))
+        if not labels.any():
+            empty.append(view.name)
+        if progress is not None:
+            progress(done, len(views))
+    if empty:
+        warnings = [
+            *warnings,
+            f"masks from {source.name}: nothing was found in {len(empty)} photos ({empty[0]}, …)",
+        ]
+    return {
+        "source": source.name,
+        "identity": source.identity,
+        "photos": len(views),
+        "skipped": skipped,
+        "seconds": perf_counter() - start,
+        "masks": float(np.mean(counts)) if counts else 0.0,
+        "empty": empty,
+        "warnings": warnings,
+    }
+
+
+def label_file(folder: Path, view: View) -> Path:
+    """Where a view's label image lies. The photo's suffix is kept: `a.jpg` and `a.png` may both exist."""
+    return folder / f"{view.name}.png"
+
+
+def load_labels(folder: Path, view: View) -> np.ndarray:
+    """[h, w] int32 as written by compute_masks, 0 = unlabelled."""
+    from PIL import Image
+
+    file = label_file(folder, view)
+    if not file.is_file():
+        raise InputError(f"{file}: no label image for photo {view.name}; run the masks stage again")
+    with Image.open(file) as image:
+        return np.asarray(image).astype(np.int32)
+
+
+def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
+    """labels: [h, w] integers ≥ 0. Ids are renumbered 1.. when they would not fit into 16 bit."""
+    from PIL import Image, PngImagePlugin
+
+    if labels.max(initial=0) > 65535:
+        unique, inverse = np.unique(labels, return_inverse=True)
+        labels = inverse.reshape(labels.shape) + int(unique[0] != 0)
+    if labels.min(initial=0) < 0 or labels.max(initial=0) > 65535:
+        raise ValueError(f"{file}: labels must lie in 0..65535, found {labels.min()}..{labels.max()}")
+    info = PngImagePlugin.PngInfo()
+    info.add_text(_KEY, key)
+    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            Image.fromarray(labels.astype(np.uint16)).save(temporary, "PNG", compress_level=4, pnginfo=info)
+            temporary.replace(file)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{file}: cannot be written ({error.strerror or error})") from error
+
+
+def stored_key(file: Path) -> str | None:
+    """The key a label image was written with; None when there is no readable one."""
+    from PIL import Image
+
+    if not file.is_file():
+        return None
+    try:
+        with Image.open(file) as image:
+            image.load()
+            return str(image.info.get(_KEY))
+    except (OSError, SyntaxError):
+        return None
+
+
+def _key(view: View, source: MaskSource) -> str:
+    """Everything a label image depends on, as a short digest."""
+    digest = hashlib.sha256(
+        f"{source.identity}\n{view.name} {view.width} {view.height} {view.lens}\n".encode()
+    )
+    digest.update(np.ascontiguousarray(view.K, dtype=np.float64).tobytes())
+    if view.photo.is_file():
+        status = view.photo.stat()
+        digest.update(f"{status.st_size} {status.st_mtime_ns}".encode())
+    return digest.hexdigest()[:32]

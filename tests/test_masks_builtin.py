@@ -1,0 +1,66 @@
+"""The built-in segmentation on known pictures, and the benchmark's scores against brute force."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perception.bench.masks import main, score_photo
+from perception.masks.regions import segment_photo
+
+
+def disc_and_box(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A red disc and a blue box on grey, with noise: [120, 160, 3] uint8 and the truth [120, 160]."""
+    y, x = np.mgrid[:120, :160]
+    truth = np.zeros((120, 160), int)
+    truth[(x - 45) ** 2 + (y - 60) ** 2 < 30**2] = 1
+    truth[30:90, 95:140] = 2
+    colours = np.array([[150, 150, 150], [190, 40, 40], [40, 60, 180]])
+    noisy = colours[truth] + np.random.default_rng(seed).normal(0, 4, (120, 160, 3))
+    return noisy.clip(0, 255).astype(np.uint8), truth
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_flat_objects_are_found_whole(seed):
+    photo, truth = disc_and_box(seed)
+    labels = segment_photo(photo)
+    assert labels.dtype == np.int32 and labels.shape == truth.shape
+    score = score_photo(labels, truth + 1)
+    assert (score.best_iou > 0.9).all() and score.masks <= 8
+
+
+def test_an_even_photo_is_one_region():
+    labels = segment_photo(np.full((60, 80, 3), 128, np.uint8))
+    assert len(np.unique(labels)) == 1
+
+
+def test_the_same_photo_gives_the_same_labels():
+    photo, _ = disc_and_box(3)
+    np.testing.assert_array_equal(segment_photo(photo), segment_photo(photo.copy()))
+
+
+def test_scores_against_brute_force():
+    rng = np.random.default_rng(0)
+    truth = rng.integers(0, 4, (30, 30))
+    labels = np.where(rng.random((30, 30)) < 0.6, truth * 3, rng.integers(0, 9, (30, 30)))
+    score = score_photo(labels, truth, smallest=1)
+    for row, i in enumerate((1, 2, 3)):
+        pairs = [((truth == i) & (labels == m), (truth == i) | (labels == m)) for m in np.unique(labels) if m]
+        assert score.best_iou[row] == pytest.approx(max(a.sum() / b.sum() for a, b in pairs))
+    assert score.masks == len(np.unique(labels[labels > 0]))
+
+
+def test_unlabelled_pixels_match_nothing():
+    assert score_photo(np.zeros((20, 20), int), np.ones((20, 20), int)).best_iou.tolist() == [0.0]
+
+
+@pytest.mark.skipif("PERCEPTION_DATA" not in os.environ, reason="needs PERCEPTION_DATA")
+def test_benchmark_runs_on_a_truth_scene(capsys):
+    import json
+
+    assert main([str(Path(os.environ["PERCEPTION_DATA"]) / "tabletop_a"), "--every", "20"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["mean_best_iou"] > 0.4 and result["photos"] == 4
