@@ -1,0 +1,1 @@
+"""Photos of a made-up tabletop with exact truth, for `perception demo` and the tests."""
