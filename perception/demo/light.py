@@ -15,8 +15,8 @@ from perception.demo.shapes import Shape, to_local, to_world
 
 LAMP_CENTER = np.array([-1.0, -0.9, 1.75])
 LAMP_RADIUS = 0.34
-LAMP_COLOR = np.array([1.0, 0.93, 0.82]) * 5.2  # irradiance at one metre
-SKY_COLOR = np.array([0.52, 0.58, 0.66])
+LAMP_COLOR = np.array([1.0, 0.93, 0.82]) * 6.4  # irradiance at one metre
+SKY_COLOR = np.array([0.36, 0.41, 0.48])
 SKY_REACH = 0.8  # metres beyond which an object no longer dims the sky
 
 
@@ -45,14 +45,33 @@ class Body:
     parts: list[Part]
     is_stuff: bool = False
 
-    def sphere(self) -> tuple[np.ndarray, float]:
-        """A ball (centre [3], radius) around the parts that cast shadows."""
-        corners = np.concatenate([to_world(p.shape, _corners(p.shape)) for p in self.parts if p.casts])
-        center = (corners.min(0) + corners.max(0)) / 2
-        return center, float(np.linalg.norm(corners - center, axis=1).max())
+
+@dataclass(frozen=True)
+class Caster:
+    """What a shadow ray needs of a body: its shapes, a ball around them, the colour it lends to its neighbours."""
+
+    shapes: list[Shape]
+    center: np.ndarray
+    radius: float
+    tint: np.ndarray
 
 
-def _corners(shape: Shape) -> np.ndarray:
+def casters(bodies: list[Body]) -> list[Caster]:
+    """The bodies that stand in the light, ready for `first_hits`."""
+    found = []
+    for body in bodies:
+        shapes = [part.shape for part in body.parts if part.casts]
+        if shapes:
+            points = np.concatenate([to_world(shape, corners(shape)) for shape in shapes])
+            center = (points.min(0) + points.max(0)) / 2
+            paint = np.mean([to_linear(part.paint[::4, ::4]).mean((0, 1)) for part in body.parts], axis=0)
+            radius = float(np.linalg.norm(points - center, axis=1).max())
+            found.append(Caster(shapes, center, radius, 0.6 * paint))
+    return found
+
+
+def corners(shape: Shape) -> np.ndarray:
+    """[8, 3] corners of the shape's local bounds."""
     low, high = shape.bounds()
     return np.array([[(low, high)[b >> i & 1][i] for i in range(3)] for b in range(8)])
 
@@ -68,30 +87,28 @@ def to_srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(soft <= 0.0031308, 12.92 * soft, 1.055 * np.maximum(soft, 0) ** (1 / 2.4) - 0.055)
 
 
-def first_hits(bodies: list[Body], origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance [N] to the first shadow caster along each ray (inf = none) and its index in `bodies` (-1)."""
+def first_hits(around: list[Caster], origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance [N] to the first caster along each unit ray (inf = none) and its index in the list (-1 = none)."""
+    origins, rays = origins.astype(np.float32), rays.astype(np.float32)
     distance = np.full(len(origins), np.inf, np.float32)
     index = np.full(len(origins), -1, np.int32)
-    for i, body in enumerate(bodies):
-        if not any(part.casts for part in body.parts):
+    for i, caster in enumerate(around):
+        offset = caster.center.astype(np.float32) - origins
+        along = np.maximum(np.einsum("nk,nk->n", offset, rays), 0)
+        gap = offset - along[:, None] * rays
+        near = np.flatnonzero(np.einsum("nk,nk->n", gap, gap) < caster.radius**2)
+        if not len(near):
             continue
-        center, radius = body.sphere()
-        offset = (center - origins).astype(np.float32)
-        along = np.maximum(np.einsum("nk,nk->n", offset, directions), 0)
-        gap = offset - along[:, None] * directions
-        near = np.flatnonzero(np.einsum("nk,nk->n", gap, gap) < radius * radius)
-        for part in body.parts:
-            if not part.casts or not len(near):
-                continue
-            o = to_local(part.shape, origins[near]).astype(np.float32)
-            t = part.shape.hit(o, (directions[near] @ part.shape.rotation).astype(np.float32))[0]
+        for shape in caster.shapes:
+            local = to_local(shape, origins[near]).astype(np.float32)
+            t = shape.hit(local, rays[near] @ shape.rotation.astype(np.float32))[0]
             closer = t < distance[near]
             distance[near[closer]] = t[closer]
             index[near[closer]] = i
     return distance, index
 
 
-def bake(bodies: list[Body], part: Part, rng: np.random.Generator, samples: int = 40) -> None:
+def bake(around: list[Caster], part: Part, rng: np.random.Generator, samples: int = 40) -> None:
     """Fills `part.lit` with paint × light, as the 8-bit sRGB picture a camera would record."""
     rows, columns = part.light_texels
     v, u = np.mgrid[0:rows, 0:columns]
@@ -99,7 +116,7 @@ def bake(bodies: list[Body], part: Part, rng: np.random.Generator, samples: int 
     points, normals = part.shape.point_normal(u, v)
     points, normals = to_world(part.shape, points), normals @ part.shape.rotation.T
     start = points + 1e-3 * normals
-    light = _lamp(bodies, start, normals, rng, samples) + _sky(bodies, start, normals, rng, samples)
+    light = _lamp(around, start, normals, rng, samples) + _sky(around, start, normals, rng, samples)
     light = light.reshape(rows, columns, 3).astype(np.float32)
     wide = np.concatenate([light[:, -4:], light, light[:, :4]], 1)  # the chart of a round thing closes on itself
     wide = cv2.GaussianBlur(wide if wide.shape[1] > 12 else light, (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
@@ -109,7 +126,7 @@ def bake(bodies: list[Body], part: Part, rng: np.random.Generator, samples: int 
     part.lit = np.round(255 * np.clip(to_srgb(to_linear(part.paint) * light), 0, 1)).astype(np.uint8)
 
 
-def _lamp(bodies: list[Body], start: np.ndarray, normals: np.ndarray, rng: np.random.Generator, samples: int):
+def _lamp(around: list[Caster], start: np.ndarray, normals: np.ndarray, rng: np.random.Generator, samples: int):
     """Light [N, 3] of the round lamp: mean over its disc of visibility × cosine / distance²."""
     total = np.zeros(len(start))
     shift = rng.random((len(start), 2))
@@ -126,14 +143,14 @@ def _lamp(bodies: list[Body], start: np.ndarray, normals: np.ndarray, rng: np.ra
         ray = ray / length[:, None]
         cosine = np.einsum("nk,nk->n", ray, normals)
         facing = np.flatnonzero(cosine > 0)
-        blocked = first_hits(bodies, start[facing], ray[facing])[0] < length[facing]
+        blocked = first_hits(around, start[facing], ray[facing])[0] < length[facing]
         total[facing] += np.where(blocked, 0, cosine[facing] / length[facing] ** 2)
     return total[:, None] / samples * LAMP_COLOR
 
 
-def _sky(bodies: list[Body], start: np.ndarray, normals: np.ndarray, rng: np.random.Generator, samples: int):
+def _sky(around: list[Caster], start: np.ndarray, normals: np.ndarray, rng: np.random.Generator, samples: int):
     """Light [N, 3] from all around: cosine-spread rays; one that meets a body brings a little of its colour."""
-    tints = np.array([_tint(body) for body in bodies] + [np.zeros(3)])
+    tints = np.array([caster.tint for caster in around] + [np.zeros(3)])
     helper = np.where(np.abs(normals[:, :1]) > 0.7, [[0.0, 1, 0]], [[1.0, 0, 0]])
     side = np.cross(helper, normals)
     side /= np.linalg.norm(side, axis=1, keepdims=True)
@@ -145,16 +162,11 @@ def _sky(bodies: list[Body], start: np.ndarray, normals: np.ndarray, rng: np.ran
         r, angle = np.sqrt(a), 2 * np.pi * b
         ray = (r * np.cos(angle))[:, None] * side + (r * np.sin(angle))[:, None] * up
         ray += np.sqrt(1 - a)[:, None] * normals
-        distance, index = first_hits(bodies, start, ray.astype(np.float32))
+        distance, index = first_hits(around, start, ray.astype(np.float32))
         shade = np.clip(1 - distance / SKY_REACH, 0, 1)[:, None]
         height = 0.72 + 0.28 * ray[:, 2:]
         total += height * SKY_COLOR * (1 - shade) + shade * 0.55 * tints[index]
     return total / samples
-
-
-def _tint(body: Body) -> np.ndarray:
-    """Mean linear paint of a body: the colour it lends to what stands beside it."""
-    return np.mean([to_linear(part.paint).mean((0, 1)) for part in body.parts], axis=0) * 0.6
 
 
 def _sequence(k: int, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

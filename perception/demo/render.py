@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from perception.demo.light import LAMP_CENTER, Body, Part, _corners
+from perception.demo.light import LAMP_CENTER, Body, Part, corners
 from perception.demo.shapes import to_local, to_world
 
 
@@ -76,7 +76,7 @@ def _blocks(image: np.ndarray, samples: int) -> np.ndarray:
 
 def _window(part: Part, camera: Camera, samples: int) -> tuple[slice, slice] | None:
     """The part of the fine grid where the part can be seen, from its projected bounds; None = out of sight."""
-    pixels, z = camera.project(to_world(part.shape, _corners(part.shape)))
+    pixels, z = camera.project(to_world(part.shape, corners(part.shape)))
     if (z <= 0.02).all():
         return None
     if (z <= 0.02).any():  # reaches behind the camera: projected bounds mean nothing

@@ -8,7 +8,7 @@ import numpy as np
 
 from perception.demo import textures as tex
 from perception.demo import things
-from perception.demo.light import Body, Part, bake
+from perception.demo.light import Body, Part, bake, casters
 from perception.demo.shapes import Sheet, rotation_from_axes, spin
 
 TABLE = (1.10, 0.78)  # metres along x and y; its top is z = 0 and centred on the origin
@@ -31,8 +31,9 @@ def build(seed: int) -> list[Body]:
     bodies = _objects(rng) + _room(rng)
     jobs = [(body, part) for body in bodies for part in body.parts]
     seeds = rng.integers(0, 2**31, len(jobs))
+    around = casters(bodies)
     with ThreadPoolExecutor() as pool:  # numpy lets go of the interpreter lock in its loops
-        list(pool.map(lambda k: bake(bodies, jobs[k][1], np.random.default_rng(seeds[k])), range(len(jobs))))
+        list(pool.map(lambda k: bake(around, jobs[k][1], np.random.default_rng(seeds[k])), range(len(jobs))))
     return bodies
 
 
@@ -60,11 +61,13 @@ def _room(rng: np.random.Generator) -> list[Body]:
     edge = tex.wood(rng, 48, 1270, 1, "#b37d49", "#6f4120")
     plank = things.box_parts(np.array([0, 0, -0.02]), (width, depth, 0.04), np.eye(3), [top, edge, edge], (20, 64))
     plank[0].light_texels = (150, 210)
+    for part in plank[1:]:
+        part.casts = False
     leg = tex.wood(rng, 80, 700, 1, "#a97443", "#66391a").transpose(1, 0, 2)
     for x in (-1, 1):
         for y in (-1, 1):
             center = np.array([x * (width / 2 - 0.06), y * (depth / 2 - 0.06), (FLOOR - 0.04) / 2])
-            plank += things.box_parts(center, (0.055, 0.055, -FLOOR - 0.04), np.eye(3), [leg], (24, 4))
+            plank += things.box_parts(center, (0.055, 0.055, -FLOOR - 0.04), np.eye(3), [leg], (24, 4), casts=False)
     paper = tex.wallpaper(rng, 900, 1550, "#b9cdc4", ["#9db8ac", "#86a699", "#d3dfd8", "#c7a86b", "#7b978f"])
     other = tex.wallpaper(rng, 900, 1100, "#cfc3ae", ["#b7a88d", "#a3957a", "#e0d7c6", "#8a9a86", "#b98a5e"])
     tall, middle = 2.0, FLOOR + 1.0
