@@ -1,0 +1,5 @@
+"""Photos of a made-up tabletop with exact truth, for `perception demo` and the tests."""
+
+from perception.demo.scene import DemoTruth, load_truth, make_photos
+
+__all__ = ["DemoTruth", "load_truth", "make_photos"]

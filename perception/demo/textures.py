@@ -1,0 +1,199 @@
+"""Pictures painted by formula: wood, glaze, peel, balls, posters. All are [h, w, 3] float32 sRGB in [0, 1]."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+Color = tuple[float, float, float]
+
+
+def rgb(code: str) -> np.ndarray:
+    """'#rrggbb' -> [3] float32 in [0, 1]."""
+    return np.array([int(code[i : i + 2], 16) for i in (1, 3, 5)], np.float32) / 255
+
+
+def noise(rng: np.random.Generator, height: int, width: int, cells: tuple[float, float], octaves: int = 4):
+    """Fractal value noise [h, w] float32 of zero mean and about unit deviation, periodic along the width.
+
+    cells: how many lattice cells the first octave has down and across; each octave doubles them at half the weight.
+    """
+    total = np.zeros((height, width), np.float32)
+    weight = 1.0
+    for octave in range(octaves):
+        rows = int(np.clip(round(cells[0] * 2**octave), 2, height))
+        columns = int(np.clip(round(cells[1] * 2**octave), 2, width))
+        grid = np.tile(rng.standard_normal((rows, columns)).astype(np.float32), (1, 3))
+        wide = cv2.resize(grid, (3 * width, height), interpolation=cv2.INTER_CUBIC)
+        total += weight * wide[:, width : 2 * width]
+        weight *= 0.55
+    return total / max(float(total.std()), 1e-6)
+
+
+def blend(amount: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """first where amount [h, w] is 0, second where it is 1."""
+    a = np.clip(amount, 0, 1)[..., None].astype(np.float32)
+    return first * (1 - a) + second * a
+
+
+def speckle(rng: np.random.Generator, picture: np.ndarray, count: int, sizes: tuple[int, int], colors: list[str]):
+    """`count` small blots of the given colours and radii (pixels) dropped on a copy of the picture."""
+    out = np.ascontiguousarray(picture, np.float32).copy()
+    height, width = out.shape[:2]
+    for _ in range(count):
+        center = int(rng.integers(width)), int(rng.integers(height))
+        axes = tuple(int(x) for x in rng.integers(sizes[0], sizes[1] + 1, 2))
+        color = rgb(colors[rng.integers(len(colors))]).tolist()
+        cv2.ellipse(out, center, axes, float(rng.uniform(0, 180)), 0, 360, color, -1, cv2.LINE_AA)
+    return out
+
+
+def wood(rng: np.random.Generator, height: int, width: int, planks: int, light: str, dark: str) -> np.ndarray:
+    """Planks with grain along the width, knots, pores and dark joints."""
+    rows = []
+    edges = np.linspace(0, height, planks + 1).astype(int)
+    for top, bottom in zip(edges[:-1], edges[1:], strict=True):
+        rows.append(_plank(rng, bottom - top, width, rgb(light), rgb(dark)))
+    return np.clip(np.concatenate(rows), 0, 1)
+
+
+def _plank(rng: np.random.Generator, height: int, width: int, light: np.ndarray, dark: np.ndarray) -> np.ndarray:
+    y, x = np.mgrid[0:height, 0:width].astype(np.float32)
+    warp = noise(rng, height, width, (2, 4), 3) * height * 0.05
+    for _ in range(int(rng.integers(1, 4))):  # knots bend the grain around them
+        ky, kx, r = rng.uniform(0, height), rng.uniform(0, width), rng.uniform(0.06, 0.12) * height
+        warp += 2.2 * r * np.exp(-(((y - ky) / r) ** 2 + ((x - kx) / (3 * r)) ** 2) / 2) * np.sign(y - ky)
+    rings = 0.5 + 0.5 * np.sin((y + warp) / height * rng.uniform(30, 46) + rng.uniform(0, 6))
+    grain = noise(rng, height, width, (height / 5, width / 60), 3)
+    tone = 0.42 * rings + 0.13 * grain + 0.10 * noise(rng, height, width, (3, 6), 4) + rng.uniform(0.05, 0.35)
+    plank = blend(tone, light, dark)
+    pores = noise(rng, height, width, (height / 2, width / 14), 1) > 2.1
+    plank[pores] *= 0.72
+    joint = np.minimum(y, height - 1 - y) < 1.2
+    plank[joint] *= 0.45
+    return plank
+
+
+def directions(height: int, width: int) -> np.ndarray:
+    """[h, w, 3] unit vectors of the longitude-latitude chart of an ellipsoid."""
+    lat = (np.arange(height) + 0.5) / height * np.pi
+    lon = (np.arange(width) + 0.5) / width * 2 * np.pi
+    sin = np.sin(lat)[:, None]
+    return np.stack([sin * np.cos(lon), sin * np.sin(lon), np.broadcast_to(np.cos(lat)[:, None], (height, width))], -1)
+
+
+def basketball(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
+    """Orange pebbled leather with the black ribs of a basketball."""
+    x, y, z = np.moveaxis(directions(height, width), -1, 0)
+    pebbles = noise(rng, height, width, (height / 5, width / 5), 1)
+    skin = blend(0.5 + 0.22 * pebbles + 0.16 * noise(rng, height, width, (6, 12), 4), rgb("#d9681d"), rgb("#a8430c"))
+    bow = np.abs(np.arccos(np.clip(np.abs(y), 0, 1)) - 0.85 + 0.12 * x * x)
+    rib = np.minimum(np.minimum(np.abs(x), np.abs(z)), bow)
+    return blend(1.6 - rib / 0.022, skin, rgb("#17120f"))
+
+
+def soccer_ball(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
+    """White hexagons and black pentagons: the central projection of a truncated icosahedron."""
+    golden = (1 + 5**0.5) / 2
+    corners = np.array([(0, a, b * golden) for a in (1, -1) for b in (1, -1)])
+    pentagons = np.concatenate([np.roll(corners, k, 1) for k in range(3)]) / np.hypot(1, golden)
+    near = pentagons @ pentagons.T > 0.4  # neighbours on the icosahedron
+    hexagons = np.array(
+        [
+            pentagons[[i, j, k]].mean(0)
+            for i in range(12)
+            for j in range(i)
+            for k in range(j)
+            if near[i, j] and near[j, k] and near[i, k]
+        ]
+    )
+    hexagons /= np.linalg.norm(hexagons, axis=1, keepdims=True)
+    # Face distances of the solid with unit edge; a direction meets the face of greatest n·c / distance.
+    heights = np.concatenate([np.full(12, 2.3274), np.full(20, 2.2673)])
+    score = directions(height, width) @ (np.concatenate([pentagons, hexagons]) / heights[:, None]).T
+    face = score.argmax(-1)
+    best = np.partition(score, -2, axis=-1)
+    seam = (best[..., -1] - best[..., -2]) < 0.004
+    grime = 0.10 * noise(rng, height, width, (8, 16), 5)[..., None]
+    ball = np.where((face < 12)[..., None], rgb("#16181c") + 0.3 * np.abs(grime), rgb("#eeece6") - np.abs(grime))
+    ball[seam] = rgb("#6d6a66")
+    return np.clip(ball, 0, 1).astype(np.float32)
+
+
+def peel(rng: np.random.Generator, height: int, width: int, light: str, dark: str, pores: float = 4) -> np.ndarray:
+    """The skin of a fruit: pores and blotches, darker at the two poles."""
+    dots = noise(rng, height, width, (height / pores, width / pores), 1)
+    skin = blend(0.35 + 0.16 * dots + 0.22 * noise(rng, height, width, (4, 8), 4), rgb(light), rgb(dark))
+    v = (np.arange(height) + 0.5) / height
+    pole = np.exp(-((np.minimum(v, 1 - v) / 0.035) ** 2))[:, None] * np.ones((1, width))
+    return blend(0.9 * pole, skin, rgb("#4c5a1e"))
+
+
+def glaze(rng: np.random.Generator, height: int, width: int, color: str, specks: list[str], count: int) -> np.ndarray:
+    """Fired ceramic: one colour with clouds and specks."""
+    base = np.broadcast_to(rgb(color), (height, width, 3))
+    cloud = 0.055 * noise(rng, height, width, (4, 8), 5)[..., None] + 0.02 * rng.standard_normal((height, width, 1))
+    return np.clip(speckle(rng, base * (1 + cloud), count, (1, 2), specks), 0, 1).astype(np.float32)
+
+
+def draw_text(picture: np.ndarray, text: str, center: tuple[float, float], size: int, color: str) -> np.ndarray:
+    """Text written on a copy of the picture, centred at (x, y) pixels, `size` pixels high."""
+    image = Image.fromarray((np.clip(picture, 0, 1) * 255).astype(np.uint8))
+    font = ImageFont.load_default(size=size)
+    ImageDraw.Draw(image).text(center, text, fill=color, font=font, anchor="mm")
+    return np.asarray(image, np.float32) / 255
+
+
+def wallpaper(rng: np.random.Generator, height: int, width: int, ground: str, leaves: list[str]) -> np.ndarray:
+    """Plaster-toned paper with scattered leaves, no two alike, so that no feature is mistaken for another."""
+    paper = np.broadcast_to(rgb(ground), (height, width, 3)) * (
+        1 + 0.035 * noise(rng, height, width, (height / 40, width / 40), 5)[..., None]
+    )
+    paper = np.ascontiguousarray(paper, np.float32)
+    for _ in range(height * width // 3600):
+        x, y, turn = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0, 2 * np.pi)
+        color = rgb(leaves[rng.integers(len(leaves))]).tolist()
+        reach = rng.uniform(9, 24)
+        for side in (-0.55, 0.0, 0.55):
+            a = turn + side
+            tip = int(x + reach * np.cos(a)), int(y + reach * np.sin(a))
+            axes = int(reach * 0.55) + 1, max(2, int(reach * rng.uniform(0.12, 0.24)))
+            cv2.ellipse(paper, tip, axes, np.degrees(a), 0, 360, color, -1, cv2.LINE_AA)
+    return np.clip(paper, 0, 1)
+
+
+def landscape(rng: np.random.Generator, height: int, width: int, sky: list[str], hills: list[str], title: str):
+    """A travel poster: a sun over ranges of hills, a title beneath."""
+    y = np.linspace(0, 1, height)[:, None] * np.ones((1, width))
+    art = blend(y * 1.4, rgb(sky[0]), rgb(sky[1])).astype(np.float32)
+    sun = int(width * rng.uniform(0.25, 0.75)), int(height * 0.3)
+    cv2.circle(art, sun, width // 8, rgb("#fff3cf").tolist(), -1, cv2.LINE_AA)
+    for i, color in enumerate(hills):
+        crest = height * (0.38 + 0.13 * i) + height * 0.05 * noise(rng, 2, width, (1, 3 + i), 5)[0]
+        below = np.arange(height)[:, None] > crest[None]
+        shade = 1 + 0.08 * noise(rng, height, width, (12, 12), 4)
+        art = np.where(below[..., None], rgb(color) * shade[..., None], art).astype(np.float32)
+    art = speckle(rng, art, 60, (1, 3), ["#fff3cf", "#1f2a36"])
+    border = max(4, width // 24)
+    art[:border] = art[-3 * border :] = rgb("#f4efe2")
+    art[:, :border] = art[:, -border:] = rgb("#f4efe2")
+    return draw_text(np.clip(art, 0, 1), title, (width / 2, height - 1.5 * border), int(1.9 * border), "#22303c")
+
+
+def mosaic(rng: np.random.Generator, height: int, width: int, colors: list[str]) -> np.ndarray:
+    """An abstract poster of overlapping discs, bars and triangles."""
+    art = np.ascontiguousarray(np.broadcast_to(rgb("#f3ead7"), (height, width, 3)), np.float32)
+    for i in range(42):
+        color = rgb(colors[rng.integers(len(colors))]).tolist()
+        x, y = int(rng.uniform(0.08, 0.92) * width), int(rng.uniform(0.08, 0.92) * height)
+        r = int(rng.uniform(0.04, 0.16) * width)
+        if i % 3 == 0:
+            cv2.circle(art, (x, y), r, color, -1 if i % 2 else max(3, r // 4), cv2.LINE_AA)
+        elif i % 3 == 1:
+            box = cv2.boxPoints(((x, y), (2.4 * r, 0.5 * r), float(rng.uniform(0, 180)))).astype(np.int32)
+            cv2.fillPoly(art, [box], color, cv2.LINE_AA)
+        else:
+            corners = np.array([[x, y]]) + rng.uniform(-r, r, (3, 2))
+            cv2.fillPoly(art, [corners.astype(np.int32)], color, cv2.LINE_AA)
+    return np.clip(art * (1 + 0.02 * noise(rng, height, width, (60, 60), 3)[..., None]), 0, 1)

@@ -1,0 +1,212 @@
+"""The objects on the table: everyday things of plain shapes. Metres; z up; the table top is z = 0."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perception.demo import textures as tex
+from perception.demo.light import Body, Part
+from perception.demo.shapes import Ellipsoid, Lathe, Sheet, Tube, rotation_from_axes, spin
+
+Place = tuple[float, float]
+
+
+def _at(place: Place, height: float = 0.0) -> np.ndarray:
+    return np.array([*place, height])
+
+
+def mug(rng: np.random.Generator, id: int, name: str, place: Place, turn: float, paint: np.ndarray) -> Body:
+    """A coffee mug: a turned cup with a thick rim and a bent handle; `turn` (degrees) is where the handle points."""
+    profile = [
+        (0.0, 0.0), (0.034, 0.0), (0.040, 0.005), (0.0425, 0.015), (0.0435, 0.092), (0.0425, 0.0965), (0.0405, 0.0965),
+        (0.0395, 0.092), (0.038, 0.014), (0.033, 0.008), (0.0, 0.007),
+    ]  # fmt: skip
+    turned = spin(turn)
+    cup = Lathe(np.array(profile), turned, _at(place))
+    outward, up = turned[:, 0], np.array([0, 0, 1.0])
+    handle = Tube(
+        0.026, np.radians(-105), np.radians(105), np.full(9, 0.0056),
+        np.stack([outward, up, np.cross(outward, up)], 1), _at(place, 0.05) + 0.0425 * outward,
+    )  # fmt: skip
+    grip = np.ascontiguousarray(paint[5:45, :60])
+    return Body(id, name, [name, "coffee mug"], [Part(cup, paint, 0.5, (40, 48)), Part(handle, grip, 0.5, (12, 32))])
+
+
+def mug_paint(rng: np.random.Generator, color: str, ink: str, word: str) -> np.ndarray:
+    """Glaze with a printed word and a band on the outer wall (profile share .20 to .52 of the chart)."""
+    height, width = 480, 560
+    paint = tex.glaze(rng, height, width, color, [ink, "#ffffff", "#1c1c1c"], 420)
+    for row in (112, 236):
+        paint[row : row + 5] = tex.rgb(ink)
+    for column in (70, 350):
+        # The profile runs upwards, the chart's rows with it: print upside down to read upright.
+        label = tex.draw_text(paint[120:234, column : column + 200][::-1], word, (100, 57), 52, ink)
+        paint[120:234, column : column + 200] = label[::-1]
+    return paint
+
+
+def vase(rng: np.random.Generator, id: int, name: str, place: Place) -> Body:
+    """A bellied vase with a narrow neck, white with painted blue bands, dots and leaves."""
+    z = np.linspace(0, 1, 22)
+    radius = 0.034 + 0.036 * np.exp(-(((z - 0.42) / 0.26) ** 2)) - 0.012 * np.exp(-(((z - 0.86) / 0.13) ** 2))
+    radius[-3:] += [0.0015, 0.005, 0.009]
+    outer = np.stack([radius, 0.26 * z], 1)
+    inner = np.array([(radius[-1] - 0.004, 0.26), (radius[-4] - 0.005, 0.215), (0.05, 0.11), (0.0, 0.1)])
+    height, width = 620, 800
+    paint = tex.glaze(rng, height, width, "#ebe9e0", ["#c9ccd0", "#b9b3a2"], 260)
+    paint = _painted_bands(rng, paint)
+    body = Lathe(np.concatenate([[(0.0, 0.0)], outer, inner]), spin(0), _at(place))
+    return Body(id, name, [name, "blue and white vase", "ceramic vase"], [Part(body, paint, 0.6, (64, 56))])
+
+
+def _painted_bands(rng: np.random.Generator, paint: np.ndarray) -> np.ndarray:
+    import cv2
+
+    height, width = paint.shape[:2]
+    blue = [tex.rgb("#1f3f94"), tex.rgb("#2f62b8"), tex.rgb("#5b8ccf")]
+    for top, thick in ((0.11, 9), (0.135, 4), (0.47, 7), (0.50, 3), (0.61, 8)):
+        paint[int(top * height) : int(top * height) + thick] = blue[0]
+    for i in range(26):
+        x, y = int((i + 0.5) * width / 26), int((0.30 + 0.055 * np.sin(i * 2 * np.pi / 6.5)) * height)
+        for leaf in range(int(rng.integers(4, 7))):
+            a = float(rng.uniform(0, 360))
+            r = int(rng.integers(10, 22))
+            tip = int(x + r * np.cos(np.radians(a))), int(y + r * np.sin(np.radians(a)))
+            cv2.ellipse(paint, tip, (r // 2 + 3, 4), a, 0, 360, blue[leaf % 3].tolist(), -1, cv2.LINE_AA)
+        cv2.circle(paint, (x, y), 5, tex.rgb("#d8b13c").tolist(), -1, cv2.LINE_AA)
+    for i in range(40):
+        color = blue[int(rng.integers(3))].tolist()
+        cv2.circle(paint, (int((i + 0.5) * width / 40), int(0.555 * height)), 5, color, -1, cv2.LINE_AA)
+    return paint
+
+
+def ball(id: int, name: str, place: Place, radius: float, paint: np.ndarray, tilt: list[float]) -> Body:
+    """A ball resting on the table, its pole along `tilt`."""
+    rotation = rotation_from_axes([1, 0.3, 0.1], tilt)
+    part = Part(Ellipsoid(np.full(3, radius), rotation, _at(place, radius)), paint, 0.18, (36, 64))
+    return Body(id, name, [name, "ball"], [part])
+
+
+def orange(rng: np.random.Generator, id: int, name: str, place: Place) -> Body:
+    """An orange, slightly flattened."""
+    radii = np.array([0.040, 0.040, 0.037])
+    shape = Ellipsoid(radii, rotation_from_axes([1, 0, 0.2], [0.25, -0.35, 1]), _at(place, 0.0375))
+    paint = tex.peel(rng, 280, 560, "#f7921e", "#dd6a07")
+    return Body(id, name, [name, "orange fruit"], [Part(shape, paint, 0.25, (32, 56))])
+
+
+def banana(rng: np.random.Generator, id: int, name: str, place: Place, turn: float) -> Body:
+    """A banana lying on its side: a tapering bent tube with a stem and brown tips."""
+    radii = np.array([0.0045, 0.005, 0.0095, 0.0155, 0.0178, 0.0185, 0.0185, 0.0175, 0.0145, 0.008, 0.004])
+    shape = Tube(0.115, np.radians(28), np.radians(137), radii, spin(turn), _at(place, 0.0186), steps=64)
+    height, width = 520, 260
+    paint = tex.peel(rng, height, width, "#f6d335", "#e2b41d", 9)
+    across = np.arange(width) / width
+    ridge = np.exp(-((((across * 5) % 1) - 0.5) ** 2) / 0.006)[None] * np.ones((height, 1))
+    paint = tex.blend(0.45 * ridge, paint, tex.rgb("#b98f1c"))
+    paint = tex.speckle(rng, paint, 150, (1, 5), ["#6b4716", "#8a611d", "#a87d22"])
+    v = np.linspace(0, 1, height)[:, None] * np.ones((1, width))
+    paint = tex.blend((0.10 - v) / 0.06, paint, tex.rgb("#8d8a3a"))
+    paint = tex.blend((v - 0.955) / 0.02, paint, tex.rgb("#33240f"))
+    paint = tex.blend((0.018 - v) / 0.01, paint, tex.rgb("#33240f"))
+    return Body(id, name, [name, "yellow banana"], [Part(shape, paint, 0.1, (48, 20))])
+
+
+def box_parts(
+    center: np.ndarray, extent: tuple[float, float, float], rotation: np.ndarray, paints: list[np.ndarray],
+    texels: tuple[int, int] = (24, 24), casts: bool = True,
+) -> list[Part]:  # fmt: skip
+    """Six sheets around a box: paints for +z, -z and the four sides (-y, +x, +y, -x), cycled when fewer."""
+    x, y, z = extent
+    faces = [
+        ([0, 0, 1], [1, 0, 0], z, x, y), ([0, 0, -1], [1, 0, 0], z, x, y), ([0, -1, 0], [1, 0, 0], y, x, z),
+        ([1, 0, 0], [0, 1, 0], x, y, z), ([0, 1, 0], [-1, 0, 0], y, x, z), ([-1, 0, 0], [0, -1, 0], x, y, z),
+    ]  # fmt: skip
+    parts = []
+    for i, (normal, along, depth, width, height) in enumerate(faces):
+        local = rotation_from_axes(along, normal)
+        origin = center + rotation @ (np.array(normal) * depth / 2)
+        shape = Sheet(width, height, rotation @ local, origin)
+        parts.append(Part(shape, paints[i % len(paints)], 0.0, texels, casts))
+    return parts
+
+
+def book(rng: np.random.Generator, id: int, name: str, place: Place, turn: float) -> Body:
+    """A thick green hardback lying on the table, title up."""
+    width, depth, thick = 0.150, 0.205, 0.036
+    cover = tex.landscape(
+        rng, 560, 410, ["#0d4f4a", "#1c8a78"], ["#2a9a7d", "#166b5d", "#0f4c46", "#0a3330"], "FIELD GUIDE"
+    )
+    cover = tex.draw_text(cover, "BIRDS", (205, 210), 88, "#fff3cf")
+    cover = tex.draw_text(cover, "OF THE NORTH", (205, 275), 34, "#f2d98a")
+    spine = tex.glaze(rng, 100, 560, "#0d4f4a", ["#1c8a78"], 200)
+    spine = tex.draw_text(spine, "BIRDS OF THE NORTH", (280, 50), 38, "#f2d98a")
+    lines = tex.noise(rng, 100, 560, (50, 3), 2)
+    pages = tex.blend(0.35 + 0.25 * lines, tex.rgb("#f1e8d2") * np.ones((100, 560, 3), np.float32), tex.rgb("#a8946a"))
+    for edge in (slice(0, 8), slice(-8, None)):
+        pages[edge] = tex.rgb("#0a3330")
+    parts = box_parts(_at(place, thick / 2), (width, depth, thick), spin(turn), [cover, spine, pages, pages, pages, spine])
+    return Body(id, name, [name, "green book", "hardback book"], parts)
+
+
+def cactus(rng: np.random.Generator, id: int, name: str, place: Place) -> Body:
+    """A ribbed cactus with two arms in a terracotta pot."""
+    pot = Lathe(
+        np.array([(0, 0), (0.034, 0), (0.046, 0.062), (0.051, 0.063), (0.053, 0.085), (0.048, 0.086), (0.046, 0.074), (0, 0.073)]),
+        spin(0), _at(place),
+    )  # fmt: skip
+    clay = tex.blend(
+        0.4 + 0.25 * tex.noise(rng, 360, 560, (8, 12), 5), tex.rgb("#c76b3f") * np.ones((360, 560, 3), np.float32),
+        tex.rgb("#9a4a29"),
+    )  # fmt: skip
+    clay[250:] = tex.speckle(rng, tex.rgb("#3b2a1d") * np.ones((110, 560, 3), np.float32), 900, (1, 4), ["#6d5137", "#1f150e", "#8d7454"])
+    stem = Ellipsoid(np.array([0.027, 0.027, 0.075]), spin(20), _at(place, 0.128))
+    parts = [Part(pot, clay, 0.0, (32, 40)), Part(stem, _ribs(rng, 400, 460, 13), 0.0, (32, 52))]
+    for side, height, size in ((15.0, 0.135, 0.026), (195.0, 0.115, 0.024)):
+        outward = spin(side)[:, 0]
+        axes = np.stack([outward, np.array([0, 0, 1.0]), np.cross(outward, [0, 0, 1.0])], 1)
+        # A quarter bend: out of the stem sideways, then upwards.
+        bend = Tube(size, np.radians(-100), np.radians(20), np.array([0.009, 0.011, 0.0115, 0.0115, 0.011]), axes,
+                    _at(place, height + size) + 0.028 * outward)  # fmt: skip
+        parts.append(Part(bend, _ribs(rng, 160, 160, 7), 0.0, (20, 24)))
+    return Body(id, name, [name, "potted cactus", "flowerpot"], parts)
+
+
+def _ribs(rng: np.random.Generator, height: int, width: int, count: int) -> np.ndarray:
+    """Cactus skin: light ridges set with pale spines, dark valleys."""
+    u = (np.arange(width) + 0.5) / width * count
+    ridge = (0.5 + 0.5 * np.cos(2 * np.pi * u))[None] * np.ones((height, 1))
+    skin = tex.blend(ridge + 0.12 * tex.noise(rng, height, width, (8, 8), 4), tex.rgb("#1f4a26"), tex.rgb("#5f9a4a"))
+    rows = np.arange(6, height - 4, 13)
+    for k in range(count):
+        for y in rows + int(rng.integers(0, 7)):
+            x = round(k * width / count)
+            skin[y - 1 : y + 2, max(x - 2, 0) : x + 3] = tex.rgb("#efe6c0")
+    return skin.astype(np.float32)
+
+
+def clock(rng: np.random.Generator, id: int, name: str, center: np.ndarray) -> Body:
+    """A wall clock that faces -y: a turned black case and a white dial at ten past ten."""
+    import cv2
+
+    facing = rotation_from_axes([1, 0, 0], [0, -1, 0])
+    case = Lathe(
+        np.array([(0.132, 0.0), (0.135, 0.02), (0.128, 0.03), (0.120, 0.029), (0.117, 0.018)]), facing, center
+    )
+    dial = tex.glaze(rng, 480, 480, "#f3f1ea", ["#dedacd", "#c8c4b8"], 120)
+    for i in range(60):
+        a = np.radians(6 * i)
+        inner = 0.86 if i % 5 else 0.80
+        ends = [(int(240 + 225 * r * np.sin(a)), int(240 - 225 * r * np.cos(a))) for r in (inner, 0.93)]
+        cv2.line(dial, *ends, tex.rgb("#22262b").tolist(), 2 if i % 5 else 7, cv2.LINE_AA)
+    for hour in range(1, 13):
+        a = np.radians(30 * hour)
+        dial = tex.draw_text(dial, str(hour), (240 + 152 * np.sin(a), 240 - 152 * np.cos(a)), 46, "#22262b")
+    for turn, reach, wide in ((305.0, 105, 13), (60.0, 165, 9)):
+        a = np.radians(turn)
+        tip = (int(240 + reach * np.sin(a)), int(240 - reach * np.cos(a)))
+        cv2.line(dial, (240, 240), tip, tex.rgb("#22262b").tolist(), wide, cv2.LINE_AA)
+    cv2.circle(dial, (240, 240), 14, tex.rgb("#b3271e").tolist(), -1, cv2.LINE_AA)
+    face = Sheet(0.236, 0.236, facing, center + np.array([0, -0.019, 0]), elliptic=True)
+    wood = tex.wood(rng, 120, 600, 1, "#4a2c1a", "#23130a")
+    return Body(id, name, [name, "clock", "round clock"], [Part(case, wood, 0.3, (12, 56)), Part(face, dial, 0.0, (24, 24))])
