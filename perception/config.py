@@ -140,25 +140,25 @@ def _parse(text: str, kind: Any, where: str) -> Any:
     raise InputError(f"{where}: found {text!r}, expected {names}")
 
 
-def set_value(config: Any, key: str, value: Any, where: str = "--set") -> Any:
+def set_value(config: Any, key: str, value: Any, where: str = "--set", prefix: str = "") -> Any:
     """A copy of a config dataclass with one dotted `key` ("train.iterations") replaced."""
     head, _, rest = key.partition(".")
     hints = typing.get_type_hints(type(config))
     if head not in hints:
-        raise InputError(f"{where}: unknown setting '{head}', expected one of: {', '.join(hints)}")
+        raise InputError(f"{where}: unknown setting '{prefix}{head}', expected one of: {', '.join(hints)}")
     current = getattr(config, head)
     if dataclasses.is_dataclass(current):
         if isinstance(value, dict):
             for name, inner in value.items():
-                current = set_value(current, name, inner, where)
+                current = set_value(current, name, inner, where, f"{head}.")
         elif not rest:
             raise InputError(f"{where}: '{head}' is a group of settings, write {head}.NAME=VALUE")
         else:
-            current = set_value(current, rest, value, where)
+            current = set_value(current, rest, value, where, f"{head}.")
         return dataclasses.replace(config, **{head: current})
     if rest:
         raise InputError(f"{where}: '{head}' has no setting '{rest}'")
-    return dataclasses.replace(config, **{head: _parse(value, hints[head], f"{where} {key}")})
+    return dataclasses.replace(config, **{head: _parse(value, hints[head], f"{where} {prefix}{key}")})
 
 
 def load_config(file: Path | None = None, pairs: list[str] | None = None, preset: str = "default") -> MapConfig:

@@ -79,7 +79,7 @@ class Trainer:
         self.statistics = Statistics.zeros(len(gaussians))
         self.optimiser = SparseAdam(vars(gaussians), self._rates(0.0))
         self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
-        self._before_raise: float | None = None
+        self._trials: list[float] = []
         self._sh_settled = config.train.sh_degree == 0
         self._started = time.monotonic()
         self._order: np.ndarray = np.zeros(0, dtype=np.int64)
@@ -119,7 +119,7 @@ class Trainer:
             "optimiser": self.optimiser.state_dict(),
             "statistics": vars(self.statistics),
             "record": dict(vars(self.record), seconds=self.elapsed, iterations=self.iteration),
-            "harmonics": (self._before_raise, self._sh_settled),
+            "harmonics": (self._trials, self._sh_settled),
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -129,7 +129,7 @@ class Trainer:
         self.record = TrainRecord(**state["record"])
         self.iteration = state["iteration"]
         self.initial_count = state["initial_count"]
-        self._before_raise, self._sh_settled = state["harmonics"]
+        self._trials, self._sh_settled = state["harmonics"]
         self._started = time.monotonic()
 
     def _restart_optimiser(self, state: dict[str, Any]) -> None:
@@ -248,38 +248,34 @@ class Trainer:
     def _settle_harmonics(self, progress: float) -> None:
         """Raises the spherical-harmonic degree by one, and takes the raise back if it did not pay.
 
-        Each degree is tried for 5 % of the run after growth has stopped; the gain is what the held-out (else
-        training) PSNR rose by, less what it was rising by before.
+        After growth has stopped the run is cut into trials of 5 % each. The first raises nothing and tells what a
+        trial gains by itself; a raise pays when its trial gains `sh_min_gain_db` more than that. Gains are of the
+        held-out PSNR (of the training PSNR where nothing is held out).
         """
-        if self._sh_settled:
+        if self._sh_settled or progress < self.config.densify.stop + 0.05 * len(self._trials):
             return
-        config = self.config.train
-        degree = self.gaussians.sh_degree
-        step = 0.05
-        due = self.config.densify.stop + step * (degree + 1)
-        if progress < due:
+        degree, limit = self.gaussians.sh_degree, self.config.train.sh_degree
+        self._trials.append(self.score(limit=8)["psnr"])
+        if len(self._trials) == 1:
             return
-        score = self.score(limit=6)["psnr"]
-        if self._before_raise is not None and score - self._before_raise < config.sh_min_gain_db:
-            self.record.decisions.append(
-                f"harmonics: degree {degree} gained {score - self._before_raise:+.2f} dB, under {config.sh_min_gain_db}; stay"
-            )
-            self._sh_settled = True
-            return
-        if degree >= config.sh_degree:
-            self._sh_settled = True
-            return
-        gained = "" if self._before_raise is None else f" (the last one gained {score - self._before_raise:+.2f} dB)"
-        self.record.decisions.append(f"harmonics: degree {degree + 1} at iteration {self.iteration}{gained}")
-        self._before_raise = score
-        self._raise_degree(degree + 1)
+        gains = np.diff(self._trials)
+        if len(gains) > 1:
+            extra = float(gains[-1] - gains[0])
+            paid = extra >= self.config.train.sh_min_gain_db
+            self.record.decisions.append(f"harmonics: degree {degree} gained {extra:+.2f} dB, {'kept' if paid else 'taken back'}")
+            if not paid:
+                self._set_degree(degree - 1)
+            self._sh_settled = not paid or degree == limit
+        if not self._sh_settled:
+            self._set_degree(degree + 1)
 
-    def _raise_degree(self, degree: int) -> None:
+    def _set_degree(self, degree: int) -> None:
         state = self.optimiser.state_dict()
-        more = (degree + 1) ** 2 - self.gaussians.sh.shape[1]
+        count = (degree + 1) ** 2
         for table in ("params", "first", "second"):
             sh = state[table]["sh"]
-            state[table]["sh"] = torch.cat([sh, torch.zeros(len(sh), more, 3)], dim=1)
+            more = torch.zeros(len(sh), max(0, count - sh.shape[1]), 3)
+            state[table]["sh"] = torch.cat([sh[:, :count], more], dim=1)
         self._restart_optimiser(state)
 
     # ------------------------------------------------------------------ figures
