@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from perception.errors import InputError
+from perception.language.onnx import Device
 
 
 class Encoder(Protocol):
@@ -15,7 +16,7 @@ class Encoder(Protocol):
 
     identity: model, version and preprocessing; a map stores it and refuses embeddings of another.
     dim: length of an embedding.
-    absent_below: relevancy under which the best answer counts as "not present" (calibrated per encoder).
+    templates: sentences with one {} that a prompt is put into; their embeddings are averaged.
     """
 
     @property
@@ -25,7 +26,7 @@ class Encoder(Protocol):
     def dim(self) -> int: ...
 
     @property
-    def absent_below(self) -> float: ...
+    def templates(self) -> tuple[str, ...]: ...
 
     def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """RGB uint8 [H, W, 3] pictures of any size → float32 [n, dim], unit rows."""
@@ -36,10 +37,11 @@ class Encoder(Protocol):
         ...
 
 
-def make_encoder(spec: str) -> Encoder | None:
+def make_encoder(spec: str, device: Device = "auto") -> Encoder | None:
     """Make the encoder named by `spec`.
 
     "conse": the offline default. "clip:IMAGE.onnx,TEXT.onnx" or "clip:DIR": a CLIP-family pair. "none": None.
+    device: where ONNX models run; "cuda" is an InputError where they would silently run on the CPU.
     """
     kind, _, argument = spec.partition(":")
     if kind == "none" and not argument:
@@ -51,7 +53,7 @@ def make_encoder(spec: str) -> Encoder | None:
     if kind == "clip" and argument:
         from perception.language.clip import ClipEncoder
 
-        return ClipEncoder.from_spec(argument)
+        return ClipEncoder.from_spec(argument, device)
     raise InputError(f"encoder '{spec}': expected conse, clip:IMAGE.onnx,TEXT.onnx, clip:DIR or none")
 
 

@@ -32,7 +32,7 @@ class ConseEncoder:
     """EfficientNet-lite2 class probabilities combined in the space of all-MiniLM-L6-v2; dim 384."""
 
     dim = MiniLM.dim
-    absent_below = 0.5
+    templates: tuple[str, ...] = ("{}",)
     identity = f"conse-2/efficientnet-lite2-{SIDE}/all-minilm-l6-v2/top{TOP}-sqrt-centred"
 
     def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
