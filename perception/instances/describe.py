@@ -1,0 +1,80 @@
+"""Describe instances photo by photo: an encoder sees their crops, a palette keeps their colours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from perception.instances.crops import Background, crop_levels, mask_box
+from perception.language.base import Encoder, unit_rows
+from perception.language.colors import palette
+from perception.language.description import InstanceDescription, unseen
+
+COLOR_SAMPLES = 2000  # pixels of a mask that its palette is made from, per view
+Load = Callable[[int], tuple[np.ndarray, np.ndarray]]
+
+
+def describe_instances(
+    encoder: Encoder,
+    choices: Sequence[np.ndarray],
+    load: Load,
+    view_names: Sequence[str],
+    levels: int = 3,
+    expansion: float = 0.3,
+    background: Background = "plain",
+    progress: Callable[[int, int], Any] | None = None,
+) -> list[InstanceDescription]:
+    """Descriptions of the I instances whose views `choices` lists (see `crops.choose_views`).
+
+    load(view) → photo [H, W, 3] uint8 and instance image [H, W] int32 (silhouettes with occlusion; value = position
+    in `choices`, −1 = none). Each needed photo is loaded once and dropped, so memory does not grow with their number.
+    progress(done, all) is told after every photo.
+    """
+    wanted: dict[int, list[tuple[int, int]]] = {}
+    for instance, views in enumerate(choices):
+        for rank, view in enumerate(views):
+            wanted.setdefault(int(view), []).append((instance, rank))
+    seen: list[dict[int, Any]] = [{} for _ in choices]
+    for done, view in enumerate(sorted(wanted)):
+        photo, ids = load(view)
+        shown = [(i, rank, ids == i) for i, rank in wanted[view]]
+        crops = [crop_levels(photo, mask, levels, expansion, background) for _, _, mask in shown]
+        flat = [crop for group in crops for crop in group]
+        embedded = encoder.encode_images(flat) if flat else np.zeros((0, encoder.dim), np.float32)
+        start = 0
+        for (instance, rank, mask), group in zip(shown, crops, strict=True):
+            if group:
+                rows = embedded[start : start + len(group)]
+                seen[instance][rank] = (view_names[view], mask_box(mask), rows, _color_sample(photo, mask))
+            start += len(group)
+        if progress:
+            progress(done + 1, len(wanted))
+    return [_summary(found, encoder.dim) for found in seen]
+
+
+def _summary(found: dict[int, Any], dim: int) -> InstanceDescription:
+    if not found:
+        return unseen(dim)
+    views = [found[rank] for rank in sorted(found)]
+    per_view = unit_rows(np.stack([rows.mean(axis=0) for _, _, rows, _ in views]))
+    mean = np.concatenate([rows for _, _, rows, _ in views]).mean(axis=0)
+    colors = palette(np.concatenate([pixels for _, _, _, pixels in views]))
+    return InstanceDescription(
+        unit_rows(mean[None])[0],
+        per_view,
+        colors,
+        [name for name, *_ in views],
+        [box for _, box, *_ in views],
+    )
+
+
+def _color_sample(photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Up to COLOR_SAMPLES pixels [P, 3] of the mask less its rim, whose colours bleed; the whole mask if too thin."""
+    import cv2
+
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
+    pixels = photo[inner] if inner.sum() >= 50 else photo[mask]
+    step = max(1, -(-len(pixels) // COLOR_SAMPLES))
+    return pixels[::step]

@@ -1,0 +1,85 @@
+"""The one protocol all encoders speak, and the factory that makes them from a short text."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.language.onnx import Device
+
+
+class Encoder(Protocol):
+    """Images and texts in one space, where the dot product of two unit rows says how well they fit.
+
+    identity: model, version and preprocessing; a map stores it and refuses embeddings of another.
+    dim: length of an embedding.
+    templates: sentences with one {} that a prompt is put into; their embeddings are averaged.
+    """
+
+    @property
+    def identity(self) -> str: ...
+
+    @property
+    def dim(self) -> int: ...
+
+    @property
+    def templates(self) -> tuple[str, ...]: ...
+
+    def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """RGB uint8 [H, W, 3] pictures of any size → float32 [n, dim], unit rows."""
+        ...
+
+    def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
+        """Texts in any script → float32 [n, dim], unit rows. An empty text is an InputError."""
+        ...
+
+
+def make_encoder(spec: str, device: Device = "auto") -> Encoder | None:
+    """Make the encoder named by `spec`.
+
+    "conse": the offline default. "clip:IMAGE.onnx,TEXT.onnx" or "clip:DIR": a CLIP-family pair. "none": None.
+    device: where ONNX models run; "cuda" is an InputError where they would silently run on the CPU.
+    """
+    kind, _, argument = spec.partition(":")
+    if kind == "none" and not argument:
+        return None
+    if kind == "conse" and not argument:
+        from perception.language.conse import ConseEncoder
+
+        return ConseEncoder()
+    if kind == "clip" and argument:
+        from perception.language.clip import ClipEncoder
+
+        return ClipEncoder.from_spec(argument, device)
+    raise InputError(f"encoder '{spec}': expected conse, clip:IMAGE.onnx,TEXT.onnx, clip:DIR or none")
+
+
+def check_texts(texts: Sequence[str]) -> list[str]:
+    """Texts with their white space tidied; an empty one is an InputError."""
+    if isinstance(texts, str):
+        raise InputError(f"texts: expected a list of texts, found the single text '{texts[:40]}'")
+    tidy = [" ".join(text.split()) for text in texts]
+    for n, text in enumerate(tidy):
+        if not text:
+            raise InputError(
+                f"text {n + 1} of {len(tidy)}: it is empty; write what to look for, e.g. 'red mug'"
+            )
+    return tidy
+
+
+def check_images(images: Sequence[np.ndarray]) -> None:
+    """Every picture must be RGB uint8 [H, W, 3] and hold a pixel."""
+    for n, image in enumerate(images):
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
+            raise InputError(
+                f"picture {n + 1}: expected RGB uint8 [H, W, 3], found {image.dtype} of shape {list(image.shape)}"
+            )
+
+
+def unit_rows(x: np.ndarray) -> np.ndarray:
+    """Rows scaled to length 1, float32; a zero row stays zero."""
+    norms = np.linalg.norm(x.astype(np.float64), axis=-1, keepdims=True)
+    return (x / np.where(norms > 0, norms, 1.0)).astype(np.float32)

