@@ -1,0 +1,337 @@
+"""Segment Anything exports with separate encoder and decoder, recognised by their inputs and outputs.
+
+| family | encoder takes | decoder takes points in |
+|---|---|---|
+| SAM, MobileSAM | HWC 0–255, or 1×3×S×S normalised and padded bottom and right | pixels of the square |
+| EfficientSAM | 1×3×h×w in 0–1, original size | pixels of the photo |
+| SAM 2 | 1×3×S×S normalised, squashed | pixels of the square |
+| SAM by optimum | 1×3×S×S as SAM | pixels of the square |
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from perception.errors import InputError
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
+# One role, the names it goes by in public exporters.
+_ALIASES = {
+    "image": ("input_image", "image", "batched_images", "pixel_values", "x", "input", "images"),
+    "embedding": ("image_embeddings", "image_embed", "image_embedding", "embeddings"),
+    "high_res_0": ("high_res_feats_0", "high_res_feat_0", "high_res_features1"),
+    "high_res_1": ("high_res_feats_1", "high_res_feat_1", "high_res_features2"),
+    "positional": ("image_positional_embeddings",),
+    "points": ("point_coords", "batched_point_coords", "input_points"),
+    "labels": ("point_labels", "batched_point_labels", "input_labels"),
+    "mask_input": ("mask_input",),
+    "has_mask": ("has_mask_input",),
+    "size": ("orig_im_size",),
+    # Low resolution first: some exports froze the size of the photo they were traced with.
+    "masks": ("low_res_masks", "pred_masks", "masks", "output_masks"),
+    "iou": ("iou_predictions", "iou_scores", "iou_preds"),
+}
+_ROLES = {alias: role for role, aliases in reversed(_ALIASES.items()) for alias in aliases}
+_MEAN = np.array([123.675, 116.28, 103.53], np.float32)
+_STD = np.array([58.395, 57.12, 57.375], np.float32)
+_NUMPY: dict[str, Any] = {
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(double)": np.float64,
+}
+_NUMPY |= {"tensor(int64)": np.int64, "tensor(int32)": np.int32, "tensor(uint8)": np.uint8}
+
+
+@dataclass(frozen=True)
+class Graph:
+    """An opened ONNX file with its inputs and outputs by role."""
+
+    path: Path
+    session: InferenceSession
+    inputs: dict[str, Any]
+    outputs: dict[str, str]
+
+    @property
+    def is_decoder(self) -> bool:
+        return "points" in self.inputs and "embedding" in self.inputs
+
+    @property
+    def is_encoder(self) -> bool:
+        return "image" in self.inputs and "embedding" in self.outputs and "points" not in self.inputs
+
+    def run(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """values by role, cast to the types the graph asks for; outputs by role."""
+        feeds = {}
+        for role, argument in self.inputs.items():
+            feeds[argument.name] = values[role].astype(_NUMPY[argument.type], copy=False)
+        results = self.session.run(list(self.outputs.values()), feeds)
+        return dict(zip(self.outputs, results, strict=True))
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """size, used, canvas: (h, w) of photo, of it in the model, of the input; scale: (x, y) used / size."""
+
+    tensors: dict[str, np.ndarray]
+    size: tuple[int, int]
+    scale: tuple[float, float]
+    used: tuple[int, int]
+    canvas: tuple[int, int]
+
+
+class SamModel:
+    """An encoder and a decoder that fit each other."""
+
+    def __init__(self, encoder: Graph, decoder: Graph) -> None:
+        self.encoder, self.decoder = encoder, decoder
+        self.family = _family(encoder, decoder)
+        _check_pair(encoder, decoder)
+        self.fingerprint = f"{_digest(encoder.path)}-{_digest(decoder.path)}"
+        self.provider = " + ".join(dict.fromkeys(g.session.get_providers()[0] for g in (encoder, decoder)))
+        self.warnings = [w for graph in (encoder, decoder) for w in _provider_warnings(graph)]
+
+    def encode(self, photo: np.ndarray) -> Encoded:
+        """photo: [h, w, 3] uint8 RGB."""
+        h, w = photo.shape[:2]
+        image, used, canvas = self._prepare(photo)
+        tensors = self.encoder.run({"image": image})
+        return Encoded(tensors, (h, w), (used[1] / w, used[0] / h), used, canvas)
+
+    def decode(self, embedding: Encoded, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """points: [P, 2] (x, y) in photo pixels. Raw masks [P, m, ?, ?] and predicted IoU [P, m], float32."""
+        if self._batched:
+            return self._decode(embedding, points)
+        parts = [self._decode(embedding, points[i : i + 1]) for i in range(len(points))]
+        return np.concatenate([logits for logits, _ in parts]), np.concatenate([iou for _, iou in parts])
+
+    @property
+    def _batched(self) -> bool:
+        """Whether the graph takes many single-point prompts at once: the axis is named, not fixed to 1."""
+        axis = 1 if self.family in ("EfficientSAM", "SAM by optimum") else 0
+        return not isinstance(self.decoder.inputs["points"].shape[axis], int)
+
+    def _prepare(self, photo: np.ndarray) -> tuple[np.ndarray, tuple[int, int], tuple[int, int]]:
+        """The encoder's input, the (h, w) the photo fills in it, and its whole (h, w)."""
+        shape = self.encoder.inputs["image"].shape
+        if self.family == "EfficientSAM":
+            return photo.transpose(2, 0, 1)[None] / np.float32(255), photo.shape[:2], photo.shape[:2]
+        if self.family == "SAM 2":
+            height, width = (_fixed(n, 1024) for n in shape[2:])
+            squashed = _resize(photo, height, width)
+            normal = (squashed / np.float32(255) - _MEAN / 255) / (_STD / 255)
+            return normal.transpose(2, 0, 1)[None], (height, width), (height, width)
+        raw = len(shape) == 3
+        height, width = (_fixed(n, 1024) for n in (shape[:2] if raw else shape[2:]))
+        ratio = min(height / photo.shape[0], width / photo.shape[1])
+        used = (int(photo.shape[0] * ratio + 0.5), int(photo.shape[1] * ratio + 0.5))
+        resized = _resize(photo, *used).astype(np.float32)
+        if raw and not isinstance(shape[0], int):
+            return resized, used, used  # the graph pads by itself
+        padded = np.zeros((height, width, 3), np.float32)
+        padded[: used[0], : used[1]] = resized if raw else (resized - _MEAN) / _STD
+        return (padded if raw else padded.transpose(2, 0, 1)[None]), used, (height, width)
+
+    def _decode(self, embedding: Encoded, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values = {**embedding.tensors, **self._prompts(embedding, points)}
+        result = self.decoder.run(values)
+        masks, iou = result["masks"], result["iou"]
+        masks = masks.reshape(len(points), -1, *masks.shape[-2:]).astype(np.float32, copy=False)
+        iou = iou.reshape(len(points), -1).astype(np.float32, copy=False)
+        if iou.shape[1] == 4:  # the first is the answer to many prompts at once, not to a single point
+            masks, iou = masks[:, 1:], iou[:, 1:]
+        return masks, iou
+
+    def _prompts(self, embedding: Encoded, points: np.ndarray) -> dict[str, np.ndarray]:
+        scaled = (points * np.array(embedding.scale)).astype(np.float32)[:, None]
+        labels = np.ones((len(points), 1), np.float32)
+        if self.family in ("EfficientSAM", "SAM by optimum"):  # [1, P, 1, 2]: one image, P queries
+            size = np.array(embedding.size)
+            return {"points": scaled[None], "labels": labels[None], "size": size}
+        # A point without a box is followed by a padding point, as in the published predictor.
+        scaled = np.concatenate([scaled, np.zeros_like(scaled)], axis=1)
+        labels = np.concatenate([labels, -labels], axis=1)
+        rows, height, width = self._mask_shape(len(points), 4 * embedding.tensors["embedding"].shape[-1])
+        return {
+            "points": scaled,
+            "labels": labels,
+            "mask_input": np.zeros((rows, 1, height, width), np.float32),
+            "has_mask": np.zeros(rows, np.float32),
+            "size": np.array(embedding.size if self._whole_photo(embedding) else embedding.canvas),
+        }
+
+    def _mask_shape(self, points: int, side: int) -> tuple[int, int, int]:
+        """Rows, height and width of the (empty) mask prompt: one row, or one a point where left open."""
+        argument = self.decoder.inputs.get("mask_input")
+        shape = [1, 1, side, side] if argument is None else argument.shape
+        return _fixed(shape[0], points), _fixed(shape[2], side), _fixed(shape[3], side)
+
+    def _whole_photo(self, embedding: Encoded) -> bool:
+        """Whether the decoder may be told the photo's size: its scaling then is the one that `encode` did.
+
+        SAM's graph assumes that the long side fills the square; encoders of a fixed oblong size do otherwise.
+        """
+        if self.family == "SAM 2":
+            return True
+        return max(embedding.used) == _square(embedding) and max(embedding.canvas) == max(embedding.used)
+
+    def upscale(self, embedding: Encoded, raw: np.ndarray) -> np.ndarray:
+        """raw: one mask as the graph gave it. Logits [h, w] float32 at the photo's size."""
+        import cv2
+
+        height, width = embedding.size
+        if raw.shape == (height, width):
+            return raw
+        if self.family != "SAM 2":  # a quarter of the padded square, of which the photo fills the top left
+            if raw.shape != embedding.canvas:
+                side = _square(embedding)
+                raw = cv2.resize(raw, (side, side), interpolation=cv2.INTER_LINEAR)
+            raw = raw[: embedding.used[0], : embedding.used[1]]
+        return cv2.resize(raw, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def open_sam(spec: str) -> SamModel:
+    """spec: a folder with both graphs, the encoder with its decoder beside it, or `ENCODER,DECODER`."""
+    if "," in spec:
+        graphs = [open_graph(Path(part.strip())) for part in spec.split(",")]
+    else:
+        graphs = [open_graph(path) for path in _candidates(Path(spec))]
+    encoders, decoders = [g for g in graphs if g.is_encoder], [g for g in graphs if g.is_decoder]
+    if len(encoders) == 1 and len(decoders) == 1:
+        return SamModel(encoders[0], decoders[0])
+    if not encoders and not decoders:
+        found = ", ".join(f"{g.path.name}: {_signature(g)}" for g in graphs)
+        raise InputError(f"sam:{spec}: no SAM encoder or decoder recognised ({found})")
+    for kind, here, other in (("encoder", encoders, decoders), ("decoder", decoders, encoders)):
+        if not here:
+            role = "decoder" if kind == "encoder" else "encoder"
+            raise InputError(
+                f"sam:{spec}: {other[0].path.name} is a {role} and its {kind} is missing; "
+                f"put both into one folder or write sam:ENCODER,DECODER"
+            )
+    names = ", ".join(g.path.name for g in encoders + decoders)
+    raise InputError(f"sam:{spec}: several models found ({names}); write sam:ENCODER,DECODER")
+
+
+def open_graph(path: Path) -> Graph:
+    """Opens an ONNX file on the best provider that onnxruntime has."""
+    import onnxruntime
+
+    if not path.is_file():
+        raise InputError(f"sam:{path}: no such file; expected an ONNX model")
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=wanted_providers())
+    except Exception as error:  # onnxruntime's own exceptions share no public base class
+        raise InputError(
+            f"{path}: not an ONNX model that onnxruntime can open ({_first_line(error)})"
+        ) from error
+    inputs = {_ROLES.get(argument.name, argument.name): argument for argument in session.get_inputs()}
+    return Graph(path, session, inputs, _outputs([argument.name for argument in session.get_outputs()]))
+
+
+def wanted_providers() -> list[str]:
+    """CUDA where this onnxruntime was built with it, then the CPU."""
+    import onnxruntime
+
+    available = onnxruntime.get_available_providers()
+    return [name for name in ("CUDAExecutionProvider", "CPUExecutionProvider") if name in available]
+
+
+def _outputs(names: list[str]) -> dict[str, str]:
+    """Role -> name; of several mask outputs the first in the order of the aliases."""
+    outputs: dict[str, str] = {}
+    for role in ("embedding", "high_res_0", "high_res_1", "positional", "masks", "iou"):
+        found = [alias for alias in _ALIASES[role] if alias in names]
+        if found:
+            outputs[role] = found[0]
+    if len(names) == 1 and not outputs:
+        outputs["embedding"] = names[0]  # encoders with a nameless single output
+    return outputs
+
+
+def _candidates(path: Path) -> list[Path]:
+    if path.is_dir():
+        files = sorted(path.glob("*.onnx"))
+        if not files:
+            raise InputError(f"sam:{path}: no .onnx file in this folder; expected an encoder and a decoder")
+        return files
+    if not path.is_file():
+        raise InputError(f"sam:{path}: no such file or folder; expected a SAM encoder and decoder as ONNX")
+    partners = [
+        path.with_name(path.name.replace(a, b)) for a, b in (("encoder", "decoder"), ("decoder", "encoder"))
+    ]
+    beside = [partner for partner in partners if partner != path and partner.is_file()]
+    other = [file for file in sorted(path.parent.glob("*.onnx")) if file != path and "decoder" in file.name]
+    return [path, *(beside or (other if len(other) == 1 else []))]
+
+
+def _family(encoder: Graph, decoder: Graph) -> str:
+    names = {argument.name for argument in decoder.session.get_inputs()}
+    if "batched_point_coords" in names:
+        return "EfficientSAM"
+    if "high_res_0" in decoder.inputs:
+        return "SAM 2"
+    return "SAM by optimum" if "input_points" in names else "SAM"
+
+
+def _check_pair(encoder: Graph, decoder: Graph) -> None:
+    known = {"points", "labels", "mask_input", "has_mask", "size"}
+    unmet = [
+        a.name for role, a in decoder.inputs.items() if role not in known and role not in encoder.outputs
+    ]
+    if unmet:
+        raise InputError(f"{decoder.path}: needs {', '.join(unmet)}, which {encoder.path.name} does not give")
+    lacking = [role for role in ("masks", "iou") if role not in decoder.outputs]
+    if lacking:
+        found = ", ".join(argument.name for argument in decoder.session.get_outputs())
+        raise InputError(
+            f"{decoder.path}: no output for {' and '.join(lacking)} (found {found}); not a SAM decoder"
+        )
+
+
+def _provider_warnings(graph: Graph) -> list[str]:
+    wanted, used = wanted_providers()[0], graph.session.get_providers()[0]
+    return [] if wanted == used else [f"{graph.path.name}: {wanted} did not come up, running on {used}"]
+
+
+def _square(embedding: Encoded) -> int:
+    """Side of the padded square: SAM's encoders have a stride of 16."""
+    return 16 * embedding.tensors["embedding"].shape[-1]
+
+
+def _fixed(size: Any, default: int) -> int:
+    return size if isinstance(size, int) and size > 0 else default
+
+
+def _resize(photo: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Bilinear with anti-aliasing, as Pillow and so the published predictor does it."""
+    from PIL import Image
+
+    return np.asarray(Image.fromarray(photo).resize((width, height), Image.Resampling.BILINEAR))
+
+
+def _signature(graph: Graph) -> str:
+    takes = ", ".join(argument.name for argument in graph.session.get_inputs())
+    return f"{takes} → {', '.join(argument.name for argument in graph.session.get_outputs())}"
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__
+
+
+def _digest(path: Path) -> str:
+    """Size, first and last MiB: enough to tell models apart without reading gigabytes."""
+    digest = hashlib.sha256(str(path.stat().st_size).encode())
+    with path.open("rb") as stream:
+        digest.update(stream.read(1 << 20))
+        stream.seek(max(0, path.stat().st_size - (1 << 20)))
+        digest.update(stream.read(1 << 20))
+    return digest.hexdigest()[:12]
