@@ -87,6 +87,16 @@ def to_srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(soft <= 0.0031308, 12.92 * soft, 1.055 * np.maximum(soft, 0) ** (1 / 2.4) - 0.055)
 
 
+_STEPS = 4096  # of the table below, per unit of linear light
+_RECORD = np.round(255 * np.clip(to_srgb(np.arange(2 * _STEPS) / _STEPS), 0, 1)).astype(np.uint8)
+_LINEAR = to_linear(np.arange(1024) / 1023).astype(np.float32)
+
+
+def _linear(srgb: np.ndarray) -> np.ndarray:
+    """`to_linear` by table, for whole textures."""
+    return _LINEAR[(np.clip(srgb, 0, 1) * 1023 + 0.5).astype(np.int32)]
+
+
 def first_hits(around: list[Caster], origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance [N] to the first caster along each unit ray (inf = none) and its index in the list (-1 = none)."""
     origins, rays = origins.astype(np.float32), rays.astype(np.float32)
@@ -108,7 +118,7 @@ def first_hits(around: list[Caster], origins: np.ndarray, rays: np.ndarray) -> t
     return distance, index
 
 
-def bake(around: list[Caster], part: Part, rng: np.random.Generator, samples: int = 40) -> None:
+def bake(around: list[Caster], part: Part, rng: np.random.Generator, samples: int = 20) -> None:
     """Fills `part.lit` with paint × light, as the 8-bit sRGB picture a camera would record."""
     rows, columns = part.light_texels
     v, u = np.mgrid[0:rows, 0:columns]
@@ -123,7 +133,7 @@ def bake(around: list[Caster], part: Part, rng: np.random.Generator, samples: in
     light = wide[:, 4:-4] if wide.shape[1] > columns else wide
     height, width = part.paint.shape[:2]
     light = cv2.resize(light, (width, height), interpolation=cv2.INTER_LINEAR)
-    part.lit = np.round(255 * np.clip(to_srgb(to_linear(part.paint) * light), 0, 1)).astype(np.uint8)
+    part.lit = _RECORD[(_linear(part.paint) * light * _STEPS).astype(np.int32).clip(0, len(_RECORD) - 1)]
 
 
 def _lamp(around: list[Caster], start: np.ndarray, normals: np.ndarray, rng: np.random.Generator, samples: int):

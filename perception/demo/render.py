@@ -58,14 +58,14 @@ def cast(bodies: list[Body], camera: Camera, samples: int = 2) -> Picture:
             if window is not None:
                 _paint(part, body.id, camera.center, rays[window], depth[window], ids[window], color[window])
     rgb = cv2.resize(color, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    # The second smallest of four ids is the majority wherever three agree.
-    blocks = _blocks(ids, samples)
-    middle = np.sort(blocks, -1)[..., (samples * samples - 1) // 2]
-    nearest = np.where(blocks == middle[..., None], _blocks(depth, samples), np.inf)
-    finite = np.isfinite(nearest)
-    count = np.maximum(finite.sum(-1), 1)
-    mean = np.where(finite, nearest, 0).sum(-1) / count
-    return Picture(rgb, middle, np.where(finite.any(-1), mean, np.inf).astype(np.float32))
+    id_blocks, depth_blocks = _blocks(ids, samples), _blocks(depth, samples)
+    # The second smallest of four ids is the majority wherever three agree; most blocks hold one id only.
+    middle, mean = id_blocks[:, :, 0].copy(), depth_blocks.mean(-1)
+    mixed = (id_blocks != middle[..., None]).any(-1)
+    middle[mixed] = np.sort(id_blocks[mixed], -1)[:, (samples * samples - 1) // 2]
+    same = id_blocks[mixed] == middle[mixed][:, None]
+    mean[mixed] = np.where(same, depth_blocks[mixed], 0).sum(-1) / same.sum(-1)
+    return Picture(rgb, middle, mean.astype(np.float32))
 
 
 def _blocks(image: np.ndarray, samples: int) -> np.ndarray:
