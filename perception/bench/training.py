@@ -1,7 +1,7 @@
-"""Milliseconds of the training losses and of Adam beside plain torch and OpenCV: python -m perception.bench.training.
+"""Training losses and Adam beside plain torch and OpenCV, in ms: python -m perception.bench.training.
 
-Every ratio is taken within one run: the contenders take turns, the median over turns is printed with its quartiles.
-The forward and the backward pass are timed together, at the size of a photo and of a map as they occur in training.
+Every ratio is taken within one run: the contenders take turns, and the median over turns is printed with its
+quartiles. Forward and backward are timed together, at the size of a photo and of a map as they occur in training.
 """
 
 from __future__ import annotations

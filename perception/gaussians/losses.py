@@ -3,8 +3,8 @@
     L = L_RGB + λ_inst2D (w_p L_pos + w_n L_neg) + λ_var L_var
 
 All take CPU tensors, float32 or float64, are differentiable once, and sum values in float64. The kernels use
-all processors unless `_core.training.set_threads` says otherwise; the bits do not depend on how many. Keep torch
-itself at one thread beside them: the idle workers of its OpenMP pool spin for milliseconds.
+all processors unless `_core.training.set_threads` says otherwise; the bits do not depend on how many. Keep
+torch itself at one thread beside them: the idle workers of its OpenMP pool spin for milliseconds.
 """
 
 from __future__ import annotations
