@@ -1,7 +1,7 @@
 """Training losses and Adam beside plain torch and OpenCV, in ms: python -m perception.bench.training.
 
-Every ratio is taken within one run: the contenders take turns, and the median over turns is printed with its
-quartiles. Forward and backward are timed together, at the size of a photo and of a map as they occur in training.
+Every ratio is taken within one run: contenders take turns; printed are the median over turns and its
+quartiles. Forward and backward are timed together, at the sizes of a photo and a map in training.
 """
 
 from __future__ import annotations
