@@ -82,6 +82,23 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted(poison):
     assert all(torch.isfinite(t).all() for t in ours.state_dict()["second"].values())
 
 
+@pytest.mark.parametrize("share", [0.2, 0.8])
+def test_a_bad_gradient_in_an_invisible_row_is_nobodys_concern(share):
+    visible = torch.from_numpy(np.random.default_rng(2).random(500) < share)
+    ours, clean = SparseAdam(leaves(500), RATES), SparseAdam(leaves(500), RATES)
+    grads = tensors(500, seed=1)
+    clean.step(visible, grads)
+    report = ours.step(visible, {n: torch.where(_rows(visible, g), g, torch.inf) for n, g in grads.items()})
+    assert set(report.skipped.values()) == {0}
+    for name, param in ours.params.items():
+        assert torch.isfinite(param).all()
+        assert torch.allclose(param, clean.params[name], rtol=1e-14, atol=0)
+
+
+def _rows(mask, like):
+    return mask.reshape(-1, *[1] * (like.ndim - 1))
+
+
 def test_zero_gradient_moves_on_by_momentum():
     ours = SparseAdam({"x": torch.zeros(2, 1, dtype=torch.float64)}, {"x": 0.1})
     ours.step(None, {"x": torch.ones(2, 1, dtype=torch.float64)})

@@ -117,6 +117,13 @@ double sum(In<T, 1> values, bool squared, int threads, const std::string &level)
 }
 
 template <class T>
+void scale(In<T, 1> values, double factor, Out<T, 1> out, int threads) {
+  require(same_shape(values, out), "scale: shapes differ");
+  nb::gil_scoped_release release;
+  pt::scale(values.data(), static_cast<int64_t>(values.size()), factor, out.data(), {threads, "auto"});
+}
+
+template <class T>
 auto adam(Out<T, 2> param, In<T, 2> grad, Out<T, 2> first, Out<T, 2> second,
           std::optional<In<uint8_t, 1>> visible, In<double, 1> rate, int64_t step, double beta1, double beta2,
           double eps, int threads, const std::string &level) {
@@ -149,6 +156,7 @@ void bind_precision(nb::module_ &m) {
   m.def("spread", &spread<T>, arg("features"), arg("slots"), arg("means"), arg("pull"), arg("push"), arg("out"),
         "threads"_a = 0, "level"_a = "auto", "out = pull[slot] (F - means[slot]) + push[slot].");
   m.def("sum", &sum<T>, arg("values"), "squared"_a, "threads"_a = 0, "level"_a = "auto");
+  m.def("scale", &scale<T>, arg("values"), "factor"_a, arg("out"), "threads"_a = 0, "out = factor * values.");
   m.def("adam", &adam<T>, arg("param"), arg("grad"), arg("first"), arg("second"), arg("visible").none(), arg("rate"),
         "step"_a, "beta1"_a, "beta2"_a, "eps"_a, "threads"_a = 0, "level"_a = "auto",
         "One Adam step in place on the visible rows; (rows updated, rows skipped for a non-finite gradient).");
@@ -159,6 +167,8 @@ void bind_precision(nb::module_ &m) {
 void bind_training(nb::module_ &parent) {
   nb::module_ m = parent.def_submodule("training", "Fused losses and the optimiser; float32 and float64.");
   m.def("levels", &pt::supported_levels, "Instruction sets this processor supports, narrowest first.");
+  m.def("set_threads", &pt::set_default_threads, "threads"_a,
+        "Threads of calls that name none; 0 means all processors. Results do not depend on it.");
   m.def("assign", &assign, nb::arg("labels").noconvert(), "fraction"_a, "seed"_a, nb::arg("slots").noconvert(),
         "(ids, counts, first pixel) of the labels in use; slots gets each pixel's index into ids, or -1.");
   m.def("separation", &separation, nb::arg("a").noconvert(), nb::arg("b").noconvert().none(), "margin"_a, "squared"_a,

@@ -9,9 +9,7 @@
 
 namespace perception::training {
 
-inline int resolve_threads(int threads) {
-  return threads > 0 ? threads : std::max(1, static_cast<int>(std::thread::hardware_concurrency()));
-}
+int resolve_threads(int threads);  // 0 becomes the default of set_default_threads
 
 template <class Body>  // body(item, worker) for item in [0, items)
 void parallel_for(int64_t items, int threads, const Body &body) {

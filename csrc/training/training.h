@@ -1,11 +1,13 @@
 // Losses with their gradients, and Adam. Every function gives the same bits for any number of threads.
-// threads 0: all processors. level: see levels.h. Invalid arguments throw std::invalid_argument.
+// threads 0: as set_default_threads says. level: see levels.h. Invalid arguments throw std::invalid_argument.
 #pragma once
 #include <cstdint>
 #include <string>
 #include <vector>
 
 namespace perception::training {
+
+void set_default_threads(int threads);  // 0, the initial value: all processors
 
 struct Execution {
   int threads = 0;
@@ -55,6 +57,10 @@ double separation(const double *a, int64_t rows, const double *b, int64_t others
 
 template <class T>
 double sum(const T *values, int64_t n, bool squared, const Execution &);
+
+// out = factor values; out may be values.
+template <class T>
+void scale(const T *values, int64_t n, double factor, T *out, const Execution &);
 
 struct AdamResult {
   int64_t updated, skipped;  // rows

@@ -18,6 +18,20 @@ double sum(const T *values, int64_t n, bool squared, const Execution &how) {
   return total;
 }
 
+template <class T>
+void scale(const T *values, int64_t n, double factor, T *out, const Execution &how) {
+  const Pieces pieces(n, 65536);
+  const T f = T(factor);
+  parallel_for(pieces.count, how.threads, [&](int64_t piece, int) {
+    const T *from = values + pieces.begin(piece);
+    T *to = out + pieces.begin(piece);
+    const int64_t m = pieces.end(piece) - pieces.begin(piece);
+    for (int64_t i = 0; i < m; ++i) to[i] = f * from[i];
+  });
+}
+
+template void scale(const float *, int64_t, double, float *, const Execution &);
+template void scale(const double *, int64_t, double, double *, const Execution &);
 template double sum(const float *, int64_t, bool, const Execution &);
 template double sum(const double *, int64_t, bool, const Execution &);
 

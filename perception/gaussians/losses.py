@@ -2,8 +2,9 @@
 
     L = L_RGB + λ_inst2D (w_p L_pos + w_n L_neg) + λ_var L_var
 
-All take CPU tensors, float32 or float64, and are differentiable once. The value is summed in float64 and the bits do
-not depend on the number of threads (torch.get_num_threads()).
+All take CPU tensors, float32 or float64, are differentiable once, and sum values in float64. The kernels use
+all processors unless `_core.training.set_threads` says otherwise; the bits do not depend on how many. Keep
+torch itself at one thread beside them: the idle workers of its OpenMP pool spin for milliseconds.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from perception import _core
 from perception.errors import InputError
 
 _kernels = _core.training  # type: ignore[attr-defined]
+_LARGEST_ID = 2**31 - 1
 VarianceForm = Literal["paper", "channels", "plain"]
 
 
@@ -32,7 +34,13 @@ def _ready(name: str, tensor: Tensor) -> Tensor:
     return tensor.detach().contiguous()
 
 
-# ---------------------------------------------------------------------------------------------------- photometric
+def _scaled(tensor: Tensor, factor: float) -> Tensor:
+    out = torch.empty_like(tensor)
+    _kernels.scale(tensor.detach().view(-1), factor, out.view(-1))
+    return out
+
+
+# ---------- photometric
 
 
 @dataclass(frozen=True)
@@ -55,8 +63,7 @@ class _Photometric(Function):
         report: list[float],
     ) -> Tensor:
         gradient = torch.empty_like(render)
-        threads = torch.get_num_threads()
-        loss, *parts = _kernels.photometric(render.detach(), target, weight, gradient, beta, threads)
+        loss, *parts = _kernels.photometric(render.detach(), target, weight, gradient, beta)
         report.extend(parts)
         ctx.save_for_backward(gradient)
         return render.new_tensor(loss)
@@ -65,7 +72,7 @@ class _Photometric(Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
         (gradient,) = ctx.saved_tensors
-        return (gradient if grad == 1 else gradient * grad), None, None, None, None
+        return (gradient if grad == 1 else _scaled(gradient, float(grad))), None, None, None, None
 
 
 def photometric(
@@ -74,11 +81,11 @@ def photometric(
     """L_RGB = (1 − β) L1 + β (1 − SSIM): the value with its parts.
 
     render: [H, W, C] in [0, 1]. target: same shape, of render's dtype in [0, 1], or uint8 (read as x / 255).
-    weight: [H, W] ≥ 0; the loss is the weighted mean over pixels of |x − y| and 1 − SSIM (a masked pixel still lies in
-    its neighbours' windows). All weights 0: loss 0, gradient 0.
+    weight: [H, W] ≥ 0; the loss is the weighted mean over pixels of |x − y| and 1 − SSIM (a masked pixel
+    still lies in its neighbours' windows). All weights 0: loss 0, gradient 0.
 
-    SSIM (Wang et al. 2004): 11 × 11 Gaussian window, σ = 1.5, C1 = .01², C2 = .03², biased moments, zero padding to the
-    input's size and mean over all pixels and channels, as 3DGS has it. With β = 0 SSIM is skipped.
+    SSIM (Wang et al. 2004): 11 × 11 Gaussian window, σ = 1.5, C1 = .01², C2 = .03², biased moments, zero
+    padding to the input's size, mean over pixels and channels, as 3DGS has it. With β = 0 SSIM is skipped.
     """
     image = target if isinstance(target, Tensor) else torch.from_numpy(np.ascontiguousarray(target))
     if render.ndim != 3 or render.shape != image.shape:
@@ -107,12 +114,12 @@ def photometric_loss(
     return photometric(render, target, beta, weight).value
 
 
-# ------------------------------------------------------------------------------------------------------- instance
+# ---------- instance
 
 
 @dataclass(frozen=True)
 class LabelAssignment:
-    """The labels of one photo, ready for the kernels; worth keeping between iterations when no pixels are drawn.
+    """The labels of one photo, ready for the kernels; keep it between iterations if all pixels count.
 
     ids: [M] int32 ascending, 0 left out. counts: [M] int64 pixels. first: [M] int64 a pixel of each label.
     slots: [P] int32, each pixel's index into ids or −1. shape: (H, W).
@@ -128,19 +135,24 @@ class LabelAssignment:
 def assign_labels(labels: Tensor | np.ndarray, fraction: float = 1.0, seed: int = 0) -> LabelAssignment:
     """Reads label image `labels` [H, W] of any integer type (0 = unlabelled, ids need not be dense).
 
-    fraction: each pixel is kept with this probability, decided by a hash of (seed, pixel); M_i then means the kept
-    pixels, and a label without any drops out.
+    fraction: each pixel is kept with this probability, decided by a hash of (seed, pixel); M_i then means the
+    kept pixels, and a label without any drops out.
     """
-    image = labels if isinstance(labels, Tensor) else torch.from_numpy(np.asarray(labels).astype(np.int32))
-    if image.is_floating_point() or image.dtype == torch.bool:
+    image = np.asarray(labels)
+    if image.dtype.kind not in "iu":
         raise InputError(f"labels: found {image.dtype}, expected integers (0 = unlabelled)")
-    if image.numel() and int(image.min()) < 0:
-        raise InputError(f"labels: found {int(image.min())}, expected ids >= 0 (0 = unlabelled)")
+    if image.size and image.dtype not in (np.uint8, np.uint16, np.int32):
+        low, high = int(image.min()), int(image.max())
+        if low < 0 or high > _LARGEST_ID:
+            raise InputError(f"labels: found ids {low} to {high}, expected 0 to {_LARGEST_ID}")
     if not 0 < fraction <= 1:
         raise InputError(f"labels: fraction is {fraction}, expected above 0 and at most 1")
-    flat = image.detach().to(torch.int32).contiguous().reshape(-1)
+    flat = torch.from_numpy(np.ascontiguousarray(image, dtype=np.int32).reshape(-1))
     slots = torch.empty_like(flat)
-    ids, counts, first = _kernels.assign(flat, float(fraction), int(seed), slots)
+    try:
+        ids, counts, first = _kernels.assign(flat, float(fraction), int(seed), slots)
+    except ValueError as error:  # an id below 0
+        raise InputError(str(error)) from None
     long = torch.int64
     return LabelAssignment(
         torch.tensor(ids, dtype=torch.int32),
@@ -161,9 +173,7 @@ class _Prototypes(Function):
         count, width = len(labels.ids), features.shape[1]
         means = torch.empty(count, width, dtype=torch.float64)
         scatter = torch.empty(count, dtype=torch.float64)
-        _kernels.prototypes(
-            features, labels.slots, labels.counts, labels.first, means, scatter, torch.get_num_threads()
-        )
+        _kernels.prototypes(features, labels.slots, labels.counts, labels.first, means, scatter)
         pixels = labels.counts.to(torch.float64)
         shares = 1 / pixels.sum().expand(count) if per_pixel else 1 / (count * pixels)
         ctx.save_for_backward(features, means, shares)
@@ -179,7 +189,7 @@ class _Prototypes(Function):
         pull = 2 * shares * grad_pos.double()
         push = grad_means.double() / labels.counts[:, None]
         out = torch.empty_like(features)
-        _kernels.spread(features, labels.slots, means, pull, push, out, torch.get_num_threads())
+        _kernels.spread(features, labels.slots, means, pull, push, out)
         return out, None, None
 
 
@@ -205,13 +215,11 @@ def separation_loss(
 ) -> Tensor:
     """L_neg: mean over pairs of ReLU(γ − ‖z_i − z_j‖²), or of ReLU(γ − ‖z_i − z_j‖) with squared=False.
 
-    prototypes: [M, D]; the pairs are i < j. With others [K, D] (say, prototypes remembered from other views) they are
-    all M·K pairs between the two, differentiable in both. No pair: 0. The gradient of ‖z‖ at 0 is taken as 0.
+    prototypes: [M, D]; the pairs are i < j. With others [K, D] (say, prototypes remembered from other views)
+    they are all M·K pairs between the two, differentiable in both. No pair: 0. The gradient of ‖z‖ at 0 is 0.
     """
     if prototypes.ndim != 2 or (others is not None and others.shape[1:] != prototypes.shape[1:]):
-        raise InputError(
-            f"separation loss: prototypes are {list(prototypes.shape)}, expected [M, D] of one width D"
-        )
+        raise InputError(f"separation loss: found {list(prototypes.shape)}, expected [M, D]")
     return _Separation.apply(prototypes, others, float(margin), bool(squared))
 
 
@@ -249,8 +257,8 @@ def instance_loss(
         L_neg = 2/(N (N − 1)) Σ_{i<j} ReLU(γ − ‖z_i − z_j‖²)
 
     features: [H, W, D] F. labels: [H, W] integers, 0 = unlabelled, or what `assign_labels` made of them.
-    The authors' released code differs: per_pixel=True averages L_pos over all labelled pixels instead of per mask,
-    squared=False takes the distance unsquared in L_neg. fraction, seed: see `assign_labels`.
+    The authors' released code differs: per_pixel=True averages L_pos over all labelled pixels instead of per
+    mask, squared=False takes the distance unsquared in L_neg. fraction, seed: see `assign_labels`.
     """
     if features.ndim != 3 or features.shape[2] < 1:
         raise InputError(f"instance loss: features are {list(features.shape)}, expected [H, W, D]")
@@ -268,13 +276,13 @@ def instance_loss(
     return InstanceLoss(w_pos * pos + w_neg * neg, pos, neg, prototypes, labels.ids, labels.counts)
 
 
-# ------------------------------------------------------------------------------------------------------- variance
+# ---------- variance
 
 
 class _Variance(Function):
     @staticmethod
     def forward(ctx: Any, variance: Tensor, squared: bool, count: int) -> Tensor:
-        total = _kernels.sum(variance.detach().reshape(-1), squared, torch.get_num_threads())
+        total = _kernels.sum(variance.detach().reshape(-1), squared)
         ctx.save_for_backward(variance)
         ctx.squared, ctx.count = squared, count
         return variance.new_tensor(total / count if count else 0.0)
@@ -284,15 +292,15 @@ class _Variance(Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
         (variance,) = ctx.saved_tensors
         scale = float(grad) / max(1, ctx.count)
-        out = variance * (2 * scale) if ctx.squared else torch.full_like(variance, scale)
+        out = _scaled(variance, 2 * scale) if ctx.squared else torch.full_like(variance, scale)
         return out, None, None
 
 
 def variance_loss(feature_variance: Tensor, form: VarianceForm = "paper") -> Tensor:
     """L_var = 1/|I| Σ_p ‖Var(F(p))‖² of the rendered per-pixel variance, feature_variance [H, W, D].
 
-    form "paper": as above, summed over channels. "channels": the authors' released code, also averaged over the D
-    channels. "plain": the mean of Var itself, over pixels and channels.
+    form "paper": as above, summed over channels. "channels": the authors' released code, also averaged over
+    the D channels. "plain": the mean of Var itself, over pixels and channels.
     """
     if feature_variance.ndim != 3:
         raise InputError(f"variance loss: found {list(feature_variance.shape)}, expected [H, W, D]")

@@ -27,15 +27,16 @@ class StepReport:
 class SparseAdam:
     """Adam (Kingma & Ba 2015) on the rows a mask selects, for tensors that grow and shrink together.
 
-    params: name -> [N, ...] float32 or float64 leaf tensors on the CPU, all with the same N; updated in place.
-    rates: name -> learning rate, or a tensor of one rate per column, shaped like a row ([...]), so that for example
-    the DC and the higher spherical harmonics may share one tensor and still learn at different speeds.
+    params: name -> [N, ...] float32 or float64 leaf tensors on the CPU, the same N for all; updated in place.
+    rates: name -> learning rate, or a tensor of one rate per column, shaped like a row ([...]), so that for
+    example the DC and the higher spherical harmonics share a tensor and still learn at different speeds.
 
     What "sparse" means, exactly:
-    - A selected row is updated as dense Adam would, also when its gradient is 0: its moments decay and it moves on.
-    - A row not selected is untouched: its moments do not decay, it does not move (as in Taming 3DGS and gsplat).
-    - The bias correction uses the global step count, common to all rows, as in 3DGS. So a row of zero state that
-      enters late takes up to (1 − β1)/√(1 − β2) ≈ 3.2 times the rate at its first step.
+    - A selected row is updated as dense Adam would, also when its gradient is 0: its moments decay and it
+      moves on by what momentum it has.
+    - A row not selected is untouched: its moments do not decay, it does not move.
+    - The bias correction uses the global step count, common to all rows, as in 3DGS. So a row of zero state
+      that enters late takes up to (1 − β1)/√(1 − β2) ≈ 3.2 times the rate at its first step.
     - A selected row whose gradient holds a NaN or an infinity is left untouched in that tensor, and counted.
 
     With every row selected and every gradient finite this is torch.optim.Adam(eps=1e-15), to rounding.
@@ -96,10 +97,7 @@ class SparseAdam:
         rate = torch.as_tensor(self.rates[name], dtype=torch.float64).reshape(-1)
         rate = rate.expand(flat[0].shape[1]).contiguous()
         param, first, second = flat
-        threads = torch.get_num_threads()
-        return _kernels.adam(
-            param, gradient, first, second, visible, rate, self.steps, *self.betas, self.eps, threads
-        )
+        return _kernels.adam(param, gradient, first, second, visible, rate, self.steps, *self.betas, self.eps)
 
     def zero_grad(self) -> None:
         """Drops all gradients."""

@@ -15,52 +15,81 @@ bool all_finite(const T *__restrict values, int64_t n) {
   return !bad;
 }
 
-// rate_step 0: one rate for all elements; 1: one per element.
-template <class T, int RateStep>
-void update(const AdamRows<T> &a, int64_t from, int64_t n) {
+// RateStep 0: one rate for all elements; 1: one per element. Selected: where select is 0 the factors become 1 and 0,
+// which leaves every finite number as it was (masked stores would be slow on some processors).
+template <class T, int RateStep, bool Selected = false>
+void update(const AdamRows<T> &a, int64_t from, int64_t n, const T *__restrict select = nullptr) {
   T *__restrict param = a.param + from, *__restrict first = a.first + from, *__restrict second = a.second + from;
   const T *__restrict grad = a.grad + from, *__restrict rate = a.rate;
-  const T beta1 = a.beta1, beta2 = a.beta2, eps = a.eps, scale = a.second_scale;
+  const T eps = a.eps, scale = a.second_scale, rate0 = a.rate[0];
+  const T keep1 = a.beta1, keep2 = a.beta2, gain1 = T(1) - keep1, gain2 = T(1) - keep2;
+#pragma GCC ivdep
   for (int64_t i = 0; i < n; ++i) {
+    const bool take = !Selected || select[i] != T(0);
     const T g = grad[i];
-    const T m = beta1 * first[i] + (T(1) - beta1) * g;
-    const T v = beta2 * second[i] + (T(1) - beta2) * g * g;
+    const T m = (take ? keep1 : T(1)) * first[i] + (take ? gain1 : T(0)) * g;
+    const T v = (take ? keep2 : T(1)) * second[i] + (take ? gain2 : T(0)) * (g * g);
     first[i] = m;
     second[i] = v;
-    param[i] -= rate[RateStep * i] * m / (root(v) * scale + eps);
+    param[i] -= (take ? RateStep ? rate[i] : rate0 : T(0)) * m / (root(v) * scale + eps);
   }
+}
+
+constexpr int64_t kBlockElements = 1024;
+
+// Rows [from, to), those selected, one at a time.
+template <class T>
+void update_each(const AdamRows<T> &a, int64_t from, int64_t to, int64_t *updated, int64_t *skipped) {
+  for (int64_t row = from; row < to; ++row) {
+    if (a.visible && !a.visible[row]) continue;
+    if (!all_finite(a.grad + row * a.width, a.width)) {
+      ++*skipped;
+      continue;
+    }
+    a.uniform ? update<T, 0>(a, row * a.width, a.width) : update<T, 1>(a, row * a.width, a.width);
+    ++*updated;
+  }
+}
+
+template <class T, int Fixed>  // Fixed > 0: the width at compile time
+void repeat(const uint8_t *visible, int64_t rows, int64_t width, T *__restrict select) {
+  const int64_t w = Fixed > 0 ? Fixed : width;
+  for (int64_t row = 0; row < rows; ++row)
+    for (int64_t k = 0; k < w; ++k) select[row * w + k] = T(visible[row]);
+}
+
+// Scattered rows: cheaper to compute all of the block and take those selected.
+template <class T>
+void update_selected(const AdamRows<T> &a, int64_t from, int64_t to) {
+  alignas(64) T select[kBlockElements];
+  const int64_t w = a.width;
+  (w == 1 ? repeat<T, 1> : w == 3 ? repeat<T, 3> : w == 4 ? repeat<T, 4> : w == 8 ? repeat<T, 8> : repeat<T, 0>)(
+      a.visible + from, to - from, w, select);
+  update<T, 0, true>(a, from * w, (to - from) * w, select);
 }
 
 template <class T>
 int64_t adam(const AdamRows<T> &a, int64_t begin, int64_t end, int64_t *updated) {
-  const int64_t width = a.width;
-  int64_t skipped = 0, done = 0;
-  auto row_by_row = [&](int64_t from, int64_t to) {
-    for (int64_t row = from; row < to; ++row) {
-      if (!all_finite(a.grad + row * width, width)) {
-        ++skipped;
-        continue;
-      }
-      a.uniform ? update<T, 0>(a, row * width, width) : update<T, 1>(a, row * width, width);
-      ++done;
+  const int64_t width = a.width, block = width < kBlockElements ? kBlockElements / width : 1;
+  int64_t skipped = 0;
+  *updated = 0;
+  for (int64_t from = begin; from < end; from += block) {
+    const int64_t to = from + block < end ? from + block : end, rows = to - from;
+    int64_t chosen = rows;
+    if (a.visible) {
+      chosen = 0;
+      for (int64_t row = from; row < to; ++row) chosen += a.visible[row] != 0;
     }
-  };
-  for (int64_t row = begin; row < end;) {
-    if (a.visible && !a.visible[row]) {
-      ++row;
+    if (chosen == 0) continue;
+    const bool whole = a.uniform && (chosen == rows || (width < kBlockElements && 3 * chosen >= rows));
+    if (!whole || !all_finite(a.grad + from * width, rows * width)) {
+      update_each(a, from, to, updated, &skipped);
       continue;
     }
-    int64_t stop = row + 1;  // a run of selected rows, short enough to stay in the L1
-    while (stop < end && (stop - row) * width < 2048 && (!a.visible || a.visible[stop])) ++stop;
-    if (a.uniform && stop - row > 1 && all_finite(a.grad + row * width, (stop - row) * width)) {
-      update<T, 0>(a, row * width, (stop - row) * width);
-      done += stop - row;
-    } else {
-      row_by_row(row, stop);
-    }
-    row = stop;
+    if (chosen == rows) update<T, 0>(a, from * width, rows * width);
+    else update_selected(a, from, to);
+    *updated += chosen;
   }
-  *updated = done;
   return skipped;
 }
 

@@ -7,6 +7,8 @@ namespace perception::training {
 
 constexpr int kRadius = 5;             // SSIM window: 11 taps
 constexpr int kTaps = 2 * kRadius + 1;
+constexpr int kBlock = 4;               // rows a tile advances by
+constexpr int kRing = kTaps + kBlock - 1;
 constexpr int kRowCapacity = 848;      // elements of a tile row; not a multiple of 4 KiB, which would thrash the L1
 constexpr int kTileElements = 832;     // of these, usable for a tile with its halo of 2 * kRadius pixels a side
 constexpr int kMaxChannels = 16;
@@ -61,6 +63,6 @@ struct Kernels {
 };
 
 constexpr int64_t kPhotometricScratch =
-    int64_t(kRowCapacity) * (kTaps * (kInputMaps + kGradientMaps) + 2 * kInputMaps + kGradientMaps + 2);
+    int64_t(kRowCapacity) * (kRing * (kInputMaps + kGradientMaps) + (1 + kBlock) * kInputMaps + 3);
 
 }  // namespace perception::training
