@@ -1,0 +1,65 @@
+"""Rigid and similarity transforms in float64. Transforms are named a_from_b; quaternions are wxyz."""
+
+from __future__ import annotations
+
+import numpy as np
+
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Camera axes: OpenGL (x right, y up, z backward) to OpenCV (x right, y down, z forward). Its own inverse."""
+
+
+def rotation_from_quaternion(wxyz: np.ndarray) -> np.ndarray:
+    """Rotation [3, 3] of a quaternion [4] wxyz; the quaternion need not be of unit length."""
+    w, x, y, z = np.asarray(wxyz, dtype=np.float64) / np.linalg.norm(wxyz)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def inverse_se3(a_from_b: np.ndarray) -> np.ndarray:
+    """b_from_a [4, 4] of a rigid a_from_b [4, 4]."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = a_from_b[:3, :3].T
+    inverse[:3, 3] = -a_from_b[:3, :3].T @ a_from_b[:3, 3]
+    return inverse
+
+
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """The rotation [3, 3] closest to `matrix` [3, 3] in the Frobenius norm (polar decomposition)."""
+    u, _, vt = np.linalg.svd(matrix)
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+
+
+def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """camera_from_world [4, 4], OpenCV axes, of a camera at `eye` looking at `target`; `up` not along the view."""
+    forward = np.asarray(target, dtype=np.float64) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    camera_from_world = np.eye(4)
+    camera_from_world[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ eye
+    return camera_from_world
+
+
+def align_similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale s, rotation R [3, 3] and translation t [3] that minimise Σ |a_i − (s R b_i + t)|² over points [N, 3].
+
+    Umeyama 1991, equations 34–42; N ≥ 3 points that are not on one line.
+    """
+    mean_a, mean_b = a.mean(0), b.mean(0)
+    u, singular, vt = np.linalg.svd((a - mean_a).T @ (b - mean_b) / len(a))
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ np.diag(sign) @ vt
+    scale = float((singular * sign).sum() / ((b - mean_b) ** 2).sum(1).mean())
+    return scale, rotation, mean_a - scale * rotation @ mean_b
+
+
+def rotation_angle(rotation: np.ndarray) -> np.ndarray:
+    """Angle in degrees of rotations [..., 3, 3]."""
+    cosine = (np.trace(rotation, axis1=-2, axis2=-1) - 1.0) / 2.0
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))

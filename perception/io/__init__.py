@@ -1,0 +1,1 @@
+"""Reading and writing: photos, camera files, COLMAP workspaces, transforms.json, structure from motion."""

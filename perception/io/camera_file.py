@@ -1,0 +1,78 @@
+"""Calibrated cameras in ROS camera_info YAML (the format of camera_calibration and of `calib/`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.types import Lens
+
+_COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
+
+
+def read_camera(path: Path) -> Lens:
+    """The lens in a camera_info file. Pixels; distortion models plumb_bob, rational_polynomial, equidistant.
+
+    ROS and OpenCV put the centre of the first pixel at (0, 0), COLMAP and this project at (0.5, 0.5): half a pixel
+    is added to the principal point.
+    """
+    path = Path(path)
+    data = _load(path)
+    width, height = (int(_numbers(data.get(key), 1, path, key)[0]) for key in ("image_width", "image_height"))
+    matrix = _numbers(_data(data, "camera_matrix"), 9, path, "camera_matrix.data").reshape(3, 3)
+    fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
+    if min(width, height) < 1 or min(fx, fy) <= 0:
+        raise InputError(f"{path}: image size and focal lengths must be positive, found {width}×{height}, {fx:g}, {fy:g}")
+    name = data.get("distortion_model", "plumb_bob")
+    if name not in _COUNTS:
+        raise InputError(f"{path}: distortion_model '{name}' is not known; expected one of {', '.join(_COUNTS)}")
+    values = _data(data, "distortion_coefficients")
+    found = len(values) if isinstance(values, (list, tuple)) else 0
+    if found not in _COUNTS[name]:
+        expected = " or ".join(map(str, _COUNTS[name]))
+        raise InputError(f"{path}: {name} has {expected} distortion_coefficients, found {found}")
+    k = _numbers(values, found, path, "distortion_coefficients.data").tolist()
+    model, distortion = _colmap_distortion(name, k)
+    return Lens(model, (float(fx), float(fy), float(cx), float(cy), *distortion), width, height)
+
+
+def _colmap_distortion(name: str, k: list[float]) -> tuple[str, list[float]]:
+    if name == "equidistant":
+        return "OPENCV_FISHEYE", k
+    if not any(k):
+        return "PINHOLE", []
+    if not any(k[4:]):
+        return "OPENCV", k[:4]
+    return "FULL_OPENCV", (k + [0.0, 0.0, 0.0])[:8]
+
+
+def _load(path: Path) -> dict[str, Any]:
+    import yaml
+
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such camera file") from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f"{path}: not a readable YAML file; expected ROS camera_info") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: expected a ROS camera_info mapping with image_width, image_height, camera_matrix")
+    return data
+
+
+def _data(data: dict[str, Any], key: str) -> Any:
+    block = data.get(key)
+    return block.get("data") if isinstance(block, dict) else block
+
+
+def _numbers(value: Any, count: int, path: Path, key: str) -> np.ndarray:
+    try:
+        array = np.asarray(value, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.size != count or not np.isfinite(array).all():
+        raise InputError(f"{path}: {key} must hold {count} finite number(s), found {value!r}")
+    return array
