@@ -20,7 +20,9 @@ def mesh_edges(faces: np.ndarray, num_points: int) -> np.ndarray:
 
 
 def knn_edges(points: np.ndarray, k: int = 8) -> np.ndarray:
-    """Edges [E, 2] int32, each once with a < b: the k nearest neighbours of every finite point, either way round."""
+    """Edges [E, 2] int32, each once with a < b: the k nearest neighbours of every finite point, either way
+    round.
+    """
     return _unique_edges(*_neighbors(points, k, np.inf))
 
 
@@ -75,7 +77,8 @@ def mesh_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def estimate_normals(points: np.ndarray, k: int = 12) -> np.ndarray:
     """Normals [P, 3] float32 of a bare cloud: least variance direction of the k nearest neighbours.
 
-    The sign is arbitrary: weights of such normals must not tell the two directions apart. Zero at lone points.
+    The sign is arbitrary: weights of such normals must not tell the two directions apart. Zero at lone
+    points.
     """
     normals = np.zeros((len(points), 3), np.float32)
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
@@ -94,7 +97,9 @@ def estimate_normals(points: np.ndarray, k: int = 12) -> np.ndarray:
 
 
 def _least_direction(offsets: np.ndarray) -> np.ndarray:
-    """Eigenvector [B, 3] of the smallest eigenvalue of each neighbourhood [B, k, 3]; zero when there is no plane."""
+    """Eigenvector [B, 3] of the smallest eigenvalue of each neighbourhood [B, k, 3]; zero when there is no
+    plane.
+    """
     covariance = np.einsum("bki,bkj->bij", offsets, offsets).astype(np.float64)
     values, vectors = np.linalg.eigh(covariance)
     flat = values[:, 1] > 1e-12 * np.maximum(values[:, 2], 1e-300)

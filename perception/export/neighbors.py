@@ -1,4 +1,6 @@
-"""Nearest neighbours in 3D on the compiled k-d tree: exact in float32 about a common centre, any machine, any order."""
+"""Nearest neighbours in 3D on the compiled k-d tree: exact in float32 about a common centre, any machine, any
+order.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,9 @@ def cores() -> int:
 
 
 class Neighbors:
-    """A search tree over points [N, 3] (any float dtype, finite). Coordinates are taken about the points' centre in
-    float64 before they become float32, so that clouds in map coordinates far from the origin lose nothing.
+    """A search tree over points [N, 3] (any float dtype, finite). Coordinates are taken about the points'
+    centre in float64 before they become float32, so that clouds in map coordinates far from the origin lose
+    nothing.
     """
 
     def __init__(self, points: np.ndarray, threads: int | None = None) -> None:
@@ -40,8 +43,8 @@ class Neighbors:
     ) -> tuple[np.ndarray, np.ndarray]:
         """The k nearest of queries [Q, 3]: indices [Q, k] int32 and distances [Q, k] float32, nearest first.
 
-        −1 and infinity where fewer than k points lie within max_distance, or the query is not finite. Equal distances
-        go to the smaller index.
+        −1 and infinity where fewer than k points lie within max_distance, or the query is not finite. Equal
+        distances go to the smaller index.
         """
         queries = np.asarray(queries)
         indices = np.empty((len(queries), k), np.int32)

@@ -1,4 +1,6 @@
-"""Superpoint smoothing: segment the cloud by shape (Felzenszwalb-Huttenlocher), then each segment takes one label."""
+"""Superpoint smoothing: segment the cloud by shape (Felzenszwalb-Huttenlocher), then each segment takes one
+label.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +28,9 @@ from perception.types import PointCloud
 class SmoothOptions:
     """k_threshold, min_size: ScanNet's kThresh .01 and segMinVerts 20.
 
-    graph: "auto" (mesh edges when there are faces, else kNN), "mesh", "knn" or "radius". neighbors: of each point in
-    the kNN graph. radius: length in the cloud's unit; None means three times the cloud's spacing. color_weight: added
-    weight of a colour difference, per unit of RGB distance in [0, √3].
+    graph: "auto" (mesh edges when there are faces, else kNN), "mesh", "knn" or "radius". neighbors: of each
+    point in the kNN graph. radius: length in the cloud's unit; None means three times the cloud's spacing.
+    color_weight: added weight of a colour difference, per unit of RGB distance in [0, √3].
     """
 
     k_threshold: float = 0.01
@@ -44,7 +46,8 @@ def felzenszwalb(
 ) -> np.ndarray:
     """Segment [num_nodes] int32 of each node of a graph, numbered in order of appearance (IJCV 2004).
 
-    edges [E, 2] int32, weights [E]; equal weights are taken in the order of their nodes, not of their position.
+    edges [E, 2] int32, weights [E]; equal weights are taken in the order of their nodes, not of their
+    position.
     """
     labels = np.empty(num_nodes, np.int32)
     edges = np.ascontiguousarray(edges, np.int32)
@@ -75,7 +78,7 @@ def segment_cloud(cloud: PointCloud, options: SmoothOptions | None = None) -> np
     if options.color_weight and cloud.colors is not None:
         difference = cloud.colors[edges[:, 0]].astype(np.float32) - cloud.colors[edges[:, 1]]
         weights += options.color_weight / 255 * np.linalg.norm(difference, axis=1)
-    weights = np.nan_to_num(weights, nan=np.float32(2), copy=False)
+    weights = np.nan_to_num(weights, nan=2.0).astype(np.float32)
     return felzenszwalb(edges, weights, len(points), options.k_threshold, options.min_size)
 
 
@@ -110,7 +113,7 @@ def vote(labels: np.ndarray, segments: np.ndarray) -> np.ndarray:
 
 
 def read_segments(path: str | Path, num_points: int) -> np.ndarray:
-    """Segments [P] int32 from a ScanNet `*.segs.json` (its list "segIndices"), one for each vertex in order."""
+    """Segments [P] int32 from a ScanNet `*.segs.json` (its list "segIndices"), one for each vertex."""
     path = Path(path)
     try:
         values = np.asarray(json.loads(path.read_text(encoding="utf-8"))["segIndices"], np.int64)
