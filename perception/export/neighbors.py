@@ -33,9 +33,10 @@ class Neighbors:
         self.center = (low + high) / 2
         self.low, self.high = low, high
         self.threads = threads or cores()
-        self._tree = _core.KdTree(self._local(points), self.threads)
+        self._tree = _core.KdTree(self.local(points), self.threads)
 
-    def _local(self, points: np.ndarray) -> np.ndarray:
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """points [Q, 3] about the tree's centre, as the tree sees them: float32, contiguous."""
         return np.ascontiguousarray(np.asarray(points) - self.center, dtype=np.float32)
 
     def query(
@@ -50,5 +51,5 @@ class Neighbors:
         indices = np.empty((len(queries), k), np.int32)
         squared = np.empty((len(queries), k), np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
-            self._tree.knn(self._local(queries), indices, squared, float(max_distance), self.threads)
+            self._tree.knn(self.local(queries), indices, squared, float(max_distance), self.threads)
         return indices, np.sqrt(squared, out=squared)
