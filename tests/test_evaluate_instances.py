@@ -12,9 +12,11 @@ from perception.evaluate.instances import evaluate, evaluate_masks
 
 
 def slow_ap(masks, scores, classes, gt_ids, gt_classes, label, threshold, min_region):
-    """One mask at a time, straight from the rules: Python sets, an explicit curve, trapezoids between neighbours."""
+    """One mask at a time, straight from the rules: Python sets, an explicit curve, trapezoids between
+    neighbours.
+    """
     preds = []
-    for mask, score, cls in zip(masks, scores, classes):
+    for mask, score, cls in zip(masks, scores, classes, strict=True):
         points = set(np.flatnonzero(mask).tolist())
         if cls == label and len(points) >= max(min_region, 1):
             preds.append((points, score))

@@ -8,6 +8,7 @@
 
 #include "felzenszwalb.hpp"
 #include "kdtree.hpp"
+#include "neighborhood.hpp"
 
 namespace nb = nanobind;
 using perception::graph::KdTree;
@@ -55,6 +56,29 @@ std::size_t segment(Array<const std::int32_t, nb::shape<-1, 2>> edges, Array<con
   return perception::graph::segment(e, w, count, nodes, k, min_size, labels.data());
 }
 
+using Lists = Array<const std::int32_t, nb::shape<-1, -1>>;
+
+bool within(const Lists &lists, std::size_t points) {
+  const std::int32_t *data = lists.data();
+  return std::all_of(data, data + lists.size(), [points](std::int32_t v) { return v < 0 || std::size_t(v) < points; });
+}
+
+std::size_t undirected(Lists neighbors, Array<std::int32_t, nb::shape<-1, 2>> edges) {
+  const std::size_t count = neighbors.shape(0), k = neighbors.shape(1);
+  if (edges.shape(0) < count * k) throw nb::value_error("edges must have room for N * k pairs");
+  if (!within(neighbors, count)) throw nb::value_error("neighbors: an index lies outside the points");
+  nb::gil_scoped_release release;
+  return perception::graph::undirected(neighbors.data(), count, k, edges.data());
+}
+
+void plane_normals(Points points, Lists neighbors, Array<float, nb::shape<-1, 3>> normals, int threads) {
+  if (normals.shape(0) != neighbors.shape(0)) throw nb::value_error("normals must be [Q, 3] for neighbors [Q, k]");
+  if (!within(neighbors, points.shape(0))) throw nb::value_error("neighbors: an index lies outside the points");
+  nb::gil_scoped_release release;
+  perception::graph::plane_normals(points.data(), neighbors.data(), neighbors.shape(0), neighbors.shape(1),
+                                   std::max(threads, 1), normals.data());
+}
+
 }  // namespace
 
 void bind_graph(nb::module_ &m) {
@@ -66,4 +90,9 @@ void bind_graph(nb::module_ &m) {
   m.def("felzenszwalb", &segment, nb::arg("edges").noconvert(), nb::arg("weights").noconvert(), nb::arg("k"),
         nb::arg("min_size"), nb::arg("labels").noconvert(),
         "Felzenszwalb-Huttenlocher on a graph; fills labels [nodes] int32 and returns the number of segments.");
+  m.def("undirected", &undirected, nb::arg("neighbors").noconvert(), nb::arg("edges").noconvert(),
+        "Pairs of neighbour lists [N, k], each once; fills edges and returns how many there are.");
+  m.def("plane_normals", &plane_normals, nb::arg("points").noconvert(), nb::arg("neighbors").noconvert(),
+        nb::arg("normals").noconvert(), nb::arg("threads") = 1,
+        "Normals [Q, 3] of the planes through neighbour lists [Q, k] of points [N, 3]; zero where there is none.");
 }

@@ -42,6 +42,7 @@ class KdTree {
   void build(std::vector<Entry> &entries, std::size_t begin, std::size_t end, std::size_t node, int threads);
 
   std::size_t size_;
+  float low_[3], high_[3];
   std::vector<Node> nodes_;
   std::vector<float> x_, y_, z_;
   std::vector<std::int32_t> index_;

@@ -17,7 +17,7 @@ _WINDOW, _SIGMA = 11, 1.5
 
 PROTOCOL = {
     "psnr": "10 log10(1 / mean squared error), RGB in [0, 1], all pixels",
-    "ssim": "Wang et al. 2004: Gaussian window 11x11, sigma 1.5, K .01 .03, biased covariance, mean over channels",
+    "ssim": "Wang et al. 2004: Gaussian window 11x11, sigma 1.5, K .01 .03, biased covariance, channel mean",
     "ssim_padding": "valid (windows wholly inside the picture, as scikit-image and torchmetrics)",
     "missing_prediction": "psnr 0, ssim 0",
     "mean": "over views",
@@ -31,9 +31,11 @@ def psnr(prediction: np.ndarray, truth: np.ndarray) -> float:
 
 
 def ssim(prediction: np.ndarray, truth: np.ndarray, padding: str = "valid") -> float:
-    """Structural similarity of pictures [H, W, 3] in [0, 1] (Wang et al. 2004, equation 13), mean over channels.
+    """Structural similarity of pictures [H, W, 3] in [0, 1] (Wang et al. 2004, equation 13), mean over
+    channels.
 
-    padding "valid": only windows inside the picture; "same": zeros beyond the border, as 3DGS trains and reports.
+    padding "valid": only windows inside the picture; "same": zeros beyond the border, as 3DGS trains and
+    reports.
     """
     x, y = (np.asarray(image, np.float64) for image in (prediction, truth))
     if min(x.shape[:2]) < _WINDOW:
@@ -62,7 +64,7 @@ def read_rgb(path: Path) -> np.ndarray:
         raise InputError(f"{path}: is not a readable 8 or 16 bit picture")
     image = raw[..., None] if raw.ndim == 2 else raw
     image = np.repeat(image[..., :1], 3, axis=2) if image.shape[2] < 3 else image[..., 2::-1]
-    return image / np.float64(np.iinfo(raw.dtype).max)
+    return image / (255.0 if raw.dtype == np.uint8 else 65535.0)
 
 
 def pictures(folder: str | Path) -> dict[str, Path]:
@@ -82,7 +84,9 @@ def pictures(folder: str | Path) -> dict[str, Path]:
 
 
 def evaluate_images(prediction_dir: str | Path, truth_dir: str | Path) -> dict[str, Any]:
-    """PSNR and SSIM of each true picture and their means; pictures are paired by stem, a missing one scores 0."""
+    """PSNR and SSIM of each true picture and their means; pictures are paired by stem, a missing one scores
+    0.
+    """
     predictions, truths = pictures(prediction_dir), pictures(truth_dir)
     if not truths:
         raise InputError(f"{truth_dir}: holds no pictures")
@@ -94,8 +98,8 @@ def evaluate_images(prediction_dir: str | Path, truth_dir: str | Path) -> dict[s
         predicted, true = read_rgb(predictions[stem]), read_rgb(path)
         if predicted.shape != true.shape:
             raise InputError(
-                f"{predictions[stem]}: is {predicted.shape[1]}x{predicted.shape[0]} pixels, the truth {path} is "
-                f"{true.shape[1]}x{true.shape[0]}; render at the truth's size"
+                f"{predictions[stem]}: is {predicted.shape[1]}x{predicted.shape[0]} pixels, the truth {path} "
+                f"is {true.shape[1]}x{true.shape[0]}; render at the truth's size"
             )
         views[stem] = {
             "psnr": min(psnr(predicted, true), 100.0),

@@ -25,8 +25,8 @@ class Protocol:
     """Every switch that moves a figure; printed with each result.
 
     thresholds: the IoU thresholds averaged into AP; extra_thresholds are reported beside (AP25).
-    constant_score: all confidences 1.0 (Segment3D). remove_ignored: points marked "ignore" (truth ids below −1, or a
-    mask) leave truth and prediction before anything is counted (ScanNet++); elsewhere they are void.
+    constant_score: all confidences 1.0 (Segment3D). remove_ignored: points marked "ignore" (truth ids below
+    −1, or a mask) leave truth and prediction before anything is counted (ScanNet++); elsewhere they are void.
     """
 
     name: str
@@ -60,7 +60,7 @@ PROTOCOLS = {
 
 
 def get_protocol(protocol: str | Protocol, **changes: Any) -> Protocol:
-    """A protocol by name ("scannet", "mask3d", "segment3d", "scannetpp"), with switches changed where given."""
+    """A protocol by name ("scannet", "mask3d", "segment3d", "scannetpp"), switches changed where given."""
     if isinstance(protocol, str):
         if protocol not in PROTOCOLS:
             raise InputError(f"protocol '{protocol}' is unknown; expected one of {', '.join(PROTOCOLS)}")
@@ -79,16 +79,18 @@ def evaluate(
     ignore: np.ndarray | None = None,
     **changes: Any,
 ) -> dict[str, Any]:
-    """AP of a labelling against the truth, both [N] int over the same points; negative prediction = no instance.
+    """AP of a labelling against the truth, both [N] int over the same points; negative prediction = no
+    instance.
 
-    pred_scores: confidence by id (None: all 1). *_semantics [N] int are needed for by_class and valid_classes; a
-    prediction's class is the most frequent semantic id of its points. ignore [N] bool. changes: switches of Protocol.
+    pred_scores: confidence by id (None: all 1). *_semantics [N] int are needed for by_class and
+    valid_classes; a prediction's class is the most frequent semantic id of its points. ignore [N] bool.
+    changes: switches of Protocol.
     """
     rules = get_protocol(protocol, **changes)
     pred_ids, gt_ids = np.asarray(pred_ids), np.asarray(gt_ids)
     if len(pred_ids) != len(gt_ids):
         raise InputError(
-            f"prediction has {len(pred_ids)} points, truth has {len(gt_ids)}; both must be the same points in order"
+            f"prediction has {len(pred_ids)} points, truth has {len(gt_ids)}; they must be the same points"
         )
     keep, truth = _truth(rules, gt_ids, gt_semantics, ignore)
     pred_ids = pred_ids[keep]
@@ -116,7 +118,9 @@ def evaluate_masks(
     ignore: np.ndarray | None = None,
     **changes: Any,
 ) -> dict[str, Any]:
-    """AP of masks (each bool [N]; they may overlap) against the truth ids [N]; the masks' order is the input order."""
+    """AP of masks (each bool [N]; they may overlap) against the truth ids [N]; the masks' order is the input
+    order.
+    """
     rules = get_protocol(protocol, **changes)
     return evaluate_overlaps(
         [_mask_overlap(rules, masks, scores, gt_ids, classes, gt_semantics, ignore)], rules
@@ -172,7 +176,9 @@ def _truth(
 
 
 def evaluate_overlaps(scenes: Sequence[Overlap], rules: Protocol) -> dict[str, Any]:
-    """AP over scenes pooled as the benchmarks pool them. NaN (no truth of a class) becomes null in the result."""
+    """AP over scenes pooled as the benchmarks pool them. NaN (no truth of a class) becomes null in the
+    result.
+    """
     thresholds = [*rules.thresholds, *rules.extra_thresholds]
     labels = sorted({int(c) for scene in scenes for c in scene.gt_classes})
     table = np.full((len(labels), len(thresholds)), np.nan)

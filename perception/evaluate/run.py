@@ -26,8 +26,8 @@ def run_instances(
 ) -> tuple[dict[str, Any], str]:
     """Instance AP of a labelled cloud against the truth: (result, table).
 
-    Confidences come from `scores` or the sidecar JSON beside the prediction; without either all are 1, and the result
-    says so. A truth property `ignore` marks points by a non-zero value.
+    Confidences come from `scores` or the sidecar JSON beside the prediction; without either all are 1, and
+    the result says so. A truth property `ignore` marks points by a non-zero value.
     """
     pred, gt = read_cloud(prediction), read_cloud(truth)
     pred_ids, gt_ids = _ids(pred, prediction), _ids(gt, truth)
@@ -62,7 +62,7 @@ def read_scores(path: str | Path) -> dict[int, float]:
         return {int(key): float(row["score"]) for key, row in rows.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
-            f'{path}: expected {{"instances": {{"<id>": {{"score": number}}}}}} ({type(error).__name__}: {error})'
+            f'{path}: expected {{"instances": {{"<id>": {{"score": number}}}}}} ({error!r})'
         ) from error
 
 
@@ -84,8 +84,10 @@ def instances_table(result: dict[str, Any]) -> str:
     lines.append(
         f"protocol {rules['name']}: IoU {rules['thresholds'][0]:.2f}-{rules['thresholds'][-1]:.2f} "
         f"({len(rules['thresholds'])} thresholds), at least {rules['min_region']} points, "
-        f"{'by class' if rules['by_class'] else 'class-agnostic'}, confidence {rules.get('confidence', 'given')}, "
-        f"ignored points {'removed' if rules['remove_ignored'] else 'void'}, void ids < 0 and {list(rules['void_ids'])}"
+        f"{'by class' if rules['by_class'] else 'class-agnostic'}, "
+        f"confidence {rules.get('confidence', 'given')}, "
+        f"ignored points {'removed' if rules['remove_ignored'] else 'void'}, "
+        f"void ids < 0 and {list(rules['void_ids'])}"
     )
     return "\n".join(lines)
 

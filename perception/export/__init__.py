@@ -1,1 +1,3 @@
-"""From the instances of a Gaussian map to the points of clouds and meshes, and out into other programs' files."""
+"""From the instances of a Gaussian map to the points of clouds and meshes, and out into other programs'
+files.
+"""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from perception import _core
 from perception.errors import InputError
 from perception.export.neighbors import Neighbors
 
@@ -20,15 +21,15 @@ def mesh_edges(faces: np.ndarray, num_points: int) -> np.ndarray:
 
 
 def knn_edges(points: np.ndarray, k: int = 8) -> np.ndarray:
-    """Edges [E, 2] int32, each once with a < b: the k nearest neighbours of every finite point, either way round."""
-    return _unique_edges(*_neighbors(points, k, np.inf))
+    """Edges [E, 2] int32, each once with a < b: each finite point and its k nearest neighbours."""
+    return _edges(points, k, np.inf)
 
 
 def radius_edges(points: np.ndarray, radius: float, max_neighbors: int = 32) -> np.ndarray:
     """Edges [E, 2] int32 between points within `radius`, of each point at most the `max_neighbors` nearest."""
     if not radius > 0:
         raise InputError(f"radius is {radius}; expected a positive length")
-    return _unique_edges(*_neighbors(points, max_neighbors, radius))
+    return _edges(points, max_neighbors, radius)
 
 
 def spacing(points: np.ndarray, sample: int = 20000) -> float:
@@ -42,23 +43,15 @@ def spacing(points: np.ndarray, sample: int = 20000) -> float:
     return float(np.median(positive)) if len(positive) else 0.0
 
 
-def _neighbors(points: np.ndarray, k: int, max_distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """(a [M], b [M]) of every neighbour pair a -> b, the point itself left out."""
+def _edges(points: np.ndarray, k: int, max_distance: float) -> np.ndarray:
     finite = np.flatnonzero(np.isfinite(points).all(axis=1)).astype(np.int32)
     if len(finite) == 0:
-        return np.empty(0, np.int32), np.empty(0, np.int32)
+        return np.empty((0, 2), np.int32)
     inside = points if len(finite) == len(points) else points[finite]
     found = Neighbors(inside).query(inside, min(k + 1, len(finite), 1024), max_distance)[0]
-    a = np.broadcast_to(np.arange(len(finite), dtype=np.int32)[:, None], found.shape)
-    real = (found >= 0) & (found != a)
-    return finite[a[real]], finite[found[real]]
-
-
-def _unique_edges(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    low, high = np.minimum(a, b), np.maximum(a, b)
-    order = np.sort((low.astype(np.int64) << 32) | high)
-    kept = order[np.concatenate(([True], order[1:] != order[:-1]))] if len(order) else order
-    return np.stack([kept >> 32, kept & 0xFFFFFFFF], axis=1).astype(np.int32)
+    edges = np.empty((found.size, 2), np.int32)
+    edges = edges[: _core.undirected(found, edges)]
+    return edges if len(finite) == len(points) else finite[edges]
 
 
 def mesh_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -75,7 +68,8 @@ def mesh_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def estimate_normals(points: np.ndarray, k: int = 12) -> np.ndarray:
     """Normals [P, 3] float32 of a bare cloud: least variance direction of the k nearest neighbours.
 
-    The sign is arbitrary: weights of such normals must not tell the two directions apart. Zero at lone points.
+    The sign is arbitrary: weights of such normals must not tell the two directions apart. Zero at lone
+    points.
     """
     normals = np.zeros((len(points), 3), np.float32)
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
@@ -83,22 +77,15 @@ def estimate_normals(points: np.ndarray, k: int = 12) -> np.ndarray:
         return normals
     inside = points[finite]
     tree = Neighbors(inside)
-    local = (inside - tree.center).astype(np.float32)
+    local = tree.local(inside)
     k = min(k, len(inside))
-    for begin in range(0, len(inside), 1 << 18):
-        block = slice(begin, begin + (1 << 18))
-        offsets = local[tree.query(inside[block], k)[0]] - local[block, None]
-        offsets -= offsets.mean(axis=1, keepdims=True)
-        normals[finite[block]] = _least_direction(offsets)
+    for begin in range(0, len(inside), 1 << 20):
+        block = slice(begin, begin + (1 << 20))
+        lists = tree.query(inside[block], k)[0]
+        found = np.empty((len(lists), 3), np.float32)
+        _core.plane_normals(local, lists, found, tree.threads)
+        normals[finite[block]] = found
     return normals
-
-
-def _least_direction(offsets: np.ndarray) -> np.ndarray:
-    """Eigenvector [B, 3] of the smallest eigenvalue of each neighbourhood [B, k, 3]; zero when there is no plane."""
-    covariance = np.einsum("bki,bkj->bij", offsets, offsets).astype(np.float64)
-    values, vectors = np.linalg.eigh(covariance)
-    flat = values[:, 1] > 1e-12 * np.maximum(values[:, 2], 1e-300)
-    return np.where(flat[:, None], vectors[:, :, 0], 0).astype(np.float32)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -1,4 +1,6 @@
-"""Nearest neighbours in 3D on the compiled k-d tree: exact in float32 about a common centre, any machine, any order."""
+"""Nearest neighbours in 3D on the compiled k-d tree: exact in float32 about a common centre, any machine, any
+order.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,9 @@ def cores() -> int:
 
 
 class Neighbors:
-    """A search tree over points [N, 3] (any float dtype, finite). Coordinates are taken about the points' centre in
-    float64 before they become float32, so that clouds in map coordinates far from the origin lose nothing.
+    """A search tree over points [N, 3] (any float dtype, finite). Coordinates are taken about the points'
+    centre in float64 before they become float32, so that clouds in map coordinates far from the origin lose
+    nothing.
     """
 
     def __init__(self, points: np.ndarray, threads: int | None = None) -> None:
@@ -30,9 +33,10 @@ class Neighbors:
         self.center = (low + high) / 2
         self.low, self.high = low, high
         self.threads = threads or cores()
-        self._tree = _core.KdTree(self._local(points), self.threads)
+        self._tree = _core.KdTree(self.local(points), self.threads)
 
-    def _local(self, points: np.ndarray) -> np.ndarray:
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """points [Q, 3] about the tree's centre, as the tree sees them: float32, contiguous."""
         return np.ascontiguousarray(np.asarray(points) - self.center, dtype=np.float32)
 
     def query(
@@ -40,12 +44,12 @@ class Neighbors:
     ) -> tuple[np.ndarray, np.ndarray]:
         """The k nearest of queries [Q, 3]: indices [Q, k] int32 and distances [Q, k] float32, nearest first.
 
-        −1 and infinity where fewer than k points lie within max_distance, or the query is not finite. Equal distances
-        go to the smaller index.
+        −1 and infinity where fewer than k points lie within max_distance, or the query is not finite. Equal
+        distances go to the smaller index.
         """
         queries = np.asarray(queries)
         indices = np.empty((len(queries), k), np.int32)
         squared = np.empty((len(queries), k), np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
-            self._tree.knn(self._local(queries), indices, squared, float(max_distance), self.threads)
+            self._tree.knn(self.local(queries), indices, squared, float(max_distance), self.threads)
         return indices, np.sqrt(squared, out=squared)

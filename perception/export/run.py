@@ -20,10 +20,11 @@ from perception.types import PointCloud
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """drop_noise: Gaussians without an instance take no part, so every point gets a label (the paper's released code).
+    """drop_noise: Gaussians without an instance take no part, so every point gets a label (the paper's
+    released code).
 
-    max_distance: in map units; None = no limit, as in the paper. smooth: superpoint vote, on or off. segments: a
-    ScanNet *.segs.json used instead of an own segmentation.
+    max_distance: in map units; None = no limit, as in the paper. smooth: superpoint vote, on or off.
+    segments: a ScanNet *.segs.json used instead of an own segmentation.
     """
 
     drop_noise: bool = True
@@ -93,7 +94,7 @@ def write_export(
     labelled = PointCloud(cloud.points, cloud.colors, cloud.normals, cloud.faces)
     labelled.labels = {"instance_id": labels.astype(np.int32)}
     ids, counts = np.unique(labels[labels >= 0], return_counts=True)
-    sidecar = {"instances": {}}
+    sidecar: dict[str, Any] = {"instances": {}}
     for i, n in zip(ids.tolist(), counts.tolist(), strict=True):
         known = instances.get(i, {})
         sidecar["instances"][str(i)] = {

@@ -1,4 +1,6 @@
-"""Superpoint smoothing: segment the cloud by shape (Felzenszwalb-Huttenlocher), then each segment takes one label."""
+"""Superpoint smoothing: segment the cloud by shape (Felzenszwalb-Huttenlocher), then each segment takes one
+label.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +24,17 @@ from perception.export.graph import (
 from perception.types import PointCloud
 
 
+COLOR_WEIGHT = 0.05  # of bare clouds: without it a poster joins its wall, whose normals are the same
+
+
 @dataclass(frozen=True)
 class SmoothOptions:
     """k_threshold, min_size: ScanNet's kThresh .01 and segMinVerts 20.
 
-    graph: "auto" (mesh edges when there are faces, else kNN), "mesh", "knn" or "radius". neighbors: of each point in
-    the kNN graph. radius: length in the cloud's unit; None means three times the cloud's spacing. color_weight: added
-    weight of a colour difference, per unit of RGB distance in [0, √3].
+    graph: "auto" (mesh edges when there are faces, else kNN), "mesh", "knn" or "radius". neighbors: of each
+    point in the kNN graph. radius: length in the cloud's unit; None means three times the cloud's spacing.
+    color_weight: weight added per unit of RGB distance in [0, √3]; None means COLOR_WEIGHT, but 0 on mesh edges, where
+    ScanNet has none.
     """
 
     k_threshold: float = 0.01
@@ -36,7 +42,7 @@ class SmoothOptions:
     graph: str = "auto"
     neighbors: int = 8
     radius: float | None = None
-    color_weight: float = 0.0
+    color_weight: float | None = None
 
 
 def felzenszwalb(
@@ -44,7 +50,8 @@ def felzenszwalb(
 ) -> np.ndarray:
     """Segment [num_nodes] int32 of each node of a graph, numbered in order of appearance (IJCV 2004).
 
-    edges [E, 2] int32, weights [E]; equal weights are taken in the order of their nodes, not of their position.
+    edges [E, 2] int32, weights [E]; equal weights are taken in the order of their nodes, not of their
+    position.
     """
     labels = np.empty(num_nodes, np.int32)
     edges = np.ascontiguousarray(edges, np.int32)
@@ -72,11 +79,19 @@ def segment_cloud(cloud: PointCloud, options: SmoothOptions | None = None) -> np
         raise InputError(f"graph '{kind}' is unknown; expected auto, mesh, knn or radius")
     normals, oriented = _normals(cloud, faces)
     weights = scannet_weights(points, normals, edges, oriented=oriented)
-    if options.color_weight and cloud.colors is not None:
-        difference = cloud.colors[edges[:, 0]].astype(np.float32) - cloud.colors[edges[:, 1]]
-        weights += options.color_weight / 255 * np.linalg.norm(difference, axis=1)
-    weights = np.nan_to_num(weights, nan=np.float32(2), copy=False)
+    color_weight = (
+        (0.0 if kind == "mesh" else COLOR_WEIGHT) if options.color_weight is None else options.color_weight
+    )
+    if color_weight and cloud.colors is not None:
+        weights += color_weight * _color_difference(cloud.colors, edges)
+    weights = np.nan_to_num(weights, nan=2.0).astype(np.float32)
     return felzenszwalb(edges, weights, len(points), options.k_threshold, options.min_size)
+
+
+def _color_difference(colors: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Euclidean RGB distance [E] float32 of the ends of edges, in [0, √3]."""
+    difference = colors[edges[:, 0]].astype(np.float32) - colors[edges[:, 1]]
+    return np.sqrt(np.einsum("ei,ei->e", difference, difference)) / np.float32(255)
 
 
 def _normals(cloud: PointCloud, faces: np.ndarray | None) -> tuple[np.ndarray, bool]:
@@ -110,7 +125,7 @@ def vote(labels: np.ndarray, segments: np.ndarray) -> np.ndarray:
 
 
 def read_segments(path: str | Path, num_points: int) -> np.ndarray:
-    """Segments [P] int32 from a ScanNet `*.segs.json` (its list "segIndices"), one for each vertex in order."""
+    """Segments [P] int32 from a ScanNet `*.segs.json` (its list "segIndices"), one for each vertex."""
     path = Path(path)
     try:
         values = np.asarray(json.loads(path.read_text(encoding="utf-8"))["segIndices"], np.int64)

@@ -1,9 +1,12 @@
-"""Point clouds and meshes from and to files, the format told by the file's extension. Order and count are kept."""
+"""Point clouds and meshes from and to files, the format told by the file's extension. Order and count are
+kept.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,8 +26,8 @@ _NOT_LABELS = {"alpha", "diffuse_alpha", "a"}
 def read_cloud(path: str | Path) -> PointCloud:
     """Read .ply (cloud or mesh), .pcd, .xyz/.txt/.pts, .npz, .obj, .las or .laz.
 
-    points are float64 where the file stores doubles, else float32; integer columns besides the colours become `labels`;
-    faces of more than three corners are split into fans. NaN and infinite points are kept in place.
+    points are float64 where the file stores doubles, else float32; integer columns besides the colours become
+    `labels`; faces of more than three corners are split into fans. NaN and infinite points are kept in place.
     """
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
@@ -46,7 +49,9 @@ def read_cloud(path: str | Path) -> PointCloud:
 
 
 def write_cloud(path: str | Path, cloud: PointCloud) -> None:
-    """Write .ply (binary), .pcd (binary), .npz or .xyz: points, and colours, normals, faces and labels the format has."""
+    """Write .ply (binary), .pcd (binary), .npz or .xyz: points, and colours, normals, faces and labels the
+    format has.
+    """
     path = Path(path)
     writer = _WRITERS.get(path.suffix.lower())
     if writer is None:
@@ -55,7 +60,9 @@ def write_cloud(path: str | Path, cloud: PointCloud) -> None:
 
 
 def to_int32(values: np.ndarray, where: str) -> np.ndarray:
-    """Label column as int32; values that do not fit (or are no whole numbers) are an InputError naming `where`."""
+    """Label column as int32; values that do not fit (or are no whole numbers) are an InputError naming
+    `where`.
+    """
     if values.dtype == np.int32:
         return values
     limits = np.iinfo(np.int32)
@@ -98,7 +105,9 @@ def _read_ply_cloud(path: Path) -> PointCloud:
 
 
 def to_uint8(colors: np.ndarray) -> np.ndarray:
-    """Colours [P, 3] as uint8: floats in [0, 1] are scaled by 255, 16-bit values by 1/257, bytes are taken as they are."""
+    """Colours [P, 3] as uint8: floats in [0, 1] are scaled by 255, 16-bit values by 1/257, bytes are taken as
+    they are.
+    """
     if colors.dtype == np.uint8:
         return colors
     if colors.dtype.kind == "f":
@@ -160,8 +169,9 @@ def _read_npz(path: Path) -> PointCloud:
 def _write_npz(path: Path, cloud: PointCloud) -> None:
     parts = {"points": cloud.points, "colors": cloud.colors, "normals": cloud.normals, "faces": cloud.faces}
     arrays = {name: values for name, values in parts.items() if values is not None}
+    everything: dict[str, Any] = arrays | cloud.labels
     with replacing(path) as file:
-        np.savez(file, **arrays, **cloud.labels)
+        np.savez(file, **everything)
 
 
 _READERS: dict[str, Callable[[Path], PointCloud]] = {

@@ -1,4 +1,6 @@
-"""PCD, the Point Cloud Library's format (version 0.7): ASCII, binary and binary_compressed (LZF) in, binary out."""
+"""PCD, the Point Cloud Library's format (version 0.7): ASCII, binary and binary_compressed (LZF) in, binary
+out.
+"""
 
 from __future__ import annotations
 
@@ -106,7 +108,7 @@ def _from_compressed(data: bytes, dtype: np.dtype, points: int, path: Path) -> n
 
 
 def lzf_decompress(data: bytes, size: int) -> bytes | None:
-    """LZF (Marc Lehmann): literal runs and back references of at most 8 KiB; None when the stream is damaged."""
+    """LZF (Marc Lehmann): literal runs and back references of at most 8 KiB; None if it is damaged."""
     out = bytearray()
     at, end = 0, len(data)
     try:

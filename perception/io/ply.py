@@ -1,6 +1,7 @@
 """The PLY container: elements of named properties, ASCII and both byte orders, fixed or ragged lists.
 
-Format: Greg Turk's "The PLY Polygon File Format" (1994). Binary tables are mapped straight onto structured arrays.
+Format: Greg Turk's "The PLY Polygon File Format" (1994). Binary tables are mapped straight onto structured
+arrays.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ class _Table:
 def read_ply(path: str | Path) -> dict[str, Element]:
     """All elements of a PLY file: {element: {property: array}}, file order kept, native byte order.
 
-    A scalar property is an array [rows]; a list property is [rows, k] when all its lists have the same length k and an
-    object array of 1D arrays otherwise.
+    A scalar property is an array [rows]; a list property is [rows, k] when all its lists have the same length
+    k and an object array of 1D arrays otherwise.
     """
     path = Path(path)
     try:
@@ -140,7 +141,7 @@ def _read_binary(file: BinaryIO, table: _Table, order: str, path: Path) -> Eleme
     if not table.has_list:
         found = len(raw) // max(dtype.itemsize, 1)
         raise InputError(
-            f"{path}: is cut short: element '{table.name}' has {found} complete rows, header says {table.rows}"
+            f"{path}: is cut short: element '{table.name}' has {found} whole rows, header says {table.rows}"
         )
     file.seek(start)
     return _read_ragged(file, table, order, path)

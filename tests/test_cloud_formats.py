@@ -1,0 +1,212 @@
+"""Cloud files against plyfile-free oracles: bytes written by hand, numpy, and invariance under a round trip."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+
+from perception.errors import InputError
+from perception.io.cloud import read_cloud, write_cloud
+from perception.io.cloud_pcd import lzf_decompress
+from perception.io.ply import read_ply, write_ply
+from perception.types import PointCloud
+
+
+def sample(n: int = 57, *, faces: bool = True) -> PointCloud:
+    rng = np.random.default_rng(3)
+    cloud = PointCloud(rng.normal(size=(n, 3)).astype(np.float32))
+    cloud.colors = rng.integers(0, 256, (n, 3)).astype(np.uint8)
+    cloud.normals = rng.normal(size=(n, 3)).astype(np.float32)
+    cloud.labels = {"instance_id": rng.integers(-1, 9, n).astype(np.int32)}
+    if faces:
+        cloud.faces = rng.integers(0, n, (21, 3)).astype(np.int32)
+    return cloud
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd", "npz", "xyz"])
+def test_a_round_trip_keeps_points_and_order(tmp_path, suffix):
+    cloud = sample()
+    path = tmp_path / f"cloud.{suffix}"
+    write_cloud(path, cloud)
+    back = read_cloud(path)
+    np.testing.assert_array_equal(back.points.astype(np.float32), cloud.points)
+    np.testing.assert_array_equal(back.colors, cloud.colors)
+    np.testing.assert_allclose(back.normals, cloud.normals, rtol=1e-7)
+    if suffix != "xyz":
+        np.testing.assert_array_equal(back.labels["instance_id"], cloud.labels["instance_id"])
+    if suffix in ("ply", "npz"):
+        np.testing.assert_array_equal(back.faces, cloud.faces)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]  # nothing temporary is left
+
+
+def test_written_ply_is_what_the_contract_says(tmp_path):
+    cloud = sample(3, faces=False)
+    cloud.normals = None
+    write_cloud(tmp_path / "c.ply", cloud)
+    data = (tmp_path / "c.ply").read_bytes()
+    header, body = data.split(b"end_header\n")
+    assert header.decode().splitlines() == [
+        "ply",
+        "format binary_little_endian 1.0",
+        "element vertex 3",
+        *[f"property float {a}" for a in "xyz"],
+        *[f"property uchar {c}" for c in ("red", "green", "blue")],
+        "property int instance_id",
+    ]
+    rows = [struct.unpack_from("<fffBBBi", body, 19 * i) for i in range(3)]
+    assert len(body) == 3 * 19
+    for i, row in enumerate(rows):
+        assert row[:3] == tuple(cloud.points[i].tolist())
+        assert row[3:6] == tuple(cloud.colors[i].tolist())
+        assert row[6] == cloud.labels["instance_id"][i]
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_binary_ply_of_both_byte_orders_with_mixed_faces(tmp_path, order):
+    name = {"<": "little", ">": "big"}[order]
+    header = (
+        f"ply\nformat binary_{name}_endian 1.0\ncomment odd\nelement vertex 4\nproperty double x\nproperty double y\n"
+        "property double z\nproperty ushort label\nelement face 2\nproperty list uchar int vertex_indices\n"
+        "property uchar flag\nelement edge 1\nproperty short a\nend_header\n"
+    )
+    body = b"".join(struct.pack(order + "dddH", i, 2 * i, -i, 60000 + i) for i in range(4))
+    body += struct.pack(order + "BiiiB", 3, 0, 1, 2, 7) + struct.pack(order + "BiiiiB", 4, 0, 1, 2, 3, 8)
+    body += struct.pack(order + "h", -5)
+    (tmp_path / "m.ply").write_bytes(header.encode() + body)
+    cloud = read_cloud(tmp_path / "m.ply")
+    assert cloud.points.dtype == np.float64
+    np.testing.assert_array_equal(cloud.points, [[i, 2 * i, -i] for i in range(4)])
+    assert cloud.labels["label"].tolist() == [60000, 60001, 60002, 60003]
+    assert cloud.faces.tolist() == [[0, 1, 2], [0, 1, 2], [0, 2, 3]]
+    elements = read_ply(tmp_path / "m.ply")
+    assert elements["edge"]["a"].tolist() == [-5]
+    assert elements["face"]["flag"].tolist() == [7, 8]
+
+
+def test_ascii_ply_equals_binary(tmp_path):
+    rng = np.random.default_rng(0)
+    vertex = {a: rng.normal(size=30) for a in "xyz"} | {"id": rng.integers(-9, 9, 30).astype(np.int32)}
+    elements = {"vertex": vertex, "face": {"vertex_index": rng.integers(0, 30, (8, 3)).astype(np.int32)}}
+    write_ply(tmp_path / "a.ply", elements, ascii=True)
+    write_ply(tmp_path / "b.ply", elements)
+    a, b = read_cloud(tmp_path / "a.ply"), read_cloud(tmp_path / "b.ply")
+    np.testing.assert_array_equal(a.points, b.points)
+    np.testing.assert_array_equal(a.faces, b.faces)
+    np.testing.assert_array_equal(a.labels["id"], b.labels["id"])
+
+
+def test_nan_and_infinite_points_stay_in_place(tmp_path):
+    points = np.array([[0, 0, 0], [np.nan, 1, 2], [np.inf, 0, 0], [4, 5, 6]], np.float32)
+    for suffix in ("ply", "pcd", "npz", "xyz"):
+        write_cloud(tmp_path / f"n.{suffix}", PointCloud(points))
+        np.testing.assert_array_equal(read_cloud(tmp_path / f"n.{suffix}").points, points)
+
+
+def pcd(fields: str, size: str, kind: str, points: int, data: str) -> bytes:
+    count = " ".join("1" for _ in fields.split())
+    return (
+        f"# .PCD\nVERSION .7\nFIELDS {fields}\nSIZE {size}\nTYPE {kind}\nCOUNT {count}\nWIDTH {points}\nHEIGHT 1\n"
+        f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {data}\n"
+    ).encode()
+
+
+def test_pcd_ascii_with_packed_colour(tmp_path):
+    packed = struct.unpack("<f", struct.pack("<I", (200 << 16) | (100 << 8) | 7))[0]
+    text = pcd("x y z rgb label", "4 4 4 4 4", "F F F F U", 2, "ascii")
+    (tmp_path / "a.pcd").write_bytes(text + f"1 2 3 {packed:.9g} 5\n4 5 nan {packed:.9g} 6\n".encode())
+    cloud = read_cloud(tmp_path / "a.pcd")
+    np.testing.assert_array_equal(cloud.points, np.array([[1, 2, 3], [4, 5, np.nan]], np.float32))
+    assert cloud.colors.tolist() == [[200, 100, 7]] * 2
+    assert cloud.labels["label"].tolist() == [5, 6]
+
+
+def test_pcd_compressed_holds_fields_one_after_the_other(tmp_path):
+    x, y, z = (np.arange(6) * s for s in (1.0, 2.0, 0.0))
+    plain = b"".join(v.astype("<f4").tobytes() for v in (x, y, z))
+    # literal runs of at most 32 bytes, and for the 24 zero bytes of z: one literal zero, then a reference of 23
+    packed = b"".join(bytes([len(c) - 1]) + c for c in (plain[:32], plain[32:48], plain[48:49]))
+    packed += bytes([7 << 5, 23 - 2 - 7, 0])
+    assert lzf_decompress(packed, len(plain)) == plain
+    head = pcd("x y z", "4 4 4", "F F F", 6, "binary_compressed")
+    (tmp_path / "c.pcd").write_bytes(head + struct.pack("<II", len(packed), len(plain)) + packed)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "c.pcd").points, np.stack([x, y, z], axis=1))
+
+
+def test_obj_faces_fans_negative_indices_and_colours(tmp_path):
+    (tmp_path / "o.obj").write_text(
+        "# a quad and a triangle\nmtllib x.mtl\nv 0 0 0 1 0 0\nv 1 0 0 0 1 0\nv 1 1 0 0 0 1\nv 0 1 0 1 1 1\n"
+        "vn 0 0 1\nf 1//1 2//1 3//1 4//1\nf -4/1 -3/2 -2/3\n"
+    )
+    cloud = read_cloud(tmp_path / "o.obj")
+    assert cloud.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 2]]
+    assert cloud.colors.tolist() == [[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]]
+
+
+def test_xyz_with_commas_comments_and_colours(tmp_path):
+    (tmp_path / "x.xyz").write_text("# x,y,z,r,g,b\n0.5, 1, 2, 255, 0, 1\n3;4;5;0;128;9\n")
+    cloud = read_cloud(tmp_path / "x.xyz")
+    assert cloud.points.tolist() == [[0.5, 1, 2], [3, 4, 5]]
+    assert cloud.colors.tolist() == [[255, 0, 1], [0, 128, 9]]
+    (tmp_path / "x.pts").write_text("2\n0 0 0\n1 1 1\n")
+    assert len(read_cloud(tmp_path / "x.pts").points) == 2
+
+
+GOOD = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "word"),
+    [
+        ("a.ply", b"", "not a PLY"),
+        ("a.ply", b"solid\n", "not a PLY"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex\n", "cannot be understood"),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty quad x\nend_header\n",
+            "cannot be understood",
+        ),
+        ("a.ply", b"ply\nformat ascii 1.0\n", "cut short"),
+        ("a.ply", GOOD + b"end_header\n1 2\n", "cut short"),
+        ("a.ply", GOOD + b"end_header\n1 two 3\n", "numbers are expected"),
+        ("a.ply", GOOD.replace(b"ascii", b"binary_little_endian") + b"end_header\n\0\0", "0 whole rows"),
+        ("a.ply", GOOD.replace(b"vertex 1", b"vertex 0") + b"end_header\n", "no points"),
+        ("a.ply", GOOD.replace(b"float z", b"float w") + b"end_header\n1 2 3\n", "x, y and z"),
+        (
+            "a.ply",
+            GOOD + b"element face 1\nproperty list uchar int vertex_indices\nend_header\n1 2 3\n3 0 0 9\n",
+            "names vertex 9",
+        ),
+        ("a.pcd", b"VERSION .7\n", "no DATA"),
+        ("a.pcd", pcd("x y z", "4 4 4", "F F F", 3, "binary") + b"123", "cut short"),
+        ("a.pcd", pcd("x y z", "4 4 4", "F F F", 3, "zipped"), "zipped"),
+        ("a.pcd", pcd("x y z", "4 4", "F F F", 3, "ascii"), "cannot be understood"),
+        (
+            "a.pcd",
+            pcd("x y z", "4 4 4", "F F F", 1, "binary_compressed") + b"\1\0\0\0\x0c\0\0\0\0\0",
+            "damaged",
+        ),
+        ("a.npz", b"nonsense", "NPZ"),
+        ("a.xyz", b"1 2 3\n4 5\n", "3 numbers"),
+        ("a.xyz", b"", "no points"),
+        ("a.obj", b"v 1 2\n", "x y z"),
+        ("a.obj", b"v 1 2 b\n", "line 1"),
+        ("a.stl", b"", "unknown point cloud format"),
+    ],
+)
+def test_bad_files_are_told_in_one_line(tmp_path, name, data, word):
+    path = tmp_path / name
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=word) as error:
+        read_cloud(path)
+    assert str(path) in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_missing_file_and_a_folder_that_cannot_be_written(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_cloud(tmp_path / "none.ply")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_cloud(tmp_path / "no" / "c.ply", sample())
+    with pytest.raises(InputError, match="cannot write the format"):
+        write_cloud(tmp_path / "c.stl", sample())
