@@ -5,13 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from perception.errors import InputError
 from perception.io.store import GaussianMap, read_map
 from perception.types import OrientedBox
+
+if TYPE_CHECKING:
+    from perception.language.ranking import Ranker
 
 
 @dataclass(frozen=True)
@@ -59,9 +62,10 @@ class LoadedMap:
         return self.gmap.instances
 
     @cached_property
-    def _language(self) -> tuple[list[Any], Any]:
+    def _ranker(self) -> Ranker:
         from perception.language import make_encoder
         from perception.language.description import check_encoder, from_arrays
+        from perception.language.ranking import Ranker
 
         if not self.gmap.language:
             raise InputError(f"{self.path}: holds no language embeddings; map again with an encoder (language.encoder=…)")
@@ -71,27 +75,23 @@ class LoadedMap:
         if encoder is None:
             raise InputError(f"{self.path}: was mapped without an encoder; map again with language.encoder=conse")
         check_encoder(identity, encoder.identity)
-        return descriptions, encoder
+        return Ranker(descriptions, encoder, [entry.get("label") for entry in self.instances])
 
     def query(self, text: str, top_k: int = 3, min_score: float | None = None) -> list[Hit]:
         """The instances that answer `text`, best first, at most top_k; empty when it is not present.
 
         With `min_score` the encoder's own judgement of presence is replaced by that bound on the score.
         """
-        from perception.language.ranking import rank
-
         if not text.strip():
             raise InputError("query: the text is empty; ask for a thing, such as \"red mug\"")
         if top_k < 1:
             raise InputError(f"query: top_k is {top_k}, expected at least 1")
         if not self.instances:
             return []
-        descriptions, encoder = self._language
-        labels = {i: entry["label"] for i, entry in enumerate(self.instances) if entry.get("label")}
-        ranking = rank(text, descriptions, encoder, labels=labels)
-        if min_score is None and not ranking.present:
+        answer = self._ranker.rank(text, min_score)
+        if not answer.present:
             return []
-        chosen = [(i, s) for i, s in ranking.ranked if min_score is None or s >= min_score]
+        chosen = answer.hits if min_score is None else [(i, s) for i, s in answer.hits if s >= min_score]
         return [self.hit(i, s) for i, s in chosen[:top_k]]
 
     def hit(self, instance: int, score: float = 1.0) -> Hit:

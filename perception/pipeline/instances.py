@@ -97,7 +97,7 @@ def _embed(
     """Language arrays of all instances from their best views (paper eq. 8); {} without an encoder."""
     from perception.instances.crops import choose_views, view_scores
     from perception.language import make_encoder
-    from perception.language.describe import describe_instances
+    from perception.instances.describe import describe_instances
     from perception.language.description import to_arrays
 
     spec = config.language.encoder
