@@ -183,5 +183,8 @@ def test_empty_and_bad_input():
         ours.step(torch.ones(3, dtype=torch.bool), tensors(4))
     with pytest.raises(InputError, match="gradient of means"):
         ours.step(None, {"means": torch.zeros(5, 3)})
+    ours.rates["sh"] = torch.ones(7)
+    with pytest.raises(InputError, match="rates of sh are 7, expected 1 or 48"):
+        ours.step(None, tensors(4))
     with pytest.raises(InputError, match="append"):
         ours.append({"means": torch.zeros(1, 3)})

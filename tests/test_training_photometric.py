@@ -157,6 +157,10 @@ def test_bad_input_is_told():
     x, y = images(10, 12)
     with pytest.raises(InputError, match="shapes"):
         photometric_loss(x, y[:5])
+    with pytest.raises(InputError, match="1 to 16 channels"):
+        photometric_loss(torch.zeros(4, 4, 17), torch.zeros(4, 4, 17))
+    with pytest.raises(InputError, match="not empty"):
+        photometric_loss(torch.zeros(0, 4, 3), torch.zeros(0, 4, 3))
     with pytest.raises(InputError, match="beta"):
         photometric_loss(x, y, 1.5)
     with pytest.raises(InputError, match="weight"):

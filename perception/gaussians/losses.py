@@ -93,6 +93,10 @@ def photometric(
         raise InputError(
             f"photometric loss: render and target have shapes {found}, expected one shape [H, W, C]"
         )
+    if render.numel() == 0 or render.shape[2] > 16:
+        raise InputError(
+            f"photometric loss: images are {list(render.shape)}, expected 1 to 16 channels, not empty"
+        )
     if not 0 <= beta <= 1:
         raise InputError(f"photometric loss: beta is {beta}, expected 0 to 1")
     _ready("render", render)

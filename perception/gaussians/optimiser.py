@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -92,12 +93,15 @@ class SparseAdam:
         if not param.numel():
             return 0, 0
         rows = (len(param), -1)
-        flat = [t.detach().view(rows) for t in (param, self._first[name], self._second[name])]
-        gradient = grad.detach().contiguous().view(rows)
-        rate = torch.as_tensor(self.rates[name], dtype=torch.float64).reshape(-1)
-        rate = rate.expand(flat[0].shape[1]).contiguous()
-        param, first, second = flat
-        return _kernels.adam(param, gradient, first, second, visible, rate, self.steps, *self.betas, self.eps)
+        tensors = (param, grad.contiguous(), self._first[name], self._second[name])
+        arrays = [t.detach().view(rows).numpy() for t in tensors]
+        width = arrays[0].shape[1]
+        rate = np.asarray(self.rates[name], dtype=np.float64).reshape(-1)
+        if rate.size not in (1, width):
+            raise InputError(f"SparseAdam: rates of {name} are {rate.size}, expected 1 or {width}")
+        rate = np.ascontiguousarray(np.broadcast_to(rate, width))
+        mask = None if visible is None else visible.numpy()
+        return _kernels.adam(*arrays, mask, rate, self.steps, *self.betas, self.eps)
 
     def zero_grad(self) -> None:
         """Drops all gradients."""

@@ -1,6 +1,7 @@
 // Adam on selected rows (Kingma & Ba 2015, algorithm 1, on the rows a mask selects).
 #pragma once
 #include "table.h"
+#include "vector.h"
 
 namespace perception::training::PERCEPTION_LEVEL {
 
@@ -8,11 +9,18 @@ inline float root(float x) { return __builtin_sqrtf(x); }
 inline double root(double x) { return __builtin_sqrt(x); }
 
 template <class T>
-bool all_finite(const T *__restrict values, int64_t n) {
-  // x - x is 0 for a finite x and NaN otherwise; NaN is the only value not equal to itself.
-  int bad = 0;
-  for (int64_t i = 0; i < n; ++i) bad |= !(values[i] - values[i] == T(0));
-  return !bad;
+bool all_finite(const T *values, int64_t n) {
+  // 0 x is 0 for a finite x and NaN otherwise, and NaN stays in a sum.
+  constexpr int size = Pack<T>::size;
+  typename Pack<T>::type lanes[4] = {};
+  int64_t i = 0;
+  for (; i + 4 * size <= n; i += 4 * size)
+    for (int k = 0; k < 4; ++k) lanes[k] += T(0) * PERCEPTION_LOAD(T, values + i + k * size);
+  T sum = 0;
+  for (; i < n; ++i) sum += T(0) * values[i];
+  const typename Pack<T>::type all = (lanes[0] + lanes[1]) + (lanes[2] + lanes[3]);
+  for (int k = 0; k < size; ++k) sum += all[k];
+  return sum == T(0);
 }
 
 // RateStep 0: one rate for all elements; 1: one per element. Selected: where select is 0 the factors become 1 and 0,
