@@ -137,5 +137,7 @@ def _title(strip: np.ndarray, text: str) -> None:
     from PIL import Image, ImageDraw, ImageFont
 
     image = Image.fromarray(strip)
-    ImageDraw.Draw(image).text((2, strip.shape[0] // 2), text, fill=(40, 40, 40), anchor="lm", font=ImageFont.load_default(size=14))
+    ImageDraw.Draw(image).text(
+        (2, strip.shape[0] // 2), text, fill=(40, 40, 40), anchor="lm", font=ImageFont.load_default(size=14)
+    )
     strip[:] = np.asarray(image)
