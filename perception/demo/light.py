@@ -128,15 +128,21 @@ def bake(around: list[Caster], part: Part, rng: np.random.Generator, samples: in
     start = points + 1e-3 * normals
     light = _lamp(around, start, normals, rng, samples) + _sky(around, start, normals, rng, samples)
     light = light.reshape(rows, columns, 3).astype(np.float32)
-    wide = np.concatenate([light[:, -4:], light, light[:, :4]], 1)  # the chart of a round thing closes on itself
-    wide = cv2.GaussianBlur(wide if wide.shape[1] > 12 else light, (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
+    wide = np.concatenate(
+        [light[:, -4:], light, light[:, :4]], 1
+    )  # the chart of a round thing closes on itself
+    wide = cv2.GaussianBlur(
+        wide if wide.shape[1] > 12 else light, (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE
+    )
     light = wide[:, 4:-4] if wide.shape[1] > columns else wide
     height, width = part.paint.shape[:2]
     light = cv2.resize(light, (width, height), interpolation=cv2.INTER_LINEAR)
     part.lit = _RECORD[(_linear(part.paint) * light * _STEPS).astype(np.int32).clip(0, len(_RECORD) - 1)]
 
 
-def _lamp(around: list[Caster], start: np.ndarray, normals: np.ndarray, rng: np.random.Generator, samples: int):
+def _lamp(
+    around: list[Caster], start: np.ndarray, normals: np.ndarray, rng: np.random.Generator, samples: int
+):
     """Light [N, 3] of the round lamp: mean over its disc of visibility × cosine / distance²."""
     total = np.zeros(len(start))
     shift = rng.random((len(start), 2))
@@ -158,7 +164,9 @@ def _lamp(around: list[Caster], start: np.ndarray, normals: np.ndarray, rng: np.
     return total[:, None] / samples * LAMP_COLOR
 
 
-def _sky(around: list[Caster], start: np.ndarray, normals: np.ndarray, rng: np.random.Generator, samples: int):
+def _sky(
+    around: list[Caster], start: np.ndarray, normals: np.ndarray, rng: np.random.Generator, samples: int
+):
     """Light [N, 3] from all around: cosine-spread rays; one that meets a body brings a little of its colour."""
     tints = np.array([caster.tint for caster in around] + [np.zeros(3)])
     helper = np.where(np.abs(normals[:, :1]) > 0.7, [[0.0, 1, 0]], [[1.0, 0, 0]])

@@ -81,7 +81,10 @@ def _window(part: Part, camera: Camera, samples: int) -> tuple[slice, slice] | N
         return None
     if (z <= 0.02).any():  # reaches behind the camera: projected bounds mean nothing
         return slice(None), slice(None)
-    low, high = np.floor(pixels.min(0) * samples).astype(int) - 1, np.ceil(pixels.max(0) * samples).astype(int) + 1
+    low, high = (
+        np.floor(pixels.min(0) * samples).astype(int) - 1,
+        np.ceil(pixels.max(0) * samples).astype(int) + 1,
+    )
     low, high = np.maximum(low, 0), np.minimum(high, np.array([camera.width, camera.height]) * samples)
     return (slice(low[1], high[1]), slice(low[0], high[0])) if (high > low).all() else None
 
@@ -114,7 +117,9 @@ def _sample(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return cv2.remap(picture, *folded, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).reshape(-1, 3)[: len(x)]
 
 
-def _add_highlight(part: Part, sampled: np.ndarray, u: np.ndarray, v: np.ndarray, eye: np.ndarray) -> np.ndarray:
+def _add_highlight(
+    part: Part, sampled: np.ndarray, u: np.ndarray, v: np.ndarray, eye: np.ndarray
+) -> np.ndarray:
     """Blinn-Phong gleam of the lamp, only where the baked light says that the lamp is seen."""
     points, normals = part.shape.point_normal(u, v)
     points, normals = to_world(part.shape, points), normals @ part.shape.rotation.T

@@ -33,7 +33,9 @@ def make_photos(
     The same arguments give the same photos. Distances in metres, z up, the origin on the middle of the table top.
     """
     if views < 3 or width < 64 or height < 48:
-        raise InputError(f"demo photos: {views} views of {width}x{height} asked; at least 3 views of 64x48 are needed")
+        raise InputError(
+            f"demo photos: {views} views of {width}x{height} asked; at least 3 views of 64x48 are needed"
+        )
     folder = Path(folder)
     truth_folder = folder.parent / "truth"
     folder.mkdir(parents=True, exist_ok=True)
@@ -91,13 +93,22 @@ def _surface(bodies: list[Body], rng: np.random.Generator) -> tuple[np.ndarray, 
             v = np.arccos(1 - 2 * v) / np.pi  # even over a ball
         p, n = part.shape.point_normal(u, v)
         rows, across = part.lit.shape[:2]
-        color = part.lit[np.minimum(v * rows, rows - 1).astype(int), np.minimum(u * across, across - 1).astype(int)]
+        color = part.lit[
+            np.minimum(v * rows, rows - 1).astype(int), np.minimum(u * across, across - 1).astype(int)
+        ]
         for column, value in zip(
-            columns, (to_world(part.shape, p), n @ part.shape.rotation.T, color, np.full(count, body.id)), strict=True
+            columns,
+            (to_world(part.shape, p), n @ part.shape.rotation.T, color, np.full(count, body.id)),
+            strict=True,
         ):
             column.append(value)
     points, normals, colors, ids = (np.concatenate(column) for column in columns)
-    return points.astype(np.float32), normals.astype(np.float32), colors.astype(np.uint8), ids.astype(np.int32)
+    return (
+        points.astype(np.float32),
+        normals.astype(np.float32),
+        colors.astype(np.uint8),
+        ids.astype(np.int32),
+    )
 
 
 def _times_seen(

@@ -194,9 +194,7 @@ def _segment_roots(
             return [(t, (radius - r0) / (r1 - r0))]
         slope = (r1 - r0) / (z1 - z0)
         radius = r0 + slope * (oz - z0)
-        roots = _quadratic(
-            dd - (slope * slope) * dz * dz, od - slope * dz * radius, oo - radius * radius
-        )
+        roots = _quadratic(dd - (slope * slope) * dz * dz, od - slope * dz * radius, oo - radius * radius)
         return [(t, (oz + t * dz - z0) / (z1 - z0)) for t in roots]
 
 

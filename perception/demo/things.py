@@ -25,19 +25,19 @@ def mug(rng: np.random.Generator, id: int, name: str, place: Place, turn: float,
     cup = Lathe(np.array(profile), turned, _at(place))
     outward, up = turned[:, 0], np.array([0, 0, 1.0])
     handle = Tube(
-        0.026, np.radians(-105), np.radians(105), np.full(9, 0.0056),
+        0.0295, np.radians(-105), np.radians(105), np.full(9, 0.0064),
         np.stack([outward, up, np.cross(outward, up)], 1), _at(place, 0.05) + 0.0425 * outward,
     )  # fmt: skip
     grip = np.ascontiguousarray(paint[5:45, :60])
-    return Body(id, name, [name, "coffee mug"], [Part(cup, paint, 0.5, (40, 48)), Part(handle, grip, 0.5, (12, 32))])
+    return Body(
+        id, name, [name, "coffee mug"], [Part(cup, paint, 0.5, (40, 48)), Part(handle, grip, 0.5, (12, 32))]
+    )
 
 
 def mug_paint(rng: np.random.Generator, color: str, ink: str, word: str) -> np.ndarray:
-    """Glaze with a printed word and a band on the outer wall (profile share .20 to .52 of the chart)."""
+    """Glaze with a printed word twice on the outer wall (profile share .20 to .52 of the chart)."""
     height, width = 480, 560
-    paint = tex.glaze(rng, height, width, color, [ink, "#ffffff", "#1c1c1c"], 420)
-    for row in (112, 236):
-        paint[row : row + 5] = tex.rgb(ink)
+    paint = tex.glaze(rng, height, width, color, [ink, "#1c1c1c"], 90)
     for column in (70, 350):
         # The profile runs upwards, the chart's rows with it: print upside down to read upright.
         label = tex.draw_text(paint[120:234, column : column + 200][::-1], word, (100, 57), 52, ink)
@@ -142,10 +142,14 @@ def book(rng: np.random.Generator, id: int, name: str, place: Place, turn: float
     spine = tex.glaze(rng, 100, 560, "#0d4f4a", ["#1c8a78"], 200)
     spine = tex.draw_text(spine, "BIRDS OF THE NORTH", (280, 50), 38, "#f2d98a")
     lines = tex.noise(rng, 100, 560, (50, 3), 2)
-    pages = tex.blend(0.35 + 0.25 * lines, tex.rgb("#f1e8d2") * np.ones((100, 560, 3), np.float32), tex.rgb("#a8946a"))
+    pages = tex.blend(
+        0.35 + 0.25 * lines, tex.rgb("#f1e8d2") * np.ones((100, 560, 3), np.float32), tex.rgb("#a8946a")
+    )
     for edge in (slice(0, 8), slice(-8, None)):
         pages[edge] = tex.rgb("#0a3330")
-    parts = box_parts(_at(place, thick / 2), (width, depth, thick), spin(turn), [cover, spine, pages, pages, pages, spine])
+    parts = box_parts(
+        _at(place, thick / 2), (width, depth, thick), spin(turn), [cover, spine, pages, pages, pages, spine]
+    )
     return Body(id, name, [name, "green book", "hardback book"], parts)
 
 
@@ -159,7 +163,13 @@ def cactus(rng: np.random.Generator, id: int, name: str, place: Place) -> Body:
         0.4 + 0.25 * tex.noise(rng, 360, 560, (8, 12), 5), tex.rgb("#c76b3f") * np.ones((360, 560, 3), np.float32),
         tex.rgb("#9a4a29"),
     )  # fmt: skip
-    clay[250:] = tex.speckle(rng, tex.rgb("#3b2a1d") * np.ones((110, 560, 3), np.float32), 900, (1, 4), ["#6d5137", "#1f150e", "#8d7454"])
+    clay[250:] = tex.speckle(
+        rng,
+        tex.rgb("#3b2a1d") * np.ones((110, 560, 3), np.float32),
+        900,
+        (1, 4),
+        ["#6d5137", "#1f150e", "#8d7454"],
+    )
     stem = Ellipsoid(np.array([0.027, 0.027, 0.075]), spin(20), _at(place, 0.128))
     parts = [Part(pot, clay, 0.0, (32, 40)), Part(stem, _ribs(rng, 400, 460, 13), 0.0, (32, 52))]
     for side, height, size in ((15.0, 0.135, 0.026), (195.0, 0.115, 0.024)):
@@ -176,7 +186,9 @@ def _ribs(rng: np.random.Generator, height: int, width: int, count: int) -> np.n
     """Cactus skin: light ridges set with pale spines, dark valleys."""
     u = (np.arange(width) + 0.5) / width * count
     ridge = (0.5 + 0.5 * np.cos(2 * np.pi * u))[None] * np.ones((height, 1))
-    skin = tex.blend(ridge + 0.12 * tex.noise(rng, height, width, (8, 8), 4), tex.rgb("#1f4a26"), tex.rgb("#5f9a4a"))
+    skin = tex.blend(
+        ridge + 0.12 * tex.noise(rng, height, width, (8, 8), 4), tex.rgb("#1f4a26"), tex.rgb("#5f9a4a")
+    )
     rows = np.arange(6, height - 4, 13)
     for k in range(count):
         for y in rows + int(rng.integers(0, 7)):
@@ -209,4 +221,9 @@ def clock(rng: np.random.Generator, id: int, name: str, center: np.ndarray) -> B
     cv2.circle(dial, (240, 240), 14, tex.rgb("#b3271e").tolist(), -1, cv2.LINE_AA)
     face = Sheet(0.236, 0.236, facing, center + np.array([0, -0.019, 0]), elliptic=True)
     wood = tex.wood(rng, 120, 600, 1, "#4a2c1a", "#23130a")
-    return Body(id, name, [name, "clock", "round clock"], [Part(case, wood, 0.3, (12, 56)), Part(face, dial, 0.0, (24, 24))])
+    return Body(
+        id,
+        name,
+        [name, "clock", "round clock"],
+        [Part(case, wood, 0.3, (12, 56)), Part(face, dial, 0.0, (24, 24))],
+    )

@@ -67,7 +67,9 @@ class DemoTruth:
             "queries": [{"text": text, "instance_ids": ids} for text, ids in self.queries],
         }
         (self.folder / "scene.json").write_text(json.dumps(scene, indent=1))
-        (self.folder / "transforms.json").write_text(json.dumps(_transforms(self.names, self.cameras), indent=1))
+        (self.folder / "transforms.json").write_text(
+            json.dumps(_transforms(self.names, self.cameras), indent=1)
+        )
         _write_points(self.folder / "gt_points.ply", self)
 
 
@@ -99,11 +101,21 @@ def load_truth(folder: Path | str) -> DemoTruth:
 def _transforms(names: list[str], cameras: list[Camera]) -> dict[str, Any]:
     first = cameras[0]
     frames = [
-        {"file_path": f"images/{name}", "transform_matrix": (np.linalg.inv(camera.camera_from_world) @ FLIP).tolist()}
+        {
+            "file_path": f"images/{name}",
+            "transform_matrix": (np.linalg.inv(camera.camera_from_world) @ FLIP).tolist(),
+        }
         for name, camera in zip(names, cameras, strict=True)
     ]
     K = first.K
-    intrinsics = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": first.width, "h": first.height}
+    intrinsics = {
+        "fl_x": K[0, 0],
+        "fl_y": K[1, 1],
+        "cx": K[0, 2],
+        "cy": K[1, 2],
+        "w": first.width,
+        "h": first.height,
+    }
     return {"camera_model": "OPENCV", **intrinsics, "frames": frames}
 
 
@@ -123,5 +135,12 @@ def _write_points(path: Path, truth: DemoTruth) -> None:
     data["instance_id"] = truth.instance_ids
     types = {"<f4": "float", "|u1": "uchar", "<i4": "int"}
     lines = [f"property {types[_VERTEX[name].str]} {name}" for name in _VERTEX.names or ()]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(data)}", *lines, "end_header", ""]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(data)}",
+        *lines,
+        "end_header",
+        "",
+    ]
     path.write_bytes("\n".join(header).encode() + data.tobytes())

@@ -25,10 +25,14 @@ def read_camera(path: Path) -> Lens:
     matrix = _numbers(_data(data, "camera_matrix"), 9, path, "camera_matrix.data").reshape(3, 3)
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
     if min(width, height) < 1 or min(fx, fy) <= 0:
-        raise InputError(f"{path}: image size and focal lengths must be positive, found {width}×{height}, {fx:g}, {fy:g}")
+        raise InputError(
+            f"{path}: image size and focal lengths must be positive, found {width}×{height}, {fx:g}, {fy:g}"
+        )
     name = data.get("distortion_model", "plumb_bob")
     if name not in _COUNTS:
-        raise InputError(f"{path}: distortion_model '{name}' is not known; expected one of {', '.join(_COUNTS)}")
+        raise InputError(
+            f"{path}: distortion_model '{name}' is not known; expected one of {', '.join(_COUNTS)}"
+        )
     values = _data(data, "distortion_coefficients")
     found = len(values) if isinstance(values, (list, tuple)) else 0
     if found not in _COUNTS[name]:
@@ -59,7 +63,9 @@ def _load(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(f"{path}: not a readable YAML file; expected ROS camera_info") from error
     if not isinstance(data, dict):
-        raise InputError(f"{path}: expected a ROS camera_info mapping with image_width, image_height, camera_matrix")
+        raise InputError(
+            f"{path}: expected a ROS camera_info mapping with image_width, image_height, camera_matrix"
+        )
     return data
 
 

@@ -1,0 +1,128 @@
+"""COLMAP workspaces: `images/` beside `sparse/0`, `sparse/*` or `sparse`, binary or text, any undistortable camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.features import Progress
+from perception.io.lens import lens_from_camera, load_pycolmap
+from perception.io.triangulate import MIN_POINTS, cloud_of, triangulated_cloud
+from perception.io.views import fit_lens, make_view
+from perception.types import Lens, Scene, View
+
+
+def is_workspace(folder: Path) -> bool:
+    """True for a folder with photos in `images/` and a sparse model."""
+    return (folder / "images").is_dir() and bool(_models(folder))
+
+
+def read_workspace(folder: Path, workdir: Path, seed: int, progress: Progress) -> Scene:
+    """The largest sparse model of a workspace as a Scene, in COLMAP's world. Photos that are missing are reported."""
+    found = {path: _read_model(path) for path in _models(folder)}
+    path, model = max(found.items(), key=lambda item: item[1].num_reg_images())
+    if model.num_reg_images() == 0:
+        raise InputError(f"{path}: the sparse model is empty (no registered photo); run structure from motion again")
+    views, missing, notes = views_of_model(model, folder / "images", path)
+    if not views:
+        raise InputError(f"{folder / 'images'}: none of the {model.num_reg_images()} photos of {path} is there")
+    report: dict[str, Any] = {
+        "input": "colmap",
+        "model": path.relative_to(folder).as_posix(),
+        "registered": len(views),
+        "left_out": missing,
+        "cameras": sorted({_camera_text(lens_from_camera(c)) for c in model.cameras.values()}),
+        "mean_reprojection_error_px": _reprojection_error(model),
+        "warnings": notes,
+        "seconds": {},
+    }
+    if len(found) > 1:
+        sizes = ", ".join(f"{p.name}: {m.num_reg_images()}" for p, m in found.items())
+        notes.append(f"{folder}: {len(found)} sparse models (photos in {sizes}); the largest is used")
+    points, colors = cloud_of(model)
+    if len(points) < MIN_POINTS:
+        notes.append(f"{path}: the sparse model holds {len(points)} points; new ones are triangulated")
+        points, colors, facts = triangulated_cloud(views, folder / "images", workdir, seed, progress)
+        notes += facts.pop("warnings")
+        report.update(facts)
+    report["points"] = len(points)
+    return Scene(views, points, colors, report=report)
+
+
+def views_of_model(
+    model: Any, images: Path, source: Path
+) -> tuple[list[View], list[dict[str, str]], list[str]]:
+    """Views sorted by name, photos left out with the reason, notes."""
+    views, missing, notes = [], [], set()
+    lenses = {camera_id: lens_from_camera(camera) for camera_id, camera in model.cameras.items()}
+    for image_id in model.reg_image_ids():
+        image = model.images[image_id]
+        photo = images / image.name
+        if not photo.is_file():
+            missing.append({"name": image.name, "why": "in the sparse model, but the photo is missing"})
+            continue
+        lens, note = fit_lens(lenses[image.camera_id], photo, source)
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().matrix()
+        views.append(make_view(image.name, photo, lens, pose, source))
+        if note:
+            notes.add(note)
+    views.sort(key=lambda view: view.name)
+    return views, sorted(missing, key=lambda item: item["name"]), sorted(notes)
+
+
+def _camera_text(lens: Lens) -> str:
+    return f"{lens.model} {lens.width}×{lens.height} " + " ".join(f"{value:.6g}" for value in lens.params)
+
+
+def _reprojection_error(model: Any) -> float | None:
+    """Mean error in pixels recomputed from tracks (files may lack it); None without observations."""
+    if not any(point.track.length() for point in model.points3D.values()):
+        return None
+    model.update_point_3d_errors()
+    error = float(model.compute_mean_reprojection_error())
+    return error if np.isfinite(error) else None
+
+
+def _models(folder: Path) -> list[Path]:
+    sparse = folder / "sparse"
+    if not sparse.is_dir():
+        return []
+    inside = sorted(path for path in sparse.iterdir() if path.is_dir())
+    return [path for path in [sparse, *inside] if _has_model(path)]
+
+
+def _has_model(path: Path) -> bool:
+    return any((path / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))
+
+
+def _read_model(path: Path) -> Any:
+    pycolmap = load_pycolmap()
+    for suffix in (".bin", ".txt"):
+        if (path / f"images{suffix}").is_file():
+            needed = [f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
+            absent = [name for name in needed if not (path / name).is_file()]
+            if absent:
+                raise InputError(f"{path}: the sparse model lacks {', '.join(absent)}")
+            break
+    _refuse_nan_text(path)
+    try:
+        return pycolmap.Reconstruction(path)
+    except (ValueError, RuntimeError, IndexError) as error:
+        reason = str(error).splitlines()[0][:120] if str(error) else "unknown reason"
+        raise InputError(f"{path}: not a readable COLMAP model ({reason})") from error
+
+
+def _refuse_nan_text(path: Path) -> None:
+    """NaN poses in a text model, told by name (reading them may end in COLMAP's own fatal checks)."""
+    file = path / "images.txt"
+    if not file.is_file() or (path / "images.bin").is_file():
+        return
+    lines = [line for line in file.read_text().splitlines() if line and not line.startswith("#")]
+    for line in lines:
+        fields = line.split()
+        if len(fields) == 10 and any(value.lower().lstrip("+-") in ("nan", "inf") for value in fields[1:8]):
+            raise InputError(f"{file}: the pose of {fields[9]} is not finite (NaN); repair or remove that photo")

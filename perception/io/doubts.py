@@ -1,0 +1,90 @@
+"""Can the model be wrong although nearly every photo registered? Equal textures fold a scene: check what can be checked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.io.lens import load_pycolmap
+
+MAX_UNREGISTERED, MAX_SECOND_MODEL, MAX_INCONSISTENT, MAX_UNMATCHED = 0.15, 0.30, 0.15, 0.30
+EPIPOLAR_TOLERANCE = 4.0 / 1000
+"""Sampson distance in normalised image coordinates: 4 pixels at a focal length of 1000."""
+
+
+def doubts_about(models: list[Any], database: Path, photos: int) -> list[str]:
+    """Warnings, one line each, about models sorted by size; models[0] is the one used."""
+    best = models[0]
+    warnings = []
+    registered = best.num_reg_images()
+    if registered < (1 - MAX_UNREGISTERED) * photos:
+        warnings.append(f"only {registered} of {photos} photos are registered")
+    if len(models) > 1 and models[1].num_reg_images() > MAX_SECOND_MODEL * registered:
+        sizes = ", ".join(str(model.num_reg_images()) for model in models)
+        warnings.append(f"the photos split into {len(models)} unconnected models (photos: {sizes}); the largest is used")
+    verified = _inlier_shares(best, database)
+    wrong = sum(share < 0.5 for share in verified.values())
+    if len(verified) >= 5 and wrong > MAX_INCONSISTENT * len(verified):
+        warnings.append(
+            f"{wrong} of {len(verified)} matched photo pairs contradict the model: it may be folded (equal textures?)"
+        )
+    lonely, near = _unmatched_neighbors(best, set(verified))
+    if near >= 5 and lonely > MAX_UNMATCHED * near:
+        warnings.append(
+            f"{lonely} of {near} photo pairs that the model puts at one place, looking the same way, do not match: "
+            "it may be folded (equal textures?)"
+        )
+    return warnings
+
+
+def _inlier_shares(model: Any, database: Path) -> dict[tuple[int, int], float]:
+    """(image, image) -> share of the verified matches that satisfy the model's epipolar geometry."""
+    pycolmap = load_pycolmap()
+    db = pycolmap.Database.open(database)
+    pairs, geometries = db.read_two_view_geometries()
+    db.close()
+    registered = set(model.reg_image_ids())
+    poses = {i: model.images[i].cam_from_world().matrix() for i in registered}
+    rays: dict[int, np.ndarray] = {i: _normalised(model.images[i]) for i in registered}
+    shares = {}
+    for pair, geometry in zip(pairs, geometries, strict=True):
+        i, j = pycolmap.pair_id_to_image_pair(pair)
+        if i not in registered or j not in registered or len(geometry.inlier_matches) < 30:
+            continue
+        a, b = rays[i][geometry.inlier_matches[:, 0]], rays[j][geometry.inlier_matches[:, 1]]
+        distance = _sampson(a, b, poses[i], poses[j])
+        shares[(i, j)] = float((distance < EPIPOLAR_TOLERANCE).mean())
+    return shares
+
+
+def _normalised(image: Any) -> np.ndarray:
+    pixels = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
+    return np.c_[np.asarray(image.camera.cam_from_img(pixels)).reshape(-1, 2), np.ones(len(pixels))]
+
+
+def _sampson(a: np.ndarray, b: np.ndarray, a_from_w: np.ndarray, b_from_w: np.ndarray) -> np.ndarray:
+    """First-order distance of matches a, b [M, 3] from the epipolar geometry (Hartley & Zisserman, eq. 11.9)."""
+    rotation = b_from_w[:, :3] @ a_from_w[:, :3].T
+    x, y, z = b_from_w[:, 3] - rotation @ a_from_w[:, 3]
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
+    line_b, line_a = a @ essential.T, b @ essential
+    slope = (line_b[:, :2] ** 2).sum(1) + (line_a[:, :2] ** 2).sum(1)
+    return np.abs((b * line_b).sum(1)) / np.sqrt(np.maximum(slope, 1e-30))
+
+
+def _unmatched_neighbors(model: Any, matched: set[tuple[int, int]]) -> tuple[int, int]:
+    """(pairs without matches, all pairs) among cameras close together for their depth and within 15° of view."""
+    ids = sorted(model.reg_image_ids())
+    centers = np.stack([model.images[i].projection_center() for i in ids])
+    forward = np.stack([model.images[i].viewing_direction() for i in ids])
+    xyz = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    if len(xyz) == 0:
+        return 0, 0
+    distances = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    depth = np.median(np.linalg.norm(xyz[:: max(1, len(xyz) // 2000), None] - centers[None], axis=2), axis=0)
+    close = (distances < 0.1 * np.minimum.outer(depth, depth)) & (forward @ forward.T > np.cos(np.radians(15)))
+    pairs = [(ids[r], ids[c]) for r, c in zip(*np.nonzero(np.triu(close, 1)), strict=True)]
+    alone = sum((i, j) not in matched and (j, i) not in matched for i, j in pairs)
+    return alone, len(pairs)

@@ -1,0 +1,219 @@
+"""SIFT features, pair selection and verified matches in a COLMAP database, on the CPU (pycolmap)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageOps
+
+from perception.io.atomic import atomic_directory, recover
+from perception.io.lens import load_pycolmap
+from perception.io.photos import photo_size, read_photo
+from perception.types import Lens
+
+Progress = Callable[[str, float], None]
+
+MAX_IMAGE_SIDE = 1600
+"""Larger photos are shrunk for feature extraction only; keypoints come back in full-resolution pixels."""
+UPSAMPLE_BELOW = 900
+"""SIFT starts one octave below the photo (doubled size) when the long side is under this: four times the cost."""
+MAX_FEATURES = 2048
+EXHAUSTIVE_BELOW = 20
+NEIGHBORS = 4
+"""Neighbours by name that are always matched: photos are usually taken in order."""
+COARSE_FEATURES, COARSE_MIN_MATCHES = 256, 4
+
+
+class FeatureStore:
+    """A folder with `database.db` and, when photos had to be converted, `photos/`.
+
+    names[i] is the photo's name in the database, in the order of the photos given.
+    """
+
+    def __init__(self, folder: Path, image_root: Path, names: list[str], facts: dict[str, Any]) -> None:
+        self.folder, self.image_root, self.names, self.facts = folder, image_root, names, facts
+
+    @property
+    def database(self) -> Path:
+        return self.folder / "database.db"
+
+
+def build_features(
+    root: Path, photos: list[Path], lenses: list[Lens | None], workdir: Path, seed: int, progress: Progress
+) -> FeatureStore:
+    """Extract and match; skipped when `workdir` holds the result for the same photos, lenses, seed and options.
+
+    lenses: known intrinsics per photo, or None to let structure from motion find them. Photos share one camera when
+    size, EXIF camera and known lens agree.
+    """
+    folder = workdir / f"features-{_key(photos, lenses, seed)}"
+    recover(folder)
+    facts_file = folder / "facts.json"
+    if not facts_file.exists():
+        with atomic_directory(folder) as new:
+            facts = _build(new, root, photos, lenses, seed, progress)
+            (new / "facts.json").write_text(json.dumps(facts))
+    facts = json.loads(facts_file.read_text())
+    staged = folder / "photos"
+    return FeatureStore(folder, staged if staged.is_dir() else root, facts.pop("names"), facts)
+
+
+def _build(
+    folder: Path, root: Path, photos: list[Path], lenses: list[Lens | None], seed: int, progress: Progress
+) -> dict[str, Any]:
+    pycolmap = load_pycolmap()
+    pycolmap.set_random_seed(seed)
+    started = time.perf_counter()
+    image_root, names = _stage(folder / "photos", root, photos)
+    database = folder / "database.db"
+    _extract(database, image_root, photos, names, lenses, progress)
+    extracted = time.perf_counter()
+    count, total = _match(database, folder / "pairs.txt", names, seed, progress)
+    return {
+        "names": names,
+        "pairs_matched": count,
+        "pairs_possible": total,
+        "seconds": {"features": extracted - started, "matching": time.perf_counter() - extracted},
+    }
+
+
+def _stage(staged: Path, root: Path, photos: list[Path]) -> tuple[Path, list[str]]:
+    """pycolmap ignores EXIF rotation and reads few formats: if any photo needs it, all are laid out anew."""
+    if all(_is_plain(photo) for photo in photos):
+        return root, [photo.relative_to(root).as_posix() for photo in photos]
+    names = []
+    for index, photo in enumerate(photos):
+        plain = _is_plain(photo)
+        names.append(f"{index:06d}{photo.suffix.lower() if plain else '.jpg'}")
+        target = staged / names[-1]
+        target.parent.mkdir(exist_ok=True)
+        if plain:
+            target.symlink_to(photo.resolve())
+            continue
+        with Image.open(photo) as image:
+            exif = ImageOps.exif_transpose(image).getexif() if image.getexif() else None
+        Image.fromarray(read_photo(photo)).save(target, quality=98, subsampling=0, **({"exif": exif} if exif else {}))
+    return staged, names
+
+
+def _is_plain(photo: Path) -> bool:
+    with Image.open(photo) as image:
+        upright = image.getexif().get(0x0112, 1) == 1
+        return upright and image.mode in ("RGB", "L") and image.format in ("JPEG", "PNG")
+
+
+def _extract(
+    database: Path,
+    root: Path,
+    photos: list[Path],
+    names: list[str],
+    lenses: list[Lens | None],
+    progress: Progress,
+) -> None:
+    pycolmap = load_pycolmap()
+    groups: dict[Any, list[int]] = {}
+    for index, photo in enumerate(photos):
+        groups.setdefault(lenses[index] or _camera_key(photo), []).append(index)
+    done = 0
+    for members in groups.values():
+        lens = lenses[members[0]]
+        options = pycolmap.FeatureExtractionOptions()
+        options.use_gpu = False
+        options.max_image_size = MAX_IMAGE_SIDE
+        options.sift.max_num_features = MAX_FEATURES
+        options.sift.first_octave = -1 if max(photo_size(photos[members[0]])) < UPSAMPLE_BELOW else 0
+        reader = pycolmap.ImageReaderOptions()
+        if lens is not None:
+            reader.camera_model = lens.model
+            reader.camera_params = ", ".join(map(repr, lens.params))
+        pycolmap.extract_features(
+            database, root, [names[i] for i in members], pycolmap.CameraMode.SINGLE, reader, options
+        )
+        done += len(members)
+        progress("features", done / len(photos))
+
+
+def _camera_key(photo: Path) -> tuple[Any, ...]:
+    """Photos with the same key share one camera: size, EXIF maker, model, focal length, zoom."""
+    with Image.open(photo) as image:
+        exif = image.getexif()
+        details = exif.get_ifd(0x8769)
+    return (*photo_size(photo), exif.get(0x010F), exif.get(0x0110), details.get(0x920A), details.get(0xA404))
+
+
+def _match(database: Path, pair_file: Path, names: list[str], seed: int, progress: Progress) -> tuple[int, int]:
+    pycolmap = load_pycolmap()
+    pairs = _select_pairs(database, names)
+    pair_file.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs))
+    progress("matching", 0.0)
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    verification.ransac.max_num_trials = 2000
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = pair_file
+    pycolmap.match_image_pairs(database, matching, pairing, verification)
+    progress("matching", 1.0)
+    return len(pairs), len(names) * (len(names) - 1) // 2
+
+
+def _select_pairs(database: Path, names: list[str]) -> list[tuple[int, int]]:
+    """All pairs of a small set; else neighbours by name and pairs whose largest features match.
+
+    Preemptive matching (Wu, "Towards Linear-time Incremental Structure from Motion", 3DV 2013, section 3): the
+    largest-scale features are few and predict whether a pair overlaps. It also closes loops without a vocabulary.
+    """
+    count = len(names)
+    every = list(combinations(range(count), 2))
+    if count < EXHAUSTIVE_BELOW:
+        return every
+    descriptors = _largest_features(database, names)
+    chosen = []
+    for i, j in every:
+        if j - i <= NEIGHBORS or _mutual_matches(descriptors[i], descriptors[j]) >= COARSE_MIN_MATCHES:
+            chosen.append((i, j))
+    return chosen
+
+
+def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
+    pycolmap = load_pycolmap()
+    result = []
+    db = pycolmap.Database.open(database)
+    for name in names:
+        image = db.read_image_with_name(name)
+        keypoints = db.read_keypoints(image.image_id)
+        keypoints = keypoints if isinstance(keypoints, np.ndarray) else pycolmap.keypoints_to_matrix(keypoints)
+        data = np.asarray(db.read_descriptors(image.image_id).data, dtype=np.float32)
+        area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
+        top = np.argsort(-area, kind="stable")[:COARSE_FEATURES]
+        norms = np.linalg.norm(data[top], axis=1, keepdims=True)
+        result.append(data[top] / np.maximum(norms, 1e-9))
+    db.close()
+    return result
+
+
+def _mutual_matches(a: np.ndarray, b: np.ndarray, ratio: float = 0.85) -> int:
+    """Number of mutual nearest neighbours that pass Lowe's ratio test (distances of unit descriptors)."""
+    if min(len(a), len(b)) < 2:
+        return 0
+    similarity = a @ b.T
+    best = similarity.argmax(1)
+    mutual = similarity.argmax(0)[best] == np.arange(len(a))
+    second, first = np.partition(similarity, -2, axis=1)[:, -2:].T
+    distinct = (1 - first) <= ratio**2 * (1 - second)
+    return int((mutual & distinct).sum())
+
+
+def _key(photos: list[Path], lenses: list[Lens | None], seed: int) -> str:
+    facts = [(str(p.resolve()), p.stat().st_size, p.stat().st_mtime_ns, repr(l)) for p, l in zip(photos, lenses, strict=True)]
+    options = (MAX_IMAGE_SIDE, UPSAMPLE_BELOW, MAX_FEATURES, EXHAUSTIVE_BELOW, NEIGHBORS, seed)
+    options += (COARSE_FEATURES, COARSE_MIN_MATCHES)
+    return hashlib.sha256(repr((facts, options)).encode()).hexdigest()[:12]

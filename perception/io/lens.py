@@ -1,0 +1,113 @@
+"""Lenses: from a COLMAP camera to the ideal pinhole a view is seen through, and the warp between the two."""
+
+from __future__ import annotations
+
+import os
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.types import Lens
+
+_PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+
+
+def load_pycolmap() -> Any:
+    """Import pycolmap, quietly. Every import of pycolmap goes through here.
+
+    PIL's compiled module must be loaded first: pycolmap 4.2's wheel exports its own zlib, and PIL loaded after it
+    crashes when it writes a PNG. Its log is silent unless GLOG_minloglevel is set.
+    """
+    from PIL import _imaging  # type: ignore[attr-defined]  # noqa: F401
+
+    import pycolmap  # isort: skip
+
+    if "GLOG_minloglevel" not in os.environ:
+        pycolmap.logging.minloglevel = 3
+    return pycolmap
+
+
+def lens_from_camera(camera: Any) -> Lens:
+    """The lens of a pycolmap camera."""
+    return Lens(
+        camera.model_name, tuple(float(x) for x in camera.params), int(camera.width), int(camera.height)
+    )
+
+
+def camera_from_lens(lens: Lens, camera_id: int = 1) -> Any:
+    """The pycolmap camera of a lens."""
+    pycolmap = load_pycolmap()
+    try:
+        camera = pycolmap.Camera(
+            model=lens.model,
+            width=lens.width,
+            height=lens.height,
+            params=list(lens.params),
+            camera_id=camera_id,
+        )
+        valid = camera.verify_params() and np.isfinite(lens.params).all()
+    except (ValueError, RuntimeError) as error:
+        raise InputError(
+            f"camera model {lens.model} is not known to pycolmap, or its parameters do not fit"
+        ) from error
+    if not valid or camera.mean_focal_length() <= 0:
+        raise InputError(f"camera {lens.model}: the parameters {list(lens.params)} are not valid")
+    return camera
+
+
+def rescale_lens(lens: Lens, width: int, height: int) -> Lens:
+    """The same lens for its photos resized to width × height, scaled by the true ratio of each axis."""
+    camera = camera_from_lens(lens)
+    camera.rescale(width, height)
+    return lens_from_camera(camera)
+
+
+@lru_cache(maxsize=256)
+def pinhole_from_lens(lens: Lens) -> tuple[tuple[float, float, float, float], int, int]:
+    """(fx, fy, cx, cy), width, height of the pinhole image that `lens` undistorts to.
+
+    COLMAP's default: focal lengths kept, size chosen so that no pixel is blank (0.2 to 2 times the photo). A lens
+    without distortion is returned as it is.
+    """
+    camera = camera_from_lens(lens)
+    if is_pinhole(lens):
+        focal = (camera.focal_length_x, camera.focal_length_y)
+        center = (camera.principal_point_x, camera.principal_point_y)
+        return (*focal, *center), lens.width, lens.height
+    pycolmap = load_pycolmap()
+    try:
+        ideal = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"camera model {lens.model} cannot be undistorted to a pinhole") from error
+    fx, fy, cx, cy = (float(x) for x in ideal.params)
+    if not np.isfinite([fx, fy, cx, cy]).all() or min(ideal.width, ideal.height) < 2:
+        raise InputError(f"camera {lens.model} {list(lens.params)} cannot be undistorted to a pinhole")
+    return (fx, fy, cx, cy), int(ideal.width), int(ideal.height)
+
+
+def is_pinhole(lens: Lens) -> bool:
+    """True when photos of this lens need no undistortion."""
+    if lens.model in _PINHOLES:
+        return True
+    if lens.model == "EQUIRECTANGULAR" or "FISHEYE" in lens.model or lens.model == "FOV":
+        return False
+    camera = camera_from_lens(lens)
+    return not any(camera.params[index] for index in camera.extra_params_idxs())
+
+
+@lru_cache(maxsize=4)
+def warp_grid(
+    lens: Lens, pinhole: tuple[float, float, float, float], width: int, height: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Photo coordinates x, y [height, width] float32 (pixel centres at +0.5) that each pinhole pixel centre sees."""
+    fx, fy, cx, cy = pinhole
+    camera = camera_from_lens(lens)
+    x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
+    rays = np.stack([x.ravel(), y.ravel(), np.ones(width * height)], axis=1)
+    pixels = np.asarray(camera.img_from_cam(rays), dtype=np.float32).reshape(height, width, 2)
+    grid = np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
+    for part in grid:
+        part.setflags(write=False)
+    return grid

@@ -1,0 +1,162 @@
+"""Photos: finding them, decoding them upright as 8-bit RGB, undistorting and shrinking them to a view's pinhole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from perception.errors import InputError
+from perception.io.lens import warp_grid
+from perception.types import View
+
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
+_DECODE_ERRORS = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+
+
+def list_photos(folder: Path) -> list[Path]:
+    """All photos under `folder`, sorted by their path relative to it; hidden files and folders are skipped."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of photos")
+    found = [p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file()]
+    relative = sorted(p.relative_to(folder) for p in found)
+    return [folder / p for p in relative if not any(part.startswith(".") for part in p.parts)]
+
+
+def photo_size(path: Path) -> tuple[int, int]:
+    """(width, height) of a photo after EXIF rotation, from its header."""
+    with _open(path) as image:
+        width, height = image.size
+        return (height, width) if image.getexif().get(0x0112, 1) >= 5 else (width, height)
+
+
+def check_photo(path: Path) -> None:
+    """Raise InputError when the photo cannot be decoded to its last byte (JPEG: at 1/8 size, which reads them all)."""
+    with _open(path) as image:
+        image.draft("RGB", (max(1, image.width // 8), max(1, image.height // 8)))
+        _decode(image, path)
+
+
+def read_photo(path: Path) -> np.ndarray:
+    """The photo as uint8 [h, w, 3] RGB, rotated as EXIF says.
+
+    Grey is repeated to three channels, 16 bits become 8 (v / 257 rounded), palettes are expanded; transparent pixels
+    are composited on black. Floating-point images are refused.
+    """
+    with _open(path) as image:
+        _decode(image, path)
+        return _rgb(ImageOps.exif_transpose(image), path)
+
+
+def scaled_size(view: View, max_side: int | None) -> tuple[int, int]:
+    """(width, height) of the view with its long side at most `max_side` pixels; None keeps the size, none grows."""
+    side = max(view.width, view.height)
+    if max_side is None or side <= max_side:
+        return view.width, view.height
+    return max(1, round(view.width * max_side / side)), max(1, round(view.height * max_side / side))
+
+
+def scaled_K(view: View, width: int, height: int) -> np.ndarray:
+    """Intrinsics [3, 3] float64 of the view resized to width × height: the true ratio of the sizes, per axis."""
+    return np.diag([width / view.width, height / view.height, 1.0]) @ view.K
+
+
+def load_photo(view: View, max_side: int | None = None) -> np.ndarray:
+    """The view's picture as uint8 [h, w, 3] RGB through its ideal pinhole, (w, h) = scaled_size(view, max_side).
+
+    The photo is shrunk by area averaging, then undistorted bilinearly. Nothing is cached but the warp of the last
+    lenses. A photo whose stored orientation alone agrees with the camera is taken as stored (COLMAP ignores EXIF).
+    """
+    width, height = scaled_size(view, max_side)
+    photo = _oriented(view)
+    if view.lens is None:
+        return _shrink(photo, width, height)
+    h, w = photo.shape[:2]
+    small_w = min(w, max(1, round(w * width / view.width)))
+    small_h = min(h, max(1, round(h * height / view.height)))
+    small = _shrink(photo, small_w, small_h)
+    x, y = _grid(view, width, height)
+    map_x = x * np.float32(small_w / w) - np.float32(0.5)  # cv2 has pixel centres at integers
+    map_y = y * np.float32(small_h / h) - np.float32(0.5)
+    return cv2.remap(small, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def warp_labels(view: View, labels: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Labels [H, W] in the photo's geometry to int32 [height, width] in the view's pinhole, nearest sampling.
+
+    Pixels that see nothing of the photo get 0. The label image must have the photo's size (after EXIF rotation).
+    """
+    expected = (view.height, view.width) if view.lens is None else (view.lens.height, view.lens.width)
+    if labels.ndim != 2 or labels.shape != expected:
+        found = "×".join(map(str, labels.shape[::-1]))
+        raise InputError(
+            f"{view.name}: the label image is {found}, expected {expected[1]}×{expected[0]} like the photo"
+        )
+    if view.lens is None:
+        column = ((np.arange(width) + 0.5) * view.width / width).astype(np.int64)
+        row = ((np.arange(height) + 0.5) * view.height / height).astype(np.int64)
+        return labels[row[:, None], column[None, :]].astype(np.int32)
+    x, y = _grid(view, width, height)
+    inside = (x >= 0) & (y >= 0) & (x < expected[1]) & (y < expected[0])
+    warped = np.zeros((height, width), np.int32)
+    warped[inside] = labels[y[inside].astype(np.int64), x[inside].astype(np.int64)]
+    return warped
+
+
+def _grid(view: View, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    assert view.lens is not None
+    K = scaled_K(view, width, height)
+    return warp_grid(view.lens, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), width, height)
+
+
+def _oriented(view: View) -> np.ndarray:
+    size = (view.width, view.height) if view.lens is None else (view.lens.width, view.lens.height)
+    photo = read_photo(view.photo)
+    if photo.shape[1::-1] != size:
+        with _open(view.photo) as image:
+            stored = image.size
+            if stored == size:
+                _decode(image, view.photo)
+                return _rgb(image, view.photo)
+        found = "×".join(map(str, photo.shape[1::-1]))
+        raise InputError(f"{view.photo}: the photo is {found}, its camera expects {size[0]}×{size[1]}")
+    return photo
+
+
+def _shrink(photo: np.ndarray, width: int, height: int) -> np.ndarray:
+    if photo.shape[:2] == (height, width):
+        return photo
+    return cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _open(path: Path) -> Image.Image:
+    try:
+        return Image.open(path)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such photo") from error
+    except (UnidentifiedImageError, *_DECODE_ERRORS) as error:
+        raise InputError(f"{path}: not a readable image; replace or remove it") from error
+
+
+def _decode(image: Image.Image, path: Path) -> None:
+    try:
+        image.load()
+    except _DECODE_ERRORS as error:
+        raise InputError(f"{path}: the photo is truncated or damaged; replace or remove it") from error
+
+
+def _rgb(image: Image.Image, path: Path) -> np.ndarray:
+    if image.mode.startswith("I"):  # 16-bit grey, as "I;16" or widened to "I"
+        grey = np.clip(np.asarray(image).astype(np.float64), 0, 65535)
+        eight = (grey / 257 + 0.5).astype(np.uint8)
+        return np.ascontiguousarray(np.repeat(eight[..., None], 3, axis=2))
+    if image.mode == "F":
+        raise InputError(f"{path}: floating-point images are not photos; convert it to 8 or 16 bit")
+    if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
+        rgba = image.convert("RGBA")
+        black = Image.new("RGBA", rgba.size, (0, 0, 0, 255))
+        image = Image.alpha_composite(black, rgba)
+    return np.array(image.convert("RGB"))

@@ -1,0 +1,204 @@
+"""transforms.json as nerfstudio and instant-ngp write it: camera-to-world matrices with OpenGL camera axes."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
+from perception.io.features import Progress
+from perception.io.photos import SUFFIXES, photo_size
+from perception.io.triangulate import triangulated_cloud
+from perception.io.views import fit_lens, make_view, rigid_pose
+from perception.types import Lens, Scene, View
+
+_FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE")
+
+
+def read_transforms(file: Path, workdir: Path, seed: int, progress: Progress) -> Scene:
+    """The frames of a transforms.json whose photos exist, as a Scene in the file's own world.
+
+    Intrinsics per frame win over global ones; without fl_x, camera_angle_x gives the focal length; without w, h the
+    photo does. Points come from `ply_file_path`, else they are triangulated with the given poses. The unit is never
+    trusted to be the metre. Views are named by their path below the folder that holds all photos.
+    """
+    data = _load(file)
+    frames = data["frames"]
+    if not frames:
+        raise InputError(f"{file}: 'frames' is empty; expected at least one posed photo")
+    photos, missing = _photos(file, frames)
+    if not photos:
+        raise InputError(f"{file}: none of the {len(frames)} photos it lists exists (first: {missing[0]['name']})")
+    root = _common_root(list(photos.values()))
+    views, notes = _views(file, data, frames, photos, root)
+    report: dict[str, Any] = {
+        "input": "transforms",
+        "registered": len(views),
+        "left_out": missing,
+        "warnings": notes,
+        "cameras": sorted({_summary(view) for view in views}),
+        "mean_reprojection_error_px": None,
+        "seconds": {},
+    }
+    points, colors = _listed_cloud(file, data)
+    if len(points):
+        report["points_from"] = str(data["ply_file_path"])
+    else:
+        points, colors, facts = triangulated_cloud(views, root, workdir, seed, progress)
+        notes += facts.pop("warnings")
+        report.update(facts)
+    report["points"] = len(points)
+    return Scene(views, points, colors, report=report)
+
+
+def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:
+    """(file_path, camera_from_world [4, 4], lens) of every frame, in file order; photos need not exist if w, h are given."""
+    data = _load(file)
+    return [
+        (str(frame["file_path"]), _pose(file, frame), _lens(file, {**data, **frame}, None)) for frame in data["frames"]
+    ]
+
+
+def _views(
+    file: Path, data: dict[str, Any], frames: list[dict[str, Any]], photos: dict[int, Path], root: Path
+) -> tuple[list[View], list[str]]:
+    views: dict[str, View] = {}
+    notes: set[str] = set()
+    for index, photo in photos.items():
+        frame = frames[index]
+        lens, note = fit_lens(_lens(file, {**data, **frame}, photo), photo, file)
+        name = photo.relative_to(root).as_posix()
+        if name in views:
+            notes.add(f"{name} is listed more than once; the first pose is used")
+            continue
+        views[name] = make_view(name, photo, lens, _pose(file, frame), file)
+        if note:
+            notes.add(note)
+    return [views[name] for name in sorted(views)], sorted(notes)
+
+
+def _load(file: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"{file}: no such file") from error
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"{file}: not readable JSON ({error})") from error
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list):
+        raise InputError(f"{file}: expected an object with a list 'frames' (nerfstudio / instant-ngp)")
+    for index, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not {"file_path", "transform_matrix"} <= frame.keys():
+            raise InputError(f"{file}: frame {index} lacks file_path or transform_matrix")
+    return data
+
+
+def _photos(file: Path, frames: list[dict[str, Any]]) -> tuple[dict[int, Path], list[dict[str, str]]]:
+    photos, missing = {}, []
+    for index, frame in enumerate(frames):
+        photo = _find(file.parent, str(frame["file_path"]))
+        if photo is None:
+            missing.append({"name": str(frame["file_path"]), "why": "listed, but the photo is missing"})
+        else:
+            photos[index] = photo
+    return photos, missing
+
+
+def _find(folder: Path, listed: str) -> Path | None:
+    plain = folder / listed
+    if plain.is_file():
+        return plain
+    candidates = [plain.with_name(plain.name + suffix) for suffix in sorted(SUFFIXES)]
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _common_root(photos: list[Path]) -> Path:
+    return Path(os.path.commonpath([str(photo.parent) for photo in photos]))
+
+
+def _pose(file: Path, frame: dict[str, Any]) -> np.ndarray:
+    what = f"{file}: the pose of {frame['file_path']}"
+    try:
+        matrix = np.asarray(frame["transform_matrix"], dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what} is not a 4×4 matrix of numbers") from error
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
+    return OPENCV_FROM_OPENGL @ inverse_se3(rigid_pose(matrix, what))
+
+
+def _lens(file: Path, values: dict[str, Any], photo: Path | None) -> Lens:
+    """COLMAP lens of one frame; `values` are the frame's over the file's."""
+    what = f"{file}: {values['file_path']}"
+    width, height = (_number(values, key, what) for key in ("w", "h"))
+    if width is None or height is None:
+        if photo is None:
+            raise InputError(f"{what} has no w and h")
+        width, height = photo_size(photo)
+    fx, fy = _focals(values, what, width, height)
+    cx, cy = _number(values, "cx", what), _number(values, "cy", what)
+    center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+    k1, k2, k3, k4, p1, p2 = (_number(values, key, what) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    model = str(values.get("camera_model") or "OPENCV").upper()
+    if values.get("is_fisheye") or model in _FISHEYE:
+        name, extra = "OPENCV_FISHEYE", (k1, k2, k3, k4)
+    elif model not in _PERSPECTIVE:
+        raise InputError(f"{what}: camera_model '{model}' is not supported; expected one of {_PERSPECTIVE + _FISHEYE}")
+    elif k3 or k4:
+        name, extra = "FULL_OPENCV", (k1, k2, p1, p2, k3, k4, 0.0, 0.0)
+    elif any((k1, k2, p1, p2)) and "PINHOLE" not in model:
+        name, extra = "OPENCV", (k1, k2, p1, p2)
+    else:
+        name, extra = "PINHOLE", ()
+    return Lens(name, (fx, fy, *center, *extra), int(width), int(height))
+
+
+def _focals(values: dict[str, Any], what: str, width: float, height: float) -> tuple[float, float]:
+    fx, fy = _number(values, "fl_x", what), _number(values, "fl_y", what)
+    angle_x, angle_y = _number(values, "camera_angle_x", what), _number(values, "camera_angle_y", what)
+    if fx is None and angle_x:
+        fx = 0.5 * width / math.tan(0.5 * angle_x)
+    if fy is None and angle_y and _number(values, "fl_x", what) is None:
+        fy = 0.5 * height / math.tan(0.5 * angle_y)
+    fx = fy if fx is None else fx
+    fy = fx if fy is None else fy
+    if fx is None or fy is None or min(fx, fy) <= 0:
+        raise InputError(f"{what} has no focal length; expected fl_x (pixels) or camera_angle_x (radians), above 0")
+    return fx, fy
+
+
+def _number(values: dict[str, Any], key: str, what: str) -> float | None:
+    value = values.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise InputError(f"{what}: {key} must be a finite number, found {value!r}")
+    return float(value)
+
+
+def _summary(view: View) -> str:
+    if view.lens is None:
+        return f"PINHOLE {view.width}×{view.height}"
+    return f"{view.lens.model} {view.lens.width}×{view.lens.height}"
+
+
+def _listed_cloud(file: Path, data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    empty = np.empty((0, 3)), np.empty((0, 3), np.uint8)
+    listed = data.get("ply_file_path")
+    if not listed:
+        return empty
+    path = file.parent / str(listed)
+    if not path.is_file():
+        raise InputError(f"{file}: ply_file_path {listed} does not exist; remove the entry or add the file")
+    from perception.io.cloud import read_cloud
+
+    cloud = read_cloud(path)
+    colors = np.full((len(cloud.points), 3), 128, np.uint8) if cloud.colors is None else cloud.colors
+    return np.asarray(cloud.points, dtype=np.float64), colors

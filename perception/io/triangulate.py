@@ -1,0 +1,102 @@
+"""A sparse cloud for posed photos that come without one: features matched, points triangulated with fixed poses."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from perception.geometry import inverse_se3
+from perception.io.features import Progress, build_features
+from perception.io.lens import camera_from_lens, load_pycolmap
+from perception.types import Lens, View
+
+MIN_POINTS = 50
+FALLBACK_POINTS = 5000
+
+
+def view_lens(view: View) -> Lens:
+    """The lens of the view's photo; a pinhole when the photo needs no undistortion."""
+    if view.lens is not None:
+        return view.lens
+    K = view.K
+    return Lens("PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), view.width, view.height)
+
+
+def triangulated_cloud(
+    views: list[View], root: Path, workdir: Path, seed: int, progress: Progress
+) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    """points [P, 3] float64 in the world of the views, colors [P, 3] uint8, facts for the report.
+
+    Under MIN_POINTS points, random ones in the views' frusta take their place, and a warning says so.
+    """
+    started = time.perf_counter()
+    store = build_features(root, [v.photo for v in views], [view_lens(v) for v in views], workdir, seed, progress)
+    featured = time.perf_counter()
+    points, colors, error = _triangulate(views, store, seed)
+    facts: dict[str, Any] = {
+        "points_from": "triangulated with the given poses",
+        "points": len(points),
+        "mean_reprojection_error_px": error,
+        "seconds": {**store.facts["seconds"], "triangulation": time.perf_counter() - featured},
+        "warnings": [],
+        "features_cached": featured - started < 0.5 * sum(store.facts["seconds"].values()),
+    }
+    if len(points) < MIN_POINTS:
+        facts["warnings"].append(
+            f"only {len(points)} points could be triangulated with the given poses (are they right?); "
+            f"{FALLBACK_POINTS} random points in the cameras' view are used instead"
+        )
+        points, colors = random_cloud(views, seed)
+        facts.update(points_from="random", points=len(points))
+    return points, colors, facts
+
+
+def random_cloud(views: list[View], seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Random grey points in the frusta of the views, at depths around the size of the camera path."""
+    rng = np.random.default_rng(seed)
+    worlds = np.stack([inverse_se3(v.camera_from_world) for v in views])
+    spread = np.linalg.norm(worlds[:, :3, 3] - worlds[:, :3, 3].mean(0), axis=1).mean() or 1.0
+    which = rng.integers(len(views), size=FALLBACK_POINTS)
+    depth = spread * rng.uniform(0.5, 2.5, FALLBACK_POINTS)
+    points = np.empty((FALLBACK_POINTS, 3))
+    for index, view in enumerate(views):
+        mine = which == index
+        pixel = rng.uniform(size=(int(mine.sum()), 2)) * (view.width, view.height)
+        ray = np.c_[pixel, np.ones(len(pixel))] @ np.linalg.inv(view.K).T * depth[mine, None]
+        points[mine] = ray @ worlds[index, :3, :3].T + worlds[index, :3, 3]
+    return points, np.full((FALLBACK_POINTS, 3), 128, np.uint8)
+
+
+def _triangulate(views: list[View], store: Any, seed: int) -> tuple[np.ndarray, np.ndarray, float | None]:
+    pycolmap = load_pycolmap()
+    model = pycolmap.Reconstruction()
+    db = pycolmap.Database.open(store.database)
+    cameras: set[int] = set()
+    for view, name in zip(views, store.names, strict=True):
+        image = db.read_image_with_name(name)
+        if image.camera_id not in cameras:
+            model.add_camera_with_trivial_rig(camera_from_lens(view_lens(view), image.camera_id))
+            cameras.add(image.camera_id)
+        plain = pycolmap.Image(name=name, camera_id=image.camera_id, image_id=image.image_id)
+        model.add_image_with_trivial_frame(plain, pycolmap.Rigid3d(view.camera_from_world[:3]))
+    db.close()
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = seed
+    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    with TemporaryDirectory(dir=store.folder) as out:
+        model = pycolmap.triangulate_points(model, store.database, store.image_root, out, True, options)
+    points, colors = cloud_of(model)
+    return points, colors, float(model.compute_mean_reprojection_error()) if len(points) else None
+
+
+def cloud_of(model: Any) -> tuple[np.ndarray, np.ndarray]:
+    """points [P, 3] float64 and colors [P, 3] uint8 of a pycolmap reconstruction, in the order of point ids."""
+    ids = sorted(model.points3D)
+    points = np.array([model.points3D[i].xyz for i in ids], dtype=np.float64).reshape(-1, 3)
+    colors = np.array([model.points3D[i].color for i in ids], dtype=np.uint8).reshape(-1, 3)
+    finite = np.isfinite(points).all(1)
+    return points[finite], colors[finite]

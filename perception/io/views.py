@@ -1,0 +1,54 @@
+"""From a posed lens and its photo to a View, checked; shared by all readers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from perception.errors import InputError
+from perception.geometry import nearest_rotation
+from perception.io.lens import is_pinhole, pinhole_from_lens, rescale_lens
+from perception.io.photos import check_photo, photo_size
+from perception.types import Lens, View
+
+
+def make_view(name: str, photo: Path, lens: Lens, camera_from_world: np.ndarray, source: Path) -> View:
+    """A view of `photo`, whose lens already has the photo's size; raises InputError on a NaN or non-rigid pose."""
+    pose = rigid_pose(camera_from_world, f"{source}: the pose of {name}")
+    (fx, fy, cx, cy), width, height = pinhole_from_lens(lens)
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return View(name, photo, K, width, height, pose, None if is_pinhole(lens) else lens)
+
+
+def rigid_pose(matrix: np.ndarray, what: str) -> np.ndarray:
+    """[4, 4] with an exact rotation; small numerical slack is repaired, anything else is an InputError."""
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError(f"{what} is not a finite 4×4 matrix (NaN or missing values); repair or remove that frame")
+    rotation = nearest_rotation(matrix[:3, :3])
+    if np.abs(matrix[:3, :3] - rotation).max() > 1e-2:
+        raise InputError(f"{what} is not a rigid transform (scaled, sheared or mirrored); repair or remove that frame")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, matrix[:3, 3]
+    return pose
+
+
+def fit_lens(lens: Lens, photo: Path, source: Path) -> tuple[Lens, str | None]:
+    """The lens at the photo's true size, and a note when it had to be scaled; other aspects are an InputError."""
+    check_photo(photo)
+    size = photo_size(photo)
+    if size == (lens.width, lens.height) or _stored_size(photo) == (lens.width, lens.height):
+        return lens, None
+    if size[0] * lens.height == size[1] * lens.width:
+        note = f"{photo.name}: photo {size[0]}×{size[1]}, camera {lens.width}×{lens.height}: intrinsics scaled"
+        return rescale_lens(lens, *size), note
+    raise InputError(
+        f"{source}: {photo.name} is {size[0]}×{size[1]} but its camera says {lens.width}×{lens.height}; "
+        "give the camera of these photos or the photos of this camera"
+    )
+
+
+def _stored_size(photo: Path) -> tuple[int, int]:
+    with Image.open(photo) as image:
+        return image.size

@@ -1,0 +1,143 @@
+"""Small pictures people look at: instance colours, depth, errors, outlines, montages. Images are [H, W, 3] uint8 RGB."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+GREY = np.array([128, 128, 128], np.uint8)  # the colour of "no instance"
+_GOLDEN = 0.6180339887498949
+
+
+def instance_palette(ids: int | np.ndarray | Sequence[int]) -> np.ndarray:
+    """Colours [N, 3] uint8 for instance ids (or for 0..n-1): the same id always gets the same colour, -1 is grey.
+
+    Hues step by the golden ratio, so ids near each other lie far apart on the wheel; lightness and saturation
+    change as the wheel fills up.
+    """
+    wanted = np.arange(ids) if isinstance(ids, int | np.integer) else np.asarray(ids, np.int64)
+    k = np.maximum(wanted, 0)
+    hue = (0.02 + k * _GOLDEN) % 1.0
+    saturation = np.array([0.80, 0.55, 0.95])[(k // 8) % 3]
+    value = np.array([0.95, 0.78, 0.62])[(k // 8 + k // 24) % 3]
+    hsv = np.stack([hue * 360, saturation, value], -1).astype(np.float32).reshape(1, -1, 3)
+    if not hsv.size:
+        return np.zeros((0, 3), np.uint8)
+    colors = np.round(255 * cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0]).astype(np.uint8)
+    colors[np.ravel(wanted) < 0] = GREY
+    return colors
+
+
+def colorize_instances(ids: np.ndarray) -> np.ndarray:
+    """Instance ids [H, W] (-1 = none) -> picture."""
+    present, inverse = np.unique(ids, return_inverse=True)
+    return instance_palette(present)[inverse.reshape(ids.shape)]
+
+
+def colorize_depth(depth: np.ndarray, near: float | None = None, far: float | None = None) -> np.ndarray:
+    """Depth [H, W] -> picture, near bright, far dark, evenly in 1 / depth; 0 and non-finite depths are black.
+
+    near, far: the range shown; by default the 2nd and 98th percentile of what is there.
+    """
+    valid = np.isfinite(depth) & (depth > 0)
+    if not valid.any():
+        return np.zeros((*depth.shape, 3), np.uint8)
+    lowest, highest = np.percentile(depth[valid], [2, 98])
+    near, far = (lowest if near is None else near), (highest if far is None else far)
+    inverse = 1 / np.where(valid, depth, 1)
+    span = max(1 / near - 1 / far, 1e-12)
+    level = np.clip((inverse - 1 / far) / span, 0, 1)
+    picture = _colormap(level, cv2.COLORMAP_TURBO)
+    picture[~valid] = 0
+    return picture
+
+
+def _colormap(level: np.ndarray, name: int) -> np.ndarray:
+    return cv2.applyColorMap(np.round(255 * level).astype(np.uint8), name)[..., ::-1].copy()
+
+
+def error_map(a: np.ndarray, b: np.ndarray, full: float = 0.25) -> np.ndarray:
+    """Where two pictures (uint8, or float in [0, 1]) differ: black = equal, bright = `full` or more (of 1)."""
+    if a.shape != b.shape:
+        raise ValueError(f"error_map: pictures of shapes {a.shape} and {b.shape}; they must agree")
+    difference = np.abs(_unit(a) - _unit(b)).mean(-1)
+    return _colormap(np.clip(difference / full, 0, 1), cv2.COLORMAP_INFERNO)
+
+
+def _unit(picture: np.ndarray) -> np.ndarray:
+    return picture.astype(np.float32) / 255 if picture.dtype == np.uint8 else picture.astype(np.float32)
+
+
+def overlay(photo: np.ndarray, ids: np.ndarray, alpha: float = 0.55) -> np.ndarray:
+    """Instance colours laid over a photo with a thin border between instances; -1 leaves the photo as it is."""
+    tinted = (1 - alpha) * photo + alpha * colorize_instances(ids)
+    out = np.where((ids >= 0)[..., None], tinted, photo)
+    out[_borders(ids)] = 255
+    return np.round(out).astype(np.uint8)
+
+
+def _borders(ids: np.ndarray) -> np.ndarray:
+    edge = np.zeros(ids.shape, bool)
+    edge[:, 1:] |= ids[:, 1:] != ids[:, :-1]
+    edge[1:] |= ids[1:] != ids[:-1]
+    return edge
+
+
+def outline(
+    photo: np.ndarray, mask: np.ndarray, color: tuple[int, int, int] = (255, 64, 160), thickness: int = 2
+) -> np.ndarray:
+    """A copy of the photo with the boundary of mask [H, W] bool drawn, everything outside it dimmed."""
+    out = np.where(mask[..., None], photo, np.round(photo * 0.55)).astype(np.uint8)
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(np.ascontiguousarray(out), contours, -1, color, thickness, cv2.LINE_AA)
+
+
+def features_to_rgb(features: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """Features [..., D] -> colours [..., 3] uint8: their first three principal components, stretched to 1-99 %.
+
+    mask [...]: which entries decide the axes and the stretch (default all); the sign of an axis is made definite.
+    """
+    flat = features.reshape(-1, features.shape[-1]).astype(np.float64)
+    basis = flat if mask is None or not mask.any() else flat[mask.ravel()]
+    center = basis.mean(0)
+    _, axes = np.linalg.eigh(np.cov((basis - center).T).reshape(flat.shape[1], -1))
+    axes = axes[:, ::-1][:, :3]
+    strongest = np.abs(axes).argmax(0)
+    axes = axes * np.sign(axes[strongest, np.arange(axes.shape[1])])
+    low, high = np.percentile((basis - center) @ axes, [1, 99], axis=0)
+    level = np.clip(((flat - center) @ axes - low) / np.maximum(high - low, 1e-12), 0, 1)
+    level = np.pad(level, ((0, 0), (0, 3 - level.shape[1])), constant_values=0.5)
+    return np.round(255 * level).astype(np.uint8).reshape(*features.shape[:-1], 3)
+
+
+def montage(
+    images: Sequence[np.ndarray], columns: int, titles: Sequence[str] | None = None, gap: int = 6
+) -> np.ndarray:
+    """Pictures in a grid on white, each scaled to the size of the first, a small title above each."""
+    if not images:
+        raise ValueError("montage: no images")
+    height, width = images[0].shape[:2]
+    head = 22 if titles else 0
+    rows = -(-len(images) // columns)
+    sheet = np.full((rows * (height + head + gap) + gap, columns * (width + gap) + gap, 3), 255, np.uint8)
+    for i, image in enumerate(images):
+        y, x = gap + (i // columns) * (height + head + gap), gap + (i % columns) * (width + gap)
+        if titles and i < len(titles):
+            _title(sheet[y : y + head, x : x + width], titles[i])
+        if image.shape[:2] != (height, width):
+            image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        sheet[y + head : y + head + height, x : x + width] = image
+    return sheet
+
+
+def _title(strip: np.ndarray, text: str) -> None:
+    """Writes text into a strip of a picture, in place."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    image = Image.fromarray(strip)
+    ImageDraw.Draw(image).text(
+        (2, strip.shape[0] // 2), text, fill=(40, 40, 40), anchor="lm", font=ImageFont.load_default(size=14)
+    )
+    strip[:] = np.asarray(image)

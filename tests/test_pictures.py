@@ -1,0 +1,75 @@
+"""Pictures: separation of the palette, and the other helpers against what they must show by definition."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from skimage.color import deltaE_ciede2000, rgb2lab
+
+from perception import pictures
+
+
+def test_palette_is_stable_separated_and_grey_for_none() -> None:
+    colors = pictures.instance_palette(24)
+    np.testing.assert_array_equal(
+        pictures.instance_palette([7, -1, 3]), [colors[7], pictures.GREY, colors[3]]
+    )
+    lab = rgb2lab(np.concatenate([colors, pictures.GREY[None]])[None] / 255.0)[0]
+    distance = deltaE_ciede2000(lab[:, None], lab[None])[np.triu_indices(25, 1)]
+    assert distance.min() > 5  # told apart side by side; 2.3 is about the least difference seen
+    neighbours = deltaE_ciede2000(lab[:23], lab[1:24])
+    assert neighbours.min() > 20
+    assert pictures.instance_palette(0).shape == (0, 3)
+
+
+def test_instances_and_overlay() -> None:
+    ids = np.array([[-1, -1, 2, 2]] * 4)
+    picture = pictures.colorize_instances(ids)
+    np.testing.assert_array_equal(picture[0, 0], pictures.GREY)
+    np.testing.assert_array_equal(picture[3, 3], pictures.instance_palette([2])[0])
+    photo = np.full((4, 4, 3), 90, np.uint8)
+    laid = pictures.overlay(photo, ids, 0.5)
+    np.testing.assert_array_equal(laid[:, 0], photo[:, 0])
+    assert (laid[:, 2] == 255).all()
+    np.testing.assert_array_equal(laid[0, 3], np.round((90.0 + picture[0, 3]) / 2))
+
+
+def test_error_map_is_dark_where_equal_and_bright_where_not() -> None:
+    a = np.zeros((8, 8, 3), np.uint8)
+    b = a.copy()
+    b[2, 5] = 255
+    error = pictures.error_map(a, b)
+    assert error.sum(-1).argmax() == 2 * 8 + 5 and (error[0, 0] < 10).all()
+    np.testing.assert_array_equal(error, pictures.error_map(a / 255.0, b))
+    with pytest.raises(ValueError, match="agree"):
+        pictures.error_map(a, b[:4])
+
+
+def test_depth_is_black_where_missing_and_monotone() -> None:
+    depth = np.array([[0.0, np.inf, np.nan, 1.0, 2.0, 4.0]])
+    picture = pictures.colorize_depth(depth, near=1, far=4).astype(int)
+    assert not picture[0, :3].any()
+    assert picture[0, 3, 0] > picture[0, 5, 0]  # near is red in turbo, far dark blue
+    assert not pictures.colorize_depth(np.zeros((2, 3))).any()
+
+
+def test_features_to_rgb_ignores_rotation_up_to_axis_signs() -> None:
+    rng = np.random.default_rng(0)
+    features = rng.standard_normal((40, 30, 8)) * np.array([9, 5, 3, 1, 1, 1, 0.5, 0.1])
+    turn, _ = np.linalg.qr(rng.standard_normal((8, 8)))
+    a = pictures.features_to_rgb(features).astype(int)
+    b = pictures.features_to_rgb(features @ turn).astype(int)
+    for k in range(3):
+        assert min(np.abs(a[..., k] - b[..., k]).max(), np.abs(255 - a[..., k] - b[..., k]).max()) <= 1
+    assert pictures.features_to_rgb(features[..., :2]).shape == (40, 30, 3)
+
+
+def test_outline_and_montage() -> None:
+    photo = np.full((40, 60, 3), 200, np.uint8)
+    mask = np.zeros((40, 60), bool)
+    mask[10:30, 20:40] = True
+    drawn = pictures.outline(photo, mask)
+    assert (drawn[20, 30] == 200).all() and (drawn[2, 2] == 110).all() and (drawn[10, 30] != 200).any()
+    sheet = pictures.montage([photo, drawn, photo[:20, :30]], 2, ["one", "two", "three"])
+    assert sheet.shape == (2 * (40 + 22 + 6) + 6, 2 * 66 + 6, 3)
+    np.testing.assert_array_equal(sheet[28:68, 72:132], drawn)
