@@ -1,4 +1,4 @@
-"""Cloud files against plyfile-free oracles: bytes written by hand, numpy, and invariance under a round trip."""
+"""Cloud files against plyfile-free oracles: bytes written by hand, and invariance under a round trip."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ def test_written_ply_is_what_the_contract_says(tmp_path):
 def test_binary_ply_of_both_byte_orders_with_mixed_faces(tmp_path, order):
     name = {"<": "little", ">": "big"}[order]
     header = (
-        f"ply\nformat binary_{name}_endian 1.0\ncomment odd\nelement vertex 4\nproperty double x\nproperty double y\n"
-        "property double z\nproperty ushort label\nelement face 2\nproperty list uchar int vertex_indices\n"
+        f"ply\nformat binary_{name}_endian 1.0\ncomment odd\nelement vertex 4\nproperty double x\n"
+        "property double y\nproperty double z\nproperty ushort label\nelement face 2\nproperty list uchar int vertex_indices\n"
         "property uchar flag\nelement edge 1\nproperty short a\nend_header\n"
     )
     body = b"".join(struct.pack(order + "dddH", i, 2 * i, -i, 60000 + i) for i in range(4))
@@ -107,8 +107,8 @@ def test_nan_and_infinite_points_stay_in_place(tmp_path):
 def pcd(fields: str, size: str, kind: str, points: int, data: str) -> bytes:
     count = " ".join("1" for _ in fields.split())
     return (
-        f"# .PCD\nVERSION .7\nFIELDS {fields}\nSIZE {size}\nTYPE {kind}\nCOUNT {count}\nWIDTH {points}\nHEIGHT 1\n"
-        f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {data}\n"
+        f"# .PCD\nVERSION .7\nFIELDS {fields}\nSIZE {size}\nTYPE {kind}\nCOUNT {count}\n"
+        f"WIDTH {points}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {data}\n"
     ).encode()
 
 
@@ -125,7 +125,7 @@ def test_pcd_ascii_with_packed_colour(tmp_path):
 def test_pcd_compressed_holds_fields_one_after_the_other(tmp_path):
     x, y, z = (np.arange(6) * s for s in (1.0, 2.0, 0.0))
     plain = b"".join(v.astype("<f4").tobytes() for v in (x, y, z))
-    # literal runs of at most 32 bytes, and for the 24 zero bytes of z: one literal zero, then a reference of 23
+    # literal runs of at most 32 bytes; for the 24 zero bytes of z one literal, then a reference of 23
     packed = b"".join(bytes([len(c) - 1]) + c for c in (plain[:32], plain[32:48], plain[48:49]))
     packed += bytes([7 << 5, 23 - 2 - 7, 0])
     assert lzf_decompress(packed, len(plain)) == plain

@@ -28,7 +28,7 @@ CLOUDS = {
     "integer ties": lambda rng: rng.integers(0, 4, (700, 3)).astype(float),
     "all the same": lambda rng: np.ones((100, 3)),
     "a line": lambda rng: np.outer(np.arange(200.0), [1, 0, 0]),
-    "far from the origin": lambda rng: rng.random((800, 3)) + [4e5, -5e6, 100],
+    "far from the origin": lambda rng: rng.random((800, 3)) + np.array([4e5, -5e6, 100]),
     "two scales": lambda rng: np.concatenate([rng.random((400, 3)), 1e-4 * rng.random((400, 3))]),
 }
 

@@ -172,14 +172,14 @@ def _same_length(predicted: int, true: int) -> None:
 def _overlap(
     ids: np.ndarray, scores: Sequence[float], classes: Sequence[int], table: np.ndarray, truth: Truth
 ) -> Overlap:
-    scores = np.asarray(scores, np.float64).reshape(len(ids))
-    if not np.isfinite(scores).all():
+    confidence = np.asarray(scores, np.float64).reshape(len(ids))
+    if not np.isfinite(confidence).all():
         raise InputError(
-            f"prediction: score of instance {ids[~np.isfinite(scores)][0]} is not a finite number"
+            f"prediction: score of instance {ids[~np.isfinite(confidence)][0]} is not a finite number"
         )
     return Overlap(
         pred_ids=ids,
-        pred_scores=scores,
+        pred_scores=confidence,
         pred_classes=np.asarray(classes, np.int64).reshape(len(ids)),
         pred_sizes=table.sum(axis=1),
         pred_void=table[:, -1],

@@ -26,7 +26,7 @@ def knn_edges(points: np.ndarray, k: int = 8) -> np.ndarray:
 
 
 def radius_edges(points: np.ndarray, radius: float, max_neighbors: int = 32) -> np.ndarray:
-    """Edges [E, 2] int32 between points within `radius`, of each point at most the `max_neighbors` nearest."""
+    """Edges [E, 2] int32 between points within `radius`, at most the `max_neighbors` nearest of each."""
     if not radius > 0:
         raise InputError(f"radius is {radius}; expected a positive length")
     return _edges(points, max_neighbors, radius)

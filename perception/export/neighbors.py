@@ -18,9 +18,10 @@ def cores() -> int:
 
 
 class Neighbors:
-    """A search tree over points [N, 3] (any float dtype, finite). Coordinates are taken about the points'
-    centre in float64 before they become float32, so that clouds in map coordinates far from the origin lose
-    nothing.
+    """A search tree over points [N, 3] (any float dtype, finite).
+
+    Where the cloud lies far from the origin, coordinates are taken about its centre in float64 before they
+    become float32, so that clouds in map coordinates lose nothing.
     """
 
     def __init__(self, points: np.ndarray, threads: int | None = None) -> None:
@@ -30,14 +31,17 @@ class Neighbors:
         low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
         if not np.isfinite(low + high).all():
             raise InputError("points hold NaN or infinite coordinates; leave those out before the search")
-        self.center = (low + high) / 2
+        # Coordinates small against the extent stay as they are: the difference of two near floats is exact.
+        small = np.maximum(np.abs(low), np.abs(high)).max() <= 4 * (high - low).max()
+        self.center = np.zeros(3) if small else (low + high) / 2
         self.low, self.high = low, high
         self.threads = threads or cores()
         self._tree = _core.KdTree(self.local(points), self.threads)
 
     def local(self, points: np.ndarray) -> np.ndarray:
         """points [Q, 3] about the tree's centre, as the tree sees them: float32, contiguous."""
-        return np.ascontiguousarray(np.asarray(points) - self.center, dtype=np.float32)
+        shifted = np.asarray(points) - self.center if self.center.any() else points
+        return np.ascontiguousarray(shifted, dtype=np.float32)
 
     def query(
         self, queries: np.ndarray, k: int = 1, max_distance: float = np.inf

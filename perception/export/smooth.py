@@ -23,7 +23,6 @@ from perception.export.graph import (
 )
 from perception.types import PointCloud
 
-
 COLOR_WEIGHT = 0.05  # of bare clouds: without it a poster joins its wall, whose normals are the same
 
 
@@ -33,8 +32,8 @@ class SmoothOptions:
 
     graph: "auto" (mesh edges when there are faces, else kNN), "mesh", "knn" or "radius". neighbors: of each
     point in the kNN graph. radius: length in the cloud's unit; None means three times the cloud's spacing.
-    color_weight: weight added per unit of RGB distance in [0, √3]; None means COLOR_WEIGHT, but 0 on mesh edges, where
-    ScanNet has none.
+    color_weight: weight added per unit of RGB distance in [0, √3]; None means COLOR_WEIGHT, but 0 on mesh
+    edges, where ScanNet has none.
     """
 
     k_threshold: float = 0.01

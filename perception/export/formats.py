@@ -1,0 +1,131 @@
+"""Files of labelled clouds for other programs: coloured, split, boxes, and ScanNet's submission layout."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.export.boxes import instance_boxes
+from perception.io.cloud import write_cloud
+from perception.io.cloud_atomic import replacing
+from perception.types import PointCloud
+
+Instances = Mapping[int, Mapping[str, Any]]
+NO_INSTANCE = (90, 90, 90)
+
+
+def instance_colors(labels: np.ndarray) -> np.ndarray:
+    """A fixed, well spread colour [P, 3] uint8 for each instance id, grey for −1; the same id is always the
+    same.
+
+    Hues step by the golden angle; lightness and saturation take turns, so that neighbouring ids differ
+    clearly.
+    """
+    ids, index = np.unique(labels, return_inverse=True)
+    palette = np.empty((len(ids), 3), np.uint8)
+    for row, i in enumerate(ids.tolist()):
+        palette[row] = NO_INSTANCE if i < 0 else _color(i)
+    return palette[index]
+
+
+def _color(i: int) -> tuple[int, ...]:
+    import colorsys
+
+    hue = (0.61803398875 * i) % 1.0
+    rgb = colorsys.hsv_to_rgb(hue, (0.85, 0.55, 0.95)[i % 3], (0.95, 1.0, 0.7)[(i // 3) % 3])
+    return tuple(round(255 * c) for c in rgb)
+
+
+def write_split(
+    folder: str | Path, cloud: PointCloud, labels: np.ndarray, suffix: str = ".ply"
+) -> list[Path]:
+    """One file for each instance, "<id><suffix>" in a new or empty folder, points in the cloud's order."""
+    folder = Path(folder)
+    _new_folder(folder)
+    written = []
+    for i in np.unique(labels[labels >= 0]).tolist():
+        rows = labels == i
+        part = PointCloud(
+            cloud.points[rows],
+            None if cloud.colors is None else cloud.colors[rows],
+            None if cloud.normals is None else cloud.normals[rows],
+            _faces_within(cloud.faces, rows),
+            {"instance_id": labels[rows]},
+        )
+        written.append(folder / f"{i}{suffix}")
+        write_cloud(written[-1], part)
+    return written
+
+
+def _new_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        occupied = any(folder.iterdir())
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made a folder ({error.strerror})") from error
+    if occupied:
+        raise InputError(f"{folder}: is not empty; give a new folder")
+
+
+def _faces_within(faces: np.ndarray | None, rows: np.ndarray) -> np.ndarray | None:
+    if faces is None:
+        return None
+    renumber = np.cumsum(rows) - 1
+    return renumber[faces[rows[faces].all(axis=1)]].astype(np.int32)
+
+
+def write_boxes(
+    path: str | Path,
+    points: np.ndarray,
+    labels: np.ndarray,
+    instances: Instances,
+    *,
+    frame: str = "map",
+    metric: bool = False,
+) -> dict[str, Any]:
+    """3D boxes as JSON: {"frame", "metric", "boxes": [{"id", "label", "score", "num_points", "centroid",
+    "aabb", "obb"}]}.
+    """
+    rows = []
+    for i, box in instance_boxes(points, labels).items():
+        known = instances.get(i, {})
+        rows.append({"id": i, "label": known.get("label"), "score": float(known.get("score", 1.0))} | box)
+    result = {"frame": frame, "metric": metric, "boxes": rows}
+    with replacing(path) as file:
+        file.write(json.dumps(result, indent=1).encode())
+    return result
+
+
+def write_scannet(
+    folder: str | Path,
+    scene: str,
+    labels: np.ndarray,
+    instances: Instances,
+    classes: Mapping[int, int] | None = None,
+) -> Path:
+    """ScanNet's 3D instance submission: <scene>.txt with "predicted_masks/<scene>_<nnn>.txt <class>
+    <confidence>" rows.
+
+    Each mask file has one 0 or 1 for each vertex. classes: class by instance id; None writes 1 for all. Best
+    score first.
+    """
+    folder = Path(folder)
+    masks = folder / "predicted_masks"
+    masks.mkdir(parents=True, exist_ok=True)
+    ids = np.unique(labels[labels >= 0]).tolist()
+    score = {i: float(instances.get(i, {}).get("score", 1.0)) for i in ids}
+    rows = []
+    for number, i in enumerate(sorted(ids, key=lambda i: (-score[i], i))):
+        name = f"{scene}_{number:03d}.txt"
+        digits = np.where(labels == i, ord("1"), ord("0")).astype(np.uint8)
+        with replacing(masks / name) as file:
+            file.write(np.stack([digits, np.full_like(digits, ord("\n"))], axis=1).tobytes())
+        rows.append(f"predicted_masks/{name} {1 if classes is None else classes[i]} {score[i]:.6f}\n")
+    with replacing(folder / f"{scene}.txt") as file:
+        file.write("".join(rows).encode())
+    return folder / f"{scene}.txt"

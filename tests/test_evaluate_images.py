@@ -1,0 +1,157 @@
+"""PSNR and SSIM against scikit-image; folders paired by stem; the instance evaluation from files."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import cv2
+import numpy as np
+import pytest
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from perception.errors import InputError
+from perception.evaluate.images import evaluate_images, psnr, ssim
+from perception.evaluate.instances import evaluate
+from perception.evaluate.run import run_images, run_instances
+from perception.io.cloud import write_cloud
+from perception.types import PointCloud
+
+
+def pair(h=48, w=61, seed=0):
+    rng = np.random.default_rng(seed)
+    truth = cv2.GaussianBlur(rng.random((h, w, 3)), (0, 0), 2)
+    return np.clip(truth + rng.normal(0, 0.03, truth.shape), 0, 1), truth
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_agrees_with_scikit_image(seed):
+    prediction, truth = pair(seed=seed)
+    assert psnr(prediction, truth) == pytest.approx(
+        peak_signal_noise_ratio(truth, prediction, data_range=1), abs=1e-9
+    )
+    want = structural_similarity(
+        truth,
+        prediction,
+        data_range=1,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+    )
+    assert ssim(prediction, truth) == pytest.approx(want, abs=1e-9)
+    assert ssim(truth, truth) == pytest.approx(1)
+
+
+def test_same_padding_is_a_zero_padded_convolution():
+    from scipy.ndimage import correlate
+
+    prediction, truth = pair(20, 17)
+    taps = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    window = np.outer(taps, taps)[..., None] / taps.sum() ** 2
+
+    def blur(image):
+        return correlate(image, window, mode="constant")
+
+    x, y = prediction, truth
+    mx, my = blur(x), blur(y)
+    vx, vy, c = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    want = (2 * mx * my + 1e-4) * (2 * c + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
+    assert ssim(prediction, truth, padding="same") == pytest.approx(want.mean(), abs=1e-9)
+
+
+def save(path, image):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), image)
+
+
+def test_folders_are_paired_by_stem_and_a_missing_view_scores_zero(tmp_path):
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (20, 30, 3)).astype(np.uint8)
+    for name in ("a.png", "sub/b.png", "c.png"):
+        save(tmp_path / "gt" / name, image)
+    save(tmp_path / "pred/a.png", image)
+    save(tmp_path / "pred/sub/b.png", 255 - image)
+    save(tmp_path / "pred/extra.png", image)
+    result, table = run_images(tmp_path / "pred", tmp_path / "gt")
+    views = result["views"]
+    assert views["a"]["psnr"] == 100 and views["a"]["ssim"] == pytest.approx(1)
+    assert views["c"] == {"psnr": 0.0, "ssim": 0.0, "missing": True} and result["missing"] == ["c"]
+    want = peak_signal_noise_ratio(image / 255, (255 - image) / 255, data_range=1)
+    assert views["sub/b"]["psnr"] == pytest.approx(want)
+    assert result["psnr"] == pytest.approx((100 + want) / 3) and result["without_truth"] == ["extra"]
+    assert "missing" in table and "mean" in table
+
+
+def test_sixteen_bit_grey_and_alpha_pictures_are_read_alike(tmp_path):
+    grey = np.arange(400, dtype=np.uint8).reshape(20, 20)
+    save(tmp_path / "gt/a.png", np.repeat(grey[..., None], 3, axis=2))
+    for name, image in {
+        "grey": grey,
+        "wide": grey.astype(np.uint16) * 257,
+        "alpha": np.dstack([grey, grey, grey, 0 * grey]),
+    }.items():
+        save(tmp_path / name / "a.png", image)
+        assert evaluate_images(tmp_path / name, tmp_path / "gt")["psnr"] == 100
+
+
+def test_bad_pictures_are_told(tmp_path):
+    save(tmp_path / "gt/a.png", np.zeros((20, 20, 3), np.uint8))
+    save(tmp_path / "small/a.png", np.zeros((10, 20, 3), np.uint8))
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken/a.png").write_bytes(b"no picture")
+    (tmp_path / "empty").mkdir()
+    for folder, word in (("small", "20x10 pixels"), ("broken", "not a readable"), ("nowhere", "no folder")):
+        with pytest.raises(InputError, match=word):
+            evaluate_images(tmp_path / folder, tmp_path / "gt")
+    with pytest.raises(InputError, match="no pictures"):
+        evaluate_images(tmp_path / "small", tmp_path / "empty")
+    with pytest.raises(InputError, match="at least 11"):
+        ssim(np.zeros((10, 40, 3)), np.zeros((10, 40, 3)))
+
+
+def labelled(path, ids, **labels):
+    cloud = PointCloud(np.zeros((len(ids), 3), np.float32), labels={"instance_id": np.asarray(ids, np.int32)})
+    cloud.labels |= {name: np.asarray(values, np.int32) for name, values in labels.items()}
+    write_cloud(path, cloud)
+
+
+def test_instances_from_files_with_scores_from_the_sidecar(tmp_path):
+    gt = np.repeat([1, 2, 3], 200)
+    pred = np.where(np.arange(600) < 200, 5, np.repeat([-1, 6, 7, 8, 9, 4], 100))
+    labelled(tmp_path / "gt.ply", gt, semantic_id=np.repeat([4, 4, 9], 200))
+    labelled(tmp_path / "pred.ply", pred, semantic_id=np.repeat([4, 4, 9], 200))
+    flat, table = run_instances(tmp_path / "pred.ply", tmp_path / "gt.ply")
+    assert flat["protocol"]["confidence"] == "constant 1.0" and "constant 1.0" in table
+    scores = {i: 0.9 if i == 5 else 0.1 for i in (5, 6, 7, 8, 9, 4)}
+    sidecar = {"instances": {str(i): {"score": s} for i, s in scores.items()}}
+    (tmp_path / "pred.json").write_text(json.dumps(sidecar))
+    ranked, _ = run_instances(tmp_path / "pred.ply", tmp_path / "gt.ply")
+    assert ranked["ap50"] == evaluate(pred, scores, gt)["ap50"] > flat["ap50"]
+    by_class, table = run_instances(tmp_path / "pred.ply", tmp_path / "gt.ply", "mask3d", by_class=True)
+    assert by_class["classes"]["9"]["ap50"] == 0 and by_class["classes"]["4"]["ap50"] == pytest.approx(0.5)
+    assert "class 4" in table
+    json.dumps(by_class)
+    (tmp_path / "pred.json").write_text("[]")
+    with pytest.raises(InputError, match=r"pred\.json"):
+        run_instances(tmp_path / "pred.ply", tmp_path / "gt.ply")
+
+
+def test_clouds_of_different_length_or_without_ids_are_told(tmp_path):
+    labelled(tmp_path / "a.ply", [1, 2])
+    labelled(tmp_path / "b.ply", [1, 2, 3])
+    with pytest.raises(InputError, match=r"has 2 points, the truth .* has 3"):
+        run_instances(tmp_path / "a.ply", tmp_path / "b.ply")
+    write_cloud(tmp_path / "c.ply", PointCloud(np.zeros((2, 3), np.float32)))
+    with pytest.raises(InputError, match="instance_id"):
+        run_instances(tmp_path / "c.ply", tmp_path / "a.ply")
+
+
+def test_two_hundred_by_two_hundred_on_a_million_points_is_fast():
+    rng = np.random.default_rng(0)
+    gt = rng.integers(1, 201, 1_000_000)
+    pred = np.where(rng.random(1_000_000) < 0.3, rng.integers(0, 200, 1_000_000), gt - 1)
+    began = time.process_time()
+    result = evaluate(pred, {i: i / 200 for i in range(200)}, gt)
+    assert time.process_time() - began < 2
+    assert result["num_truth"] == result["num_predictions"] == 200 and result["ap50"] == 1.0

@@ -1,0 +1,208 @@
+"""Written files read back by other libraries where they are installed, boxes against closed forms."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from perception.errors import InputError
+from perception.export.boxes import instance_boxes, oriented_box
+from perception.export.formats import instance_colors, write_boxes, write_scannet, write_split
+from perception.export.run import ExportOptions, check_overlap, export_labels, write_export
+from perception.export.smooth import SmoothOptions
+from perception.io.cloud import read_cloud, write_cloud
+from perception.types import PointCloud
+
+
+def scene(n: int = 3000):
+    rng = np.random.default_rng(0)
+    points = rng.random((n, 3)).astype(np.float32)
+    labels = (points[:, 0] * 4).astype(np.int32) - 1  # -1, 0, 1, 2 in slabs along x
+    return PointCloud(points, rng.integers(0, 256, (n, 3)).astype(np.uint8)), labels
+
+
+def test_export_takes_the_nearest_gaussian_and_drops_noise():
+    cloud, _ = scene(800)
+    rng = np.random.default_rng(1)
+    means = rng.random((900, 3))
+    ids = (means[:, 0] * 4).astype(np.int32) - 1
+    distance = np.linalg.norm(cloud.points[:, None] - means[None], axis=2)
+    plain = ExportOptions(smooth=False, drop_noise=False)
+    np.testing.assert_array_equal(export_labels(means, ids, None, cloud, plain), ids[distance.argmin(axis=1)])
+    kept = np.where(ids >= 0, distance, np.inf)
+    dropped = export_labels(means, ids, None, cloud, ExportOptions(smooth=False))
+    np.testing.assert_array_equal(dropped, ids[kept.argmin(axis=1)])
+    limited = export_labels(means, ids, None, cloud, ExportOptions(smooth=False, max_distance=0.05))
+    np.testing.assert_array_equal(limited, np.where(kept.min(axis=1) <= 0.05, dropped, -1))
+    assert (export_labels(means, np.full(900, -1, np.int32), None, cloud) == -1).all()
+
+
+def test_smoothing_repairs_wrong_gaussians_and_nan_points_get_nothing():
+    rng = np.random.default_rng(0)
+    side = np.arange(4000) % 2
+    points = np.concatenate([rng.random((4000, 2)), np.zeros((4000, 1))], axis=1)
+    points[side == 1] = points[side == 1][:, [2, 0, 1]] + [0, 0, 0.05]  # a wall beside the floor
+    normals = np.where(side[:, None] == 0, [0, 0, 1.0], [1.0, 0, 0]).astype(np.float32)
+    ids = side.astype(np.int32)
+    ids[rng.random(4000) < 0.2] = 9
+    points[17] = np.nan
+    cloud = PointCloud(points, normals=normals)
+    means = np.nan_to_num(points, nan=5.0)
+    labels = export_labels(means, ids, None, cloud, ExportOptions(smoothing=SmoothOptions(color_weight=0)))
+    assert labels[17] == -1
+    right = np.delete(labels == side, 17)
+    assert right.mean() > 0.99
+
+
+def test_export_file_and_sidecar(tmp_path):
+    cloud, labels = scene()
+    instances = {0: {"score": 0.25, "label": "mug"}, 1: {"score": 0.5, "label": None}, 7: {"score": 1.0}}
+    write_export(tmp_path / "out.ply", cloud, labels, instances)
+    back = read_cloud(tmp_path / "out.ply")
+    np.testing.assert_array_equal(back.points, cloud.points)
+    np.testing.assert_array_equal(back.labels["instance_id"], labels)
+    sidecar = json.loads((tmp_path / "out.json").read_text())["instances"]
+    assert sidecar.keys() == {"0", "1", "2"}
+    assert sidecar["0"] == {"score": 0.25, "label": "mug", "num_points": int((labels == 0).sum())}
+
+
+def test_plyfile_reads_what_is_written(tmp_path):
+    plyfile = pytest.importorskip("plyfile")
+    cloud, labels = scene(200)
+    cloud.faces = np.array([[0, 1, 2], [3, 4, 5]], np.int32)
+    write_export(tmp_path / "out.ply", cloud, labels, {})
+    data = plyfile.PlyData.read(str(tmp_path / "out.ply"))
+    np.testing.assert_array_equal(np.stack([data["vertex"][a] for a in "xyz"], axis=1), cloud.points)
+    np.testing.assert_array_equal(data["vertex"]["instance_id"], labels)
+    assert [list(f) for f in data["face"]["vertex_indices"]] == cloud.faces.tolist()
+
+
+def test_a_cloud_in_another_frame_is_told_with_its_distance():
+    cloud, _ = scene()
+    check_overlap(np.asarray(cloud.points) + 0.5, cloud.points)
+    with pytest.raises(InputError, match=r"does not overlap the map: it lies 9\.\d+ units away"):
+        check_overlap(cloud.points + np.array([10, 0, 0]), cloud.points)
+    with pytest.raises(InputError, match="NaN or infinite"):
+        check_overlap(cloud.points, np.full((3, 3), np.nan))
+
+
+def test_colours_are_fixed_by_id_and_distinct():
+    labels = np.array([3, -1, 0, 3, 41], np.int32)
+    colors = instance_colors(labels)
+    assert colors[1].tolist() == [90, 90, 90] and colors[0].tolist() == colors[3].tolist()
+    np.testing.assert_array_equal(instance_colors(np.array([41, 0])), colors[[4, 2]])
+    assert len({tuple(c) for c in instance_colors(np.arange(60)).tolist()}) == 60
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, 1.2])
+def test_the_box_of_a_turned_brick_is_the_brick(turn):
+    rng = np.random.default_rng(2)
+    brick = (rng.random((900, 3)) - 0.5) * [2.0, 0.6, 0.3]
+    brick[:8] = np.array([[x, y, z] for x in (-1, 1) for y in (-0.3, 0.3) for z in (-0.15, 0.15)])
+    c, s = np.cos(turn), np.sin(turn)
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    box = oriented_box(brick @ rotation.T + [5, -3, 1])
+    np.testing.assert_allclose(sorted(box.extent), [0.3, 0.6, 2.0], rtol=1e-9)
+    np.testing.assert_allclose(box.center, [5, -3, 1], atol=1e-9)
+    np.testing.assert_allclose(box.rotation @ box.rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(box.rotation) == pytest.approx(1)
+    local = (brick @ rotation.T + [5, -3, 1] - box.center) @ box.rotation.T
+    assert (np.abs(local) <= box.extent / 2 + 1e-9).all()
+
+
+def test_boxes_of_flat_lone_and_non_finite_instances(tmp_path):
+    points = np.array([[1, 2, 3], [0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0.5, 0.5, 0], [np.nan, 0, 0]])
+    labels = np.array([4, 2, 2, 2, 2, 2, 2], np.int32)
+    boxes = instance_boxes(points, labels)
+    assert boxes[4]["obb"]["extent"] == [0, 0, 0] and boxes[4]["centroid"] == [1, 2, 3]
+    assert sorted(boxes[2]["obb"]["extent"]) == pytest.approx([0, 1, 1]) and boxes[2]["num_points"] == 5
+    written = write_boxes(tmp_path / "b.json", points, labels, {4: {"score": 0.1, "label": "x"}}, metric=True)
+    assert json.loads((tmp_path / "b.json").read_text()) == written
+    assert [row["id"] for row in written["boxes"]] == [2, 4]
+
+
+def test_split_covers_the_labelled_points_in_order(tmp_path):
+    cloud, labels = scene()
+    cloud.faces = np.array([[0, 1, 2], np.flatnonzero(labels == 1)[:3]], np.int32)
+    paths = write_split(tmp_path / "parts", cloud, labels)
+    assert [p.name for p in paths] == ["0.ply", "1.ply", "2.ply"]
+    for path in paths:
+        part = read_cloud(path)
+        np.testing.assert_array_equal(part.points, cloud.points[labels == int(path.stem)])
+    assert read_cloud(paths[1]).faces.tolist() == [[0, 1, 2]]
+    with pytest.raises(InputError, match="not empty"):
+        write_split(tmp_path / "parts", cloud, labels)
+
+
+def test_scannet_submission_layout(tmp_path):
+    _, labels = scene(500)
+    path = write_scannet(
+        tmp_path, "scene0000_00", labels, {0: {"score": 0.2}, 1: {"score": 0.9}, 2: {"score": 0.5}}
+    )
+    rows = [line.split() for line in path.read_text().splitlines()]
+    assert [(row[1], float(row[2])) for row in rows] == [("1", 0.9), ("1", 0.5), ("1", 0.2)]
+    for row, i in zip(rows, (1, 2, 0), strict=True):
+        np.testing.assert_array_equal(np.loadtxt(tmp_path / row[0], dtype=int), labels == i)
+
+
+def test_mcap_is_read_back_by_rosbags(tmp_path):
+    highlevel = pytest.importorskip("rosbags.highlevel")
+    from perception.export.mcap import write_mcap
+
+    cloud, labels = scene(400)
+    path = tmp_path / "out.mcap"
+    write_mcap(
+        path, cloud, labels, {0: {"score": 0.25, "label": "mug"}}, frame="world", stamp_ns=3_000_000_007
+    )
+    messages = {}
+    with highlevel.AnyReader([path]) as reader:
+        for connection, time, raw in reader.messages():
+            assert time == 3_000_000_007
+            messages[connection.msgtype] = reader.deserialize(raw, connection.msgtype)
+    points = messages["sensor_msgs/msg/PointCloud2"]
+    assert points.header.frame_id == "world" and (points.header.stamp.sec, points.header.stamp.nanosec) == (
+        3,
+        7,
+    )
+    assert [(f.name, f.offset) for f in points.fields] == [
+        ("x", 0),
+        ("y", 4),
+        ("z", 8),
+        ("rgb", 12),
+        ("instance_id", 16),
+    ]
+    rows = np.frombuffer(points.data, [("p", "<f4", 3), ("rgb", "<u4"), ("i", "<i4")])
+    np.testing.assert_array_equal(rows["p"], cloud.points)
+    np.testing.assert_array_equal(rows["i"], labels)
+    np.testing.assert_array_equal(rows["rgb"] >> 8 & 255, cloud.colors[:, 1])
+    found = {d.id: d for d in messages["vision_msgs/msg/Detection3DArray"].detections}
+    assert found.keys() == {"0", "1", "2"}
+    hypothesis = found["0"].results[0].hypothesis
+    assert (hypothesis.class_id, hypothesis.score) == ("mug", 0.25)
+    size, center = found["0"].bbox.size, found["0"].bbox.center.position
+    own = cloud.points[labels == 0]
+    assert size.x * size.y * size.z <= np.ptp(own, axis=0).prod() * 1.002
+    middle = (own.min(axis=0) + own.max(axis=0)) / 2
+    np.testing.assert_allclose([center.x, center.y, center.z], middle, atol=0.02)
+
+
+def test_laz_through_laspy(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    las = laspy.create(point_format=2, file_version="1.2")
+    las.header.offsets, las.header.scales = [4e5, 5e6, 0], [0.001, 0.001, 0.001]
+    xyz = np.array([[400000.125, 5000000.5, 1.25], [400001.0, 5000002.0, 3.0]])
+    las.x, las.y, las.z = xyz.T
+    las.red, las.green, las.blue = np.array([[65535, 256, 0], [0, 65280, 512]]).T
+    las.classification = [2, 6]
+    las.write(str(tmp_path / "a.las"))
+    cloud = read_cloud(tmp_path / "a.las")
+    np.testing.assert_allclose(cloud.points, xyz, atol=1e-9)
+    assert cloud.colors.tolist() == [[255, 1, 0], [0, 255, 2]]
+    assert cloud.labels["classification"].tolist() == [2, 6]
+    write_cloud(tmp_path / "a.ply", cloud)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply").points, cloud.points)
+    (tmp_path / "b.las").write_bytes(b"nothing")
+    with pytest.raises(InputError, match="LAS"):
+        read_cloud(tmp_path / "b.las")
