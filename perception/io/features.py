@@ -28,7 +28,9 @@ MAX_FEATURES = 2048
 EXHAUSTIVE_BELOW = 20
 NEIGHBORS = 4
 """Neighbours by name that are always matched: photos are usually taken in order."""
-COARSE_FEATURES, COARSE_MIN_MATCHES = 256, 4
+COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS = 256, 4, 0.7, 6
+"""A strict ratio also keeps out pairs that only share repeated textures, which fold models; every photo keeps its
+PARTNERS best pairs so that the set stays connected."""
 
 
 class FeatureStore:
@@ -176,11 +178,13 @@ def _select_pairs(database: Path, names: list[str]) -> list[tuple[int, int]]:
     if count < EXHAUSTIVE_BELOW:
         return every
     descriptors = _largest_features(database, names)
-    chosen = []
+    votes = np.zeros((count, count), np.int64)
     for i, j in every:
-        if j - i <= NEIGHBORS or _mutual_matches(descriptors[i], descriptors[j]) >= COARSE_MIN_MATCHES:
-            chosen.append((i, j))
-    return chosen
+        votes[i, j] = votes[j, i] = _mutual_matches(descriptors[i], descriptors[j])
+    keep = votes >= COARSE_MIN_MATCHES
+    best = np.argsort(-votes, axis=1, kind="stable")[:, :PARTNERS]
+    np.put_along_axis(keep, best, np.take_along_axis(votes, best, axis=1) > 0, axis=1)
+    return [(i, j) for i, j in every if j - i <= NEIGHBORS or keep[i, j] or keep[j, i]]
 
 
 def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
@@ -200,7 +204,7 @@ def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
     return result
 
 
-def _mutual_matches(a: np.ndarray, b: np.ndarray, ratio: float = 0.85) -> int:
+def _mutual_matches(a: np.ndarray, b: np.ndarray, ratio: float = COARSE_RATIO) -> int:
     """Number of mutual nearest neighbours that pass Lowe's ratio test (distances of unit descriptors)."""
     if min(len(a), len(b)) < 2:
         return 0
@@ -215,5 +219,5 @@ def _mutual_matches(a: np.ndarray, b: np.ndarray, ratio: float = 0.85) -> int:
 def _key(photos: list[Path], lenses: list[Lens | None], seed: int) -> str:
     facts = [(str(p.resolve()), p.stat().st_size, p.stat().st_mtime_ns, repr(l)) for p, l in zip(photos, lenses, strict=True)]
     options = (MAX_IMAGE_SIDE, UPSAMPLE_BELOW, MAX_FEATURES, EXHAUSTIVE_BELOW, NEIGHBORS, seed)
-    options += (COARSE_FEATURES, COARSE_MIN_MATCHES)
+    options += (COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS)
     return hashlib.sha256(repr((facts, options)).encode()).hexdigest()[:12]
