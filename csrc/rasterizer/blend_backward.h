@@ -30,71 +30,86 @@ struct BackwardTile {
   uint32_t open;  // granules with a live pixel
 };
 
-// One pixel's cotangents, R before the first splat, all zero outside the image.
+// Feature channels of one pixel: their cotangents in terms of e = f - shift go to row (e, then e²). Returns what they
+// add to R and, through `constant`, to the alpha channel.
+template <class T, int NF, bool VAR>
+inline T load_pixel_features(int64_t at, int count, const T *shift, T a, const Outputs<T> &out, const Cotangents<T> &grad,
+                             T *row, T &constant) {
+  T g[NF] = {}, sum[NF] = {}, behind[NF], steady[NF];
+  const std::size_t bytes = count * sizeof(T);
+  std::memcpy(sum, out.features + at, bytes);
+  if (grad.features) std::memcpy(g, grad.features + at, bytes);
+  for (int c = 0; c < NF; ++c) behind[c] = g[c] * (sum[c] - shift[c] * a), steady[c] = g[c] * shift[c];
+  if constexpr (VAR) {
+    T v[NF] = {}, variance[NF] = {};
+    if (grad.variance) {
+      std::memcpy(v, grad.variance + at, bytes);
+      std::memcpy(variance, out.variance + at, bytes);
+    }
+    for (int c = 0; c < NF; ++c) {
+      const T e = sum[c] - shift[c] * a, twice = 2 * v[c] * (sum[c] - shift[c]);
+      const T square = variance[c] + e * e - (1 - a) * shift[c] * (shift[c] * a + 2 * e);  // Σ w e²
+      g[c] -= twice;
+      behind[c] += v[c] * square - twice * e;
+      steady[c] += v[c] * shift[c] * (shift[c] - 2 * sum[c]);
+      row[NF + c] = v[c];
+    }
+  }
+  T total = 0;
+  for (int c = 0; c < NF; ++c) row[c] = g[c], total += behind[c], constant += steady[c];
+  return total;
+}
+
+// One pixel's cotangents and R before the first splat.
 template <class T, int NF, bool VAR, bool DEPTH>
-void load_pixel(const Inputs<T> &in, int camera, int64_t pixel, Slice slice, const T *shift, const Outputs<T> &out,
-                const Cotangents<T> &grad, int g, int i, BackwardTile<T, NF, VAR, DEPTH> &tile) {
-  using Tile = BackwardTile<T, NF, VAR, DEPTH>;
+inline void load_pixel(const Inputs<T> &in, const T *background, int64_t pixel, Slice slice, const T *shift,
+                       const Outputs<T> &out, const Cotangents<T> &grad, int g, int i,
+                       BackwardTile<T, NF, VAR, DEPTH> &tile) {
   const T a = out.alphas[pixel], t = 1 - a;
   T constant = 0, behind = 0;
   if (slice.begin == 0) {
-    if (grad.alphas) constant += grad.alphas[pixel];
+    if (grad.alphas) constant = grad.alphas[pixel];
     for (int c = 0; c < 3; ++c) {
       const T v = grad.colors ? grad.colors[3 * pixel + c] : T(0);
-      const T background = in.background ? in.background[3 * camera + c] : T(0);
       tile.cotangent[g][c][i] = v;
-      behind += v * (out.colors[3 * pixel + c] - t * background);
-      constant -= v * background;
+      behind += v * (out.colors[3 * pixel + c] - t * background[c]);
+      constant -= v * background[c];
     }
     if constexpr (DEPTH) {
       const T v = grad.depths ? grad.depths[pixel] : T(0);
       tile.cotangent[g][3][i] = v;
       if (grad.depths) behind += v * out.depths[pixel];
     }
-  } else {
-    for (int c = 0; c < Tile::kBase; ++c) tile.cotangent[g][c][i] = 0;
   }
-  for (int c = 0; c < NF; ++c) {
-    T ge = 0, gee = 0;
-    if (c < slice.count) {
-      const int64_t at = pixel * in.dims + slice.begin + c;
-      const T sum = out.features[at], offset = shift[c], e = sum - offset * a;
-      ge = grad.features ? grad.features[at] : T(0);
-      constant += ge * offset;
-      if (VAR && grad.variance) {
-        gee = grad.variance[at];
-        const T square = out.variance[at] + e * e - t * offset * (offset * a + 2 * e);  // Σ w e²
-        constant += gee * offset * (offset - 2 * sum);
-        ge -= 2 * gee * (sum - offset);
-        behind += gee * square;
-      }
-      behind += ge * e;
-    }
-    tile.cotangent[g][Tile::kBase + c][i] = ge, tile.by_pixel[g][i][c] = ge;
-    if constexpr (VAR) tile.cotangent[g][Tile::kBase + NF + c][i] = gee, tile.by_pixel[g][i][NF + c] = gee;
-  }
+  if constexpr (NF > 0)
+    behind += load_pixel_features<T, NF, VAR>(pixel * in.dims + slice.begin, slice.count, shift, a, out, grad,
+                                              tile.by_pixel[g][i], constant);
   tile.behind[g][i] = behind - constant * t;
 }
 
 template <class T, int NF, bool VAR, bool DEPTH>
 void load_tile(const Inputs<T> &in, int camera, int x, int y, Slice slice, const T *shift, const Outputs<T> &out,
                const Cotangents<T> &grad, BackwardTile<T, NF, VAR, DEPTH> &tile) {
+  using Tile = BackwardTile<T, NF, VAR, DEPTH>;
+  T background[3] = {};
+  if (in.background) std::memcpy(background, in.background + 3 * camera, sizeof background);
   tile.open = 0;
   for (int g = 0; g < 16; ++g) {
     const uint32_t inside = pixels_inside(x, y, g, in.width, in.height);
     tile.open |= static_cast<uint32_t>(inside != 0) << g;
     for (int p = 0; p < kParts<T>; ++p) tile.live[g][p] = mask_from_bits<T>(inside >> (p * Vec<T>::kLanes));
-    for (int i = 0; i < 16; ++i) {
-      tile.transmittance[g][i] = 1;
-      if (inside >> i & 1) {
-        const int64_t row = static_cast<int64_t>(camera) * in.height + y + (g >> 2) * 4 + (i >> 2);
-        load_pixel(in, camera, row * in.width + x + (g & 3) * 4 + (i & 3), slice, shift, out, grad, g, i, tile);
-      } else {
-        tile.behind[g][i] = 0;
-        for (auto &channel : tile.cotangent[g]) channel[i] = 0;
-        for (T &v : tile.by_pixel[g][i]) v = 0;
-      }
+    for (T &t : tile.transmittance[g]) t = 1;
+    if (inside != 0xffff || slice.begin > 0) {  // what load_pixel leaves out is zero
+      std::memset(tile.cotangent[g], 0, sizeof tile.cotangent[g]);
+      std::memset(tile.by_pixel[g], 0, sizeof tile.by_pixel[g]);
+      std::memset(tile.behind[g], 0, sizeof tile.behind[g]);
     }
+    const int64_t first = (static_cast<int64_t>(camera) * in.height + y + (g >> 2) * 4) * in.width + x + (g & 3) * 4;
+    for (int i = 0; i < 16; ++i)
+      if (inside >> i & 1)
+        load_pixel(in, background, first + static_cast<int64_t>(i >> 2) * in.width + (i & 3), slice, shift, out, grad, g, i, tile);
+    for (int c = 0; c < Tile::kFeatures; ++c)
+      for (int i = 0; i < 16; ++i) tile.cotangent[g][Tile::kBase + c][i] = tile.by_pixel[g][i][c];
   }
 }
 

@@ -114,47 +114,52 @@ void forward_tile(Worker<T> &w, int x, int y, const uint32_t *list, int n, Forwa
   }
 }
 
-// Feature sum and variance of one pixel: mean m and centred second moment M2 of the weighted features, then
-// Var = Σ w f² - (Σ w f)² = M2 + A (1 - A) m², both terms non-negative.
-template <class T>
-void finish_feature(T shift, T s1, T s2, T t, T &sum, T &variance) {
-  const T a = 1 - t;
-  sum = shift * a + s1;
-  const T offset = a > 0 ? s1 / a : T(0), mean = shift + offset, m2 = s2 - s1 * offset;
-  variance = (m2 > 0 ? m2 : T(0)) + a * t * mean * mean;
+// Feature sums and variances of one pixel, from the sums about a shift: with the mean m and the centred second moment
+// M2 of the weighted features, Var = Σ w f² - (Σ w f)² = M2 + A (1 - A) m², both terms non-negative.
+template <class T, int NF, bool VAR>
+inline void write_features(const T (*sums)[16], int i, T t, int count, T *features, T *variance) {
+  T sum[NF], var[NF];
+  if constexpr (VAR) {
+    const T a = 1 - t, inverse = a > 0 ? 1 / a : T(0);
+    for (int c = 0; c < NF; ++c) {
+      const T s1 = sums[c][i], s2 = sums[NF + c][i], shift = sums[2 * NF + c][i];
+      const T offset = s1 * inverse, mean = shift + offset, m2 = s2 - s1 * offset;
+      sum[c] = shift * a + s1;
+      var[c] = (m2 > 0 ? m2 : T(0)) + a * t * mean * mean;
+    }
+    std::memcpy(variance, var, count * sizeof(T));
+  } else {
+    for (int c = 0; c < NF; ++c) sum[c] = sums[c][i];
+  }
+  std::memcpy(features, sum, count * sizeof(T));
 }
 
 template <class T, int NF, bool VAR, bool DEPTH>
 void write_tile(const Inputs<T> &in, int camera, int x, int y, Slice slice, const ForwardTile<T, NF, VAR, DEPTH> &tile,
                 const Outputs<T> &out) {
   using C = Channels<NF, VAR, DEPTH>;
-  const int64_t base = static_cast<int64_t>(camera) * in.height;
-  for (int g = 0; g < 16; ++g)
+  T background[3] = {};
+  if (in.background) std::memcpy(background, in.background + 3 * camera, sizeof background);
+  for (int g = 0; g < 16; ++g) {
+    const uint32_t inside = pixels_inside(x, y, g, in.width, in.height);
+    const int64_t first = (static_cast<int64_t>(camera) * in.height + y + (g >> 2) * 4) * in.width + x + (g & 3) * 4;
     for (int i = 0; i < 16; ++i) {
-      const int px = x + (g & 3) * 4 + (i & 3), py = y + (g >> 2) * 4 + (i >> 2);
-      if (px >= in.width || py >= in.height) continue;
-      const int64_t pixel = (base + py) * in.width + px;
+      if (!(inside >> i & 1)) continue;
+      const int64_t pixel = first + static_cast<int64_t>(i >> 2) * in.width + (i & 3);
       const T t = tile.transmittance[g][i];
       const T(*sums)[16] = tile.sums[g];
       if (slice.begin == 0) {
-        for (int c = 0; c < 3; ++c)
-          out.colors[3 * pixel + c] = sums[c][i] + (in.background ? t * in.background[3 * camera + c] : T(0));
+        for (int c = 0; c < 3; ++c) out.colors[3 * pixel + c] = sums[c][i] + t * background[c];
         out.alphas[pixel] = 1 - t;
         if constexpr (DEPTH)
           if (out.depths) out.depths[pixel] = sums[C::kDepth][i];
       }
       if constexpr (NF > 0) {
-        T *features = out.features + pixel * in.dims + slice.begin;
-        if constexpr (VAR) {
-          T *variance = out.variance + pixel * in.dims + slice.begin;
-          for (int c = 0; c < slice.count; ++c)
-            finish_feature(sums[C::kShift + c][i], sums[C::kSum + c][i], sums[C::kSquare + c][i], t, features[c],
-                           variance[c]);
-        } else {
-          for (int c = 0; c < slice.count; ++c) features[c] = sums[C::kSum + c][i];
-        }
+        const int64_t at = pixel * in.dims + slice.begin;
+        write_features<T, NF, VAR>(sums + C::kSum, i, t, slice.count, out.features + at, VAR ? out.variance + at : nullptr);
       }
     }
+  }
 }
 
 template <class T, int NF, bool VAR, bool DEPTH>

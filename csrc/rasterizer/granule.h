@@ -76,6 +76,7 @@ inline Blend<T> blend(const Splat<T> &s, Vec<T> px, Vec<T> py, Vec<T> transmitta
 
 // Bit i: pixel i of granule g of the 16x16 tile at (x, y) lies in the image.
 inline uint32_t pixels_inside(int x, int y, int g, int width, int height) {
+  if (x + 16 <= width && y + 16 <= height) return 0xffff;
   uint32_t m = 0;
   for (int i = 0; i < 16; ++i)
     m |= static_cast<uint32_t>(x + (g & 3) * 4 + (i & 3) < width && y + (g >> 2) * 4 + (i >> 2) < height) << i;
