@@ -16,10 +16,10 @@ def _at(place: Place, height: float = 0.0) -> np.ndarray:
 
 
 def mug(rng: np.random.Generator, id: int, name: str, place: Place, turn: float, paint: np.ndarray) -> Body:
-    """A coffee mug: a turned cup with a thick rim and a bent handle; `turn` (degrees) is where the handle points."""
+    """A coffee mug: a turned cup with a thick rim and a bent handle; `turn` (degrees) is the handle's side."""
     profile = [
-        (0.0, 0.0), (0.034, 0.0), (0.040, 0.005), (0.0425, 0.015), (0.0435, 0.092), (0.0425, 0.0965), (0.0405, 0.0965),
-        (0.0395, 0.092), (0.038, 0.014), (0.033, 0.008), (0.0, 0.007),
+        (0.0, 0.0), (0.034, 0.0), (0.040, 0.005), (0.0425, 0.015), (0.0435, 0.092), (0.0425, 0.0965),
+        (0.0405, 0.0965), (0.0395, 0.092), (0.038, 0.014), (0.033, 0.008), (0.0, 0.007),
     ]  # fmt: skip
     turned = spin(turn)
     cup = Lathe(np.array(profile), turned, _at(place))
@@ -155,14 +155,16 @@ def book(rng: np.random.Generator, id: int, name: str, place: Place, turn: float
 
 def cactus(rng: np.random.Generator, id: int, name: str, place: Place) -> Body:
     """A ribbed cactus with two arms in a terracotta pot."""
-    pot = Lathe(
-        np.array([(0, 0), (0.034, 0), (0.046, 0.062), (0.051, 0.063), (0.053, 0.085), (0.048, 0.086), (0.046, 0.074), (0, 0.073)]),
-        spin(0), _at(place),
-    )  # fmt: skip
+    profile = [
+        (0.0, 0.0), (0.034, 0.0), (0.046, 0.062), (0.051, 0.063), (0.053, 0.085), (0.048, 0.086), (0.046, 0.074),
+        (0.0, 0.073),
+    ]  # fmt: skip
+    pot = Lathe(np.array(profile), spin(0), _at(place))
     clay = tex.blend(
-        0.4 + 0.25 * tex.noise(rng, 360, 560, (8, 12), 5), tex.rgb("#c76b3f") * np.ones((360, 560, 3), np.float32),
+        0.4 + 0.25 * tex.noise(rng, 360, 560, (8, 12), 5),
+        tex.rgb("#c76b3f") * np.ones((360, 560, 3), np.float32),
         tex.rgb("#9a4a29"),
-    )  # fmt: skip
+    )
     clay[250:] = tex.speckle(
         rng,
         tex.rgb("#3b2a1d") * np.ones((110, 560, 3), np.float32),
@@ -176,8 +178,9 @@ def cactus(rng: np.random.Generator, id: int, name: str, place: Place) -> Body:
         outward = spin(side)[:, 0]
         axes = np.stack([outward, np.array([0, 0, 1.0]), np.cross(outward, [0, 0, 1.0])], 1)
         # A quarter bend: out of the stem sideways, then upwards.
-        bend = Tube(size, np.radians(-100), np.radians(20), np.array([0.009, 0.011, 0.0115, 0.0115, 0.011]), axes,
-                    _at(place, height + size) + 0.028 * outward)  # fmt: skip
+        origin = _at(place, height + size) + 0.028 * outward
+        radii = np.array([0.009, 0.011, 0.0115, 0.0115, 0.011])
+        bend = Tube(size, np.radians(-100), np.radians(20), radii, axes, origin)
         parts.append(Part(bend, _ribs(rng, 160, 160, 7), 0.0, (20, 24)))
     return Body(id, name, [name, "potted cactus", "flowerpot"], parts)
 
@@ -210,7 +213,7 @@ def clock(rng: np.random.Generator, id: int, name: str, center: np.ndarray) -> B
         a = np.radians(6 * i)
         inner = 0.86 if i % 5 else 0.80
         ends = [(int(240 + 225 * r * np.sin(a)), int(240 - 225 * r * np.cos(a))) for r in (inner, 0.93)]
-        cv2.line(dial, *ends, tex.rgb("#22262b").tolist(), 2 if i % 5 else 7, cv2.LINE_AA)
+        cv2.line(dial, ends[0], ends[1], tex.rgb("#22262b").tolist(), 2 if i % 5 else 7, cv2.LINE_AA)
     for hour in range(1, 13):
         a = np.radians(30 * hour)
         dial = tex.draw_text(dial, str(hour), (240 + 152 * np.sin(a), 240 - 152 * np.cos(a)), 46, "#22262b")
