@@ -50,8 +50,8 @@ def build(seed: int, light_samples: int = 20) -> list[Body]:
 
 
 def _objects(rng: np.random.Generator) -> list[Body]:
-    red = things.mug_paint(rng, "#c3161c", "#f6efe0", "COFFEE")
-    blue = things.mug_paint(rng, "#1c4fb5", "#f3d34a", "HELLO")
+    red = things.mug_paint(rng, "#c3161c", "#f6efe0", hearts=True)
+    blue = things.mug_paint(rng, "#1c4fb5", "#f4efdc", hearts=False)
     basket, soccer = tex.basketball(rng, 480, 960), tex.soccer_ball(rng, 440, 880)
     return [
         things.mug(rng, 1, "red mug", (-0.135, -0.155), -35, red),
