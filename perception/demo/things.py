@@ -54,7 +54,7 @@ def mug_paint(rng: np.random.Generator, color: str, ink: str, hearts: bool) -> n
     coffee = int(0.80 * height)
     brown = tex.rgb("#3a1f10") * np.ones((height - coffee, width, 3), np.float32)
     foam = tex.noise(rng, height - coffee, width, (4, 10), 5)
-    paint[coffee:] = tex.blend(0.3 * foam + 0.1, brown, tex.rgb("#a8743e"))
+    paint[coffee:] = tex.blend(0.12 * foam + 0.05, brown, tex.rgb("#a8743e"))
     return paint
 
 
