@@ -23,7 +23,7 @@ def view_lens(view: View) -> Lens:
     if view.lens is not None:
         return view.lens
     K = view.K
-    return Lens("PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), view.width, view.height)
+    return Lens("PINHOLE", tuple(map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))), view.width, view.height)
 
 
 def triangulated_cloud(
