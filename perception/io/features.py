@@ -100,10 +100,8 @@ def _stage(staged: Path, root: Path, photos: list[Path]) -> tuple[Path, list[str
             target.symlink_to(photo.resolve())
             continue
         with Image.open(photo) as image:
-            exif = ImageOps.exif_transpose(image).getexif() if image.getexif() else None
-        Image.fromarray(read_photo(photo)).save(
-            target, quality=98, subsampling=0, **({"exif": exif} if exif else {})
-        )
+            exif = ImageOps.exif_transpose(image).getexif()
+        Image.fromarray(read_photo(photo)).save(target, quality=98, subsampling=0, exif=exif)
     return staged, names
 
 
@@ -227,6 +225,13 @@ def _key(photos: list[Path], lenses: list[Lens | None], seed: int) -> str:
         (str(p.resolve()), p.stat().st_size, p.stat().st_mtime_ns, repr(l))
         for p, l in zip(photos, lenses, strict=True)
     ]
-    options = (MAX_IMAGE_SIDE, UPSAMPLE_BELOW, MAX_FEATURES, EXHAUSTIVE_BELOW, NEIGHBORS, seed)
-    options += (COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS)
+    options: tuple[float, ...] = (
+        MAX_IMAGE_SIDE,
+        UPSAMPLE_BELOW,
+        MAX_FEATURES,
+        EXHAUSTIVE_BELOW,
+        NEIGHBORS,
+        seed,
+    )
+    options = (*options, COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS)
     return hashlib.sha256(repr((facts, options)).encode()).hexdigest()[:12]

@@ -83,6 +83,9 @@ def _incremental(store: FeatureStore, fixed: bool, seed: int, count: int, progre
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
     options.min_model_size = MIN_MODEL_SIZE
+    # Global adjustment at every 40 % of growth, not 10 %: most of the time of mapping goes there.
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
+    options.ba_global_max_refinements = 3
     options.ba_refine_focal_length = options.ba_refine_extra_params = not fixed
     registered = 2
 

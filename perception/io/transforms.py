@@ -160,6 +160,8 @@ def _lens(file: Path, values: dict[str, Any], photo: Path | None) -> Lens:
         _number(values, key, what) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")
     )
     model = str(values.get("camera_model") or "OPENCV").upper()
+    name: str
+    extra: tuple[float, ...]
     if values.get("is_fisheye") or model in _FISHEYE:
         name, extra = "OPENCV_FISHEYE", (k1, k2, k3, k4)
     elif model not in _PERSPECTIVE:
