@@ -88,8 +88,9 @@ def _build(
 
 def _stage(staged: Path, root: Path, photos: list[Path]) -> tuple[Path, list[str]]:
     """pycolmap ignores EXIF rotation and reads few formats: if any photo needs it, all are laid out anew."""
-    if all(_is_plain(photo) for photo in photos):
-        return root, [photo.relative_to(root).as_posix() for photo in photos]
+    names = [photo.relative_to(root).as_posix() for photo in photos]
+    if all(_is_plain(photo) for photo in photos) and not any(" " in name for name in names):
+        return root, names  # pair lists separate names by blanks
     names = []
     for index, photo in enumerate(photos):
         plain = _is_plain(photo)
