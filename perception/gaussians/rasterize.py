@@ -108,7 +108,9 @@ class Forward:
 def _core_inputs(inputs: tuple[Tensor | None, ...], background: Tensor | None, settings: Settings) -> Any:
     means, quats, scales, opacities, colors, features, viewmats, ks = inputs
     assert means is not None  # for the type checker
-    arrays = [_numpy(t) for t in (means, quats, scales, opacities, colors, features, viewmats, ks, background)]
+    arrays = [
+        _numpy(t) for t in (means, quats, scales, opacities, colors, features, viewmats, ks, background)
+    ]
     return _core_function("RasterizerInputs", means)(
         *arrays,
         settings.width,
@@ -158,6 +160,15 @@ def rasterize_forward(
     return out
 
 
+def count_pairs(inputs: tuple[Tensor | None, ...], settings: Settings) -> int:
+    """Contributing (Gaussian, pixel) pairs of a scene; inputs as for `rasterize_forward`."""
+    assert inputs[0] is not None  # for the type checker
+    frames = rasterize_forward(inputs, None, settings).frames
+    return int(
+        _core_function("rasterizer_count_pairs", inputs[0])(_core_inputs(inputs, None, settings), frames)
+    )
+
+
 def rasterize_backward(
     inputs: tuple[Tensor | None, ...],
     background: Tensor | None,
@@ -195,7 +206,9 @@ def _autograd_function() -> Any:
 
     class RasterizeFunction(torch.autograd.Function):
         @staticmethod
-        def forward(ctx: Any, background: Tensor | None, settings: Settings, stats: RasterizationStats, *inputs: Any) -> Any:
+        def forward(
+            ctx: Any, background: Tensor | None, settings: Settings, stats: RasterizationStats, *inputs: Any
+        ) -> Any:
             contiguous = tuple(None if t is None else t.detach().contiguous() for t in inputs)
             shade = None if background is None else background.detach().contiguous()
             out = rasterize_forward(contiguous, shade, settings)
@@ -216,7 +229,9 @@ def _autograd_function() -> Any:
             inputs, background, images = saved[:8], saved[8], saved[9:]
             wanted = tuple(ctx.needs_input_grad[3:10])
             state = Forward(*images, visible=None, radii=None, frames=ctx.frames)  # type: ignore[arg-type]
-            grads, mean2d = rasterize_backward(inputs, background, ctx.settings, state, cotangents[:5], wanted)
+            grads, mean2d = rasterize_backward(
+                inputs, background, ctx.settings, state, cotangents[:5], wanted
+            )
             ctx.stats.mean2d_grad = mean2d.norm(dim=-1)
             shade = None
             if ctx.needs_input_grad[0] and cotangents[0] is not None:
@@ -325,4 +340,6 @@ def _check_shapes(tensors: dict[str, Any], sh_degree: int | None) -> None:
         expected["background"] = (3,) if background.ndim == 1 else (*c, 3)
     for name, shape in expected.items():
         if tuple(tensors[name].shape) != shape:
-            raise InputError(f"rasterize: {name} has shape {list(tensors[name].shape)}, expected {list(shape)}")
+            raise InputError(
+                f"rasterize: {name} has shape {list(tensors[name].shape)}, expected {list(shape)}"
+            )
