@@ -1,4 +1,4 @@
-"""A naive dense rasterizer in torch, the oracle of the compiled one: every rule spelt out, every pixel at once."""
+"""A naive dense rasterizer in torch, the oracle of the compiled one: every rule spelt out."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 
 def sh_colors(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
-    """3DGS spherical harmonics, from the definition: real SH with the Condon-Shortley phase; +0.5, clamped at 0."""
+    """3DGS spherical harmonics: real SH with the Condon-Shortley phase; +0.5, clamped at 0."""
     x, y, z = (directions / directions.norm(dim=-1, keepdim=True)).unbind(-1)
     pi = torch.pi
     one = torch.ones_like(x)

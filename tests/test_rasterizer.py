@@ -12,7 +12,7 @@ IMAGES = ("colors", "alphas", "depths", "features", "feature_variance")
 
 
 def scene(n=60, width=37, height=29, dims=5, cameras=2, sh_degree=None, dtype=torch.float64, seed=0):
-    """Random Gaussians in front of cameras with an off-centre principal point; some behind, some off screen."""
+    """Random Gaussians before cameras with an off-centre principal point; some behind, some off screen."""
     g = torch.Generator().manual_seed(seed)
 
     def rand(*shape):
@@ -201,7 +201,7 @@ def test_backward_may_run_twice_and_adds_up():
 
 
 def test_statistics_are_the_2d_mean_gradient_in_pixels():
-    # One isotropic Gaussian: moving it by δ px in x is moving its mean by δ z / fx (J is constant on the axis).
+    # One tiny Gaussian: moving it by δ px in x is moving its mean by δ z / fx.
     inputs = leaves(scene(n=1, dims=0, cameras=1))
     inputs["means"] = torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64).requires_grad_()
     inputs["viewmats"] = torch.eye(4, dtype=torch.float64)[None]

@@ -117,7 +117,8 @@ def test_ten_thousand_coincident_gaussians():
     inputs = scene(n=1, cameras=1, dims=2)
     inputs["means"][:] = torch.tensor([0.0, 0.0, 2.0])
     inputs["opacities"][:] = 0.3
-    many = {k: v.repeat(10000, *[1] * (v.ndim - 1)) if k in ("means", "quats", "scales", "opacities", "colors", "features") else v for k, v in inputs.items()}  # fmt: skip
+    per_gaussian = ("means", "quats", "scales", "opacities", "colors", "features")
+    many = {**inputs, **{k: inputs[k].repeat(10000, *[1] * (inputs[k].ndim - 1)) for k in per_gaussian}}
     out = assert_finite(cast(many, torch.float32))
     exact = perception.rasterize(**many)
     assert float((out.colors - exact.colors).abs().mean()) < 1e-5
@@ -198,5 +199,8 @@ def test_bad_arguments_are_named(change, message):
 
 def test_non_contiguous_input_is_accepted():
     inputs = scene()
-    strided = {k: v.transpose(0, -1).contiguous().transpose(0, -1) if isinstance(v, torch.Tensor) else v for k, v in inputs.items()}  # fmt: skip
+    strided = {
+        k: v.transpose(0, -1).contiguous().transpose(0, -1) if isinstance(v, torch.Tensor) else v
+        for k, v in inputs.items()
+    }
     assert torch.equal(perception.rasterize(**strided).colors, perception.rasterize(**inputs).colors)
