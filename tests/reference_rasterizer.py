@@ -1,4 +1,4 @@
-"""A naive dense rasterizer in torch, the oracle of the compiled one: every rule spelt out, every pixel at once."""
+"""A naive dense rasterizer in torch, the oracle of the compiled one: every rule spelt out."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 
 def sh_colors(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
-    """3DGS spherical harmonics, from the definition: real SH with the Condon-Shortley phase; +0.5, clamped at 0."""
+    """3DGS spherical harmonics: real SH with the Condon-Shortley phase; +0.5, clamped at 0."""
     x, y, z = (directions / directions.norm(dim=-1, keepdim=True)).unbind(-1)
     pi = torch.pi
     one = torch.ones_like(x)
@@ -89,7 +89,9 @@ def _camera(means, quats, scales, opacities, colors, viewmat, k, width, height, 
         mean = (w.T @ f)[:, None] / w.sum(0)[:, None, None].clamp(min=1e-300)
         centred = (f[None] - mean) ** 2  # two passes: Var = Σ w (f - m)² + A (1 - A) m²
         total = w.sum(0)[:, None]
-        out["feature_variance"] = torch.einsum("np,pnd->pd", w, centred) + total * t[:, None] * mean[:, 0] ** 2
+        out["feature_variance"] = (
+            torch.einsum("np,pnd->pd", w, centred) + total * t[:, None] * mean[:, 0] ** 2
+        )
     return out, visible
 
 

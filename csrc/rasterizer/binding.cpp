@@ -109,6 +109,9 @@ struct Arguments {
       in.features = checked("features", features, {n, in.dims});
     }
     in.viewmats = checked("viewmats", viewmats, {c, 4, 4}), in.Ks = checked("Ks", Ks, {c, 3, 3});
+    for (int64_t i = 0; i < c; ++i)
+      if (!(in.Ks[9 * i] != 0 && in.Ks[9 * i + 4] != 0))
+        throw std::invalid_argument("Ks[" + std::to_string(i) + "]: a focal length is 0");
     in.background = checked("background", background, {c, 3});
     in.width = width, in.height = height, in.near_plane = near_plane;
     return in;
@@ -151,7 +154,7 @@ std::unique_ptr<Handle<T>> forward(Arguments<T> &a, Images<T> images, Array<uint
     handle->frames = perception::rasterize_forward(in, opt, level, out, bad);
   }
   if (bad.argument)
-    throw std::domain_error(std::string(bad.argument) + "[" + std::to_string(bad.index) + "] is not finite");
+    throw std::invalid_argument(std::string(bad.argument) + "[" + std::to_string(bad.index) + "] is not finite");
   return handle;
 }
 
@@ -213,6 +216,9 @@ void bind(nb::module_ &m, const char *suffix) {
         "inputs"_a, "colors"_a.noconvert(), "alphas"_a.noconvert(), "depths"_a.noconvert().none(),
         "features"_a.noconvert().none(), "variance"_a.noconvert().none(), "visible"_a.noconvert(),
         "radii"_a.noconvert().none(), "simd"_a);
+  m.def(name("rasterizer_count_pairs").c_str(),
+        [](Arguments<T> &a, const Handle<T> &handle) { return perception::count_pairs(a.inputs(), *handle.frames); },
+        "inputs"_a, "frames"_a, "Contributing (Gaussian, pixel) pairs of a forward call.");
   m.def(name("rasterize_backward").c_str(),
         [](Arguments<T> &inputs, const Handle<T> &frames, Array<T> colors, Array<T> alphas, Optional<T> depths,
            Optional<T> features, Optional<T> variance, Optional<const T> g_colors, Optional<const T> g_alphas,

@@ -36,15 +36,14 @@ template <class T, int NF, bool VAR>
 inline T load_pixel_features(int64_t at, int count, const T *shift, T a, const Outputs<T> &out, const Cotangents<T> &grad,
                              T *row, T &constant) {
   T g[NF] = {}, sum[NF] = {}, behind[NF], steady[NF];
-  const std::size_t bytes = count * sizeof(T);
-  std::memcpy(sum, out.features + at, bytes);
-  if (grad.features) std::memcpy(g, grad.features + at, bytes);
+  copy_channels<NF>(sum, out.features + at, count);
+  if (grad.features) copy_channels<NF>(g, grad.features + at, count);
   for (int c = 0; c < NF; ++c) behind[c] = g[c] * (sum[c] - shift[c] * a), steady[c] = g[c] * shift[c];
   if constexpr (VAR) {
     T v[NF] = {}, variance[NF] = {};
     if (grad.variance) {
-      std::memcpy(v, grad.variance + at, bytes);
-      std::memcpy(variance, out.variance + at, bytes);
+      copy_channels<NF>(v, grad.variance + at, count);
+      copy_channels<NF>(variance, out.variance + at, count);
     }
     for (int c = 0; c < NF; ++c) {
       const T e = sum[c] - shift[c] * a, twice = 2 * v[c] * (sum[c] - shift[c]);
@@ -253,7 +252,7 @@ template <class T, int NF, bool VAR, bool DEPTH>
 void backward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int index, Slice slice, Scratch<T> &scratch,
                         Worker<T> &w, const Outputs<T> &out, const Cotangents<T> &grad) {
   using Tile = BackwardTile<T, NF, VAR, DEPTH>;
-  load_supertile(in, f, index, slice, NF, Tile::kFeatures, w);
+  load_supertile<NF, Tile::kFeatures>(in, f, index, slice, w);
   if (!w.n) return;
   T shift[NF ? NF : 1] = {};
   for (int c = 0; c < NF; ++c) shift[c] = w.features[c];

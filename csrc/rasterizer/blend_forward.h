@@ -127,11 +127,11 @@ inline void write_features(const T (*sums)[16], int i, T t, int count, T *featur
       sum[c] = shift * a + s1;
       var[c] = (m2 > 0 ? m2 : T(0)) + a * t * mean * mean;
     }
-    std::memcpy(variance, var, count * sizeof(T));
+    copy_channels<NF>(variance, var, count);
   } else {
     for (int c = 0; c < NF; ++c) sum[c] = sums[c][i];
   }
-  std::memcpy(features, sum, count * sizeof(T));
+  copy_channels<NF>(features, sum, count);
 }
 
 template <class T, int NF, bool VAR, bool DEPTH>
@@ -166,7 +166,7 @@ template <class T, int NF, bool VAR, bool DEPTH>
 void forward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int index, Slice slice, Worker<T> &w,
                        const Outputs<T> &out) {
   using Tile = ForwardTile<T, NF, VAR, DEPTH>;
-  load_supertile(in, f, index, slice, NF, NF, w);
+  load_supertile<NF, NF>(in, f, index, slice, w);
   std::memset(w.touched.reserve(w.n + 1), 0, w.n);
   Tile &tile = *reinterpret_cast<Tile *>(w.tile.reserve(sizeof(Tile) / sizeof(T) + 1));
   const int x0 = index % f.tiles_x * 64, y0 = index / f.tiles_x * 64;

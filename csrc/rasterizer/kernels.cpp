@@ -1,6 +1,7 @@
 // All stages for one SIMD level (PERCEPTION_LEVEL); compiled once per level.
 #include "bin_stage.h"
 #include "blend_forward.h"
+#include "count_stage.h"
 #include "project_stage.h"
 #include "reduce_stage.h"
 #include "sort_stage.h"
@@ -14,7 +15,7 @@ NonFinite prepare(const Inputs<T> &in, int camera, const Options &opt, Frame<T> 
   f.camera = make_camera(in.viewmats + 16 * camera, in.Ks + 9 * camera, in.width, in.height, in.near_plane);
   f.tiles_x = (in.width + 63) / 64, f.tiles_y = (in.height + 63) / 64;
   f.count = 0;
-  const NonFinite bad = project_all(in, opt, f, scratch, out.radii ? out.radii + in.n * camera : nullptr);
+  const NonFinite bad = project_all(in, opt, f, scratch, camera == 0, out.radii ? out.radii + in.n * camera : nullptr);
   if (bad.argument) return bad;
   sort_by_depth(opt, f.count, scratch);
   bin_splats(opt, f, scratch);
@@ -69,8 +70,8 @@ void backward(const Inputs<T> &in, int camera, const Options &opt, const Frame<T
 
 extern const Kernels<float> float_kernels;
 extern const Kernels<double> double_kernels;
-const Kernels<float> float_kernels = {prepare<float>, forward<float>, backward<float>};
-const Kernels<double> double_kernels = {prepare<double>, forward<double>, backward<double>};
+const Kernels<float> float_kernels = {prepare<float>, forward<float>, backward<float>, count_pairs<float>};
+const Kernels<double> double_kernels = {prepare<double>, forward<double>, backward<double>, count_pairs<double>};
 
 }  // namespace PERCEPTION_LEVEL
 }  // namespace perception

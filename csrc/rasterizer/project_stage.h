@@ -5,6 +5,7 @@
 
 #include "parallel.h"
 #include "scratch.h"
+#include "simd.h"
 #include "spherical_harmonics.h"
 
 namespace perception::PERCEPTION_LEVEL {
@@ -119,16 +120,48 @@ inline uint64_t depth_key(double z) {
   return k;
 }
 
+// NaN and infinity times zero are NaN, which no later addition undoes.
+template <class T>
+bool all_finite(const T *values, int64_t n) {
+  using V = Vec<T>;
+  const V zero(T(0));
+  V acc[2] = {zero, zero};
+  int64_t i = 0;
+  for (; i + 2 * V::kLanes <= n; i += 2 * V::kLanes)
+    for (int k = 0; k < 2; ++k) acc[k] = fma(V::load(values + i + k * V::kLanes), zero, acc[k]);
+  T rest = sum(acc[0] + acc[1]);
+  for (; i < n; ++i) rest += values[i] * T(0);
+  return rest == 0;
+}
+
+// Width of a Gaussian's row of colours or SH coefficients.
+template <class T>
+int color_width(const Inputs<T> &in) {
+  return in.sh_degree < 0 ? 3 : 3 * in.sh_stride;
+}
+
+// Colours and features of Gaussians [i0, i0 + n).
+template <class T>
+bool attributes_finite(const Inputs<T> &in, int64_t i0, int n) {
+  const int64_t width = color_width(in);
+  return all_finite(in.colors + width * i0, width * n) &&
+         (!in.features || all_finite(in.features + in.dims * i0, static_cast<int64_t>(in.dims) * n));
+}
+
 // Gaussians [begin, end) into splats[begin...]; returns how many, or the first bad index through `bad`.
 template <class T>
-uint32_t project_range(const Inputs<T> &in, const Frame<T> &f, int64_t begin, int64_t end, DepthKey<T> *keys, T *radii,
-                       int64_t &bad) {
+uint32_t project_range(const Inputs<T> &in, const Frame<T> &f, int64_t begin, int64_t end, bool check, DepthKey<T> *keys,
+                       T *radii, int64_t &bad) {
   ProjectionBlock<T> b;
   uint32_t out = static_cast<uint32_t>(begin);
   for (int64_t i0 = begin; i0 < end; i0 += kBlock) {
     const int n = static_cast<int>(end - i0 < kBlock ? end - i0 : kBlock);
     load_block(in, i0, n, b);
     project_block(f.camera, b);
+    if (check && !attributes_finite(in, i0, n)) {
+      bad = i0;
+      return 0;
+    }
     for (int j = 0; j < n; ++j) {
       if (!(b.finite[j] == 0)) {
         bad = i0 + j;
@@ -145,22 +178,27 @@ uint32_t project_range(const Inputs<T> &in, const Frame<T> &f, int64_t begin, in
   return out - static_cast<uint32_t>(begin);
 }
 
+// The first offender at or after Gaussian `from`.
 template <class T>
-NonFinite find_non_finite(const Inputs<T> &in, int64_t i) {
+NonFinite find_non_finite(const Inputs<T> &in, int64_t from) {
   struct Argument {
     const char *name;
     const T *data;
     int width;
-  } arguments[] = {{"means", in.means, 3}, {"quats", in.quats, 4}, {"scales", in.scales, 3}, {"opacities", in.opacities, 1}};
-  for (const Argument &a : arguments)
-    for (int c = 0; c < a.width; ++c)
-      if (!std::isfinite(a.data[a.width * i + c])) return {a.name, i};
+  } arguments[] = {{"means", in.means, 3}, {"quats", in.quats, 4}, {"scales", in.scales, 3},
+                   {"opacities", in.opacities, 1}, {"colors", in.colors, color_width(in)},
+                   {"features", in.features, in.features ? in.dims : 0}};
+  for (int64_t i = from; i < in.n; ++i)
+    for (const Argument &a : arguments)
+      for (int c = 0; c < a.width; ++c)
+        if (!std::isfinite(a.data[a.width * i + c])) return {a.name, i};
   return {};
 }
 
 // Contiguous ranges, one a thread, then closed up: the result does not depend on the number of threads.
 template <class T>
-NonFinite project_all(const Inputs<T> &in, const Options &opt, Frame<T> &f, Scratch<T> &scratch, T *radii) {
+NonFinite project_all(const Inputs<T> &in, const Options &opt, Frame<T> &f, Scratch<T> &scratch, bool check,
+                      T *radii) {
   f.splats.reserve(in.n);
   DepthKey<T> *keys = scratch.keys[0].reserve(in.n);
   const int64_t blocks = (in.n + kBlock - 1) / kBlock;
@@ -169,7 +207,7 @@ NonFinite project_all(const Inputs<T> &in, const Options &opt, Frame<T> &f, Scra
   std::vector<int64_t> bad(parts, -1);
   auto begin = [&](int64_t part) { return part == parts ? in.n : blocks * part / parts * kBlock; };
   parallel_for(opt.threads, parts, [&](std::size_t part, int) {
-    counts[part] = project_range(in, f, begin(part), begin(part + 1), keys, radii, bad[part]);
+    counts[part] = project_range(in, f, begin(part), begin(part + 1), check, keys, radii, bad[part]);
   });
   for (int64_t i : bad)
     if (i >= 0) return find_non_finite(in, i);

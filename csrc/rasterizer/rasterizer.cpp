@@ -1,6 +1,7 @@
 // Runs the stages camera by camera, on memory from a pool.
 #include "rasterizer.h"
 
+#include <cmath>
 #include <mutex>
 
 #include "frames.h"
@@ -42,6 +43,19 @@ class ObjectPool {
 };
 
 template <class T>
+NonFinite check_cameras(const Inputs<T> &in) {
+  struct Argument {
+    const char *name;
+    const T *data;
+    int width;
+  } arguments[] = {{"viewmats", in.viewmats, 16}, {"Ks", in.Ks, 9}, {"background", in.background, in.background ? 3 : 0}};
+  for (const Argument &a : arguments)
+    for (int64_t i = 0; i < in.cameras * a.width; ++i)
+      if (!std::isfinite(a.data[i])) return {a.name, i / a.width};
+  return {};
+}
+
+template <class T>
 ScratchPtr<T> take_scratch(int threads) {
   ScratchPtr<T> s(ObjectPool<Scratch<T>>::get().take().release());
   if (s->workers.size() < static_cast<std::size_t>(threads)) s->workers.resize(threads);
@@ -64,6 +78,8 @@ void FramesDelete<T>::operator()(Frames<T> *f) const {
 template <class T>
 FramesPtr<T> rasterize_forward(const Inputs<T> &in, const Options &opt, Level level, const Outputs<T> &out,
                                NonFinite &bad) {
+  bad = check_cameras(in);
+  if (bad.argument) return nullptr;
   const Kernels<T> &k = kernels<T>(level);
   const ScratchPtr<T> scratch = take_scratch<T>(opt.threads);
   FramesPtr<T> frames(new Frames<T>{{}, level});
@@ -85,6 +101,14 @@ void rasterize_backward(const Inputs<T> &in, const Options &opt, const Frames<T>
     kernels<T>(frames.level).backward(in, camera, opt, *frames.cameras[camera], *scratch, out, grad, result);
 }
 
+template <class T>
+uint64_t count_pairs(const Inputs<T> &in, const Frames<T> &frames) {
+  const ScratchPtr<T> scratch = take_scratch<T>(1);
+  uint64_t pairs = 0;
+  for (const auto &f : frames.cameras) pairs += kernels<T>(frames.level).count_pairs(in, *f, *scratch);
+  return pairs;
+}
+
 void release_memory() {
   ObjectPool<Scratch<float>>::get().clear();
   ObjectPool<Scratch<double>>::get().clear();
@@ -98,7 +122,8 @@ void release_memory() {
   template FramesPtr<T> rasterize_forward(const Inputs<T> &, const Options &, Level, const Outputs<T> &,           \
                                           NonFinite &);                                                            \
   template void rasterize_backward(const Inputs<T> &, const Options &, const Frames<T> &, const Outputs<T> &,      \
-                                   const Cotangents<T> &, const Gradients<T> &);
+                                   const Cotangents<T> &, const Gradients<T> &);                                   \
+  template uint64_t count_pairs(const Inputs<T> &, const Frames<T> &);
 INSTANTIATE(float)
 INSTANTIATE(double)
 

@@ -106,6 +106,7 @@ struct Kernels {
   void (*forward)(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Scratch<T> &, const Outputs<T> &);
   void (*backward)(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Scratch<T> &, const Outputs<T> &,
                    const Cotangents<T> &, const Gradients<T> &);
+  uint64_t (*count_pairs)(const Inputs<T> &, const Frame<T> &, Scratch<T> &);
 };
 
 enum class Level { baseline, avx2, avx512 };
@@ -129,6 +130,10 @@ FramesPtr<T> rasterize_forward(const Inputs<T> &, const Options &, Level, const 
 template <class T>
 void rasterize_backward(const Inputs<T> &, const Options &, const Frames<T> &, const Outputs<T> &,
                         const Cotangents<T> &, const Gradients<T> &);
+
+// Contributing (splat, pixel) pairs over all cameras, the unit in which speed is reported.
+template <class T>
+uint64_t count_pairs(const Inputs<T> &, const Frames<T> &);
 
 // Frees what the pools keep between calls.
 void release_memory();

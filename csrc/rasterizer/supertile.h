@@ -10,19 +10,22 @@ struct Slice {
   int begin, count;
 };
 
-template <class T>
-void load_features(const T *row, int count, int width, T *out) {
-  for (int c = 0; c < count; ++c) out[c] = row[c];
-  for (int c = count; c < width; ++c) out[c] = 0;
+// A row of count <= NF channels; the whole width as a copy of constant size.
+template <int NF, class T>
+inline void copy_channels(T *to, const T *from, int count) {
+  if (count == NF)
+    std::memcpy(to, from, NF * sizeof(T));
+  else
+    std::memcpy(to, from, count * sizeof(T));
 }
 
-// width: the kernel's feature width, stride: of worker.features.
-template <class T>
-void load_supertile(const Inputs<T> &in, const Frame<T> &f, int tile, Slice slice, int width, int stride, Worker<T> &w) {
+// NF: the kernel's feature width, STRIDE: of worker.features.
+template <int NF, int STRIDE, class T>
+void load_supertile(const Inputs<T> &in, const Frame<T> &f, int tile, Slice slice, Worker<T> &w) {
   const T x = T(tile % f.tiles_x * 64), y = T(tile / f.tiles_x * 64);
   const uint32_t *list = f.list.data() + f.offsets[tile];
   const int n = static_cast<int>(f.offsets[tile + 1] - f.offsets[tile]);
-  w.splats.reserve(n + 1), w.source.reserve(n + 16), w.features.reserve(static_cast<std::size_t>(n + 1) * stride);
+  w.splats.reserve(n + 1), w.source.reserve(n + 16), w.features.reserve(static_cast<std::size_t>(n + 1) * STRIDE);
   w.stride = n + 48;
   w.lists.reserve(16 * static_cast<std::size_t>(w.stride));
   std::memset(w.counts, 0, sizeof w.counts);
@@ -37,8 +40,11 @@ void load_supertile(const Inputs<T> &in, const Frame<T> &f, int tile, Slice slic
     Splat<T> &to = w.splats[kept];
     to = s;
     to.x -= x, to.y -= y;
-    if (width) load_features(in.features + static_cast<int64_t>(s.id) * in.dims + slice.begin, slice.count, width,
-                             w.features.data() + static_cast<std::size_t>(kept) * stride);
+    if constexpr (NF > 0) {
+      T row[NF] = {};
+      copy_channels<NF>(row, in.features + static_cast<int64_t>(s.id) * in.dims + slice.begin, slice.count);
+      std::memcpy(w.features.data() + static_cast<std::size_t>(kept) * STRIDE, row, sizeof row);
+    }
     w.source[kept] = list[i];
     masks[pending] = static_cast<uint16_t>(mask), ids[pending] = kept++;
     if (++pending == 16) append_to_lists(masks, ids, w.lists.data(), w.stride, w.counts), pending = 0;

@@ -1,7 +1,8 @@
 """Differentiable rasterization of 3D Gaussians on the CPU: the torch side of the compiled kernels.
 
-Follows the 3DGS equations: 2D covariance J R Σ Rᵀ Jᵀ + 0.3 I, alpha = min(0.999, o·exp(−½ dᵀ Σ⁻¹ d)), contributions
-under 1/255 skipped, front to back by depth (equal depths by index), stop before the transmittance falls under 1e-4.
+Follows the 3DGS equations: 2D covariance J R Σ Rᵀ Jᵀ + 0.3 I, alpha = min(0.999, o·exp(−½ dᵀ Σ⁻¹ d)),
+contributions under 1/255 skipped, front to back by depth (equal depths by index), stop before the
+transmittance falls under 1e-4.
 """
 
 from __future__ import annotations
@@ -108,7 +109,9 @@ class Forward:
 def _core_inputs(inputs: tuple[Tensor | None, ...], background: Tensor | None, settings: Settings) -> Any:
     means, quats, scales, opacities, colors, features, viewmats, ks = inputs
     assert means is not None  # for the type checker
-    arrays = [_numpy(t) for t in (means, quats, scales, opacities, colors, features, viewmats, ks, background)]
+    arrays = [
+        _numpy(t) for t in (means, quats, scales, opacities, colors, features, viewmats, ks, background)
+    ]
     return _core_function("RasterizerInputs", means)(
         *arrays,
         settings.width,
@@ -126,8 +129,8 @@ def rasterize_forward(
 ) -> Forward:
     """One forward pass, no autograd.
 
-    inputs: means [N,3], quats [N,4], scales [N,3], opacities [N], colors [N,3] or [N,K,3], features [N,D] or None,
-    viewmats [C,4,4], Ks [C,3,3]: contiguous CPU tensors of one dtype. background: [C,3] or None.
+    inputs: means [N,3], quats [N,4], scales [N,3], opacities [N], colors [N,3] or [N,K,3], features [N,D] or
+    None, viewmats [C,4,4], Ks [C,3,3]: contiguous CPU tensors of one dtype. background: [C,3] or None.
     """
     import torch
 
@@ -158,6 +161,15 @@ def rasterize_forward(
     return out
 
 
+def count_pairs(inputs: tuple[Tensor | None, ...], settings: Settings) -> int:
+    """Contributing (Gaussian, pixel) pairs of a scene; inputs as for `rasterize_forward`."""
+    assert inputs[0] is not None  # for the type checker
+    frames = rasterize_forward(inputs, None, settings).frames
+    return int(
+        _core_function("rasterizer_count_pairs", inputs[0])(_core_inputs(inputs, None, settings), frames)
+    )
+
+
 def rasterize_backward(
     inputs: tuple[Tensor | None, ...],
     background: Tensor | None,
@@ -168,8 +180,8 @@ def rasterize_backward(
 ) -> tuple[list[Tensor | None], Tensor]:
     """One backward pass, no autograd.
 
-    cotangents: dL/d colors, alphas, depths, features, feature_variance; None means zero. wanted: which of the first
-    seven inputs want a gradient. Returns those gradients and dL/d(2D mean) [C, N, 2] in pixels.
+    cotangents: dL/d colors, alphas, depths, features, feature_variance; None means zero. wanted: which of the
+    first seven inputs want a gradient. Returns those gradients and dL/d(2D mean) [C, N, 2] in pixels.
     """
     import torch
 
@@ -195,7 +207,9 @@ def _autograd_function() -> Any:
 
     class RasterizeFunction(torch.autograd.Function):
         @staticmethod
-        def forward(ctx: Any, background: Tensor | None, settings: Settings, stats: RasterizationStats, *inputs: Any) -> Any:
+        def forward(
+            ctx: Any, background: Tensor | None, settings: Settings, stats: RasterizationStats, *inputs: Any
+        ) -> Any:
             contiguous = tuple(None if t is None else t.detach().contiguous() for t in inputs)
             shade = None if background is None else background.detach().contiguous()
             out = rasterize_forward(contiguous, shade, settings)
@@ -215,8 +229,11 @@ def _autograd_function() -> Any:
             saved = ctx.saved_tensors
             inputs, background, images = saved[:8], saved[8], saved[9:]
             wanted = tuple(ctx.needs_input_grad[3:10])
-            state = Forward(*images, visible=None, radii=None, frames=ctx.frames)  # type: ignore[arg-type]
-            grads, mean2d = rasterize_backward(inputs, background, ctx.settings, state, cotangents[:5], wanted)
+            none = images[0].new_empty(0)
+            state = Forward(*images, visible=none, radii=none, frames=ctx.frames)  # type: ignore[misc]
+            grads, mean2d = rasterize_backward(
+                inputs, background, ctx.settings, state, cotangents[:5], wanted
+            )
             ctx.stats.mean2d_grad = mean2d.norm(dim=-1)
             shade = None
             if ctx.needs_input_grad[0] and cotangents[0] is not None:
@@ -251,8 +268,9 @@ def rasterize(
 ) -> Rasterization:
     """Renders Gaussians into C cameras; differentiable in everything but Ks.
 
-    means [N,3] world, quats [N,4] wxyz of any norm, scales [N,3] > 0, opacities [N] in [0,1] (activated values),
-    colors [N,3] RGB, or [N,K,3] spherical-harmonic coefficients of degree `sh_degree` (0 to 3, K ≥ (sh_degree+1)²),
+    means [N,3] world, quats [N,4] wxyz of any norm, scales [N,3] > 0, opacities [N] in [0,1] (activated
+    values), colors [N,3] RGB, or [N,K,3] spherical-harmonic coefficients of degree `sh_degree` (0 to 3,
+    K ≥ (sh_degree+1)²; 0.5 added, clamped at 0),
     viewmats [C,4,4] camera_from_world, Ks [C,3,3] pixels (pixel centres at +0.5, no skew), features [N,D],
     background [3] or [C,3]. float32 or float64, on the CPU. Gradients flow to all of them except Ks.
 
@@ -277,7 +295,7 @@ def rasterize(
     out = _function.apply(
         background, settings, stats, means, quats, scales, opacities, colors, features, viewmats, Ks
     )
-    return Rasterization(*out, stats=stats)
+    return Rasterization(*out, stats=stats)  # type: ignore[misc]
 
 
 def _check(
@@ -295,9 +313,8 @@ def _check(
         if t.device.type != "cpu":
             raise InputError(f"rasterize: {name} is on {t.device}, expected the CPU; call .cpu()")
         if t.dtype not in (torch.float32, torch.float64) or (means is not None and t.dtype != means.dtype):
-            raise InputError(
-                f"rasterize: {name} is {t.dtype}, expected {means.dtype if name != 'means' else 'float32 or float64'}"  # type: ignore[union-attr]
-            )
+            wanted = "float32 or float64" if means is None or t is means else means.dtype
+            raise InputError(f"rasterize: {name} is {t.dtype}, expected {wanted}")
     _check_shapes(tensors, sh_degree)
     if not (1 <= width <= 1 << 20 and 1 <= height <= 1 << 20):
         raise InputError(f"rasterize: image size {width} × {height}, expected 1 to 1048576 pixels a side")
@@ -325,4 +342,6 @@ def _check_shapes(tensors: dict[str, Any], sh_degree: int | None) -> None:
         expected["background"] = (3,) if background.ndim == 1 else (*c, 3)
     for name, shape in expected.items():
         if tuple(tensors[name].shape) != shape:
-            raise InputError(f"rasterize: {name} has shape {list(tensors[name].shape)}, expected {list(shape)}")
+            raise InputError(
+                f"rasterize: {name} has shape {list(tensors[name].shape)}, expected {list(shape)}"
+            )

@@ -1,0 +1,39 @@
+"""Shared by all tests: a small scene of photos with exact truth, made once."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+
+
+@pytest.fixture(scope="session")
+def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with transforms.json, images/ and labels/ of the demo's tabletop: 12 photos of 128 × 96, exact poses.
+
+    The label images carry other ids in every photo, as a segmenter's would. gt_points.ply and scene.json hold the truth.
+    """
+    import cv2
+    import numpy as np
+
+    from perception.demo import make_photos
+
+    root = tmp_path_factory.mktemp("small")
+    truth = make_photos(root / "images", views=12, width=128, height=96, light_samples=2)
+    (root / "labels").mkdir()
+    rng = np.random.default_rng(0)
+    for name in truth.names:
+        ids = truth.labels(name)
+        shuffle = np.concatenate([[0], 1 + rng.permutation(int(ids.max()))]).astype(np.uint16)
+        cv2.imwrite(str(root / "labels" / f"{Path(name).stem}.png"), shuffle[ids])
+    cameras = json.loads((root / "truth" / "transforms.json").read_text())
+    for frame in cameras["frames"]:
+        frame["file_path"] = f"images/{Path(frame['file_path']).name}"
+    # Points from the surface stand in for structure from motion, which these tests are not about.
+    (root / "transforms.json").write_text(json.dumps({**cameras, "ply_file_path": "truth/gt_points.ply"}))
+    return root

@@ -1,0 +1,182 @@
+"""The whole pipeline on a small scene with exact truth: what it writes, what it finds, how it resumes, how it refuses."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perception.cli import main
+from perception.config import load_config
+from perception.io.store import read_map
+from perception.pipeline.mapping import build_map, work_folder
+
+SETTINGS = [
+    "train.iterations=400",
+    "train.budget=6000",
+    "densify.every=50",
+    "instances.min_cluster_size=15",
+    "instances.min_samples=5",
+    "language.encoder=none",
+    "photos.holdout=6",
+]
+
+
+def settings(scene: Path, *more: str):
+    return load_config(None, [*SETTINGS, f"masks=labels:{scene / 'labels'}", *more])
+
+
+@pytest.fixture(scope="module")
+def finished(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("maps") / "small.gsmap"
+    build_map(small_scene / "transforms.json", path, settings(small_scene))
+    return path
+
+
+def test_the_map_holds_what_the_contract_says(finished: Path) -> None:
+    info = json.loads((finished / "map.json").read_text())
+    instances = json.loads((finished / "instances.json").read_text())["instances"]
+    gmap = read_map(finished)
+    assert info["num_gaussians"] == len(gmap) <= 6000
+    assert info["num_instances"] == len(instances) > 3
+    assert set(instances[0]) >= {"id", "label", "score", "num_gaussians", "centroid", "obb", "aabb"}
+    assert [entry["num_gaussians"] for entry in instances] == np.bincount(gmap.instance_ids[gmap.instance_ids >= 0]).tolist()
+    assert all(0 <= entry["score"] <= 1 for entry in instances)
+    assert {"poses", "masks", "train", "instances", "total"} <= set(info["seconds"])
+    assert len(info["quality"]["views"]) == 2 and info["config"]["train"]["budget"] == 6000
+    assert not work_folder(finished).exists()
+
+
+def test_held_out_photos_are_reproduced(finished: Path) -> None:
+    # The mean colour of these photos scores about 13 dB; a map of a 128-pixel scene must explain most of the rest.
+    assert read_map(finished).info["quality"]["psnr"] > 19
+
+
+def test_instances_agree_with_the_truth(finished: Path, small_scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "labelled.ply"
+    truth = small_scene / "truth" / "gt_points.ply"
+    assert main(["export", str(finished), "--points", str(truth), "-o", str(out), "--json"]) == 0
+    assert main(["eval", "instances", str(out), str(truth), "--json"]) == 0
+    from perception.evaluate import run_instances
+
+    result, _ = run_instances(out, truth)
+    assert result["ap25"] > 0.4
+
+
+def test_render_writes_every_kind(finished: Path, small_scene: Path, tmp_path: Path) -> None:
+    import cv2
+
+    cameras = str(small_scene / "transforms.json")
+    what = "rgb,depth,instances,features"
+    assert main(["render", str(finished), "--cameras", cameras, "-o", str(tmp_path), "--what", what]) == 0
+    for kind in what.split(","):
+        assert len(list((tmp_path / kind).rglob("*.png"))) == 12
+    depth = cv2.imread(str(next((tmp_path / "depth").rglob("*.png"))), cv2.IMREAD_UNCHANGED)
+    assert depth.dtype == np.uint16 and 300 < np.median(depth[depth > 0]) < 3000  # metres in thousandths
+
+
+def test_the_same_seed_gives_the_same_map_whatever_the_threads(finished: Path, small_scene: Path, tmp_path: Path) -> None:
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        build_map(small_scene / "transforms.json", tmp_path / "again.gsmap", settings(small_scene))
+    finally:
+        torch.set_num_threads(before)
+    for name in ("gaussians.ply", "features.npy", "instance_ids.npy"):
+        assert (finished / name).read_bytes() == (tmp_path / "again.gsmap" / name).read_bytes()
+
+
+def test_killed_and_resumed_is_the_run_that_was_never_killed(finished: Path, small_scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "killed.gsmap"
+    pairs = [f"--set={pair}" for pair in [*SETTINGS, "train.checkpoint_seconds=0.01"]]
+    command = [sys.executable, "-m", "perception.cli", "map", str(small_scene / "transforms.json"), "-o", str(out)]
+    command += ["--masks", f"labels:{small_scene / 'labels'}", *pairs]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env={**os.environ, "OMP_WAIT_POLICY": "passive"})
+    checkpoint = work_folder(out) / "checkpoint.pt"
+    while process.poll() is None and not checkpoint.exists():
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not out.exists() and checkpoint.exists()
+    assert main(command[3:]) == 2  # the unfinished run is named, not overwritten
+    assert main([*command[3:], "--resume", "--json"]) == 0
+    assert (finished / "gaussians.ply").read_bytes() == (out / "gaussians.ply").read_bytes()
+
+
+def test_resume_refuses_other_settings(small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from perception.errors import InputError
+    from perception.pipeline.checkpoint import fingerprint, load_checkpoint, save_checkpoint
+
+    config = settings(small_scene)
+    mark = fingerprint(small_scene, config)
+    save_checkpoint(tmp_path / "c.pt", {"iteration": 3}, mark)
+    assert load_checkpoint(tmp_path / "c.pt", mark) == {"iteration": 3}
+    assert fingerprint(small_scene, settings(small_scene, "train.time_limit=9")) == mark
+    with pytest.raises(InputError, match="other settings"):
+        load_checkpoint(tmp_path / "c.pt", fingerprint(small_scene, settings(small_scene, "seed=1")))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("missing", "does not exist"),
+        ("exists", "exists already"),
+        ("nan", "pose"),
+        ("label_size", "labels"),
+        ("label_missing", "labels"),
+        ("photo", "truncated"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    change: str, told: str, small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, out = tmp_path / "scene", tmp_path / "out.gsmap"
+    shutil.copytree(small_scene, scene)
+    source = scene / "transforms.json"
+    _spoil(change, scene, out)
+    if change == "missing":
+        source = tmp_path / "nowhere"
+    code = main(["map", str(source), "-o", str(out), "--masks", f"labels:{scene / 'labels'}", *[f"--set={s}" for s in SETTINGS]])
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
+    assert code == 2 and len(lines) == 1 and told in lines[0]
+    assert change == "exists" or not out.exists()
+
+
+def _spoil(change: str, scene: Path, out: Path) -> None:
+    import cv2
+
+    label = scene / "labels" / "003.png"
+    if change == "exists":
+        out.mkdir()
+    elif change == "nan":
+        data = json.loads((scene / "transforms.json").read_text())
+        data["frames"][0]["transform_matrix"][0][3] = float("nan")
+        (scene / "transforms.json").write_text(json.dumps(data))
+    elif change == "label_size":
+        cv2.imwrite(str(label), np.zeros((10, 10), np.uint8))
+    elif change == "label_missing":
+        label.unlink()
+    elif change == "photo":
+        photo = scene / "images" / "003.jpg"
+        photo.write_bytes(photo.read_bytes()[:900])
+
+
+def test_a_map_of_another_version_is_refused(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = tmp_path / "other.gsmap"
+    shutil.copytree(finished, other)
+    info = json.loads((other / "map.json").read_text())
+    (other / "map.json").write_text(json.dumps({**info, "format_version": 99}))
+    for command in (["info", str(other)], ["query", str(other), "mug"], ["export", str(other), "-o", str(tmp_path / "x.ply")]):
+        assert main(command) == 2
+        assert "format_version is 99" in capsys.readouterr().err
+    assert main(["info", str(finished), "--json"]) == 0
