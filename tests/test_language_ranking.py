@@ -73,7 +73,7 @@ def test_what_fits_comes_first_and_is_present(scene: tuple[Table, list[InstanceD
     answer = rank("plate", things, encoder)
     assert answer.present and answer.hits[0][0] == 2
     scores = [s for _, s in answer.hits]
-    assert scores == sorted(scores, reverse=True) and 0 <= min(scores) and max(scores) <= 1
+    assert scores == sorted(scores, reverse=True) and min(scores) >= 0 and max(scores) <= 1
 
 
 def test_color_words_choose_between_equals(scene: tuple[Table, list[InstanceDescription]]) -> None:

@@ -1,4 +1,6 @@
-"""How well prompts find their instances on a scene with exact truth, silhouettes perfect: `main([SCENE, ...])`."""
+"""How well prompts find their instances on a scene with exact truth, silhouettes perfect: `main([SCENE,
+...])`.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +20,17 @@ from perception.language.description import InstanceDescription
 from perception.language.ranking import PRESENT, Ranker
 
 ABSENT = (
-    "elephant, car, airplane, bicycle, motorcycle, train, horse, giraffe, sailing boat, fire truck, traffic light, "
-    "church, bridge, palm tree, shark, penguin, tractor, helicopter, snowman, waterfall, castle, whale, "
-    "lighthouse, tank, skateboard, surfboard, umbrella, piano, toothbrush, hair dryer, washing machine, "
-    "refrigerator, bathtub, toilet, violin, ladder, wheelchair, tent, parachute, lawn mower"
+    "elephant, car, airplane, bicycle, motorcycle, train, horse, giraffe, sailing boat, fire truck, "
+    "traffic light, church, bridge, palm tree, shark, penguin, tractor, helicopter, snowman, waterfall, "
+    "castle, whale, lighthouse, tank, skateboard, surfboard, umbrella, piano, toothbrush, hair dryer, "
+    "washing machine, refrigerator, bathtub, toilet, violin, ladder, wheelchair, tent, parachute, lawn mower"
 ).split(", ")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line: top-1, top-3, random and colour-blind baselines, false positives, latency; JSON with --json."""
+    """Command line: top-1, top-3, random and colour-blind baselines, false positives, latency; JSON with
+    --json.
+    """
     parser = argparse.ArgumentParser(prog="perception bench language", description=__doc__)
     parser.add_argument(
         "scenes", nargs="+", help="folders with scene.json, transforms.json, masks_gt, gt_points.ply"
@@ -110,7 +114,9 @@ def score_queries(
 
 
 def latency(descriptions: list[InstanceDescription], spec: str, instances: int = 200) -> dict[str, float]:
-    """Milliseconds a query on `instances` instances (repeats of those given): cold encoder and ranker, then warm."""
+    """Milliseconds a query on `instances` instances (repeats of those given): cold encoder and ranker, then
+    warm.
+    """
     many = [descriptions[n % len(descriptions)] for n in range(instances)]
     start = time.perf_counter()
     encoder = make_encoder(spec)
