@@ -28,6 +28,15 @@ from perception.language.ranking import Ranker  # noqa: E402
 TEXTS = ["red mug", "a longer sentence about a kitchen, with commas", "杯子 красный 🙂", "word " * 400]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Any:
+    """Two threads that wait for each other are many times slower on a busy machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="module")
 def encoder(tmp_path_factory: pytest.TempPathFactory) -> Any:
     with pytest.MonkeyPatch.context() as patch:

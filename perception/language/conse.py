@@ -158,4 +158,4 @@ def _load_classifier() -> Any:
     example = torch.zeros(2, 3, SIDE, SIDE).contiguous(memory_format=torch.channels_last)
     with warnings.catch_warnings(), torch.inference_mode(False), torch.no_grad():
         warnings.simplefilter("ignore")  # tracing warns that the image size is fixed, which it is
-        return torch.jit.freeze(torch.jit.trace(model, example))
+        return torch.jit.freeze(torch.jit.trace(model, example, check_trace=False))
