@@ -1,4 +1,6 @@
-"""How well prompts find their instances on a scene with exact truth, silhouettes perfect: `main([SCENE, ...])`."""
+"""How well prompts find their instances on a scene with exact truth, silhouettes perfect: `main([SCENE,
+...])`.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +19,54 @@ from perception.language.base import Encoder, make_encoder
 from perception.language.description import InstanceDescription
 from perception.language.ranking import PRESENT, Ranker
 
-ABSENT = ["elephant", "car", "airplane", "bicycle", "motorcycle", "train", "horse", "giraffe", "sailing boat", "fire truck", "traffic light", "church", "bridge", "palm tree", "shark", "penguin", "tractor", "helicopter", "snowman", "waterfall", "castle", "whale", "lighthouse", "tank", "skateboard", "surfboard", "umbrella", "piano", "toothbrush", "hair dryer", "washing machine", "refrigerator", "bathtub", "toilet", "violin", "ladder", "wheelchair", "tent", "parachute", "lawn mower"]
+ABSENT = [
+    "elephant",
+    "car",
+    "airplane",
+    "bicycle",
+    "motorcycle",
+    "train",
+    "horse",
+    "giraffe",
+    "sailing boat",
+    "fire truck",
+    "traffic light",
+    "church",
+    "bridge",
+    "palm tree",
+    "shark",
+    "penguin",
+    "tractor",
+    "helicopter",
+    "snowman",
+    "waterfall",
+    "castle",
+    "whale",
+    "lighthouse",
+    "tank",
+    "skateboard",
+    "surfboard",
+    "umbrella",
+    "piano",
+    "toothbrush",
+    "hair dryer",
+    "washing machine",
+    "refrigerator",
+    "bathtub",
+    "toilet",
+    "violin",
+    "ladder",
+    "wheelchair",
+    "tent",
+    "parachute",
+    "lawn mower",
+]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line: top-1, top-3, random and colour-blind baselines, false positives, latency; JSON with --json."""
+    """Command line: top-1, top-3, random and colour-blind baselines, false positives, latency; JSON with
+    --json.
+    """
     parser = argparse.ArgumentParser(prog="perception bench language", description=__doc__)
     parser.add_argument(
         "scenes", nargs="+", help="folders with scene.json, transforms.json, masks_gt, gt_points.ply"
@@ -105,7 +150,9 @@ def score_queries(
 
 
 def latency(descriptions: list[InstanceDescription], spec: str, instances: int = 200) -> dict[str, float]:
-    """Milliseconds a query on `instances` instances (repeats of those given): cold encoder and ranker, then warm."""
+    """Milliseconds a query on `instances` instances (repeats of those given): cold encoder and ranker, then
+    warm.
+    """
     many = [descriptions[n % len(descriptions)] for n in range(instances)]
     start = time.perf_counter()
     encoder = make_encoder(spec)
@@ -122,8 +169,8 @@ def latency(descriptions: list[InstanceDescription], spec: str, instances: int =
     median, p99 = np.quantile(warm, [0.5, 0.99]) * 1e3
     return {
         "query_cold_ms": round(cold * 1e3, 1),
-        "query_warm_median_ms": round(median, 2),
-        "query_warm_p99_ms": round(p99, 2),
+        "query_warm_median_ms": round(float(median), 2),
+        "query_warm_p99_ms": round(float(p99), 2),
     }
 
 

@@ -1,4 +1,6 @@
-"""A rendered scene with exact truth, read for scoring only: photos, consistent instance ids, view scores, queries."""
+"""A rendered scene with exact truth, read for scoring only: photos, consistent instance ids, view scores,
+queries.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Which photos show an instance best, and the pictures of it that an encoder sees.
 
-The view score is OpenSplat3D's: s_vi = (mask pixels / image pixels) · (visible Gaussians / all Gaussians); the top K
-views are kept and each gives L letterboxed crops, every level with a wider margin (OpenMask3D, OpenSplat3D: K = 5,
-L = 3, expansion .3).
+The view score is OpenSplat3D's: s_vi = (mask pixels / image pixels) · (visible Gaussians / all Gaussians);
+the top K views are kept and each gives L letterboxed crops, every level with a wider margin (OpenMask3D,
+OpenSplat3D: K = 5, L = 3, expansion .3).
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ def view_scores(
 ) -> np.ndarray:
     """Score [I, V] of every instance in every view.
 
-    mask_pixels [I, V], image_pixels [V] in pixels; visible_fraction [I, V] in [0, 1] (visible / all Gaussians).
+    mask_pixels [I, V], image_pixels [V] in pixels; visible_fraction [I, V] in [0, 1] (visible / all
+    Gaussians).
     """
     return np.asarray(mask_pixels, np.float64) / np.asarray(image_pixels, np.float64)[None] * visible_fraction
 
@@ -70,7 +71,9 @@ def _diverse(row: np.ndarray, directions: np.ndarray, k: int, diversity: float) 
 
 
 def mask_box(mask: np.ndarray) -> Box | None:
-    """Tight box (x0, y0, x1, y1) in pixels, x1 and y1 exclusive, of a boolean mask [H, W]; None where it is empty."""
+    """Tight box (x0, y0, x1, y1) in pixels, x1 and y1 exclusive, of a boolean mask [H, W]; None where it is
+    empty.
+    """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return None
@@ -78,7 +81,9 @@ def mask_box(mask: np.ndarray) -> Box | None:
 
 
 def expand_box(box: Box, ratio: float, width: int, height: int) -> Box:
-    """The box with `ratio` of its width added left and right and of its height above and below, clipped to the image."""
+    """The box with `ratio` of its width added left and right and of its height above and below, clipped to
+    the image.
+    """
     x0, y0, x1, y1 = box
     dx, dy = round((x1 - x0) * ratio), round((y1 - y0) * ratio)
     return max(0, x0 - dx), max(0, y0 - dy), min(width, x1 + dx), min(height, y1 + dy)
@@ -95,7 +100,9 @@ def letterbox(image: np.ndarray, fill: int = FILL) -> np.ndarray:
 
 
 def soften_background(photo: np.ndarray, mask: np.ndarray, background: Background) -> np.ndarray:
-    """The photo [H, W, 3] uint8 with everything outside `mask` left plain, dimmed half to grey, blurred or filled."""
+    """The photo [H, W, 3] uint8 with everything outside `mask` left plain, dimmed half to grey, blurred or
+    filled.
+    """
     if background == "plain":
         return photo
     import cv2
@@ -120,7 +127,9 @@ def crop_levels(
     expansion: float = 0.3,
     background: Background = "plain",
 ) -> list[np.ndarray]:
-    """`levels` square crops [S, S, 3] uint8 around a mask [H, W], level l with margin l · expansion; [] if empty."""
+    """`levels` square crops [S, S, 3] uint8 around a mask [H, W], level l with margin l · expansion; [] if
+    empty.
+    """
     box = mask_box(mask)
     if box is None:
         return []

@@ -28,9 +28,9 @@ def describe_instances(
 ) -> list[InstanceDescription]:
     """Descriptions of the I instances whose views `choices` lists (see `crops.choose_views`).
 
-    load(view) → photo [H, W, 3] uint8 and instance image [H, W] int32 (silhouettes with occlusion; value = position
-    in `choices`, −1 = none). Each needed photo is loaded once and dropped, so memory does not grow with their number.
-    progress(done, all) is told after every photo.
+    load(view) → photo [H, W, 3] uint8 and instance image [H, W] int32 (silhouettes with occlusion; value =
+    position in `choices`, −1 = none). Each needed photo is loaded once and dropped, so memory does not grow
+    with their number. progress(done, all) is told after every photo.
     """
     wanted: dict[int, list[tuple[int, int]]] = {}
     for instance, views in enumerate(choices):
@@ -71,7 +71,9 @@ def _summary(found: dict[int, Any], dim: int) -> InstanceDescription:
 
 
 def _color_sample(photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Up to COLOR_SAMPLES pixels [P, 3] of the mask less its rim, whose colours bleed; the whole mask if too thin."""
+    """Up to COLOR_SAMPLES pixels [P, 3] of the mask less its rim, whose colours bleed; the whole mask if too
+    thin.
+    """
     import cv2
 
     inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)

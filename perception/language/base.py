@@ -16,8 +16,8 @@ class Encoder(Protocol):
 
     identity: model, version and preprocessing; a map stores it and refuses embeddings of another.
     dim: length of an embedding.
-    references: [R, D] unit embeddings of many common words, the ruler for how specific a text is; None without one.
-    templates: sentences with one {} that a prompt is put into; their embeddings are averaged.
+    references: [R, D] unit embeddings of many common words, the ruler for how specific a text is; None
+    without one. templates: sentences with one {} that a prompt is put into; their embeddings are averaged.
     """
 
     @property
@@ -79,7 +79,8 @@ def check_images(images: Sequence[np.ndarray]) -> None:
     for n, image in enumerate(images):
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
             raise InputError(
-                f"picture {n + 1}: expected RGB uint8 [H, W, 3], found {image.dtype} of shape {list(image.shape)}"
+                f"picture {n + 1}: expected RGB uint8 [H, W, 3], "
+                f"found {image.dtype} of shape {list(image.shape)}"
             )
 
 

@@ -1,7 +1,8 @@
-"""The CLIP family through onnxruntime: a pair of ONNX files, or one file with both towers, bound by introspection.
+"""The CLIP family through onnxruntime: a pair of ONNX files, or one file with both towers, bound by
+introspection.
 
-Exports name their inputs and outputs differently (open_clip, transformers, optimum, immich): what counts is that one
-input takes pixels, one takes token ids, and one output is a row per picture or text.
+Exports name their inputs and outputs differently (open_clip, transformers, optimum, immich): what counts is
+that one input takes pixels, one takes token ids, and one output is a row per picture or text.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ _TEXT_OUTPUTS = ("text_embeds", "text_features", "text_embedding", "pooler_outpu
 
 
 class ClipEncoder:
-    """Image and text towers of a CLIP, open_clip, MobileCLIP or SigLIP export. The image tower opens when first used."""
+    """Image and text towers of a CLIP, open_clip, MobileCLIP or SigLIP export. The image tower opens when
+    first used.
+    """
 
     references: np.ndarray | None = None
     templates: tuple[str, ...] = ("an image of {}", "a photo of a {}", "{}")
@@ -142,8 +145,9 @@ def _find_pair(folder: Path) -> tuple[Path, Path]:
             return image, text
         if (home / "model.onnx").is_file() and not image and not text:
             return home / "model.onnx", home / "model.onnx"
-        if image or text:
-            raise InputError(f"{home}: found {(image or text).name} but not the other tower; both are needed")  # type: ignore[union-attr]
+        lonely = image or text
+        if lonely:
+            raise InputError(f"{lonely}: the other tower is not beside it; both are needed")
     found = ", ".join(sorted(p.name for p in folder.iterdir())[:6]) or "nothing"
     raise InputError(
         f"{folder}: expected vision_model.onnx and text_model.onnx (or model.onnx), found {found}"
@@ -171,7 +175,8 @@ def _ids_input(session: Any, path: Path) -> Any:
     if len(inputs) == 1:
         return inputs[0]
     raise InputError(
-        f"{path}: no input takes token ids [n, length] ({signature(session)}); the order is clip:IMAGE.onnx,TEXT.onnx"
+        f"{path}: no input takes token ids [n, length] ({signature(session)}); "
+        "the order is clip:IMAGE.onnx,TEXT.onnx"
     )
 
 

@@ -1,8 +1,8 @@
 """Colours as measured, and colours as words.
 
-An instance keeps a palette: the commonest colours of its own pixels in CIELAB, with their shares. A colour word is a few
-sRGB examples; how much of an instance it names is the share of the palette near any of them. Lightness counts less
-than hue, because exposure and shade move it.
+An instance keeps a palette: the commonest colours of its own pixels in CIELAB, with their shares. A colour
+word is a few sRGB examples; how much of an instance it names is the share of the palette near any of them.
+Lightness counts less than hue, because exposure and shade move it.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ _EXAMPLES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "silver": ((180, 182, 185), (140, 142, 145)),
 }
 _SYNONYMS = {
-    "grey": "gray", "crimson": "red", "scarlet": "red", "maroon": "red", "violet": "purple", "lilac": "purple",
-    "magenta": "pink", "cyan": "turquoise", "teal": "turquoise", "tan": "beige", "cream": "beige", "navy": "blue",
-    "golden": "gold", "silvery": "silver", "olive": "green", "amber": "orange", "reddish": "red", "bluish": "blue",
-    "greenish": "green", "yellowish": "yellow", "brownish": "brown",
+    "grey": "gray", "crimson": "red", "scarlet": "red", "maroon": "red", "reddish": "red", "violet": "purple",
+    "lilac": "purple", "magenta": "pink", "cyan": "turquoise", "teal": "turquoise", "tan": "beige",
+    "cream": "beige", "navy": "blue", "bluish": "blue", "golden": "gold", "silvery": "silver",
+    "olive": "green", "greenish": "green", "amber": "orange", "yellowish": "yellow", "brownish": "brown",
 }  # fmt: skip
 _MANY = {"colorful", "colourful", "multicolored", "multicoloured", "rainbow"}
 _PATTERN = re.compile(r"[^\W\d_]+")
@@ -51,7 +51,9 @@ _NOT_A_COLOR = {
 
 
 def color_words(text: str) -> list[str]:
-    """Colour words of a text in canonical spelling, in order, without repeats ("many" for colourful things)."""
+    """Colour words of a text in canonical spelling, in order, without repeats ("many" for colourful
+    things).
+    """
     words = [word.lower() for word in _PATTERN.findall(text)]
     found: list[str] = []
     for n, word in enumerate(words):
@@ -81,7 +83,8 @@ def without_color_words(text: str) -> str:
 
 
 def palette(pixels: np.ndarray) -> np.ndarray:
-    """The commonest colours of sRGB pixels [P, 3] uint8: float32 [PALETTE, 4] rows (L*, a*, b*, share), largest first.
+    """The commonest colours of sRGB pixels [P, 3] uint8: float32 [PALETTE, 4] rows (L*, a*, b*, share),
+    largest first.
 
     Shares sum to 1 (rows of zeros pad short palettes); no pixels give all zeros.
     """
@@ -128,7 +131,9 @@ def color_share(palettes: np.ndarray, word: str) -> np.ndarray:
 
 
 def color_match(palettes: np.ndarray, words: Sequence[str]) -> np.ndarray:
-    """How well each instance fits all the colour words: [I] in [0, 1]; half an object in the colour is a full match."""
+    """How well each instance fits all the colour words: [I] in [0, 1]; half an object in the colour is a
+    full match.
+    """
     match = np.ones(len(palettes))
     for word in words:
         match *= np.minimum(1.0, color_share(palettes, word) / (0.5 / len(words)))

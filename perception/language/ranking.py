@@ -1,13 +1,14 @@
 """Which instances answer a prompt, and whether any does.
 
-The relevancy of instance i for a prompt t is judged against the map's other instances: with ē the mean embedding of
-the map, x_ti = cos(t, e_i − β ē) / σ_t takes away what all instances share, and σ_t, the spread of cos(t, ·) over the
-encoder's reference words, makes specific and vague prompts comparable. Whether the best is good enough is told by
-probes: LERF's canonical phrases (object, things, stuff, texture) and a list of things that a scene seldom holds. Their
-best relevancies in this very map, under this very encoder, are the distribution of "not here", and
+The relevancy of instance i for a prompt t is judged against the map's other instances: with ē the mean
+embedding of the map, x_ti = cos(t, e_i − β ē) / σ_t takes away what all instances share, and σ_t, the spread
+of cos(t, ·) over the encoder's reference words, makes specific and vague prompts comparable. Whether the
+best is good enough is told by probes: LERF's canonical phrases (object, things, stuff, texture) and a list
+of things that a scene seldom holds. Their best relevancies in this very map, under this very encoder, are
+the distribution of "not here", and
     score_ti = Φ((x_ti − m) / s),   m: their median, s: such that their 80 % quantile scores .8,
-so .8 means "fits better than four probes in five". Colour words are answered by measured colour; a label given by the
-user counts as the instance's name.
+so .8 means "fits better than four probes in five". Colour words are answered by measured colour; a label
+given by the user counts as the instance's name.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ LABEL_MARGIN = 2.0  # a label means the prompt from 2 + Φ⁻¹(score) spreads a
 
 @dataclass(frozen=True)
 class Answer:
-    """Ranked (position of the instance, score in [0, 1]), best first, and whether the best reaches the threshold."""
+    """Ranked (position of the instance, score in [0, 1]), best first, and whether the best reaches the
+    threshold.
+    """
 
     text: str
     hits: list[tuple[int, float]]
@@ -59,7 +62,8 @@ class Ranker:
         )
         if rows.shape[1] != encoder.dim:
             raise InputError(
-                f"embeddings have {rows.shape[1]} dimensions, those of encoder '{encoder.identity}' {encoder.dim}"
+                f"embeddings have {rows.shape[1]} dimensions, "
+                f"those of encoder '{encoder.identity}' {encoder.dim}"
             )
         mean = rows[self._seen].mean(axis=0) if self._seen.any() else np.zeros(encoder.dim, np.float32)
         self._rows = unit_rows(rows - BETA * mean) if self._seen.sum() > 1 else rows
@@ -94,7 +98,9 @@ class Ranker:
         return self._with_labels(scores, text)
 
     def _with_labels(self, scores: np.ndarray, text: str) -> np.ndarray:
-        """The better of picture and label: 1 where the label is the prompt, Φ(z − margin) where it means it."""
+        """The better of picture and label: 1 where the label is the prompt, Φ(z − margin) where it means
+        it.
+        """
         if not len(self._named):
             return scores
         z = (self._label_rows @ self._encode([text])[0] - self._label_null[0]) / self._label_null[1]
@@ -123,7 +129,9 @@ class Ranker:
         return unit_rows(rows.mean(axis=0))
 
     def _best_of_absent(self, probe_rows: np.ndarray) -> tuple[float, float]:
-        """Median of the probes' best relevancies in this map, and the spread that puts their quantile at .8."""
+        """Median of the probes' best relevancies in this map, and the spread that puts their quantile at
+        .8.
+        """
         if not self._seen.any():
             return 0.0, 1.0
         best = self._relevancy(probe_rows)[:, self._seen].max(axis=1)

@@ -1,7 +1,7 @@
 """Tokens for the text models of the CLIP family, always offline.
 
-In order: `tokenizer.json` beside the model; `vocab.json` with `merges.txt`; CLIP's byte-pair merges, which ship inside
-the package open-clip-torch (MobileCLIP uses the same).
+In order: `tokenizer.json` beside the model; `vocab.json` with `merges.txt`; CLIP's byte-pair merges, which
+ship inside the package open-clip-torch (MobileCLIP uses the same).
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ class Tokenizer:
     """Texts → ids and attention mask of one fixed length."""
 
     def __init__(self, backend: Any, length: int, pad: int, end: int | None) -> None:
-        """backend: a `tokenizers.Tokenizer`; end: id that must close a text cut at `length`, None to leave it cut."""
+        """backend: a `tokenizers.Tokenizer`; end: id that must close a text cut at `length`, None to leave
+        it cut.
+        """
         self._backend, self.length, self.pad, self._end = backend, length, pad, end
         backend.no_padding()
         backend.no_truncation()
@@ -46,7 +48,9 @@ class Tokenizer:
 
 
 def find_tokenizer(model: Path, length: int | None) -> Tokenizer:
-    """The tokenizer of a text model; `length` from its input's shape, else from the configs, else 77 (SigLIP 64)."""
+    """The tokenizer of a text model; `length` from its input's shape, else from the configs, else 77 (SigLIP
+    64).
+    """
     try:
         import tokenizers
     except ImportError as error:
@@ -74,7 +78,9 @@ def find_tokenizer(model: Path, length: int | None) -> Tokenizer:
 
 
 def clip_bpe(vocabulary: dict[str, int], merges: list[tuple[str, str]]) -> Any:
-    """CLIP's tokenizer (lower-cased byte-level BPE with `</w>`, start and end marks) as a `tokenizers.Tokenizer`."""
+    """CLIP's tokenizer (lower-cased byte-level BPE with `</w>`, start and end marks) as a
+    `tokenizers.Tokenizer`.
+    """
     from tokenizers import Regex, Tokenizer, normalizers, pre_tokenizers, processors
     from tokenizers.models import BPE
 
@@ -126,7 +132,9 @@ def clip_vocabulary(merges: list[tuple[str, str]]) -> dict[str, int]:
 
 
 def _byte_letters() -> list[str]:
-    """The printable stand-ins of GPT-2's byte-level BPE: printable Latin-1 bytes themselves, then the others."""
+    """The printable stand-ins of GPT-2's byte-level BPE: printable Latin-1 bytes themselves, then the
+    others.
+    """
     printable = [*range(0x21, 0x7F), *range(0xA1, 0xAD), *range(0xAE, 0x100)]
     others = len(set(range(256)) - set(printable))
     return [chr(b) for b in printable] + [chr(256 + n) for n in range(others)]

