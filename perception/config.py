@@ -161,7 +161,9 @@ def set_value(config: Any, key: str, value: Any, where: str = "--set", prefix: s
     return dataclasses.replace(config, **{head: _parse(value, hints[head], f"{where} {prefix}{key}")})
 
 
-def load_config(file: Path | None = None, pairs: list[str] | None = None, preset: str = "default") -> MapConfig:
+def load_config(
+    file: Path | None = None, pairs: list[str] | None = None, preset: str = "default"
+) -> MapConfig:
     """Defaults, then the preset, then the TOML file, then KEY=VALUE pairs; checked as a whole."""
     if preset not in PRESETS:
         raise InputError(f"--preset: found '{preset}', expected one of: {', '.join(PRESETS)}")
@@ -205,11 +207,26 @@ def check(config: MapConfig) -> None:
         ("train.ssim_weight", config.train.ssim_weight, 0 <= config.train.ssim_weight <= 1, "0 to 1"),
         ("losses.feature_dim", config.losses.feature_dim, 1 <= config.losses.feature_dim <= 64, "1 to 64"),
         ("losses.margin", config.losses.margin, config.losses.margin > 0, "above 0"),
-        ("instances.min_cluster_size", config.instances.min_cluster_size, config.instances.min_cluster_size >= 2, ">= 2"),
+        (
+            "instances.min_cluster_size",
+            config.instances.min_cluster_size,
+            config.instances.min_cluster_size >= 2,
+            ">= 2",
+        ),
         ("seed", config.seed, config.seed >= 0, "0 or more"),
         ("device", config.device, config.device in ("auto", "cpu", "cuda"), "auto, cpu or cuda"),
-        ("losses.positive", config.losses.positive, config.losses.positive in ("per-mask", "per-pixel"), "per-mask or per-pixel"),
-        ("losses.negative", config.losses.negative, config.losses.negative in ("squared", "unsquared"), "squared or unsquared"),
+        (
+            "losses.positive",
+            config.losses.positive,
+            config.losses.positive in ("per-mask", "per-pixel"),
+            "per-mask or per-pixel",
+        ),
+        (
+            "losses.negative",
+            config.losses.negative,
+            config.losses.negative in ("squared", "unsquared"),
+            "squared or unsquared",
+        ),
     ]
     limit = config.train.time_limit
     rules.append(("train.time_limit", limit, limit is None or limit > 0, "seconds above 0"))

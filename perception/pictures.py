@@ -1,4 +1,5 @@
-"""Small pictures people look at: instance colours, depth, errors, outlines, montages. Images are [H, W, 3] uint8 RGB."""
+"""Small pictures people look at: instance colours, depth, errors, outlines, montages. Images are [H, W, 3]
+uint8 RGB."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ _GOLDEN = 0.6180339887498949
 
 
 def instance_palette(ids: int | np.ndarray | Sequence[int]) -> np.ndarray:
-    """Colours [N, 3] uint8 for instance ids (or for 0..n-1): the same id always gets the same colour, -1 is grey.
+    """Colours [N, 3] uint8 for instance ids (or for 0..n-1): the same id always gets the same colour, -1 is
+    grey.
 
     Hues step by the golden ratio, so ids near each other lie far apart on the wheel; lightness and saturation
     change as the wheel fills up.
@@ -59,7 +61,8 @@ def _colormap(level: np.ndarray, name: int) -> np.ndarray:
 
 
 def error_map(a: np.ndarray, b: np.ndarray, full: float = 0.25) -> np.ndarray:
-    """Where two pictures (uint8, or float in [0, 1]) differ: black = equal, bright = `full` or more (of 1)."""
+    """Where two pictures (uint8, or float in [0, 1]) differ: black = equal, bright = `full` or more (of
+    1)."""
     if a.shape != b.shape:
         raise ValueError(f"error_map: pictures of shapes {a.shape} and {b.shape}; they must agree")
     difference = np.abs(_unit(a) - _unit(b)).mean(-1)
@@ -71,7 +74,8 @@ def _unit(picture: np.ndarray) -> np.ndarray:
 
 
 def overlay(photo: np.ndarray, ids: np.ndarray, alpha: float = 0.55) -> np.ndarray:
-    """Instance colours laid over a photo with a thin border between instances; -1 leaves the photo as it is."""
+    """Instance colours laid over a photo with a thin border between instances; -1 leaves the photo as it
+    is."""
     tinted = (1 - alpha) * photo + alpha * colorize_instances(ids)
     out = np.where((ids >= 0)[..., None], tinted, photo)
     out[_borders(ids)] = 255
@@ -95,9 +99,11 @@ def outline(
 
 
 def features_to_rgb(features: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
-    """Features [..., D] -> colours [..., 3] uint8: their first three principal components, stretched to 1-99 %.
+    """Features [..., D] -> colours [..., 3] uint8: their first three principal components, stretched to 1-99
+    %.
 
-    mask [...]: which entries decide the axes and the stretch (default all); the sign of an axis is made definite.
+    mask [...]: which entries decide the axes and the stretch (default all); the sign of an axis is made
+    definite.
     """
     flat = features.reshape(-1, features.shape[-1]).astype(np.float64)
     basis = flat if mask is None or not mask.any() else flat[mask.ravel()]

@@ -68,12 +68,16 @@ class LoadedMap:
         from perception.language.ranking import Ranker
 
         if not self.gmap.language:
-            raise InputError(f"{self.path}: holds no language embeddings; map again with an encoder (language.encoder=…)")
+            raise InputError(
+                f"{self.path}: holds no language embeddings; map again with an encoder (language.encoder=…)"
+            )
         descriptions, identity = from_arrays(self.gmap.language)
         spec = self.gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
         encoder = make_encoder("conse" if spec == "auto" else spec)
         if encoder is None:
-            raise InputError(f"{self.path}: was mapped without an encoder; map again with language.encoder=conse")
+            raise InputError(
+                f"{self.path}: was mapped without an encoder; map again with language.encoder=conse"
+            )
         check_encoder(identity, encoder.identity)
         return Ranker(descriptions, encoder, [entry.get("label") for entry in self.instances])
 
@@ -83,7 +87,7 @@ class LoadedMap:
         With `min_score` the encoder's own judgement of presence is replaced by that bound on the score.
         """
         if not text.strip():
-            raise InputError("query: the text is empty; ask for a thing, such as \"red mug\"")
+            raise InputError('query: the text is empty; ask for a thing, such as "red mug"')
         if top_k < 1:
             raise InputError(f"query: top_k is {top_k}, expected at least 1")
         if not self.instances:
@@ -102,7 +106,9 @@ class LoadedMap:
         if self.gmap.language:
             counts = self.gmap.language["view_counts"]
             stop = int(counts[: instance + 1].sum())
-            views = tuple(str(name) for name in self.gmap.language["view_names"][stop - int(counts[instance]) : stop])
+            views = tuple(
+                str(name) for name in self.gmap.language["view_names"][stop - int(counts[instance]) : stop]
+            )
         return Hit(
             entry["id"],
             score,

@@ -68,8 +68,9 @@ def test_binary_ply_of_both_byte_orders_with_mixed_faces(tmp_path, order):
     name = {"<": "little", ">": "big"}[order]
     header = (
         f"ply\nformat binary_{name}_endian 1.0\ncomment odd\nelement vertex 4\nproperty double x\n"
-        "property double y\nproperty double z\nproperty ushort label\nelement face 2\nproperty list uchar int vertex_indices\n"
-        "property uchar flag\nelement edge 1\nproperty short a\nend_header\n"
+        "property double y\nproperty double z\nproperty ushort label\nelement face 2\n"
+        "property list uchar int vertex_indices\nproperty uchar flag\n"
+        "element edge 1\nproperty short a\nend_header\n"
     )
     body = b"".join(struct.pack(order + "dddH", i, 2 * i, -i, 60000 + i) for i in range(4))
     body += struct.pack(order + "BiiiB", 3, 0, 1, 2, 7) + struct.pack(order + "BiiiiB", 4, 0, 1, 2, 3, 8)
@@ -188,7 +189,7 @@ GOOD = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty flo
             "damaged",
         ),
         ("a.npz", b"nonsense", "NPZ"),
-        ("a.xyz", b"1 2 3\n4 5\n", "3 numbers"),
+        ("a.xyz", b"1 2 3\n4 5\n", "row 2 has 2 numbers"),
         ("a.xyz", b"", "no points"),
         ("a.obj", b"v 1 2\n", "x y z"),
         ("a.obj", b"v 1 2 b\n", "line 1"),
@@ -201,6 +202,20 @@ def test_bad_files_are_told_in_one_line(tmp_path, name, data, word):
     with pytest.raises(InputError, match=word) as error:
         read_cloud(path)
     assert str(path) in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_file_that_cannot_fit_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    write_cloud(tmp_path / "c.ply", sample(1000))
+    monkeypatch.setattr("perception.io.cloud_memory.available_memory", lambda: 10_000)
+    with pytest.raises(InputError, match=r"c\.ply: needs about .* GiB are free; split"):
+        read_cloud(tmp_path / "c.ply")
+
+
+def test_a_header_that_promises_too_much_is_cut_short_not_out_of_memory(tmp_path):
+    head = GOOD.replace(b"ascii", b"binary_little_endian").replace(b"vertex 1", b"vertex 99999999999999")
+    (tmp_path / "c.ply").write_bytes(head + b"end_header\n" + bytes(24))
+    with pytest.raises(InputError, match="2 whole rows, header says 99999999999999"):
+        read_cloud(tmp_path / "c.ply")
 
 
 def test_a_missing_file_and_a_folder_that_cannot_be_written(tmp_path):

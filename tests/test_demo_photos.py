@@ -15,7 +15,7 @@ from perception.errors import InputError
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, DemoTruth]:
     folder = tmp_path_factory.mktemp("demo") / "photos"
-    return folder, make_photos(folder, views=5, width=160, height=120, seed=3)
+    return folder, make_photos(folder, views=5, width=160, height=120, seed=3, light_samples=2)
 
 
 def test_truth_survives_the_disk(made: tuple[Path, DemoTruth]) -> None:
@@ -45,7 +45,8 @@ def test_projected_points_fall_on_the_mask_of_their_object(made: tuple[Path, Dem
 
 
 def test_the_table_is_the_plane_it_says(made: tuple[Path, DemoTruth]) -> None:
-    """Pixels labelled table, cast back onto z = 0 by hand, land inside the table's rectangle (or see its edge, legs)."""
+    """Pixels labelled table, cast back onto z = 0 by hand, land inside the table's rectangle (or see its
+    edge, legs)."""
     _, truth = made
     camera, labels = truth.cameras[3], truth.labels(truth.names[3])
     rows, columns = np.nonzero(labels == 11)
@@ -85,8 +86,12 @@ def test_every_thing_is_seen_and_every_query_has_its_answer(made: tuple[Path, De
 
 def test_same_seed_same_photos_other_seed_other_photos(made: tuple[Path, DemoTruth], tmp_path: Path) -> None:
     folder, truth = made
-    again = make_photos(tmp_path / "again" / "photos", views=5, width=160, height=120, seed=3)
-    other = make_photos(tmp_path / "other" / "photos", views=3, width=160, height=120, seed=4)
+    again = make_photos(
+        tmp_path / "again" / "photos", views=5, width=160, height=120, seed=3, light_samples=2
+    )
+    other = make_photos(
+        tmp_path / "other" / "photos", views=3, width=160, height=120, seed=4, light_samples=2
+    )
     for name in truth.names:
         assert (folder / name).read_bytes() == (tmp_path / "again" / "photos" / name).read_bytes()
     np.testing.assert_array_equal(again.points, truth.points)

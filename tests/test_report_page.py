@@ -1,4 +1,5 @@
-"""The report: one file that fetches nothing, well formed, escaped, under its limit, whole with parts missing."""
+"""The report: one file that fetches nothing, well formed, escaped, under its limit, whole with parts
+missing."""
 
 from __future__ import annotations
 

@@ -17,12 +17,7 @@ from perception.language.base import Encoder, make_encoder
 from perception.language.description import InstanceDescription
 from perception.language.ranking import PRESENT, Ranker
 
-ABSENT = (
-    "elephant, car, airplane, bicycle, motorcycle, train, horse, giraffe, sailing boat, fire truck, traffic light, "
-    "church, bridge, palm tree, shark, penguin, tractor, helicopter, snowman, waterfall, castle, whale, "
-    "lighthouse, tank, skateboard, surfboard, umbrella, piano, toothbrush, hair dryer, washing machine, "
-    "refrigerator, bathtub, toilet, violin, ladder, wheelchair, tent, parachute, lawn mower"
-).split(", ")
+ABSENT = ["elephant", "car", "airplane", "bicycle", "motorcycle", "train", "horse", "giraffe", "sailing boat", "fire truck", "traffic light", "church", "bridge", "palm tree", "shark", "penguin", "tractor", "helicopter", "snowman", "waterfall", "castle", "whale", "lighthouse", "tank", "skateboard", "surfboard", "umbrella", "piano", "toothbrush", "hair dryer", "washing machine", "refrigerator", "bathtub", "toilet", "violin", "ladder", "wheelchair", "tent", "parachute", "lawn mower"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

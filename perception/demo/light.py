@@ -1,6 +1,7 @@
 """Light baked once into small maps: a soft window lamp with shadows, a sky dimmed by what stands around.
 
-The scene is matte and still, so the light that leaves a surface point is the same in every photo: it is computed
+The scene is matte and still, so the light that leaves a surface point is the same in every photo: it is
+computed
 per map texel (rendering equation, one diffuse bounce off the object a sky ray meets) and kept.
 """
 
@@ -48,7 +49,8 @@ class Body:
 
 @dataclass(frozen=True)
 class Caster:
-    """What a shadow ray needs of a body: its shapes, a ball around them, the colour it lends to its neighbours."""
+    """What a shadow ray needs of a body: its shapes, a ball around them, the colour it lends to its
+    neighbours."""
 
     shapes: list[Shape]
     center: np.ndarray
@@ -98,7 +100,8 @@ def _linear(srgb: np.ndarray) -> np.ndarray:
 
 
 def first_hits(around: list[Caster], origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance [N] to the first caster along each unit ray (inf = none) and its index in the list (-1 = none)."""
+    """Distance [N] to the first caster along each unit ray (inf = none) and its index in the list (-1 =
+    none)."""
     origins, rays = origins.astype(np.float32), rays.astype(np.float32)
     distance = np.full(len(origins), np.inf, np.float32)
     index = np.full(len(origins), -1, np.int32)
@@ -142,7 +145,7 @@ def bake(around: list[Caster], part: Part, rng: np.random.Generator, samples: in
 
 def _lamp(
     around: list[Caster], start: np.ndarray, normals: np.ndarray, rng: np.random.Generator, samples: int
-):
+) -> np.ndarray:
     """Light [N, 3] of the round lamp: mean over its disc of visibility × cosine / distance²."""
     total = np.zeros(len(start))
     shift = rng.random((len(start), 2))
@@ -166,8 +169,9 @@ def _lamp(
 
 def _sky(
     around: list[Caster], start: np.ndarray, normals: np.ndarray, rng: np.random.Generator, samples: int
-):
-    """Light [N, 3] from all around: cosine-spread rays; one that meets a body brings a little of its colour."""
+) -> np.ndarray:
+    """Light [N, 3] from all around: cosine-spread rays; one that meets a body brings a little of its
+    colour."""
     tints = np.array([caster.tint for caster in around] + [np.zeros(3)])
     helper = np.where(np.abs(normals[:, :1]) > 0.7, [[0.0, 1, 0]], [[1.0, 0, 0]])
     side = np.cross(helper, normals)

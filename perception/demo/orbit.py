@@ -1,4 +1,5 @@
-"""Where the photographer stands: three arcs around the front of the table, at three heights, then closer looks."""
+"""Where the photographer stands: three arcs around the front of the table, at three heights, then closer
+looks."""
 
 from __future__ import annotations
 
@@ -43,6 +44,6 @@ def orbit(views: int, width: int, height: int) -> list[Camera]:
             eye = np.array(
                 [(radius + sway) * np.sin(angle), -(radius + sway) * np.cos(angle), lift + 0.6 * sway]
             )
-            target = np.array(aim) + [0.12 * np.sin(angle) * (k == 2), 0, 0.4 * sway]
+            target = np.array(aim) + np.array([0.12 * np.sin(angle) * (k == 2), 0, 0.4 * sway])
             cameras.append(Camera(intrinsics(width, height), look_at(eye, target), width, height))
     return cameras[:views]

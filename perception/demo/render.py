@@ -13,7 +13,8 @@ from perception.demo.shapes import to_local, to_world
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera: K [3, 3] pixels (centres at +0.5), camera_from_world [4, 4] (x right, y down, z forward)."""
+    """A pinhole camera: K [3, 3] pixels (centres at +0.5), camera_from_world [4, 4] (x right, y down, z
+    forward)."""
 
     K: np.ndarray
     camera_from_world: np.ndarray
@@ -34,7 +35,8 @@ class Camera:
 
 @dataclass
 class Picture:
-    """rgb [H, W, 3] uint8; ids [H, W] uint16, 0 = nothing; depth [H, W] float32 along the optical axis, inf = nothing."""
+    """rgb [H, W, 3] uint8; ids [H, W] uint16, 0 = nothing; depth [H, W] float32 along the optical axis, inf
+    = nothing."""
 
     rgb: np.ndarray
     ids: np.ndarray
@@ -42,7 +44,8 @@ class Picture:
 
 
 def cast(bodies: list[Body], camera: Camera, samples: int = 2) -> Picture:
-    """A noise-free picture with samples × samples rays a pixel; ids and depth at the finer grid are reduced."""
+    """A noise-free picture with samples × samples rays a pixel; ids and depth at the finer grid are
+    reduced."""
     height, width = camera.height * samples, camera.width * samples
     rotation = camera.camera_from_world[:3, :3]
     x = ((np.arange(width) + 0.5) / samples - camera.K[0, 2]) / camera.K[0, 0]
@@ -75,7 +78,8 @@ def _blocks(image: np.ndarray, samples: int) -> np.ndarray:
 
 
 def _window(part: Part, camera: Camera, samples: int) -> tuple[slice, slice] | None:
-    """The part of the fine grid where the part can be seen, from its projected bounds; None = out of sight."""
+    """The part of the fine grid where the part can be seen, from its projected bounds; None = out of
+    sight."""
     pixels, z = camera.project(to_world(part.shape, corners(part.shape)))
     if (z <= 0.02).all():
         return None
@@ -89,8 +93,18 @@ def _window(part: Part, camera: Camera, samples: int) -> tuple[slice, slice] | N
     return (slice(low[1], high[1]), slice(low[0], high[0])) if (high > low).all() else None
 
 
-def _paint(part: Part, id: int, eye: np.ndarray, rays, depth, ids, color) -> None:  # type: ignore[no-untyped-def]
-    """Casts the rays [h, w, 3] of a window at one part and writes where it is nearest (depth, ids, color in place)."""
+# type: ignore[no-untyped-def]
+def _paint(
+    part: Part,
+    id: int,
+    eye: np.ndarray,
+    rays: np.ndarray,
+    depth: np.ndarray,
+    ids: np.ndarray,
+    color: np.ndarray,
+) -> None:
+    """Casts the rays [h, w, 3] of a window at one part and writes where it is nearest (depth, ids, color in
+    place)."""
     shape = part.shape
     origin = to_local(shape, eye[None])[0].astype(np.float32)
     local = rays @ shape.rotation.astype(np.float32)
@@ -111,10 +125,13 @@ def _paint(part: Part, id: int, eye: np.ndarray, rays, depth, ids, color) -> Non
 
 
 def _sample(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Bilinear lookup at [N] positions. OpenCV remaps at most 32767 rows, so the list is folded into a square."""
+    """Bilinear lookup at [N] positions. OpenCV remaps at most 32767 rows, so the list is folded into a
+    square."""
     side = int(np.ceil(np.sqrt(len(x))))
-    folded = [np.pad(a, (0, side * side - len(a))).reshape(side, side) for a in (x, y)]
-    return cv2.remap(picture, *folded, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).reshape(-1, 3)[: len(x)]
+    map_x, map_y = (np.pad(a, (0, side * side - len(a))).reshape(side, side) for a in (x, y))
+    return cv2.remap(picture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).reshape(-1, 3)[
+        : len(x)
+    ]
 
 
 def _add_highlight(

@@ -1,4 +1,5 @@
-"""`make_photos`: a folder of photos of the demo's tabletop, and the truth about them in a folder beside it."""
+"""`make_photos`: a folder of photos of the demo's tabletop, and the truth about them in a folder beside
+it."""
 
 from __future__ import annotations
 
@@ -25,12 +26,20 @@ QUALITY = 92
 
 
 def make_photos(
-    folder: Path | str, *, views: int = 40, width: int = 640, height: int = 480, seed: int = 0
+    folder: Path | str,
+    *,
+    views: int = 40,
+    width: int = 640,
+    height: int = 480,
+    seed: int = 0,
+    light_samples: int = 20,
 ) -> DemoTruth:
     """Writes `views` JPEG photos (000.jpg ...) into `folder` and the truth into its sibling folder `truth`.
 
     The truth: labels/*.png (16-bit instance ids, 0 = nothing), scene.json, transforms.json, gt_points.ply.
-    The same arguments give the same photos. Distances in metres, z up, the origin on the middle of the table top.
+    light_samples: rays per texel of the light maps; fewer are faster and noisier.
+    The same arguments give the same photos. Distances in metres, z up, the origin on the middle of the table
+    top.
     """
     if views < 3 or width < 64 or height < 48:
         raise InputError(
@@ -40,7 +49,7 @@ def make_photos(
     truth_folder = folder.parent / "truth"
     folder.mkdir(parents=True, exist_ok=True)
     (truth_folder / "labels").mkdir(parents=True, exist_ok=True)
-    bodies = tabletop.build(seed)
+    bodies = tabletop.build(seed, light_samples)
     cameras = orbit(views, width, height)
     names = [f"{i:03d}.jpg" for i in range(views)]
 
@@ -50,7 +59,9 @@ def make_photos(
         cv2.imwrite(str(truth_folder / "labels" / f"{i:03d}.png"), picture.ids)
         return picture
 
-    with ThreadPoolExecutor() as pool:  # numpy and OpenCV let go of the interpreter lock in their loops
+    with ThreadPoolExecutor(
+        tabletop.WORKERS
+    ) as pool:  # numpy and OpenCV let go of the interpreter lock in their loops
         pictures = list(pool.map(shoot, range(views)))
     points, normals, colors, ids = _surface(bodies, np.random.default_rng((seed, views)))
     seen = _times_seen(points, normals, ids, cameras, pictures) >= 2
@@ -80,7 +91,8 @@ def _write_photo(path: Path, rgb: np.ndarray, rng: np.random.Generator) -> None:
 
 
 def _surface(bodies: list[Body], rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Points drawn on all surfaces, half of them by area, half in equal shares for the objects on the table."""
+    """Points drawn on all surfaces, half of them by area, half in equal shares for the objects on the
+    table."""
     charts = [(body, part) for body in bodies for part in body.parts]
     area = np.array([np.prod(part.shape.size()) for _, part in charts])
     small = np.array([0.0 if body.is_stuff else 1.0 for body, _ in charts])
@@ -114,7 +126,8 @@ def _surface(bodies: list[Body], rng: np.random.Generator) -> tuple[np.ndarray, 
 def _times_seen(
     points: np.ndarray, normals: np.ndarray, ids: np.ndarray, cameras: list[Camera], pictures: list[Picture]
 ) -> np.ndarray:
-    """In how many photos each point is seen: inside the frame, facing the camera, its own body the nearest."""
+    """In how many photos each point is seen: inside the frame, facing the camera, its own body the
+    nearest."""
     seen = np.zeros(len(points), int)
     for camera, picture in zip(cameras, pictures, strict=True):
         pixels, depth = camera.project(points)

@@ -6,6 +6,7 @@ Every shape lives in its own frame, `world_from_local = (rotation, origin)`, and
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -65,7 +66,8 @@ def _quadratic(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray,
 
 @dataclass
 class Sheet:
-    """A rectangle in the local xy plane, or an ellipse inscribed in it; the normal is +z. u along x, v along -y."""
+    """A rectangle in the local xy plane, or an ellipse inscribed in it; the normal is +z. u along x, v along
+    -y."""
 
     width: float
     height: float
@@ -131,7 +133,8 @@ class Ellipsoid:
 class Lathe:
     """A surface of revolution about z: the profile [S + 1, 2] of (radius, height), joined by cones and rings.
 
-    u is the angle, v the length along the profile. A profile that runs upwards on the outside has outward normals.
+    u is the angle, v the length along the profile. A profile that runs upwards on the outside has outward
+    normals.
     """
 
     profile: np.ndarray
@@ -200,10 +203,12 @@ def _segment_roots(
 
 @dataclass
 class Tube:
-    """A tube bent along a circle of radius `bend` in the local xy plane, from angle `start` to `stop` (radians).
+    """A tube bent along a circle of radius `bend` in the local xy plane, from angle `start` to `stop`
+    (radians).
 
     radii [S] are the tube's radii at equal steps along the arc. u runs around the tube, v along the arc.
-    Hits are found by sphere tracing: the distance bound is exact for constant radii, damped for tapering ones.
+    Hits are found by sphere tracing: the distance bound is exact for constant radii, damped for tapering
+    ones.
     """
 
     bend: float
@@ -276,7 +281,7 @@ class Tube:
         return 2 * np.pi * float(self.radii.max()), abs(self.stop - self.start) * self.bend
 
 
-def rotation_from_axes(x: np.ndarray | list[float], z: np.ndarray | list[float]) -> np.ndarray:
+def rotation_from_axes(x: np.ndarray | Sequence[float], z: np.ndarray | Sequence[float]) -> np.ndarray:
     """[3, 3] world_from_local rotation whose z axis is `z` and whose x axis is as near `x` as it can be."""
     z_axis = np.asarray(z, float) / np.linalg.norm(z)
     y_axis = np.cross(z_axis, np.asarray(x, float))

@@ -1,12 +1,13 @@
-"""Pictures painted by formula: wood, glaze, peel, balls, posters. All are [h, w, 3] float32 sRGB in [0, 1]."""
+"""Pictures painted by formula: wood, glaze, peel, balls, posters. All are [h, w, 3] float32 sRGB in [0,
+1]."""
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
-
-Color = tuple[float, float, float]
 
 
 def rgb(code: str) -> np.ndarray:
@@ -14,10 +15,13 @@ def rgb(code: str) -> np.ndarray:
     return np.array([int(code[i : i + 2], 16) for i in (1, 3, 5)], np.float32) / 255
 
 
-def noise(rng: np.random.Generator, height: int, width: int, cells: tuple[float, float], octaves: int = 4):
+def noise(
+    rng: np.random.Generator, height: int, width: int, cells: tuple[float, float], octaves: int = 4
+) -> np.ndarray:
     """Fractal value noise [h, w] float32 of zero mean and about unit deviation, periodic along the width.
 
-    cells: how many lattice cells the first octave has down and across; each octave doubles them at half the weight.
+    cells: how many lattice cells the first octave has down and across; each octave doubles them at half the
+    weight.
     """
     total = np.zeros((height, width), np.float32)
     weight = 1.0
@@ -39,7 +43,7 @@ def blend(amount: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarr
 
 def speckle(
     rng: np.random.Generator, picture: np.ndarray, count: int, sizes: tuple[int, int], colors: list[str]
-):
+) -> np.ndarray:
     """`count` small blots of the given colours and radii (pixels) dropped on a copy of the picture."""
     out = np.ascontiguousarray(picture, np.float32).copy()
     height, width = out.shape[:2]
@@ -55,7 +59,7 @@ def wood(rng: np.random.Generator, height: int, width: int, planks: int, light: 
     """Planks with grain along the width, knots, pores and dark joints."""
     rows = []
     edges = np.linspace(0, height, planks + 1).astype(int)
-    for top, bottom in zip(edges[:-1], edges[1:], strict=True):
+    for top, bottom in pairwise(edges):
         rows.append(_plank(rng, bottom - top, width, rgb(light), rgb(dark)))
     return np.clip(np.concatenate(rows), 0, 1)
 
@@ -185,7 +189,7 @@ def wallpaper(
 
 def landscape(
     rng: np.random.Generator, height: int, width: int, sky: list[str], hills: list[str], title: str
-):
+) -> np.ndarray:
     """A travel poster: a sun over ranges of hills, a title beneath."""
     y = np.linspace(0, 1, height)[:, None] * np.ones((1, width))
     art = blend(y * 1.4, rgb(sky[0]), rgb(sky[1])).astype(np.float32)

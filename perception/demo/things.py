@@ -16,32 +16,45 @@ def _at(place: Place, height: float = 0.0) -> np.ndarray:
 
 
 def mug(rng: np.random.Generator, id: int, name: str, place: Place, turn: float, paint: np.ndarray) -> Body:
-    """A coffee mug: a turned cup with a thick rim and a bent handle; `turn` (degrees) is where the handle points."""
+    """A mug of coffee: a turned cup with a thick rim and a bent handle that points to `turn` (degrees)."""
     profile = [
-        (0.0, 0.0), (0.034, 0.0), (0.040, 0.005), (0.0425, 0.015), (0.0435, 0.092), (0.0425, 0.0965), (0.0405, 0.0965),
-        (0.0395, 0.092), (0.038, 0.014), (0.033, 0.008), (0.0, 0.007),
+        (0.0, 0.0), (0.034, 0.0), (0.040, 0.005), (0.0425, 0.015), (0.0435, 0.092), (0.0425, 0.0965),
+        (0.0405, 0.0965), (0.0395, 0.092), (0.039, 0.078), (0.0, 0.078),
     ]  # fmt: skip
     turned = spin(turn)
     cup = Lathe(np.array(profile), turned, _at(place))
     outward, up = turned[:, 0], np.array([0, 0, 1.0])
     handle = Tube(
-        0.0295, np.radians(-105), np.radians(105), np.full(9, 0.0064),
-        np.stack([outward, up, np.cross(outward, up)], 1), _at(place, 0.05) + 0.0425 * outward,
+        0.0295, np.radians(-90), np.radians(90), np.full(9, 0.0064),
+        np.stack([outward, up, np.cross(outward, up)], 1), _at(place, 0.05) + 0.0455 * outward,
     )  # fmt: skip
-    grip = np.ascontiguousarray(paint[5:45, :60])
+    grip = np.ascontiguousarray(paint[110:150, :60])
     return Body(
         id, name, [name, "coffee mug"], [Part(cup, paint, 0.5, (40, 48)), Part(handle, grip, 0.5, (12, 32))]
     )
 
 
-def mug_paint(rng: np.random.Generator, color: str, ink: str, word: str) -> np.ndarray:
-    """Glaze with a printed word twice on the outer wall (profile share .20 to .52 of the chart)."""
+def mug_paint(rng: np.random.Generator, color: str, ink: str, hearts: bool) -> np.ndarray:
+    """Glaze with hearts or dots on the outer wall, a cream inside, coffee (the profile's last fifth)."""
+    import cv2
+
     height, width = 480, 560
-    paint = tex.glaze(rng, height, width, color, [ink, "#1c1c1c"], 90)
-    for column in (70, 350):
-        # The profile runs upwards, the chart's rows with it: print upside down to read upright.
-        label = tex.draw_text(paint[120:234, column : column + 200][::-1], word, (100, 57), 52, ink)
-        paint[120:234, column : column + 200] = label[::-1]
+    paint = tex.glaze(rng, height, width, color, [ink, "#1c1c1c"], 60)
+    for i in range(3 if hearts else 14):
+        x, y = int((i + 0.5) * width / (3 if hearts else 14)), (232 if hearts else 195 + 75 * (i % 2))
+        if hearts:
+            a = np.linspace(0, 2 * np.pi, 60)
+            rise = 13 * np.cos(a) - 5 * np.cos(2 * a) - 2 * np.cos(3 * a) - np.cos(4 * a)
+            shape = np.stack([x + 2.6 * 16 * np.sin(a) ** 3, y + 3.6 * rise], 1)  # rows run upwards
+            cv2.fillPoly(paint, [shape.astype(np.int32)], tex.rgb(ink).tolist(), cv2.LINE_AA)
+        else:
+            cv2.ellipse(paint, (x, y), (11, 15), 0, 0, 360, tex.rgb(ink).tolist(), -1, cv2.LINE_AA)
+    inside = int(0.73 * height)
+    paint[inside:] = tex.glaze(rng, height - inside, width, "#efe6d2", ["#cdbf9f"], 40)
+    coffee = int(0.80 * height)
+    brown = tex.rgb("#3a1f10") * np.ones((height - coffee, width, 3), np.float32)
+    foam = tex.noise(rng, height - coffee, width, (4, 10), 5)
+    paint[coffee:] = tex.blend(0.12 * foam + 0.05, brown, tex.rgb("#a8743e"))
     return paint
 
 
@@ -137,8 +150,8 @@ def book(rng: np.random.Generator, id: int, name: str, place: Place, turn: float
     cover = tex.landscape(
         rng, 560, 410, ["#0d4f4a", "#1c8a78"], ["#2a9a7d", "#166b5d", "#0f4c46", "#0a3330"], "FIELD GUIDE"
     )
-    cover = tex.draw_text(cover, "BIRDS", (205, 210), 88, "#fff3cf")
-    cover = tex.draw_text(cover, "OF THE NORTH", (205, 275), 34, "#f2d98a")
+    cover = tex.draw_text(cover, "BIRDS", (205, 320), 88, "#fff3cf")
+    cover = tex.draw_text(cover, "OF THE NORTH", (205, 385), 34, "#f2d98a")
     spine = tex.glaze(rng, 100, 560, "#0d4f4a", ["#1c8a78"], 200)
     spine = tex.draw_text(spine, "BIRDS OF THE NORTH", (280, 50), 38, "#f2d98a")
     lines = tex.noise(rng, 100, 560, (50, 3), 2)
@@ -155,14 +168,16 @@ def book(rng: np.random.Generator, id: int, name: str, place: Place, turn: float
 
 def cactus(rng: np.random.Generator, id: int, name: str, place: Place) -> Body:
     """A ribbed cactus with two arms in a terracotta pot."""
-    pot = Lathe(
-        np.array([(0, 0), (0.034, 0), (0.046, 0.062), (0.051, 0.063), (0.053, 0.085), (0.048, 0.086), (0.046, 0.074), (0, 0.073)]),
-        spin(0), _at(place),
-    )  # fmt: skip
+    profile = [
+        (0.0, 0.0), (0.034, 0.0), (0.046, 0.062), (0.051, 0.063), (0.053, 0.085), (0.048, 0.086),
+        (0.046, 0.074), (0.0, 0.073),
+    ]  # fmt: skip
+    pot = Lathe(np.array(profile), spin(0), _at(place))
     clay = tex.blend(
-        0.4 + 0.25 * tex.noise(rng, 360, 560, (8, 12), 5), tex.rgb("#c76b3f") * np.ones((360, 560, 3), np.float32),
+        0.4 + 0.25 * tex.noise(rng, 360, 560, (8, 12), 5),
+        tex.rgb("#c76b3f") * np.ones((360, 560, 3), np.float32),
         tex.rgb("#9a4a29"),
-    )  # fmt: skip
+    )
     clay[250:] = tex.speckle(
         rng,
         tex.rgb("#3b2a1d") * np.ones((110, 560, 3), np.float32),
@@ -176,8 +191,9 @@ def cactus(rng: np.random.Generator, id: int, name: str, place: Place) -> Body:
         outward = spin(side)[:, 0]
         axes = np.stack([outward, np.array([0, 0, 1.0]), np.cross(outward, [0, 0, 1.0])], 1)
         # A quarter bend: out of the stem sideways, then upwards.
-        bend = Tube(size, np.radians(-100), np.radians(20), np.array([0.009, 0.011, 0.0115, 0.0115, 0.011]), axes,
-                    _at(place, height + size) + 0.028 * outward)  # fmt: skip
+        origin = _at(place, height + size) + 0.028 * outward
+        radii = np.array([0.009, 0.011, 0.0115, 0.0115, 0.011])
+        bend = Tube(size, np.radians(-100), np.radians(20), radii, axes, origin)
         parts.append(Part(bend, _ribs(rng, 160, 160, 7), 0.0, (20, 24)))
     return Body(id, name, [name, "potted cactus", "flowerpot"], parts)
 
@@ -210,7 +226,7 @@ def clock(rng: np.random.Generator, id: int, name: str, center: np.ndarray) -> B
         a = np.radians(6 * i)
         inner = 0.86 if i % 5 else 0.80
         ends = [(int(240 + 225 * r * np.sin(a)), int(240 - 225 * r * np.cos(a))) for r in (inner, 0.93)]
-        cv2.line(dial, *ends, tex.rgb("#22262b").tolist(), 2 if i % 5 else 7, cv2.LINE_AA)
+        cv2.line(dial, ends[0], ends[1], tex.rgb("#22262b").tolist(), 2 if i % 5 else 7, cv2.LINE_AA)
     for hour in range(1, 13):
         a = np.radians(30 * hour)
         dial = tex.draw_text(dial, str(hour), (240 + 152 * np.sin(a), 240 - 152 * np.cos(a)), 46, "#22262b")

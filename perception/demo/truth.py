@@ -18,7 +18,8 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes <-> the OpenGL axes
 
 @dataclass(frozen=True)
 class Truth:
-    """One instance as it is: id > 0, name, prompts that name it, whether it is background (table, wall, floor...)."""
+    """One instance as it is: id > 0, name, prompts that name it, whether it is background (table, wall,
+    floor...)."""
 
     id: int
     name: str
@@ -31,7 +32,8 @@ class DemoTruth:
     """Truth of a set of demo photos, metres, z up.
 
     instances: by id. queries: (text, ids that answer it); no ids = not in the scene. names: photo file names.
-    cameras: one per photo. points [N, 3] float32, normals [N, 3] float32, colors [N, 3] uint8, instance_ids [N] int32:
+    cameras: one per photo. points [N, 3] float32, normals [N, 3] float32, colors [N, 3] uint8, instance_ids
+    [N] int32:
     surface points seen in at least two photos. folder: where the label images lie.
     """
 
@@ -87,12 +89,15 @@ def load_truth(folder: Path | str) -> DemoTruth:
     ]
     raw = (folder / "gt_points.ply").read_bytes()
     data = np.frombuffer(raw[raw.index(b"end_header\n") + 11 :], _VERTEX)
+    points, normals, colors = (np.stack([data[name] for name in group], -1) for group in _GROUPS)
     return DemoTruth(
         [Truth(**instance) for instance in scene["instances"]],
         [(query["text"], query["instance_ids"]) for query in scene["queries"]],
         [Path(frame["file_path"]).name for frame in views["frames"]],
         cameras,
-        *(np.stack([data[name] for name in group], -1) for group in _GROUPS),
+        points,
+        normals,
+        colors,
         data["instance_id"].astype(np.int32),
         folder,
     )

@@ -123,11 +123,11 @@ def evaluate_masks(
     """
     rules = get_protocol(protocol, **changes)
     return evaluate_overlaps(
-        [_mask_overlap(rules, masks, scores, gt_ids, classes, gt_semantics, ignore)], rules
+        [mask_overlap(rules, masks, scores, gt_ids, classes, gt_semantics, ignore)], rules
     )
 
 
-def _mask_overlap(
+def mask_overlap(
     rules: Protocol,
     masks: Sequence[np.ndarray],
     scores: Sequence[float],
@@ -136,6 +136,7 @@ def _mask_overlap(
     gt_semantics: np.ndarray | None,
     ignore: np.ndarray | None,
 ) -> Overlap:
+    """Overlap of one scene's masks (each bool [N]) with its truth under a protocol; see evaluate_masks."""
     for i, mask in enumerate(masks):
         if len(mask) != len(gt_ids):
             raise InputError(

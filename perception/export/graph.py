@@ -6,7 +6,7 @@ import numpy as np
 
 from perception import _core
 from perception.errors import InputError
-from perception.export.neighbors import Neighbors
+from perception.export.neighbors import Neighbors, cores
 
 
 def mesh_edges(faces: np.ndarray, num_points: int) -> np.ndarray:
@@ -22,14 +22,39 @@ def mesh_edges(faces: np.ndarray, num_points: int) -> np.ndarray:
 
 def knn_edges(points: np.ndarray, k: int = 8) -> np.ndarray:
     """Edges [E, 2] int32, each once with a < b: each finite point and its k nearest neighbours."""
-    return _edges(points, k, np.inf)
+    return list_edges(neighbor_lists(points, k + 1))
 
 
 def radius_edges(points: np.ndarray, radius: float, max_neighbors: int = 32) -> np.ndarray:
     """Edges [E, 2] int32 between points within `radius`, at most the `max_neighbors` nearest of each."""
     if not radius > 0:
         raise InputError(f"radius is {radius}; expected a positive length")
-    return _edges(points, max_neighbors, radius)
+    return list_edges(neighbor_lists(points, max_neighbors + 1, radius))
+
+
+def neighbor_lists(points: np.ndarray, k: int, max_distance: float = np.inf) -> np.ndarray:
+    """The k nearest points [P, k] int32 of each point, itself among them, nearest first; −1 where there are
+    fewer.
+
+    A point that is not finite has no neighbours and is none.
+    """
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1)).astype(np.int32)
+    if len(finite) == 0:
+        return np.full((len(points), 1), -1, np.int32)
+    k = min(k, len(finite), 1024)
+    if len(finite) == len(points):
+        return Neighbors(points).query(points, k, max_distance)[0]
+    inside = points[finite]
+    found = Neighbors(inside).query(inside, k, max_distance)[0]
+    lists = np.full((len(points), k), -1, np.int32)
+    lists[finite] = np.where(found >= 0, finite[found], -1)
+    return lists
+
+
+def list_edges(lists: np.ndarray) -> np.ndarray:
+    """Edges [E, 2] int32, each once with a < b, of neighbour lists [P, k]."""
+    edges = np.empty((lists.size, 2), np.int32)
+    return edges[: _core.undirected(np.ascontiguousarray(lists), edges)]
 
 
 def spacing(points: np.ndarray, sample: int = 20000) -> float:
@@ -41,17 +66,6 @@ def spacing(points: np.ndarray, sample: int = 20000) -> float:
     distances = Neighbors(points).query(chosen, 2)[1][:, 1]
     positive = distances[distances > 0]
     return float(np.median(positive)) if len(positive) else 0.0
-
-
-def _edges(points: np.ndarray, k: int, max_distance: float) -> np.ndarray:
-    finite = np.flatnonzero(np.isfinite(points).all(axis=1)).astype(np.int32)
-    if len(finite) == 0:
-        return np.empty((0, 2), np.int32)
-    inside = points if len(finite) == len(points) else points[finite]
-    found = Neighbors(inside).query(inside, min(k + 1, len(finite), 1024), max_distance)[0]
-    edges = np.empty((found.size, 2), np.int32)
-    edges = edges[: _core.undirected(found, edges)]
-    return edges if len(finite) == len(points) else finite[edges]
 
 
 def mesh_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -66,25 +80,25 @@ def mesh_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def estimate_normals(points: np.ndarray, k: int = 12) -> np.ndarray:
-    """Normals [P, 3] float32 of a bare cloud: least variance direction of the k nearest neighbours.
+    """Normals [P, 3] float32 of a bare cloud: least variance direction of the k nearest points, itself
+    included.
 
-    The sign is arbitrary: weights of such normals must not tell the two directions apart. Zero at lone
-    points.
+    The sign is arbitrary: weights of such normals must not tell the two directions apart. Zero where the
+    neighbours span no plane.
     """
-    normals = np.zeros((len(points), 3), np.float32)
-    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
-    if len(finite) < 3:
-        return normals
-    inside = points[finite]
-    tree = Neighbors(inside)
-    local = tree.local(inside)
-    k = min(k, len(inside))
-    for begin in range(0, len(inside), 1 << 20):
-        block = slice(begin, begin + (1 << 20))
-        lists = tree.query(inside[block], k)[0]
-        found = np.empty((len(lists), 3), np.float32)
-        _core.plane_normals(local, lists, found, tree.threads)
-        normals[finite[block]] = found
+    return list_normals(points, neighbor_lists(points, k))
+
+
+def list_normals(points: np.ndarray, lists: np.ndarray) -> np.ndarray:
+    """Normals [P, 3] float32 of the planes through the neighbour lists [P, k] of points [P, 3]; zero where
+    none is.
+    """
+    normals = np.empty((len(points), 3), np.float32)
+    first = np.flatnonzero(np.isfinite(points).all(axis=1))[:1]
+    local = (points - points[first].sum(axis=0)).astype(
+        np.float32
+    )  # about some point: large coordinates stay exact
+    _core.plane_normals(local, np.ascontiguousarray(lists), normals, cores())
     return normals
 
 

@@ -14,16 +14,23 @@ from perception import _core
 from perception.errors import InputError
 from perception.export.graph import (
     estimate_normals,
-    knn_edges,
+    list_edges,
+    list_normals,
     mesh_edges,
     mesh_normals,
+    neighbor_lists,
     radius_edges,
     scannet_weights,
     spacing,
 )
+from perception.io.cloud_memory import require_memory
 from perception.types import PointCloud
 
 COLOR_WEIGHT = 0.05  # of bare clouds: without it a poster joins its wall, whose normals are the same
+
+
+NORMAL_NEIGHBORS = 12  # of each point, for the plane that gives its normal
+_BYTES_PER_POINT = 250  # at the height of a kNN segmentation, measured with a margin
 
 
 @dataclass(frozen=True)
@@ -62,25 +69,17 @@ def segment_cloud(cloud: PointCloud, options: SmoothOptions | None = None) -> np
     """Superpoints [P] int32 of a cloud or mesh. Points that are not finite become segments of their own."""
     options = options or SmoothOptions()
     points = cloud.points
+    require_memory(
+        _BYTES_PER_POINT * len(points), "smoothing", "export without it (--no-smooth) or split the cloud"
+    )
     faces = cloud.faces if cloud.faces is not None and len(cloud.faces) else None
     kind = ("mesh" if faces is not None else "knn") if options.graph == "auto" else options.graph
-    if kind == "mesh":
-        if faces is None:
-            raise InputError(
-                "smoothing over mesh edges was asked for, but the cloud has no faces; use graph knn"
-            )
-        edges = mesh_edges(faces, len(points))
-    elif kind == "knn":
-        edges = knn_edges(points, options.neighbors)
-    elif kind == "radius":
-        edges = radius_edges(points, options.radius or 3 * spacing(points) or 1.0)
-    else:
-        raise InputError(f"graph '{kind}' is unknown; expected auto, mesh, knn or radius")
-    normals, oriented = _normals(cloud, faces)
+    edges, lists = _graph(points, faces, kind, options)
+    normals, oriented = _normals(cloud, faces, lists)
     weights = scannet_weights(points, normals, edges, oriented=oriented)
-    color_weight = (
-        (0.0 if kind == "mesh" else COLOR_WEIGHT) if options.color_weight is None else options.color_weight
-    )
+    color_weight = options.color_weight
+    if color_weight is None:
+        color_weight = 0.0 if kind == "mesh" else COLOR_WEIGHT
     if color_weight and cloud.colors is not None:
         weights += color_weight * _color_difference(cloud.colors, edges)
     weights = np.nan_to_num(weights, nan=2.0).astype(np.float32)
@@ -93,12 +92,35 @@ def _color_difference(colors: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return np.sqrt(np.einsum("ei,ei->e", difference, difference)) / np.float32(255)
 
 
-def _normals(cloud: PointCloud, faces: np.ndarray | None) -> tuple[np.ndarray, bool]:
+def _graph(
+    points: np.ndarray, faces: np.ndarray | None, kind: str, options: SmoothOptions
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """(edges [E, 2], the nearest neighbours [P, k] where the graph came from them)."""
+    if kind == "mesh":
+        if faces is None:
+            raise InputError(
+                "smoothing over mesh edges was asked for, but the cloud has no faces; use graph knn"
+            )
+        return mesh_edges(faces, len(points)), None
+    if kind == "knn":
+        lists = neighbor_lists(points, max(options.neighbors + 1, NORMAL_NEIGHBORS))
+        return list_edges(lists[:, : options.neighbors + 1]), lists[:, :NORMAL_NEIGHBORS]
+    if kind == "radius":
+        return radius_edges(points, options.radius or 3 * spacing(points) or 1.0), None
+    raise InputError(f"graph '{kind}' is unknown; expected auto, mesh, knn or radius")
+
+
+def _normals(
+    cloud: PointCloud, faces: np.ndarray | None, lists: np.ndarray | None
+) -> tuple[np.ndarray, bool]:
+    """(normals [P, 3], whether their sign means anything)."""
     if cloud.normals is not None:
         return np.nan_to_num(cloud.normals), True
     if faces is not None:
         return mesh_normals(cloud.points, faces), True
-    return estimate_normals(cloud.points), False
+    if lists is None:
+        return estimate_normals(cloud.points, NORMAL_NEIGHBORS), False
+    return list_normals(cloud.points, lists), False
 
 
 def vote(labels: np.ndarray, segments: np.ndarray) -> np.ndarray:

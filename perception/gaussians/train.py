@@ -66,7 +66,9 @@ def scene_extent(views: list[TrainingView]) -> float:
 class Trainer:
     """Holds all state of one optimisation; `state` and `load` round-trip it through a checkpoint."""
 
-    def __init__(self, gaussians: Gaussians, views: list[TrainingView], config: MapConfig, held_out: list[TrainingView]):
+    def __init__(
+        self, gaussians: Gaussians, views: list[TrainingView], config: MapConfig, held_out: list[TrainingView]
+    ):
         self.config = config
         self.views = views
         self.held_out = held_out
@@ -140,7 +142,9 @@ class Trainer:
 
     def _sync(self) -> None:
         """The optimiser owns the tensors; the model is a view of them."""
-        self.gaussians = Gaussians(**{name: tensor.detach() for name, tensor in self.optimiser.params.items()})
+        self.gaussians = Gaussians(
+            **{name: tensor.detach() for name, tensor in self.optimiser.params.items()}
+        )
 
     # ------------------------------------------------------------------ steps
 
@@ -198,6 +202,7 @@ class Trainer:
             sh_degree=self.gaussians.sh_degree,
             features=params["features"] if with_features else None,
             background=background,
+            depth=False,
         )
         loss = photometric_loss(out.colors[0], view.photo, config.train.ssim_weight)
         figures = {"rgb": float(loss.detach())}
@@ -262,7 +267,9 @@ class Trainer:
         if len(gains) > 1:
             extra = float(gains[-1] - gains[0])
             paid = extra >= self.config.train.sh_min_gain_db
-            self.record.decisions.append(f"harmonics: degree {degree} gained {extra:+.2f} dB, {'kept' if paid else 'taken back'}")
+            self.record.decisions.append(
+                f"harmonics: degree {degree} gained {extra:+.2f} dB, {'kept' if paid else 'taken back'}"
+            )
             if not paid:
                 self._set_degree(degree - 1)
             self._sh_settled = not paid or degree == limit
@@ -285,7 +292,9 @@ class Trainer:
         views = self.held_out or self.views
         if limit is not None and len(views) > limit:
             views = [views[i] for i in np.linspace(0, len(views) - 1, limit).round().astype(int)]
-        return {"psnr": float(np.mean([psnr(render_view(self.gaussians, view), view.photo) for view in views]))}
+        return {
+            "psnr": float(np.mean([psnr(render_view(self.gaussians, view), view.photo) for view in views]))
+        }
 
     def _note(self, progress: float) -> None:
         self.record.curve.append(
@@ -314,6 +323,7 @@ def render_view(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
         width,
         height,
         sh_degree=gaussians.sh_degree,
+        depth=False,
     )
     return out.colors[0].clamp(0, 1)
 

@@ -45,14 +45,21 @@ class Agreement:
         return np.where(self.weight > 0, self.total / np.maximum(self.weight, 1), 1.0)
 
 
-def scores(ids: np.ndarray, membership: np.ndarray, opacities: np.ndarray, agreement: Agreement) -> np.ndarray:
+def scores(
+    ids: np.ndarray, membership: np.ndarray, opacities: np.ndarray, agreement: Agreement
+) -> np.ndarray:
     """[M] float64 in [0, 1]: one score an instance, as told above."""
     count = len(agreement.views)
     member = ids >= 0
     sizes = np.maximum(np.bincount(ids[member], minlength=count), 1)
     strength = np.bincount(ids[member], weights=membership[member], minlength=count) / sizes
     solidity = np.bincount(ids[member], weights=opacities[member], minlength=count) / sizes
-    factors: Iterable[np.ndarray] = (strength, agreement.mean(), agreement.views / (agreement.views + 2.0), solidity)
+    factors: Iterable[np.ndarray] = (
+        strength,
+        agreement.mean(),
+        agreement.views / (agreement.views + 2.0),
+        solidity,
+    )
     product = np.ones(count)
     for factor in factors:
         product *= np.clip(factor, 0, 1)

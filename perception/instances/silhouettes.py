@@ -58,6 +58,8 @@ def render_silhouettes(
             width,
             height,
             features=white,
+            variance=False,
+            depth=False,
         )
         seen = out.visible[0]
         value, index = out.features[0].max(dim=2)

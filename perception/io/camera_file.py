@@ -50,7 +50,7 @@ def _colmap_distortion(name: str, k: list[float]) -> tuple[str, list[float]]:
         return "PINHOLE", []
     if not any(k[4:]):
         return "OPENCV", k[:4]
-    return "FULL_OPENCV", (k + [0.0, 0.0, 0.0])[:8]
+    return "FULL_OPENCV", ([*k, 0.0, 0.0, 0.0])[:8]
 
 
 def _load(path: Path) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.cloud_atomic import replacing
 from perception.io.cloud_las import read_las
+from perception.io.cloud_memory import require_memory
 from perception.io.cloud_pcd import read_pcd, write_pcd
 from perception.io.cloud_text import read_obj, read_xyz, write_xyz
 from perception.io.ply import read_ply, write_ply
@@ -37,6 +38,8 @@ def read_cloud(path: str | Path) -> PointCloud:
         )
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; expected a point cloud")
+    needed = _BYTES_PER_BYTE.get(path.suffix.lower(), 4) * path.stat().st_size
+    require_memory(needed, str(path), "split the cloud, or use a machine with more memory")
     cloud = reader(path)
     if len(cloud.points) == 0:
         raise InputError(f"{path}: holds no points")
@@ -185,6 +188,8 @@ _READERS: dict[str, Callable[[Path], PointCloud]] = {
     ".las": read_las,
     ".laz": read_las,
 }
+# Memory to read a file, by its size: compressed and text formats grow.
+_BYTES_PER_BYTE = {".laz": 40, ".obj": 12, ".xyz": 4, ".txt": 4, ".pts": 4}
 _WRITERS: dict[str, Callable[[Path, PointCloud], None]] = {
     ".ply": _write_ply_cloud,
     ".pcd": write_pcd,

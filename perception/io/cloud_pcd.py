@@ -67,7 +67,7 @@ def _row_type(header: dict[str, list[str]], path: Path) -> tuple[np.dtype, int]:
 
 def _from_ascii(data: bytes, dtype: np.dtype, points: int, path: Path) -> np.ndarray:
     try:
-        numbers = np.array(data.split(), np.float64)
+        numbers = np.fromstring(data, dtype=np.float64, sep=" ")
         widths = [int(np.prod(dtype[name].shape)) for name in dtype.names or ()]
         table = numbers.reshape(points, sum(widths))
     except ValueError as error:

@@ -36,19 +36,30 @@ def read_xyz(path: Path) -> PointCloud:
 
 
 def _table(path: Path) -> np.ndarray:
-    lines = path.read_bytes().replace(b",", b" ").replace(b";", b" ").splitlines()
-    lines = [line for line in lines if line.strip() and not line.lstrip().startswith((b"#", b"//"))]
-    if lines and len(lines) > 1 and len(lines[0].split()) == 1 and len(lines[1].split()) > 1:
-        lines = lines[1:]
-    if not lines:
+    """The numbers of a text table as [rows, columns] float64."""
+    data = path.read_bytes().replace(b",", b" ").replace(b";", b" ")
+    if b"#" in data or b"//" in data:
+        kept = [line for line in data.splitlines() if not line.lstrip().startswith((b"#", b"//"))]
+        data = b"\n".join(kept)
+    lines = data.lstrip().split(b"\n", 2)
+    if len(lines) > 1 and len(lines[0].split()) == 1 < len(lines[1].split()):
+        data = data.lstrip().split(b"\n", 1)[1]  # a .pts file begins with its count
+    width = len(data.lstrip().split(b"\n", 1)[0].split())
+    if width == 0:
         return np.empty((0, 3))
-    width = len(lines[0].split())
     try:
-        return np.array(b" ".join(lines).split(), dtype=np.float64).reshape(len(lines), width)
+        numbers = np.fromstring(data, dtype=np.float64, sep=" ")
     except ValueError as error:
-        raise InputError(
-            f"{path}: expected {width} numbers in each of {len(lines)} rows ({error})"
-        ) from error
+        raise InputError(f"{path}: holds text where numbers are expected ({error})") from error
+    stripped = data.strip()
+    if len(numbers) != width * (stripped.count(b"\n") + 1):  # blank or uneven lines
+        rows = [len(line.split()) for line in stripped.splitlines() if line.strip()]
+        uneven = [i for i, n in enumerate(rows) if n != width]
+        if uneven:
+            raise InputError(
+                f"{path}: row {uneven[0] + 1} has {rows[uneven[0]]} numbers; expected {width} as before"
+            )
+    return numbers.reshape(-1, width)
 
 
 def _looks_like_color(triple: np.ndarray) -> bool:

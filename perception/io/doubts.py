@@ -23,7 +23,9 @@ def doubts_about(models: list[Any], database: Path, photos: int) -> list[str]:
         warnings.append(f"only {registered} of {photos} photos are registered")
     if len(models) > 1 and models[1].num_reg_images() > MAX_SECOND_MODEL * registered:
         sizes = ", ".join(str(model.num_reg_images()) for model in models)
-        warnings.append(f"the photos split into {len(models)} unconnected models (photos: {sizes}); the largest is used")
+        warnings.append(
+            f"the photos split into {len(models)} unconnected models (photos: {sizes}); the largest is used"
+        )
     verified = _inlier_shares(best, database)
     wrong = sum(share < 0.5 for share in verified.values())
     if len(verified) >= 5 and wrong > MAX_INCONSISTENT * len(verified):
@@ -84,7 +86,9 @@ def _unmatched_neighbors(model: Any, matched: set[tuple[int, int]]) -> tuple[int
         return 0, 0
     distances = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     depth = np.median(np.linalg.norm(xyz[:: max(1, len(xyz) // 2000), None] - centers[None], axis=2), axis=0)
-    close = (distances < 0.1 * np.minimum.outer(depth, depth)) & (forward @ forward.T > np.cos(np.radians(15)))
+    close = (distances < 0.1 * np.minimum.outer(depth, depth)) & (
+        forward @ forward.T > np.cos(np.radians(15))
+    )
     pairs = [(ids[r], ids[c]) for r, c in zip(*np.nonzero(np.triu(close, 1)), strict=True)]
     alone = sum((i, j) not in matched and (j, i) not in matched for i, j in pairs)
     return alone, len(pairs)

@@ -28,7 +28,9 @@ MAX_FEATURES = 2048
 EXHAUSTIVE_BELOW = 20
 NEIGHBORS = 4
 """Neighbours by name that are always matched: photos are usually taken in order."""
-COARSE_FEATURES, COARSE_MIN_MATCHES = 256, 4
+COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS = 256, 4, 0.7, 6
+"""A strict ratio also keeps out pairs that only share repeated textures, which fold models; every photo keeps its
+PARTNERS best pairs so that the set stays connected."""
 
 
 class FeatureStore:
@@ -86,8 +88,9 @@ def _build(
 
 def _stage(staged: Path, root: Path, photos: list[Path]) -> tuple[Path, list[str]]:
     """pycolmap ignores EXIF rotation and reads few formats: if any photo needs it, all are laid out anew."""
-    if all(_is_plain(photo) for photo in photos):
-        return root, [photo.relative_to(root).as_posix() for photo in photos]
+    names = [photo.relative_to(root).as_posix() for photo in photos]
+    if all(_is_plain(photo) for photo in photos) and not any(" " in name for name in names):
+        return root, names  # pair lists separate names by blanks
     names = []
     for index, photo in enumerate(photos):
         plain = _is_plain(photo)
@@ -98,8 +101,8 @@ def _stage(staged: Path, root: Path, photos: list[Path]) -> tuple[Path, list[str
             target.symlink_to(photo.resolve())
             continue
         with Image.open(photo) as image:
-            exif = ImageOps.exif_transpose(image).getexif() if image.getexif() else None
-        Image.fromarray(read_photo(photo)).save(target, quality=98, subsampling=0, **({"exif": exif} if exif else {}))
+            exif = ImageOps.exif_transpose(image).getexif()
+        Image.fromarray(read_photo(photo)).save(target, quality=98, subsampling=0, exif=exif)
     return staged, names
 
 
@@ -148,7 +151,9 @@ def _camera_key(photo: Path) -> tuple[Any, ...]:
     return (*photo_size(photo), exif.get(0x010F), exif.get(0x0110), details.get(0x920A), details.get(0xA404))
 
 
-def _match(database: Path, pair_file: Path, names: list[str], seed: int, progress: Progress) -> tuple[int, int]:
+def _match(
+    database: Path, pair_file: Path, names: list[str], seed: int, progress: Progress
+) -> tuple[int, int]:
     pycolmap = load_pycolmap()
     pairs = _select_pairs(database, names)
     pair_file.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs))
@@ -176,11 +181,13 @@ def _select_pairs(database: Path, names: list[str]) -> list[tuple[int, int]]:
     if count < EXHAUSTIVE_BELOW:
         return every
     descriptors = _largest_features(database, names)
-    chosen = []
+    votes = np.zeros((count, count), np.int64)
     for i, j in every:
-        if j - i <= NEIGHBORS or _mutual_matches(descriptors[i], descriptors[j]) >= COARSE_MIN_MATCHES:
-            chosen.append((i, j))
-    return chosen
+        votes[i, j] = votes[j, i] = _mutual_matches(descriptors[i], descriptors[j])
+    keep = votes >= COARSE_MIN_MATCHES
+    best = np.argsort(-votes, axis=1, kind="stable")[:, :PARTNERS]
+    np.put_along_axis(keep, best, np.take_along_axis(votes, best, axis=1) > 0, axis=1)
+    return [(i, j) for i, j in every if j - i <= NEIGHBORS or keep[i, j] or keep[j, i]]
 
 
 def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
@@ -190,7 +197,9 @@ def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
     for name in names:
         image = db.read_image_with_name(name)
         keypoints = db.read_keypoints(image.image_id)
-        keypoints = keypoints if isinstance(keypoints, np.ndarray) else pycolmap.keypoints_to_matrix(keypoints)
+        keypoints = (
+            keypoints if isinstance(keypoints, np.ndarray) else pycolmap.keypoints_to_matrix(keypoints)
+        )
         data = np.asarray(db.read_descriptors(image.image_id).data, dtype=np.float32)
         area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
         top = np.argsort(-area, kind="stable")[:COARSE_FEATURES]
@@ -200,7 +209,7 @@ def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
     return result
 
 
-def _mutual_matches(a: np.ndarray, b: np.ndarray, ratio: float = 0.85) -> int:
+def _mutual_matches(a: np.ndarray, b: np.ndarray, ratio: float = COARSE_RATIO) -> int:
     """Number of mutual nearest neighbours that pass Lowe's ratio test (distances of unit descriptors)."""
     if min(len(a), len(b)) < 2:
         return 0
@@ -213,7 +222,17 @@ def _mutual_matches(a: np.ndarray, b: np.ndarray, ratio: float = 0.85) -> int:
 
 
 def _key(photos: list[Path], lenses: list[Lens | None], seed: int) -> str:
-    facts = [(str(p.resolve()), p.stat().st_size, p.stat().st_mtime_ns, repr(l)) for p, l in zip(photos, lenses, strict=True)]
-    options = (MAX_IMAGE_SIDE, UPSAMPLE_BELOW, MAX_FEATURES, EXHAUSTIVE_BELOW, NEIGHBORS, seed)
-    options += (COARSE_FEATURES, COARSE_MIN_MATCHES)
+    facts = [
+        (str(p.resolve()), p.stat().st_size, p.stat().st_mtime_ns, repr(l))
+        for p, l in zip(photos, lenses, strict=True)
+    ]
+    options: tuple[float, ...] = (
+        MAX_IMAGE_SIDE,
+        UPSAMPLE_BELOW,
+        MAX_FEATURES,
+        EXHAUSTIVE_BELOW,
+        NEIGHBORS,
+        seed,
+    )
+    options = (*options, COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS)
     return hashlib.sha256(repr((facts, options)).encode()).hexdigest()[:12]

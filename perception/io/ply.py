@@ -131,7 +131,7 @@ def _read_binary(file: BinaryIO, table: _Table, order: str, path: Path) -> Eleme
         else:
             fields.append((p.name, order + p.kind))
     dtype = np.dtype(fields)
-    raw = file.read(dtype.itemsize * table.rows)
+    raw = file.read(min(dtype.itemsize * table.rows, path.stat().st_size))
     if len(raw) == dtype.itemsize * table.rows:
         rows = np.frombuffer(raw, dtype)
         if all((rows[f"{name}\0count"] == n).all() for name, n in lengths.items()):
@@ -197,7 +197,7 @@ def _column(values: list[np.ndarray], p: _Property) -> np.ndarray:
 
 def _read_ascii(data: bytes, tables: list[_Table], path: Path) -> dict[str, Element]:
     try:
-        numbers = np.array(data.split(), dtype=np.float64)
+        numbers = np.fromstring(data, dtype=np.float64, sep=" ")
     except ValueError as error:
         raise InputError(f"{path}: holds text where numbers are expected ({error})") from error
     elements, at = {}, 0

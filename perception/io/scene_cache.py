@@ -14,7 +14,7 @@ from perception.types import Lens, Scene, View
 
 def save_scene(folder: Path, scene: Scene) -> None:
     """Writes `scene` to `folder`, whole or not at all; photos stay where they are."""
-    views = [_view_json(view) for view in scene.views]
+    views = [view_json(view) for view in scene.views]
     facts = {"views": views, "metric": scene.metric, "frame": scene.frame, "report": scene.report}
     with atomic_directory(folder) as aside:
         (aside / "scene.json").write_text(json.dumps(facts, default=str), encoding="utf-8")
@@ -28,11 +28,12 @@ def load_saved_scene(folder: Path) -> Scene | None:
     facts = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
     with np.load(folder / "points.npz") as arrays:
         points, colors = arrays["points"], arrays["colors"]
-    views = [_view_from_json(entry) for entry in facts["views"]]
+    views = [view_from_json(entry) for entry in facts["views"]]
     return Scene(views, points, colors, facts["metric"], facts["frame"], facts["report"])
 
 
-def _view_json(view: View) -> dict[str, Any]:
+def view_json(view: View) -> dict[str, Any]:
+    """A view as JSON."""
     lens = view.lens
     return {
         "name": view.name,
@@ -45,7 +46,8 @@ def _view_json(view: View) -> dict[str, Any]:
     }
 
 
-def _view_from_json(entry: dict[str, Any]) -> View:
+def view_from_json(entry: dict[str, Any]) -> View:
+    """The inverse of `view_json`."""
     lens = entry["lens"]
     return View(
         entry["name"],

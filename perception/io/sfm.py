@@ -36,12 +36,16 @@ def reconstruct(folder: Path, workdir: Path, lens: Lens | None, seed: int, progr
     if not photos:
         raise InputError(f"{folder}: no photos found; expected .jpg, .png, .tif, .bmp or .webp files")
     if len(photos) < MIN_PHOTOS:
-        raise InputError(f"{folder}: {len(photos)} photo(s) found, at least {MIN_PHOTOS} are needed (20 or more serve)")
+        raise InputError(
+            f"{folder}: {len(photos)} photo(s) found, at least {MIN_PHOTOS} are needed (20 or more serve)"
+        )
     for photo in photos:
         check_photo(photo)
         if lens and photo_size(photo) != (lens.width, lens.height):
             found = "×".join(map(str, photo_size(photo)))
-            raise InputError(f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}")
+            raise InputError(
+                f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}"
+            )
     store = build_features(folder, photos, [lens] * len(photos), workdir, seed, progress)
     model, report = _map(store, photos, folder, lens is not None, seed, progress)
     for image in model.images.values():
@@ -79,6 +83,9 @@ def _incremental(store: FeatureStore, fixed: bool, seed: int, count: int, progre
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
     options.min_model_size = MIN_MODEL_SIZE
+    # Global adjustment at every 40 % of growth, not 10 %: most of the time of mapping goes there.
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
+    options.ba_global_max_refinements = 3
     options.ba_refine_focal_length = options.ba_refine_extra_params = not fixed
     registered = 2
 
@@ -121,7 +128,9 @@ def _report(
         "points": best.num_points3D(),
         "mean_reprojection_error_px": float(best.compute_mean_reprojection_error()),
         "mean_track_length": float(best.compute_mean_track_length()),
-        "cameras": [f"{c.model} {c.width}×{c.height} " + " ".join(f"{p:.6g}" for p in c.params) for c in cameras],
+        "cameras": [
+            f"{c.model} {c.width}×{c.height} " + " ".join(f"{p:.6g}" for p in c.params) for c in cameras
+        ],
         "pairs_matched": store.facts["pairs_matched"],
         "pairs_possible": store.facts["pairs_possible"],
         "seconds": seconds,

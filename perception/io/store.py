@@ -1,11 +1,11 @@
 """The map on disk (`name.gsmap/`): a standard 3DGS PLY, JSON facts, and arrays beside them.
 
-    map.json        format_version, frame, metric, counts, config, seed, versions, times, quality, run record
-    gaussians.ply   the standard 3DGS properties, readable by other viewers
-    instances.json  per instance: id, label, score, num_gaussians, centroid, obb, aabb, views
-    features.npy    [N, D] float32      instance_ids.npy  [N] int32 (−1 = none)   membership.npy [N] float32
-    language.npz    what the encoder knows of each instance, with its identity (absent without an encoder)
-    cameras.npz     the views: names, K, sizes, camera_from_world, which were held out
+map.json        format_version, frame, metric, counts, config, seed, versions, times, quality, run record
+gaussians.ply   the standard 3DGS properties, readable by other viewers
+instances.json  per instance: id, label, score, num_gaussians, centroid, obb, aabb, views
+features.npy    [N, D] float32      instance_ids.npy  [N] int32 (−1 = none)   membership.npy [N] float32
+language.npz    what the encoder knows of each instance, with its identity (absent without an encoder)
+cameras.npz     the views: names, K, sizes, camera_from_world, which were held out
 """
 
 from __future__ import annotations
@@ -99,11 +99,15 @@ def read_map(path: Path) -> GaussianMap:
     except (OSError, KeyError, ValueError, EOFError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: the map is damaged ({error}); build it again with `perception map`") from error
+        raise InputError(
+            f"{path}: the map is damaged ({error}); build it again with `perception map`"
+        ) from error
     for name in ("features", "instance_ids", "membership"):
         found = len(getattr(gmap, name))
         if found != count:
-            raise InputError(f"{path / name}.npy: holds {found} rows, expected {count} as in gaussians.ply; rebuild the map")
+            raise InputError(
+                f"{path / name}.npy: holds {found} rows, expected {count} as in gaussians.ply; rebuild the map"
+            )
     return gmap
 
 
@@ -118,7 +122,9 @@ def read_info(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{file}: cannot be read as a map's facts ({error})") from error
     if version != FORMAT_VERSION:
-        raise InputError(f"{file}: format_version is {version}, this program reads {FORMAT_VERSION}; rebuild the map")
+        raise InputError(
+            f"{file}: format_version is {version}, this program reads {FORMAT_VERSION}; rebuild the map"
+        )
     return info
 
 
@@ -140,7 +146,9 @@ def write_gaussian_ply(path: Path, gmap: GaussianMap) -> None:
         table[f"scale_{i}"] = gmap.log_scales[:, i]
     for i in range(4):
         table[f"rot_{i}"] = gmap.quats[:, i]
-    write_ply(path, {"vertex": {name: np.ascontiguousarray(column, np.float32) for name, column in table.items()}})
+    write_ply(
+        path, {"vertex": {name: np.ascontiguousarray(column, np.float32) for name, column in table.items()}}
+    )
 
 
 def _read_sh(rows: dict[str, np.ndarray]) -> np.ndarray:

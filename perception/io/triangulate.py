@@ -23,7 +23,7 @@ def view_lens(view: View) -> Lens:
     if view.lens is not None:
         return view.lens
     K = view.K
-    return Lens("PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), view.width, view.height)
+    return Lens("PINHOLE", tuple(map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))), view.width, view.height)
 
 
 def triangulated_cloud(
@@ -34,7 +34,9 @@ def triangulated_cloud(
     Under MIN_POINTS points, random ones in the views' frusta take their place, and a warning says so.
     """
     started = time.perf_counter()
-    store = build_features(root, [v.photo for v in views], [view_lens(v) for v in views], workdir, seed, progress)
+    store = build_features(
+        root, [v.photo for v in views], [view_lens(v) for v in views], workdir, seed, progress
+    )
     featured = time.perf_counter()
     points, colors, error = _triangulate(views, store, seed)
     facts: dict[str, Any] = {

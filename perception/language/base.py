@@ -16,6 +16,7 @@ class Encoder(Protocol):
 
     identity: model, version and preprocessing; a map stores it and refuses embeddings of another.
     dim: length of an embedding.
+    references: [R, D] unit embeddings of many common words, the ruler for how specific a text is; None without one.
     templates: sentences with one {} that a prompt is put into; their embeddings are averaged.
     """
 
@@ -27,6 +28,9 @@ class Encoder(Protocol):
 
     @property
     def templates(self) -> tuple[str, ...]: ...
+
+    @property
+    def references(self) -> np.ndarray | None: ...
 
     def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """RGB uint8 [H, W, 3] pictures of any size → float32 [n, dim], unit rows."""

@@ -30,6 +30,7 @@ _TEXT_OUTPUTS = ("text_embeds", "text_features", "text_embedding", "pooler_outpu
 class ClipEncoder:
     """Image and text towers of a CLIP, open_clip, MobileCLIP or SigLIP export. The image tower opens when first used."""
 
+    references: np.ndarray | None = None
     templates: tuple[str, ...] = ("an image of {}", "a photo of a {}", "{}")
 
     def __init__(self, image: Path, text: Path, device: Device = "auto") -> None:

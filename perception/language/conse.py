@@ -31,9 +31,9 @@ BATCH = 12
 class ConseEncoder:
     """EfficientNet-lite2 class probabilities combined in the space of all-MiniLM-L6-v2; dim 384."""
 
-    dim = MiniLM.dim
-    templates: tuple[str, ...] = ("{}",)
-    identity = f"conse-2/efficientnet-lite2-{SIDE}/all-minilm-l6-v2/top{TOP}-sqrt-centred"
+    dim: int = MiniLM.dim
+    templates: tuple[str, ...] = ("a {}",)
+    identity: str = f"conse-2/efficientnet-lite2-{SIDE}/all-minilm-l6-v2/top{TOP}-sqrt-centred"
 
     def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """RGB uint8 [H, W, 3] pictures (squashed to 260², so give them square) → float32 [n, 384], unit rows."""
@@ -70,6 +70,11 @@ class ConseEncoder:
         top = np.argpartition(-probabilities, TOP, axis=1)[:, :TOP]
         weights = np.sqrt(np.take_along_axis(probabilities, top, axis=1))
         return unit_rows(np.einsum("nt,ntd->nd", weights, centred[top]))
+
+    @cached_property
+    def references(self) -> np.ndarray:
+        """The 1000 classes as texts, float32 [1000, 384], unit rows."""
+        return unit_rows(self._classes - self._classes.mean(axis=0))
 
     @cached_property
     def _sentences(self) -> MiniLM:

@@ -49,11 +49,15 @@ def to_arrays(descriptions: Sequence[InstanceDescription], encoder: str) -> dict
     boxes = [box for d in descriptions for box in d.boxes]
     return {
         "encoder": np.array(encoder),
-        "embeddings": np.array([d.embedding for d in descriptions], np.float32).reshape(-1, dim),
-        "palettes": np.array([d.palette for d in descriptions], np.float32).reshape(-1, PALETTE, 4),
+        "embeddings": np.array([d.embedding for d in descriptions], np.float32).reshape(
+            len(descriptions), dim
+        ),
+        "palettes": np.array([d.palette for d in descriptions], np.float32).reshape(
+            len(descriptions), PALETTE, 4
+        ),
         "view_counts": np.array([len(d.views) for d in descriptions], np.int64),
         "view_names": np.array(views, dtype=np.str_),
-        "view_boxes": np.array(boxes, np.int32).reshape(-1, 4),
+        "view_boxes": np.array(boxes, np.int32).reshape(len(boxes), 4),
         "view_embeddings": np.concatenate([d.per_view for d in descriptions] or [np.zeros((0, dim))]).astype(
             np.float32
         ),

@@ -17,6 +17,7 @@ from perception.export import export_labels, write_export
 from perception.geometry import align_similarity
 from perception.io.store import GaussianMap, read_map
 from perception.pipeline.mapping import build_map
+from perception.pipeline.reporting import write_map_report
 from perception.progress import Progress
 from perception.query import LoadedMap
 from perception.types import PointCloud
@@ -62,12 +63,9 @@ def run_demo(output: Path, progress: Progress | None = None) -> tuple[dict[str, 
         "units_per_metre": scale,
         "peak_memory_mib": gmap.info["peak_memory_mib"],
     }
-    from perception.pipeline.pictures import map_pictures
-    from perception.pipeline.reporting import report_map
-
-    pictures = map_pictures(opened, output / "pictures", [query["text"] for query in queries])
-    facts["pictures"] = [str(path) for path in pictures]
-    facts["report"] = str(report_map(opened, output / "report.html", [query["text"] for query in queries]))
+    facts["report"] = str(
+        write_map_report(opened, output / "report.html", [query["text"] for query in queries])
+    )
     (output / "demo.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     return facts, demo_text(facts)
 
@@ -80,7 +78,7 @@ def truth_in_map_frame(truth: DemoTruth, gmap: GaussianMap) -> tuple[PointCloud,
     by_name = dict(zip(truth.names, truth.cameras, strict=True))
     names = [str(name) for name in gmap.cameras["names"]]
     mapped = _centres(gmap.cameras["camera_from_world"])
-    true = np.stack([by_name[name].eye for name in names])
+    true = np.stack([by_name[name].center for name in names])
     scale, rotation, shift = align_similarity(mapped, true)
     points = scale * truth.points.astype(np.float64) @ rotation.T + shift
     normals = (truth.normals.astype(np.float64) @ rotation.T).astype(np.float32)
@@ -91,7 +89,9 @@ def _centres(camera_from_world: np.ndarray) -> np.ndarray:
     return -np.einsum("nji,nj->ni", camera_from_world[:, :3, :3], camera_from_world[:, :3, 3])
 
 
-def _ask(opened: LoadedMap, text: str, ids: list[int], truth: DemoTruth, labels: np.ndarray) -> dict[str, Any]:
+def _ask(
+    opened: LoadedMap, text: str, ids: list[int], truth: DemoTruth, labels: np.ndarray
+) -> dict[str, Any]:
     """A prompt, its answer, and whether the answer is right: the true object under most of the first hit's points."""
     hits = opened.query(text, top_k=1)
     found = None
@@ -105,7 +105,7 @@ def _ask(opened: LoadedMap, text: str, ids: list[int], truth: DemoTruth, labels:
         "present": bool(hits),
         "instance_id": hits[0].instance_id if hits else None,
         "score": hits[0].score if hits else None,
-        "found": names.get(found, None) if found is not None else None,
+        "found": names.get(found) if found is not None else None,
         "right": (found in ids) if ids else not hits,
     }
 
@@ -122,10 +122,11 @@ def demo_text(facts: dict[str, Any]) -> str:
     ]
     for query in facts["queries"]:
         if query["present"]:
-            answer = f"instance {query['instance_id']} (score {query['score']:.2f}), which is the {query['found']}"
+            answer = (
+                f"instance {query['instance_id']} (score {query['score']:.2f}), which is the {query['found']}"
+            )
         else:
             answer = "not present"
         lines.append(f'"{query["text"]}": {answer}: {"right" if query["right"] else "wrong"}')
     lines.append(f"{seconds['total']:.0f} s, peak {facts['peak_memory_mib']:.0f} MiB; open {facts['report']}")
     return "\n".join(lines)
-

@@ -49,8 +49,16 @@ def export_map(
         cloud.colors = instance_palette(labels)
     sidecar = write_export(output, cloud, labels, {entry["id"]: entry for entry in gmap.instances})
     labelled = int((labels >= 0).sum())
-    facts = {"output": str(output), "points": len(labels), "labelled": labelled, "instances": sidecar["instances"]}
-    return facts, f"{output}: {len(labels)} points, {labelled} labelled, {len(sidecar['instances'])} instances"
+    facts = {
+        "output": str(output),
+        "points": len(labels),
+        "labelled": labelled,
+        "instances": sidecar["instances"],
+    }
+    return (
+        facts,
+        f"{output}: {len(labels)} points, {labelled} labelled, {len(sidecar['instances'])} instances",
+    )
 
 
 def surface_points(gmap: GaussianMap) -> tuple[PointCloud, np.ndarray]:

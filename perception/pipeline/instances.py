@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from perception.boxes import oriented_box
 from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians
 from perception.gaussians.train import TrainingView
-from perception.boxes import oriented_box
 from perception.instances.cluster import cluster_gaussians
 from perception.instances.confidence import Agreement, scores
 from perception.instances.silhouettes import Silhouettes, render_silhouettes
@@ -39,7 +39,9 @@ def find_instances(
     has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
     if not has_labels:
         empty = np.full(len(means), -1, np.int32)
-        return FoundInstances(empty, np.zeros(len(means), np.float32), [], {}, {"warnings": ["no photo has masks"]})
+        return FoundInstances(
+            empty, np.zeros(len(means), np.float32), [], {}, {"warnings": ["no photo has masks"]}
+        )
 
     progress.log(f"clustering {len(means)} Gaussians")
     clusters = cluster_gaussians(
@@ -96,8 +98,8 @@ def _embed(
 ) -> dict[str, np.ndarray]:
     """Language arrays of all instances from their best views (paper eq. 8); {} without an encoder."""
     from perception.instances.crops import choose_views, view_scores
-    from perception.language import make_encoder
     from perception.instances.describe import describe_instances
+    from perception.language import make_encoder
     from perception.language.description import to_arrays
 
     spec = config.language.encoder
@@ -125,4 +127,3 @@ def _embed(
         progress=lambda done, of: progress.update("language", done, of),
     )
     return to_arrays(descriptions, encoder.identity)
-

@@ -13,12 +13,13 @@ import numpy as np
 from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians, from_points
-from perception.gaussians.train import Trainer, TrainingView, render_view, psnr
+from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
 from perception.io.inputs import load_scene
 from perception.io.photos import load_photo
-from perception.io.scene_cache import load_saved_scene, save_scene
+from perception.io.scene_cache import load_saved_scene, save_scene, view_json
 from perception.io.store import GaussianMap, write_map
-from perception.masks import compute_masks, make_source
+from perception.masks import make_source
+from perception.masks.store import compute_masks
 from perception.pipeline.checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from perception.pipeline.instances import find_instances
 from perception.pipeline.photos import load_all, split_views
@@ -79,6 +80,7 @@ def build_map(
         "training": vars(trainer.record),
         "instances": found.report,
         "quality": quality,
+        "views": [view_json(view) for view in scene.views],
         "seconds": {**stages.seconds, "total": round(time.monotonic() - started, 2)},
         "peak_memory_mib": peak_memory_mib(),
     }
@@ -94,7 +96,9 @@ def build_map(
 
 def _prepare(source: Path, output: Path, resume: bool) -> Path:
     if not source.exists():
-        raise InputError(f"{source}: does not exist; give a folder of photos, a COLMAP workspace or a transforms.json")
+        raise InputError(
+            f"{source}: does not exist; give a folder of photos, a COLMAP workspace or a transforms.json"
+        )
     if output.exists():
         raise InputError(f"{output}: exists already; choose another -o or remove it first")
     work = work_folder(output)
@@ -132,7 +136,9 @@ def _masks(views: list[View], work: Path, config: MapConfig, progress: Progress)
     return report
 
 
-def _photos(views: list[View], config: MapConfig, labels: Path | None, progress: Progress) -> list[TrainingView]:
+def _photos(
+    views: list[View], config: MapConfig, labels: Path | None, progress: Progress
+) -> list[TrainingView]:
     return load_all(views, config.photos.max_side, labels, _stage(progress, "photos"))
 
 
@@ -236,7 +242,9 @@ def _assemble(
         "held_out": np.array([view.name in held for view in scene.views]),
     }
     arrays = {name: tensor.detach().numpy() for name, tensor in vars(gaussians).items()}
-    arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)
+    arrays["quats"] = arrays["quats"] / np.maximum(
+        np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12
+    )
     return GaussianMap(
         **arrays,
         instance_ids=found.ids,
@@ -252,13 +260,13 @@ def _assemble(
 
 
 def _stage(progress: Progress, name: str) -> Callable[..., None]:
-    """An adapter for stages that report (done, total), or (text, done, total)."""
+    """An adapter for stages that report (done, total), or (what, share in [0, 1])."""
 
-    def tell(*values: Any) -> None:
-        if len(values) == 3:
-            progress.update(f"{name}: {values[0]}", int(values[1]), int(values[2]))
+    def tell(first: Any, second: float) -> None:
+        if isinstance(first, str):
+            progress.update(f"{name}: {first}", round(100 * second), 100)
         else:
-            progress.update(name, int(values[0]), int(values[1]))
+            progress.update(name, int(first), int(second))
 
     return tell
 
@@ -266,8 +274,8 @@ def _stage(progress: Progress, name: str) -> Callable[..., None]:
 def _tell_scene(scene: Scene, progress: Progress) -> None:
     report = scene.report
     progress.log(f"{len(scene.views)} posed photos, {len(scene.points)} points")
-    for name, reason in dict(report.get("left_out", {})).items():
-        progress.log(f"left out: {name} ({reason})")
+    for entry in report.get("left_out", []):
+        progress.log(f"left out: {entry['name']} ({entry['why']})")
     for warning in report.get("warnings", []):
         progress.log(f"warning: {warning}")
 
@@ -275,9 +283,10 @@ def _tell_scene(scene: Scene, progress: Progress) -> None:
 def _tell_result(gmap: GaussianMap, output: Path, progress: Progress) -> None:
     info = gmap.info
     quality = info["quality"]
-    scored = f", held-out PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.3f}" if "psnr" in quality else ""
+    scored = (
+        f", held-out PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.3f}" if "psnr" in quality else ""
+    )
     progress.log(
         f"{output}: {len(gmap)} Gaussians, {len(gmap.instances)} instances{scored}, "
         f"{info['seconds']['total']:.0f} s, peak {info['peak_memory_mib']:.0f} MiB"
     )
-

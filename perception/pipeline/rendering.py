@@ -18,12 +18,15 @@ from perception.types import View
 KINDS = ("rgb", "depth", "instances", "features")
 
 
-def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[str]) -> tuple[dict[str, Any], str]:
+def render_map(
+    map_path: Path, output: Path, cameras: Path | None, what: list[str]
+) -> tuple[dict[str, Any], str]:
     """Writes one picture per camera and kind: `NAME.png` for a single kind, `KIND/NAME.png` for several.
 
     rgb: 8-bit PNG. depth: 16-bit PNG, thousandths of the map's unit along the optical axis, 0 = nothing.
     instances: 16-bit PNG of id + 1, 0 = none. features: 8-bit PNG of the three main components.
-    cameras: a transforms.json; None takes the map's held-out views (all views if none were held out).
+    cameras: a transforms.json; None takes the map's held-out views (all views if none were held out). A camera with
+    lens distortion is rendered as that lens sees, so that the picture lies over the photo it was given for.
     """
     for kind in what:
         if kind not in KINDS:
@@ -36,7 +39,7 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
         for view in views:
             path = (folder / view.name).with_suffix(".png")
             path.parent.mkdir(parents=True, exist_ok=True)
-            _write(path, _picture(kind, gaussians, gmap, view))
+            _write(path, _through_lens(kind, gaussians, gmap, view))
     facts = {"output": str(output), "views": len(views), "what": what}
     return facts, f"{output}: {len(views)} views of {', '.join(what)}"
 
@@ -67,9 +70,43 @@ def map_views(gmap: GaussianMap, held_out: bool = True) -> list[View]:
 
 
 def _cameras(path: Path) -> list[View]:
-    from perception.io.transforms import read_cameras
+    """The frames of a transforms.json as views; their photos need not exist."""
+    from perception.io.lens import is_pinhole, pinhole_from_lens
+    from perception.io.transforms import read_frames
 
-    return read_cameras(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a transforms.json with the cameras to render")
+    views = []
+    for name, camera_from_world, lens in read_frames(path):
+        (fx, fy, cx, cy), width, height = pinhole_from_lens(lens)
+        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        short = Path(name).name if name.startswith(("/", "..")) else name
+        views.append(
+            View(short, path, K, width, height, camera_from_world, None if is_pinhole(lens) else lens)
+        )
+    return views
+
+
+def _through_lens(kind: str, gaussians: Gaussians, gmap: GaussianMap, view: View) -> np.ndarray:
+    """The picture as the view's own lens takes it: a wider pinhole picture, warped."""
+    if view.lens is None:
+        return _picture(kind, gaussians, gmap, view)
+    import cv2
+
+    from perception.io.lens import camera_from_lens
+
+    width, height = view.lens.width, view.lens.height
+    grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
+    rays = np.asarray(camera_from_lens(view.lens).cam_from_img(grid), np.float64)[:, :2]
+    low, high = rays.min(axis=0), rays.max(axis=0)
+    fx, fy = view.K[0, 0], view.K[1, 1]
+    K = np.array([[fx, 0, 1 - fx * low[0]], [0, fy, 1 - fy * low[1]], [0, 0, 1.0]])
+    size = np.ceil((high - low) * [fx, fy] + 2).astype(int)
+    wide = View(view.name, view.photo, K, int(size[0]), int(size[1]), view.camera_from_world)
+    picture = _picture(kind, gaussians, gmap, wide)
+    where = (rays * [fx, fy] + K[:2, 2] - 0.5).astype(np.float32).reshape(height, width, 2)
+    nearest = picture.dtype != np.uint8  # ids and depths are not to be mixed
+    return cv2.remap(picture, where, None, cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC)
 
 
 @torch.no_grad()

@@ -42,7 +42,7 @@ def info_text(path: Path, info: dict[str, Any]) -> str:
             f"held-out views: PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.4f} over {len(quality['views'])}"
         )
     lines += [f"decision: {text}" for text in training.get("decisions", [])]
-    lines += [f"left out: {name} ({why})" for name, why in dict(scene.get("left_out", {})).items()]
+    lines += [f"left out: {entry['name']} ({entry['why']})" for entry in scene.get("left_out", [])]
     lines += [f"warning: {text}" for text in scene.get("warnings", [])]
     return "\n".join(lines)
 

@@ -1,4 +1,5 @@
-"""Small inline SVG charts: a curve, and horizontal or vertical bars. Colours come from the page's style sheet."""
+"""Small inline SVG charts: a curve, and horizontal or vertical bars. Colours come from the page's style
+sheet."""
 
 from __future__ import annotations
 

@@ -24,7 +24,8 @@ class ViewRow:
 
 @dataclass(frozen=True)
 class InstanceRow:
-    """An instance: best crop, the user's label or the likeliest names, score in [0, 1], box sides in map units."""
+    """An instance: best crop, the user's label or the likeliest names, score in [0, 1], box sides in map
+    units."""
 
     id: int
     crop: np.ndarray | None = None
@@ -53,9 +54,12 @@ class QueryRow:
 class ReportData:
     """All of a report.
 
-    figures: name -> value as it should read, for the header ({"PSNR held-out": "28.4 dB"}). seconds: by stage, in order.
-    psnr_curve: (iteration, dB); gaussians_curve: (iteration, count). views: held-out views; those with pictures are
-    shown, all with a psnr appear in the bars. overview: title -> picture (instances from above, feature colours).
+    figures: name -> value as it should read, for the header ({"PSNR held-out": "28.4 dB"}). seconds: by
+    stage, in order.
+    psnr_curve: (iteration, dB); gaussians_curve: (iteration, count). views: held-out views; those with
+    pictures are
+    shown, all with a psnr appear in the bars. overview: title -> picture (instances from above, feature
+    colours).
     metric: whether extents are metres. settings: name -> value. rerun: the command that makes this map again.
     """
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from html import escape
@@ -23,7 +22,8 @@ Inline = Callable[[np.ndarray, str], str]
 
 
 def write_report(path: Path | str, data: ReportData) -> Path:
-    """Writes the report as one HTML file, replacing an old one in one step. Pictures shrink until it is under 3 MB."""
+    """Writes the report as one HTML file, replacing an old one in one step. Pictures shrink until it is
+    under 3 MB."""
     path = Path(path)
     page = b""
     for side, quality in SIZES:
@@ -32,7 +32,7 @@ def write_report(path: Path | str, data: ReportData) -> Path:
             break
     temporary = path.with_name(path.name + ".part")
     temporary.write_bytes(page)
-    os.replace(temporary, path)
+    temporary.replace(path)
     return path
 
 
@@ -86,7 +86,7 @@ def _header(data: ReportData) -> str:
 
 
 def _views(data: ReportData, inline: Inline) -> str:
-    rows = []
+    rows: list[str] = []
     for view in data.views:
         if view.photo is None or view.render is None or len(rows) == MOST_VIEWS:
             continue
@@ -145,7 +145,8 @@ def _query(query: QueryRow, inline: Inline) -> str:
         right = query.hits[0][0] in query.expected if found else not query.expected
         verdict = f' <b class="{"right" if right else "wrong"}">{"right" if right else "wrong"}</b>'
     picture = inline(query.picture, f"best hit for {query.text}") if query.picture is not None else ""
-    return f'<div class="card"><h3>“{escape(query.text)}”{verdict}</h3>{picture}<p><small>{hits}</small></p></div>'
+    head = f"<h3>“{escape(query.text)}”{verdict}</h3>"
+    return f'<div class="card">{head}{picture}<p><small>{hits}</small></p></div>'
 
 
 def _chip(id: int) -> str:

@@ -1,0 +1,53 @@
+// Stage 3: the list of splats of every 64x64-pixel tile, by bounding box, in depth order.
+#pragma once
+#include <algorithm>
+
+#include "scratch.h"
+
+namespace perception::PERCEPTION_LEVEL {
+
+template <class T>
+void bin_splats(const Options &opt, Frame<T> &f, Scratch<T> &scratch) {
+  const int tiles = f.tiles_x * f.tiles_y;
+  const uint32_t n = f.count;
+  const int parts = static_cast<int>(n / 16384 + 1 < static_cast<uint32_t>(opt.threads) ? n / 16384 + 1 : opt.threads);
+  const uint32_t *order = scratch.order[0].data();
+  uint32_t *histograms = scratch.histograms.reserve(static_cast<std::size_t>(parts) * tiles);
+  auto begin = [&](std::size_t part) { return static_cast<uint32_t>(static_cast<uint64_t>(n) * part / parts); };
+  auto each_tile = [&](std::size_t part, auto &&visit) {
+    for (uint32_t i = begin(part); i < begin(part + 1); ++i) {
+      if (i + 16 < begin(part + 1)) __builtin_prefetch(&f.splats[order[i + 16]].id);
+      const Splat<T> &s = f.splats[order[i]];
+      for (int y = s.y0; y <= s.y1; ++y)
+        for (int x = s.x0; x <= s.x1; ++x) visit(y * f.tiles_x + x, order[i]);
+    }
+  };
+  parallel_for(parts, parts, [&](std::size_t part, int) {
+    uint32_t *h = histograms + part * tiles;
+    std::memset(h, 0, tiles * sizeof *h);
+    each_tile(part, [h](int tile, uint32_t) { ++h[tile]; });
+  });
+  uint32_t *offsets = f.offsets.reserve(tiles + 1), *tile_order = f.tile_order.reserve(tiles);
+  uint64_t total = 0;
+  for (int tile = 0; tile < tiles; ++tile) {
+    offsets[tile] = static_cast<uint32_t>(total);
+    for (int part = 0; part < parts; ++part) {
+      uint32_t &h = histograms[static_cast<std::size_t>(part) * tiles + tile], count = h;
+      h = static_cast<uint32_t>(total), total += count;
+    }
+    tile_order[tile] = tile;
+  }
+  if (total >= UINT32_MAX) throw std::bad_alloc();
+  offsets[tiles] = static_cast<uint32_t>(total);
+  uint32_t *list = f.list.reserve(total);
+  parallel_for(parts, parts, [&](std::size_t part, int) {
+    uint32_t *h = histograms + part * tiles;
+    each_tile(part, [h, list](int tile, uint32_t splat) { list[h[tile]++] = splat; });
+  });
+  std::sort(tile_order, tile_order + tiles, [offsets](uint32_t a, uint32_t b) {
+    const uint32_t na = offsets[a + 1] - offsets[a], nb = offsets[b + 1] - offsets[b];
+    return na != nb ? na > nb : a < b;
+  });
+}
+
+}  // namespace perception::PERCEPTION_LEVEL

@@ -1,0 +1,86 @@
+// The geometry shared by both passes: a 64x64-pixel tile has 16 tiles of 16x16, each of these 16 granules of 4x4
+// pixels, so one test of 16 boxes serves every level and gives a 16-bit mask.
+#pragma once
+#include "project_stage.h"
+#include "simd.h"
+
+namespace perception::PERCEPTION_LEVEL {
+
+// First pixel centres of the 16 boxes of a parent whose boxes are `step` pixels wide; pixel centres of a granule.
+template <class T>
+struct Grid {
+  alignas(64) T box_x[2][16], box_y[2][16];  // [0]: 16x16 tiles of a 64x64 tile, [1]: granules of a 16x16 tile
+  constexpr Grid() : box_x(), box_y() {
+    for (int i = 0; i < 16; ++i)
+      for (int level = 0; level < 2; ++level) {
+        const int step = level == 0 ? 16 : 4;
+        box_x[level][i] = T((i & 3) * step + 0.5), box_y[level][i] = T((i >> 2) * step + 0.5);
+      }
+  }
+};
+template <class T>
+inline constexpr Grid<T> kGrid;
+
+// Bit i: the splat's exponent may reach the threshold somewhere in box i. (x, y): the mean relative to the parent.
+// The largest exponent over a box lies at the mean or on one of the two edges that face it.
+template <class T, int LEVEL>
+inline uint32_t boxes_touched(const Splat<T> &s, T x, T y) {
+  using V = Vec<T>;
+  constexpr T kExtent = LEVEL == 0 ? 15 : 3;  // from the first to the last pixel centre
+  const V zero(T(0)), extent(kExtent), mx(x), my(y), a(s.a), d(s.d), k(s.k), minus_k(-s.k), slope(s.slope), limit(-s.reach);
+  uint32_t mask = 0;
+  for (int p = 0; p < kParts<T>; ++p) {
+    const V x0 = V::load(kGrid<T>.box_x[LEVEL] + p * V::kLanes) - mx, y0 = V::load(kGrid<T>.box_y[LEVEL] + p * V::kLanes) - my;
+    const V x1 = x0 + extent, y1 = y0 + extent;
+    const V near_x = min(x1, max(x0, zero)), near_y = min(y1, max(y0, zero));
+    const V best_y = min(y1, max(y0, near_x * slope)), best_x = min(x1, max(x0, near_y * minus_k));
+    const V u1 = fma(k, best_y, near_x), u2 = fma(k, near_y, best_x);
+    const V e1 = fma(a * u1, u1, d * best_y * best_y), e2 = fma(a * u2, u2, d * near_y * near_y);
+    mask |= bits(max(e1, e2) >= limit) << (p * V::kLanes);
+  }
+  return mask;
+}
+
+// One splat over one register of pixels: everything the two passes must compute alike.
+template <class T>
+struct Blend {
+  Vec<T> u, dy;        // px
+  Vec<T> raw, alpha;   // before and after the clamp
+  Vec<T> weight;       // alpha T, 0 where the splat does not contribute
+  Vec<T> next;         // transmittance behind
+  Mask<T> mask;        // contributes
+};
+
+template <class T>
+inline Blend<T> blend(const Splat<T> &s, Vec<T> px, Vec<T> py, Vec<T> transmittance, Mask<T> &live) {
+  using V = Vec<T>;
+  Blend<T> b;
+  const V dx = V(s.x) - px;
+  b.dy = V(s.y) - py;
+  b.u = fma(V(s.k), b.dy, dx);
+  const V e = fma(V(s.a) * b.u, b.u, fma(V(s.d) * b.dy, b.dy, V(s.log_opacity)));
+  b.mask = live & (e >= V(kLogThreshold<T>));
+  b.raw = exp2_nonpositive(e);
+  b.alpha = min(b.raw, V(kMaxAlpha<T>));
+  b.weight = keep(b.mask, b.alpha * transmittance);
+  b.next = transmittance - b.weight;
+  const Mask<T> stop = b.mask & (b.next < V(kMinTransmittance<T>));
+  if (__builtin_expect(any(stop), 0)) {
+    live = and_not(live, stop);
+    b.mask = and_not(b.mask, stop);
+    b.weight = keep(b.mask, b.weight);
+    b.next = select(stop, transmittance, b.next);
+  }
+  return b;
+}
+
+// Bit i: pixel i of granule g of the 16x16 tile at (x, y) lies in the image.
+inline uint32_t pixels_inside(int x, int y, int g, int width, int height) {
+  if (x + 16 <= width && y + 16 <= height) return 0xffff;
+  uint32_t m = 0;
+  for (int i = 0; i < 16; ++i)
+    m |= static_cast<uint32_t>(x + (g & 3) * 4 + (i & 3) < width && y + (g >> 2) * 4 + (i >> 2) < height) << i;
+  return m;
+}
+
+}  // namespace perception::PERCEPTION_LEVEL

@@ -1,0 +1,76 @@
+// All stages for one SIMD level (PERCEPTION_LEVEL); compiled once per level.
+#include "bin_stage.h"
+#include "blend_forward.h"
+#include "project_stage.h"
+#include "reduce_stage.h"
+#include "sort_stage.h"
+
+namespace perception {
+namespace PERCEPTION_LEVEL {
+
+template <class T>
+NonFinite prepare(const Inputs<T> &in, int camera, const Options &opt, Frame<T> &f, Scratch<T> &scratch,
+                  const Outputs<T> &out) {
+  f.camera = make_camera(in.viewmats + 16 * camera, in.Ks + 9 * camera, in.width, in.height, in.near_plane);
+  f.tiles_x = (in.width + 63) / 64, f.tiles_y = (in.height + 63) / 64;
+  f.count = 0;
+  const NonFinite bad = project_all(in, opt, f, scratch, out.radii ? out.radii + in.n * camera : nullptr);
+  if (bad.argument) return bad;
+  sort_by_depth(opt, f.count, scratch);
+  bin_splats(opt, f, scratch);
+  return {};
+}
+
+// Calls body with the kernel's shape as compile-time constants; any feature width goes through in slices of 16.
+template <int NF_, bool VAR_, bool DEPTH_>
+struct Shape {
+  static constexpr int NF = NF_;
+  static constexpr bool VAR = VAR_, DEPTH = DEPTH_;
+};
+
+template <class Body>
+void for_each_slice(int dims, const Options &opt, Body &&body) {
+  if (dims == 0) return opt.depth ? body(Slice{0, 0}, Shape<0, false, true>()) : body(Slice{0, 0}, Shape<0, false, false>());
+  for (int begin = 0; begin < dims; begin += 16) {
+    const Slice slice{begin, dims - begin < 16 ? dims - begin : 16};
+    if (slice.count <= 8)
+      opt.variance ? body(slice, Shape<8, true, true>()) : body(slice, Shape<8, false, true>());
+    else
+      opt.variance ? body(slice, Shape<16, true, true>()) : body(slice, Shape<16, false, true>());
+  }
+}
+
+template <class T>
+void forward(const Inputs<T> &in, int camera, const Options &opt, const Frame<T> &f, Scratch<T> &scratch,
+             const Outputs<T> &out) {
+  for_each_slice(in.dims, opt, [&](Slice slice, auto shape) {
+    using S = decltype(shape);
+    parallel_for(opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
+      forward_supertile<T, S::NF, S::VAR, S::DEPTH>(in, camera, f, f.tile_order[i], slice, scratch.workers[worker], out);
+    });
+  });
+}
+
+template <class T>
+void backward(const Inputs<T> &in, int camera, const Options &opt, const Frame<T> &f, Scratch<T> &scratch,
+              const Outputs<T> &out, const Cotangents<T> &grad, const Gradients<T> &result) {
+  const uint64_t slots = assign_slots(f, scratch);
+  for_each_slice(in.dims, opt, [&](Slice slice, auto shape) {
+    using S = decltype(shape);
+    std::memset(scratch.touched.reserve(slots), 0, slots);
+    scratch.records.reserve(slots * (kGeometry + S::NF));
+    parallel_for(opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
+      backward_supertile<T, S::NF, S::VAR, S::DEPTH>(in, camera, f, f.tile_order[i], slice, scratch,
+                                                     scratch.workers[worker], out, grad);
+    });
+    reduce_gradients(in, opt, f, camera, slice, S::NF, scratch, result);
+  });
+}
+
+extern const Kernels<float> float_kernels;
+extern const Kernels<double> double_kernels;
+const Kernels<float> float_kernels = {prepare<float>, forward<float>, backward<float>};
+const Kernels<double> double_kernels = {prepare<double>, forward<double>, backward<double>};
+
+}  // namespace PERCEPTION_LEVEL
+}  // namespace perception

@@ -1,0 +1,114 @@
+#include "parallel.h"
+
+#include <pthread.h>
+
+#include <atomic>
+#include <condition_variable>
+#include <exception>
+#include <mutex>
+#include <thread>
+
+#include "buffer.h"
+
+namespace perception {
+
+void *aligned_allocate(std::size_t bytes) {
+  void *p = nullptr;
+  if (posix_memalign(&p, 64, (bytes + 63) & ~std::size_t{63}) != 0) throw std::bad_alloc();
+  return p;
+}
+
+namespace {
+
+struct Job {
+  Task run;
+  void *context;
+  std::size_t tasks;
+  std::atomic<std::size_t> next{0};
+  std::atomic<bool> failed{false};
+  std::exception_ptr error;
+
+  void work(int worker) {
+    for (std::size_t t; !failed.load(std::memory_order_relaxed) && (t = next.fetch_add(1)) < tasks;) {
+      try {
+        run(context, t, worker);
+      } catch (...) {
+        if (!failed.exchange(true)) error = std::current_exception();
+      }
+    }
+  }
+};
+
+class Pool {
+ public:
+  void run(Job &job, int helpers) {
+    std::unique_lock<std::mutex> lock(mutex_);
+    for (; started_ < helpers; ++started_) std::thread(&Pool::loop, this, started_ + 1).detach();
+    job_ = &job;
+    wanted_ = running_ = helpers;
+    ++generation_;
+    wake_.notify_all();
+    lock.unlock();
+    job.work(0);
+    lock.lock();
+    done_.wait(lock, [this] { return running_ == 0; });
+    job_ = nullptr;
+  }
+
+  std::mutex busy;  // one job at a time; a second caller runs alone
+
+ private:
+  void loop(int worker) {
+    std::unique_lock<std::mutex> lock(mutex_);
+    for (unsigned long seen = 0;;) {
+      wake_.wait(lock, [&] { return generation_ != seen && job_; });
+      seen = generation_;
+      if (worker > wanted_) continue;
+      Job *job = job_;
+      lock.unlock();
+      job->work(worker);
+      lock.lock();
+      if (--running_ == 0) done_.notify_one();
+    }
+  }
+
+  std::mutex mutex_;
+  std::condition_variable wake_, done_;
+  Job *job_ = nullptr;
+  int started_ = 0, wanted_ = 0, running_ = 0;
+  unsigned long generation_ = 0;
+};
+
+// Threads do not survive a fork: the child starts a pool of its own. Never destroyed: its threads outlive main.
+std::atomic<Pool *> current_pool{nullptr};
+
+Pool &pool() {
+  static std::once_flag once;
+  std::call_once(once, [] {
+    current_pool = new Pool;
+    pthread_atfork(nullptr, nullptr, [] { current_pool = new Pool; });
+  });
+  return *current_pool.load();
+}
+
+}  // namespace
+
+void parallel_for(int threads, std::size_t tasks, Task run, void *context) {
+  Job job{run, context, tasks, {}, {}, {}};
+  if (static_cast<std::size_t>(threads) > tasks) threads = static_cast<int>(tasks);
+  Pool *shared = threads > 1 ? &pool() : nullptr;
+  if (shared && shared->busy.try_lock()) {
+    std::lock_guard<std::mutex> hold(shared->busy, std::adopt_lock);
+    shared->run(job, threads - 1);
+  } else {
+    job.work(0);
+  }
+  if (job.error) std::rethrow_exception(job.error);
+}
+
+int hardware_threads() {
+  unsigned n = std::thread::hardware_concurrency();
+  return n ? static_cast<int>(n) : 1;
+}
+
+}  // namespace perception

@@ -1,0 +1,185 @@
+// Stage 1: projects all Gaussians, drops those no pixel can see, keeps the rest in order of their index.
+#pragma once
+#include <cstring>
+#include <limits>
+
+#include "parallel.h"
+#include "scratch.h"
+#include "spherical_harmonics.h"
+
+namespace perception::PERCEPTION_LEVEL {
+
+constexpr int kBlock = 256;
+template <class T>
+constexpr T kLog2E = T(1.4426950408889634);
+template <class T>
+constexpr T kLogThreshold = T(-7.994353436858858);  // log2(1/255)
+template <class T>
+constexpr T kMaxAlpha = T(0.999);
+template <class T>
+constexpr T kMinTransmittance = T(1e-4);
+
+template <class T>
+inline T clamp(T x, T low, T high) {
+  return x < low ? low : x > high ? high : x;
+}
+
+template <class T>
+struct ProjectionBlock {
+  alignas(64) T in[11][kBlock];
+  alignas(64) T x[kBlock], y[kBlock], z[kBlock], var_x[kBlock], k[kBlock], var_y[kBlock], cov_xx[kBlock],
+      cov_xy[kBlock], finite[kBlock];
+};
+
+template <class T>
+void load_block(const Inputs<T> &in, int64_t i0, int n, ProjectionBlock<T> &b) {
+  for (int j = 0; j < n; ++j)
+    for (int c = 0; c < 3; ++c) b.in[c][j] = in.means[3 * (i0 + j) + c];
+  for (int j = 0; j < n; ++j)
+    for (int c = 0; c < 4; ++c) b.in[3 + c][j] = in.quats[4 * (i0 + j) + c];
+  for (int j = 0; j < n; ++j)
+    for (int c = 0; c < 3; ++c) b.in[7 + c][j] = in.scales[3 * (i0 + j) + c];
+  for (int j = 0; j < n; ++j) b.in[10][j] = in.opacities[i0 + j];
+  for (auto &row : b.in)
+    for (int j = n; j < kBlock; ++j) row[j] = 0;
+}
+
+template <class T>
+void project_block(const Camera<T> &camera, ProjectionBlock<T> &b) {
+  const Camera<T> cam = camera;
+#pragma GCC ivdep
+  for (int j = 0; j < kBlock; ++j) {
+    const T m[3] = {b.in[0][j], b.in[1][j], b.in[2][j]}, q[4] = {b.in[3][j], b.in[4][j], b.in[5][j], b.in[6][j]},
+            s[3] = {b.in[7][j], b.in[8][j], b.in[9][j]};
+    const Projected<T> p = project(cam, m, q, s);
+    b.x[j] = p.x, b.y[j] = p.y, b.z[j] = p.z, b.var_x[j] = p.var_x, b.k[j] = p.k, b.var_y[j] = p.var_y;
+    b.cov_xx[j] = p.cov_xx, b.cov_xy[j] = p.cov_xy;
+    T sum = 0;  // stays 0 unless a parameter is NaN or infinite
+    for (int c = 0; c < 11; ++c) sum += b.in[c][j] * T(0);
+    b.finite[j] = sum;
+  }
+}
+
+template <class T>
+T radius(T cov_xx, T cov_xy, T cov_yy) {
+  const T half = T(0.5) * (cov_xx - cov_yy);
+  return 3 * std::sqrt(T(0.5) * (cov_xx + cov_yy) + std::sqrt(half * half + cov_xy * cov_xy));
+}
+
+// Fills the splat of lane j; false when no pixel centre can receive 1/255 of it.
+template <class T>
+bool make_splat(const Camera<T> &cam, const ProjectionBlock<T> &b, int j, Splat<T> &s) {
+  const T o = b.in[10][j], x = b.x[j], y = b.y[j], z = b.z[j];
+  if (!(z > cam.near_plane && o >= T(1) / 255)) return false;
+  const T log_opacity = std::log2(o), reach = log_opacity - kLogThreshold<T>;
+  const T q = clamp(reach, T(0), T(100)) * (2 / kLog2E<T>);
+  const T lx = std::sqrt(q * b.cov_xx[j]) * T(1.0001) + T(2e-3), ly = std::sqrt(q * b.var_y[j]) * T(1.0001) + T(2e-3);
+  const T right = cam.width - T(0.5), bottom = cam.height - T(0.5);
+  // Written so that NaN (an overflow of the projection) fails.
+  if (!(x + lx >= T(0.5) && x - lx <= right && y + ly >= T(0.5) && y - ly <= bottom)) return false;
+  if (!(b.var_x[j] <= std::numeric_limits<T>::max())) return false;
+  s.x = x, s.y = y, s.z = z;
+  s.a = T(-0.5) * kLog2E<T> / b.var_x[j], s.k = b.k[j], s.d = T(-0.5) * kLog2E<T> / b.var_y[j];
+  s.log_opacity = log_opacity;
+  s.reach = reach + T(2e-3);
+  s.slope = b.cov_xy[j] / b.cov_xx[j];
+  s.x0 = static_cast<uint16_t>(static_cast<int>(clamp(x - lx - T(0.5), T(0), right)) >> 6);
+  s.x1 = static_cast<uint16_t>(static_cast<int>(clamp(x + lx - T(0.5), T(0), right)) >> 6);
+  s.y0 = static_cast<uint16_t>(static_cast<int>(clamp(y - ly - T(0.5), T(0), bottom)) >> 6);
+  s.y1 = static_cast<uint16_t>(static_cast<int>(clamp(y + ly - T(0.5), T(0), bottom)) >> 6);
+  return true;
+}
+
+// Vector from the camera's centre -Rᵀt to the Gaussian.
+template <class T>
+void view_vector(const Camera<T> &cam, const T *mean, T *v) {
+  for (int i = 0; i < 3; ++i) v[i] = mean[i] + cam.R[i] * cam.t[0] + cam.R[3 + i] * cam.t[1] + cam.R[6 + i] * cam.t[2];
+}
+
+template <class T>
+void set_color(const Inputs<T> &in, const Camera<T> &cam, int64_t i, Splat<T> &s) {
+  T rgb[3], v[3];
+  if (in.sh_degree < 0) {
+    for (int c = 0; c < 3; ++c) rgb[c] = in.colors[3 * i + c];
+  } else {
+    view_vector(cam, in.means + 3 * i, v);
+    sh_color(in.sh_degree, v, in.colors + 3 * i * in.sh_stride, rgb);
+  }
+  s.r = rgb[0], s.g = rgb[1], s.b = rgb[2];
+}
+
+inline uint32_t depth_key(float z) {
+  uint32_t k;
+  std::memcpy(&k, &z, 4);
+  return k;
+}
+inline uint64_t depth_key(double z) {
+  uint64_t k;
+  std::memcpy(&k, &z, 8);
+  return k;
+}
+
+// Gaussians [begin, end) into splats[begin...]; returns how many, or the first bad index through `bad`.
+template <class T>
+uint32_t project_range(const Inputs<T> &in, const Frame<T> &f, int64_t begin, int64_t end, DepthKey<T> *keys, T *radii,
+                       int64_t &bad) {
+  ProjectionBlock<T> b;
+  uint32_t out = static_cast<uint32_t>(begin);
+  for (int64_t i0 = begin; i0 < end; i0 += kBlock) {
+    const int n = static_cast<int>(end - i0 < kBlock ? end - i0 : kBlock);
+    load_block(in, i0, n, b);
+    project_block(f.camera, b);
+    for (int j = 0; j < n; ++j) {
+      if (!(b.finite[j] == 0)) {
+        bad = i0 + j;
+        return 0;
+      }
+      Splat<T> &s = f.splats[out];
+      if (!make_splat(f.camera, b, j, s)) continue;
+      s.id = static_cast<int32_t>(i0 + j);
+      set_color(in, f.camera, i0 + j, s);
+      keys[out++] = depth_key(s.z);
+      if (radii) radii[i0 + j] = radius(b.cov_xx[j], b.cov_xy[j], b.var_y[j]);
+    }
+  }
+  return out - static_cast<uint32_t>(begin);
+}
+
+template <class T>
+NonFinite find_non_finite(const Inputs<T> &in, int64_t i) {
+  struct Argument {
+    const char *name;
+    const T *data;
+    int width;
+  } arguments[] = {{"means", in.means, 3}, {"quats", in.quats, 4}, {"scales", in.scales, 3}, {"opacities", in.opacities, 1}};
+  for (const Argument &a : arguments)
+    for (int c = 0; c < a.width; ++c)
+      if (!std::isfinite(a.data[a.width * i + c])) return {a.name, i};
+  return {};
+}
+
+// Contiguous ranges, one a thread, then closed up: the result does not depend on the number of threads.
+template <class T>
+NonFinite project_all(const Inputs<T> &in, const Options &opt, Frame<T> &f, Scratch<T> &scratch, T *radii) {
+  f.splats.reserve(in.n);
+  DepthKey<T> *keys = scratch.keys[0].reserve(in.n);
+  const int64_t blocks = (in.n + kBlock - 1) / kBlock;
+  const int parts = static_cast<int>(blocks < opt.threads ? (blocks ? blocks : 1) : opt.threads);
+  uint32_t *counts = scratch.histograms.reserve(parts);
+  std::vector<int64_t> bad(parts, -1);
+  auto begin = [&](int64_t part) { return part == parts ? in.n : blocks * part / parts * kBlock; };
+  parallel_for(opt.threads, parts, [&](std::size_t part, int) {
+    counts[part] = project_range(in, f, begin(part), begin(part + 1), keys, radii, bad[part]);
+  });
+  for (int64_t i : bad)
+    if (i >= 0) return find_non_finite(in, i);
+  f.count = counts[0];
+  for (int part = 1; part < parts; ++part) {
+    std::memmove(f.splats.data() + f.count, f.splats.data() + begin(part), counts[part] * sizeof(Splat<T>));
+    std::memmove(keys + f.count, keys + begin(part), counts[part] * sizeof(*keys));
+    f.count += counts[part];
+  }
+  return {};
+}
+
+}  // namespace perception::PERCEPTION_LEVEL

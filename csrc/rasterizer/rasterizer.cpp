@@ -1,0 +1,105 @@
+// Runs the stages camera by camera, on memory from a pool.
+#include "rasterizer.h"
+
+#include <mutex>
+
+#include "frames.h"
+#include "parallel.h"
+#include "scratch.h"
+
+namespace perception {
+
+namespace {
+
+// Objects whose buffers are worth keeping between calls. Never destroyed, so it is safe at exit.
+template <class Object>
+class ObjectPool {
+ public:
+  static ObjectPool &get() {
+    static ObjectPool *pool = new ObjectPool;
+    return *pool;
+  }
+  std::unique_ptr<Object> take() {
+    std::lock_guard<std::mutex> lock(mutex_);
+    if (idle_.empty()) return std::make_unique<Object>();
+    std::unique_ptr<Object> o = std::move(idle_.back());
+    idle_.pop_back();
+    return o;
+  }
+  void give(std::unique_ptr<Object> o) {
+    std::lock_guard<std::mutex> lock(mutex_);
+    if (idle_.size() < kKeep) idle_.push_back(std::move(o));
+  }
+  void clear() {
+    std::lock_guard<std::mutex> lock(mutex_);
+    idle_.clear();
+  }
+
+ private:
+  static constexpr std::size_t kKeep = 4;
+  std::mutex mutex_;
+  std::vector<std::unique_ptr<Object>> idle_;
+};
+
+template <class T>
+ScratchPtr<T> take_scratch(int threads) {
+  ScratchPtr<T> s(ObjectPool<Scratch<T>>::get().take().release());
+  if (s->workers.size() < static_cast<std::size_t>(threads)) s->workers.resize(threads);
+  return s;
+}
+
+}  // namespace
+
+template <class T>
+void ScratchDelete<T>::operator()(Scratch<T> *s) const {
+  ObjectPool<Scratch<T>>::get().give(std::unique_ptr<Scratch<T>>(s));
+}
+
+template <class T>
+void FramesDelete<T>::operator()(Frames<T> *f) const {
+  for (auto &camera : f->cameras) ObjectPool<Frame<T>>::get().give(std::move(camera));
+  delete f;
+}
+
+template <class T>
+FramesPtr<T> rasterize_forward(const Inputs<T> &in, const Options &opt, Level level, const Outputs<T> &out,
+                               NonFinite &bad) {
+  const Kernels<T> &k = kernels<T>(level);
+  const ScratchPtr<T> scratch = take_scratch<T>(opt.threads);
+  FramesPtr<T> frames(new Frames<T>{{}, level});
+  for (int camera = 0; camera < in.cameras; ++camera) {
+    frames->cameras.push_back(ObjectPool<Frame<T>>::get().take());
+    Frame<T> &f = *frames->cameras.back();
+    bad = k.prepare(in, camera, opt, f, *scratch, out);
+    if (bad.argument) return nullptr;
+    k.forward(in, camera, opt, f, *scratch, out);
+  }
+  return frames;
+}
+
+template <class T>
+void rasterize_backward(const Inputs<T> &in, const Options &opt, const Frames<T> &frames, const Outputs<T> &out,
+                        const Cotangents<T> &grad, const Gradients<T> &result) {
+  const ScratchPtr<T> scratch = take_scratch<T>(opt.threads);
+  for (int camera = 0; camera < in.cameras; ++camera)
+    kernels<T>(frames.level).backward(in, camera, opt, *frames.cameras[camera], *scratch, out, grad, result);
+}
+
+void release_memory() {
+  ObjectPool<Scratch<float>>::get().clear();
+  ObjectPool<Scratch<double>>::get().clear();
+  ObjectPool<Frame<float>>::get().clear();
+  ObjectPool<Frame<double>>::get().clear();
+}
+
+#define INSTANTIATE(T)                                                                                             \
+  template struct ScratchDelete<T>;                                                                                \
+  template struct FramesDelete<T>;                                                                                 \
+  template FramesPtr<T> rasterize_forward(const Inputs<T> &, const Options &, Level, const Outputs<T> &,           \
+                                          NonFinite &);                                                            \
+  template void rasterize_backward(const Inputs<T> &, const Options &, const Frames<T> &, const Outputs<T> &,      \
+                                   const Cotangents<T> &, const Gradients<T> &);
+INSTANTIATE(float)
+INSTANTIATE(double)
+
+}  // namespace perception

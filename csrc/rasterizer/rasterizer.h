@@ -1,0 +1,136 @@
+// The CPU rasterizer's interface, in plain arrays: no torch, no Python. Everything is templated on float and double;
+// the double build is the oracle of the float build.
+#pragma once
+#include <cstdint>
+#include <memory>
+#include <string>
+
+#include "buffer.h"
+#include "projection_math.h"
+
+namespace perception {
+
+// All arrays row-major and contiguous.
+template <class T>
+struct Inputs {
+  int64_t n, cameras;
+  const T *means;      // [N,3] world
+  const T *quats;      // [N,4] wxyz, any norm
+  const T *scales;     // [N,3]
+  const T *opacities;  // [N]
+  const T *colors;     // [N,3], or [N,K,3] when sh_degree >= 0
+  int sh_degree, sh_stride;  // -1: colours; K
+  const T *features;   // [N,D] or null
+  int dims;            // D
+  const T *viewmats;   // [C,4,4] camera_from_world
+  const T *Ks;         // [C,3,3]
+  const T *background; // [C,3] or null
+  int width, height;
+  T near_plane;
+};
+
+template <class T>
+struct Outputs {
+  T *colors;    // [C,H,W,3]
+  T *alphas;    // [C,H,W]
+  T *depths;    // [C,H,W] or null
+  T *features;  // [C,H,W,D] or null
+  T *variance;  // [C,H,W,D] or null
+  uint8_t *visible;  // [C,N], zero on entry
+  T *radii;          // [C,N] px, three standard deviations along the long axis; zero on entry, or null
+};
+
+// dL/d(output); null means zero.
+template <class T>
+struct Cotangents {
+  const T *colors, *alphas, *depths, *features, *variance;
+};
+
+// dL/d(input), added to what is there; null where not wanted.
+template <class T>
+struct Gradients {
+  T *means, *quats, *scales, *opacities, *colors, *features, *viewmats;
+  T *mean2d;      // [C,N,2] px
+};
+
+// A Gaussian as one camera sees it. exponent in base 2: log2(alpha) = log_opacity + a (dx + k dy)² + d dy².
+template <class T>
+struct Splat {
+  T x, y;         // px
+  T a, k, d, log_opacity;
+  T r, g, b, z;
+  T reach;        // log_opacity - log2(1/255) + slack: how far the exponent may fall
+  T slope;        // dy/dx of the line on which the exponent is largest for a given dx
+  int32_t id;     // index of the Gaussian
+  uint16_t x0, y0, x1, y1;  // 64-pixel tiles touched, inclusive
+};
+
+// One camera's splats and, for every 64x64-pixel tile, the indices of its splats from front to back.
+template <class T>
+struct Frame {
+  Camera<T> camera;
+  int tiles_x = 0, tiles_y = 0;
+  uint32_t count = 0;            // visible splats
+  Buffer<Splat<T>> splats;       // in order of the Gaussians' index
+  Buffer<uint32_t> list;
+  Buffer<uint32_t> offsets;      // [tiles + 1]
+  Buffer<uint32_t> tile_order;   // tiles by falling list length
+};
+
+struct Options {
+  int threads;
+  bool depth;     // blend the depth channel
+  bool variance;  // blend the variance channels
+};
+
+// Where the first non-finite value was found.
+struct NonFinite {
+  const char *argument = nullptr;
+  int64_t index = -1;
+};
+
+template <class T>
+struct Scratch;
+template <class T>
+struct ScratchDelete {
+  void operator()(Scratch<T> *) const;
+};
+template <class T>
+using ScratchPtr = std::unique_ptr<Scratch<T>, ScratchDelete<T>>;
+
+// One SIMD level.
+template <class T>
+struct Kernels {
+  // Projects, sorts and bins camera `camera` into frame.
+  NonFinite (*prepare)(const Inputs<T> &, int camera, const Options &, Frame<T> &, Scratch<T> &, const Outputs<T> &);
+  void (*forward)(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Scratch<T> &, const Outputs<T> &);
+  void (*backward)(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Scratch<T> &, const Outputs<T> &,
+                   const Cotangents<T> &, const Gradients<T> &);
+};
+
+enum class Level { baseline, avx2, avx512 };
+Level best_level();
+bool level_supported(Level);
+template <class T>
+const Kernels<T> &kernels(Level);
+
+// What a forward call keeps for its backward call: one frame a camera. Returned to a pool when destroyed.
+template <class T>
+struct Frames;
+template <class T>
+struct FramesDelete {
+  void operator()(Frames<T> *) const;
+};
+template <class T>
+using FramesPtr = std::unique_ptr<Frames<T>, FramesDelete<T>>;
+
+template <class T>
+FramesPtr<T> rasterize_forward(const Inputs<T> &, const Options &, Level, const Outputs<T> &, NonFinite &);
+template <class T>
+void rasterize_backward(const Inputs<T> &, const Options &, const Frames<T> &, const Outputs<T> &,
+                        const Cotangents<T> &, const Gradients<T> &);
+
+// Frees what the pools keep between calls.
+void release_memory();
+
+}  // namespace perception

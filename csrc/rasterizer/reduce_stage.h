@@ -1,0 +1,174 @@
+// Stage 6: sums every splat's records in a fixed order and takes the gradient from the picture plane back to the
+// Gaussian's own parameters and the camera.
+#pragma once
+#include "blend_backward.h"
+
+namespace perception::PERCEPTION_LEVEL {
+
+// Slots: splat i owns as many records as the 64x64 tiles its box touches.
+template <class T>
+uint64_t assign_slots(const Frame<T> &f, Scratch<T> &scratch) {
+  uint64_t *slots = scratch.slots.reserve(f.count + 1), total = 0;
+  for (uint32_t i = 0; i < f.count; ++i) {
+    const Splat<T> &s = f.splats[i];
+    slots[i] = total;
+    total += static_cast<uint64_t>(s.x1 - s.x0 + 1) * (s.y1 - s.y0 + 1);
+  }
+  slots[f.count] = total;
+  return total;
+}
+
+// Sum of splat i's records; false when no tile touched it.
+template <class T>
+bool sum_records(const Scratch<T> &scratch, uint32_t i, int size, T *sum) {
+  bool found = false;
+  for (uint64_t slot = scratch.slots[i]; slot < scratch.slots[i + 1]; ++slot) {
+    if (!scratch.touched[slot]) continue;
+    const T *record = scratch.records.data() + slot * size;
+    for (int c = 0; c < size; ++c) sum[c] = found ? sum[c] + record[c] : record[c];
+    found = true;
+  }
+  return found;
+}
+
+template <class T>
+struct GradientBlock {
+  alignas(64) T in[10][kBlock], picture[6][kBlock];
+  alignas(64) T out[10][kBlock], camera[12][kBlock];
+  uint32_t splat[kBlock];
+  int n = 0;
+};
+
+template <class T>
+void vjp_block(const Camera<T> &camera, GradientBlock<T> &b) {
+  const Camera<T> cam = camera;
+#pragma GCC ivdep
+  for (int j = 0; j < kBlock; ++j) {
+    const T m[3] = {b.in[0][j], b.in[1][j], b.in[2][j]}, q[4] = {b.in[3][j], b.in[4][j], b.in[5][j], b.in[6][j]},
+            s[3] = {b.in[7][j], b.in[8][j], b.in[9][j]};
+    const ProjectedGrad<T> g = {b.picture[0][j], b.picture[1][j], b.picture[2][j],
+                                b.picture[3][j], b.picture[4][j], b.picture[5][j]};
+    T gm[3], gq[4], gs[3], gR[9], gt[3];
+    project_vjp(cam, m, q, s, g, gm, gq, gs, gR, gt);
+    for (int c = 0; c < 3; ++c) b.out[c][j] = gm[c], b.out[7 + c][j] = gs[c], b.camera[9 + c][j] = gt[c];
+    for (int c = 0; c < 4; ++c) b.out[3 + c][j] = gq[c];
+    for (int c = 0; c < 9; ++c) b.camera[c][j] = gR[c];
+  }
+}
+
+template <class T>
+void load_gaussian(const Inputs<T> &in, int64_t i, int j, GradientBlock<T> &b) {
+  for (int c = 0; c < 3; ++c) b.in[c][j] = in.means[3 * i + c], b.in[7 + c][j] = in.scales[3 * i + c];
+  for (int c = 0; c < 4; ++c) b.in[3 + c][j] = in.quats[4 * i + c];
+}
+
+// Padding lanes repeat the first Gaussian with zero cotangents, so that they add exact zeros.
+template <class T>
+void pad_block(GradientBlock<T> &b) {
+  for (int j = b.n; j < kBlock; ++j) {
+    for (auto &row : b.in) row[j] = row[0];
+    for (auto &row : b.picture) row[j] = 0;
+  }
+}
+
+// From the record's moments to cotangents of the projection (see Projected for the factored form).
+template <class T>
+ProjectedGrad<T> picture_gradient(const Splat<T> &s, const T *r) {
+  const T precision_x = s.a * (-2 / kLog2E<T>), precision_y = s.d * (-2 / kLog2E<T>);  // 1/var_x, 1/var_y
+  const T gu = -r[1] * precision_x;
+  ProjectedGrad<T> g;
+  g.x = gu, g.y = s.k * gu - r[2] * precision_y, g.z = r[9];
+  factored_vjp(T(0.5) * r[3] * precision_x * precision_x, -r[4] * precision_x, T(0.5) * r[5] * precision_y * precision_y,
+               s.k, 1 / precision_y, g);
+  return g;
+}
+
+// Colours, or SH coefficients and the direction they are seen from (which moves the mean and the camera).
+template <class T>
+void color_gradient(const Inputs<T> &in, const Camera<T> &cam, const Splat<T> &s, const T *g_rgb, const Gradients<T> &out,
+                    T *g_mean, T *g_R, T *g_t) {
+  const int64_t i = s.id;
+  if (in.sh_degree < 0) {
+    if (out.colors)
+      for (int c = 0; c < 3; ++c) out.colors[3 * i + c] += g_rgb[c];
+    return;
+  }
+  T v[3], gv[3], unused[3 * kMaxShCoefficients] = {};
+  const T gated[3] = {s.r > 0 ? g_rgb[0] : 0, s.g > 0 ? g_rgb[1] : 0, s.b > 0 ? g_rgb[2] : 0};
+  view_vector(cam, in.means + 3 * i, v);
+  sh_color_vjp(in.sh_degree, v, in.colors + 3 * i * in.sh_stride, gated,
+               out.colors ? out.colors + 3 * i * in.sh_stride : unused, gv);
+  for (int c = 0; c < 3; ++c) {  // v = mean + Rᵀ t
+    g_mean[c] += gv[c];
+    for (int k = 0; k < 3; ++k) g_R[3 * k + c] += cam.t[k] * gv[c], g_t[k] += cam.R[3 * k + c] * gv[c];
+  }
+}
+
+template <class T>
+void flush_block(const Inputs<T> &in, const Frame<T> &f, int camera, const T (*colors)[3], const Gradients<T> &out,
+                 GradientBlock<T> &b, double *camera_sum) {
+  if (!b.n) return;
+  pad_block(b);
+  vjp_block(f.camera, b);
+  for (int j = 0; j < b.n; ++j) {
+    const Splat<T> &s = f.splats[b.splat[j]];
+    const int64_t i = s.id;
+    T g_mean[3] = {b.out[0][j], b.out[1][j], b.out[2][j]}, g_R[9], g_t[3];
+    for (int c = 0; c < 9; ++c) g_R[c] = b.camera[c][j];
+    for (int c = 0; c < 3; ++c) g_t[c] = b.camera[9 + c][j];
+    color_gradient(in, f.camera, s, colors[j], out, g_mean, g_R, g_t);
+    if (out.means)
+      for (int c = 0; c < 3; ++c) out.means[3 * i + c] += g_mean[c];
+    if (out.quats)
+      for (int c = 0; c < 4; ++c) out.quats[4 * i + c] += b.out[3 + c][j];
+    if (out.scales)
+      for (int c = 0; c < 3; ++c) out.scales[3 * i + c] += b.out[7 + c][j];
+    if (out.mean2d)
+      for (int c = 0; c < 2; ++c) out.mean2d[2 * (in.n * camera + i) + c] += b.picture[c][j];
+    for (int c = 0; c < 9; ++c) camera_sum[c] += g_R[c];
+    for (int c = 0; c < 3; ++c) camera_sum[9 + c] += g_t[c];
+  }
+  b.n = 0;
+}
+
+// Blocks of consecutive splats, each by one worker; the camera's gradient is summed over the blocks in order.
+template <class T>
+void reduce_gradients(const Inputs<T> &in, const Options &opt, const Frame<T> &f, int camera, Slice slice, int width,
+                      Scratch<T> &scratch, const Gradients<T> &out) {
+  const int size = kGeometry + width;
+  const std::size_t blocks = (f.count + kBlock - 1) / kBlock;
+  double *camera_sums = scratch.camera_sums.reserve(12 * (blocks + 1));
+  parallel_for(opt.threads, blocks, [&](std::size_t block, int) {
+    GradientBlock<T> b;
+    T colors[kBlock][3], sum[kGeometry + 16];
+    double *camera_sum = camera_sums + 12 * block;
+    for (int c = 0; c < 12; ++c) camera_sum[c] = 0;
+    const uint32_t end = static_cast<uint32_t>(std::min<std::size_t>(f.count, (block + 1) * kBlock));
+    for (uint32_t i = static_cast<uint32_t>(block * kBlock); i < end; ++i) {
+      if (!sum_records(scratch, i, size, sum)) continue;
+      const Splat<T> &s = f.splats[i];
+      const ProjectedGrad<T> g = picture_gradient(s, sum);
+      const T picture[6] = {g.x, g.y, g.z, g.cov_xx, g.cov_xy, g.cov_yy};
+      for (int c = 0; c < 6; ++c) b.picture[c][b.n] = picture[c];
+      for (int c = 0; c < 3; ++c) colors[b.n][c] = sum[6 + c];
+      load_gaussian(in, s.id, b.n, b);
+      if (out.opacities) out.opacities[s.id] += sum[0] / in.opacities[s.id];
+      if (out.features)
+        for (int c = 0; c < slice.count; ++c)
+          out.features[static_cast<int64_t>(s.id) * in.dims + slice.begin + c] += sum[kGeometry + c];
+      b.splat[b.n++] = i;
+    }
+    flush_block(in, f, camera, colors, out, b, camera_sum);
+  });
+  if (!out.viewmats) return;
+  double total[12] = {};
+  for (std::size_t block = 0; block < blocks; ++block)
+    for (int c = 0; c < 12; ++c) total[c] += camera_sums[12 * block + c];
+  T *viewmat = out.viewmats + 16 * camera;
+  for (int r = 0; r < 3; ++r) {
+    for (int c = 0; c < 3; ++c) viewmat[4 * r + c] += static_cast<T>(total[3 * r + c]);
+    viewmat[4 * r + 3] += static_cast<T>(total[9 + r]);
+  }
+}
+
+}  // namespace perception::PERCEPTION_LEVEL

@@ -1,0 +1,41 @@
+// Working memory of one call, reused by later calls.
+#pragma once
+#include <cstring>
+#include <type_traits>
+#include <vector>
+
+#include "parallel.h"
+#include "rasterizer.h"
+
+namespace perception {
+
+template <class T>
+using DepthKey = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
+
+template <class T>
+struct Worker {
+  Buffer<Splat<T>> splats;       // of the current 64x64 tile, front to back
+  Buffer<T> features;            // [n, width]
+  Buffer<uint32_t> source;       // [n] index into Frame::splats
+  Buffer<uint32_t> lists;        // [16, stride] per 16x16 tile, indices into splats
+  int stride = 0;
+  uint32_t counts[16];
+  int n = 0;
+  Buffer<uint8_t> touched;       // [n]
+  Buffer<T> records;             // [n, record]
+  Buffer<T> tile;                // per-pixel state
+};
+
+template <class T>
+struct Scratch {
+  Buffer<DepthKey<T>> keys[2];
+  Buffer<uint32_t> order[2];
+  Buffer<uint32_t> histograms;
+  Buffer<uint64_t> slots;        // first gradient record of every splat
+  Buffer<uint8_t> touched;       // per record
+  Buffer<T> records;
+  Buffer<double> camera_sums;
+  std::vector<Worker<T>> workers;
+};
+
+}  // namespace perception

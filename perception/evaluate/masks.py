@@ -1,0 +1,141 @@
+"""Masks in pictures: IoU, boundary IoU, and the tables of LERF-mask and LERF-OVS."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import cv2
+import numpy as np
+
+from perception.errors import InputError
+
+Masks = Mapping[tuple[str, str], np.ndarray]  # (view, prompt) -> mask [H, W]
+
+
+def mask_iou(prediction: np.ndarray, truth: np.ndarray) -> float:
+    """|intersection| / |union| of two bool masks [H, W]; 1 when both are empty."""
+    union = np.count_nonzero(prediction | truth)
+    return np.count_nonzero(prediction & truth) / union if union else 1.0
+
+
+def mask_boundary(mask: np.ndarray, dilation_ratio: float = 0.02) -> np.ndarray:
+    """The mask's pixels within round(ratio · image diagonal) (at least 1) of its border or the picture's
+    edge.
+
+    Boundary IoU (Cheng et al. 2021): 3x3 erosions with zeros beyond the picture.
+    """
+    height, width = mask.shape
+    iterations = max(round(dilation_ratio * float(np.hypot(height, width))), 1)
+    padded = cv2.copyMakeBorder(mask.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    # n erosions by 3x3 equal one by a square of side 2n + 1; the frame of zeros keeps eating inwards with each.
+    eroded = cv2.erode(padded, np.ones((3, 3), np.uint8), iterations=iterations)
+    return mask & ~eroded[1:-1, 1:-1].astype(bool)
+
+
+def boundary_iou(prediction: np.ndarray, truth: np.ndarray, dilation_ratio: float = 0.02) -> float:
+    """IoU of the two masks' boundaries."""
+    return mask_iou(mask_boundary(prediction, dilation_ratio), mask_boundary(truth, dilation_ratio))
+
+
+def evaluate_lerf_mask(predictions: Masks, truths: Masks, *, missing: str = "zero") -> dict[str, Any]:
+    """LERF-mask (Gaussian Grouping): mIoU and mean boundary IoU, mean per prompt over views, then over
+    prompts.
+
+    truths: {(view, prompt): 8-bit mask, object > 128}; predictions alike, or bool, resized to the truth by
+    nearest neighbour. missing: "zero" scores an absent prediction 0; "skip" leaves it out, as the original
+    script does.
+    """
+    if missing not in ("zero", "skip"):
+        raise InputError(f"missing is '{missing}'; expected zero or skip")
+    scores: dict[str, list[tuple[float, float]]] = {}
+    absent = []
+    for (view, prompt), truth in sorted(truths.items()):
+        per_prompt = scores.setdefault(prompt, [])
+        if (view, prompt) not in predictions:
+            absent.append([view, prompt])
+            if missing == "zero":
+                per_prompt.append((0.0, 0.0))
+            continue
+        true = truth if truth.dtype == bool else truth > 128
+        predicted = _fitted(predictions[view, prompt], true.shape, 128)
+        per_prompt.append((mask_iou(predicted, true), boundary_iou(predicted, true)))
+    if not truths:
+        raise InputError("LERF-mask: there are no truth masks")
+    prompts = {
+        prompt: {"miou": float(np.mean([s[0] for s in rows])), "mbiou": float(np.mean([s[1] for s in rows]))}
+        for prompt, rows in scores.items()
+        if rows
+    }
+    return {
+        "miou": _mean([row["miou"] for row in prompts.values()]),
+        "mbiou": _mean([row["mbiou"] for row in prompts.values()]),
+        "prompts": prompts,
+        "missing": absent,
+        "protocol": {
+            "name": "lerf-mask",
+            "truth": "> 128",
+            "prediction": "> 128 or bool, resized nearest",
+            "boundary": "3x3 erosion, round(.02 diagonal) times, zero padding",
+            "mean": "per prompt over views, then over prompts",
+            "missing_prediction": "scores 0" if missing == "zero" else "skipped",
+            "empty_union": "scores 1",
+        },
+    }
+
+
+def evaluate_lerf_ovs(predictions: Masks, truths: Masks, **switches: Any) -> dict[str, Any]:
+    """LERF-OVS in 3D (OpenGaussian) of one scene: flat mean of IoU over (view, object), and mAcc@.25
+    (strict).
+
+    truths: {(view, prompt): 8-bit mask, object > 10}; predictions: silhouettes in [0, 1] of the selected
+    Gaussians (object > .7), or bool. An absent prediction scores 0. switches (selection rule, occlusion,
+    held-out views) are printed with the figures.
+    """
+    if not truths:
+        raise InputError("LERF-OVS: there are no truth masks")
+    rows = []
+    for (view, prompt), truth in sorted(truths.items()):
+        true = truth if truth.dtype == bool else truth > 10
+        found = predictions.get((view, prompt))
+        iou = 0.0 if found is None else mask_iou(_fitted(found, true.shape, 0.7), true)
+        rows.append({"view": view, "prompt": prompt, "iou": iou, "missing": found is None})
+    ious = np.array([row["iou"] for row in rows])
+    return {
+        "miou": float(ious.mean()),
+        "macc25": float((ious > 0.25).mean()),
+        "objects": rows,
+        "protocol": {
+            "name": "lerf-ovs-3d",
+            "truth": "> 10",
+            "prediction": "silhouette > .7 or bool",
+            "mean": "flat over (view, object)",
+            "accuracy": "IoU > .25, strict",
+            "missing_prediction": "scores 0",
+            "selection": switches.pop("selection", "not stated"),
+            "occlusion": switches.pop("occlusion", "not stated"),
+            "test_views": switches.pop("test_views", "not stated"),
+            **switches,
+        },
+    }
+
+
+def mean_over_scenes(scenes: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """Mean of each figure that all scenes have, every scene counted once."""
+    if not scenes:
+        raise InputError("there are no scenes to average")
+    keys = set.intersection(*({k for k, v in s.items() if isinstance(v, float)} for s in scenes.values()))
+    return {key: float(np.mean([s[key] for s in scenes.values()])) for key in sorted(keys)}
+
+
+def _fitted(mask: np.ndarray, shape: tuple[int, ...], threshold: float) -> np.ndarray:
+    """A prediction as bool of the truth's size (nearest neighbour)."""
+    found = mask if mask.dtype == bool else mask > threshold
+    if found.shape == shape:
+        return found
+    size = (shape[1], shape[0])
+    return cv2.resize(found.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
+
+
+def _mean(values: list[float]) -> float | None:
+    return float(np.mean(values)) if values else None

@@ -1,0 +1,1 @@
+"""Gaussians: rasterization, losses, densification, training."""

@@ -1,0 +1,328 @@
+"""Differentiable rasterization of 3D Gaussians on the CPU: the torch side of the compiled kernels.
+
+Follows the 3DGS equations: 2D covariance J R Σ Rᵀ Jᵀ + 0.3 I, alpha = min(0.999, o·exp(−½ dᵀ Σ⁻¹ d)), contributions
+under 1/255 skipped, front to back by depth (equal depths by index), stop before the transmittance falls under 1e-4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from perception.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+@dataclass
+class RasterizationStats:
+    """Per-Gaussian figures for densification, in pixels.
+
+    radii: [C, N] three standard deviations along the long axis of the 2D Gaussian, 0 where it is not in view.
+    mean2d_grad: [C, N] norm of the loss's gradient with respect to the 2D mean; None until backward has run.
+    """
+
+    radii: Tensor
+    mean2d_grad: Tensor | None = None
+
+
+@dataclass
+class Rasterization:
+    """What `rasterize` returns; images are channels last."""
+
+    colors: Tensor  # [C, H, W, 3]
+    alphas: Tensor  # [C, H, W]
+    depths: Tensor  # [C, H, W] expected z-depth, alpha-weighted (not divided by alpha)
+    features: Tensor | None  # [C, H, W, D] Σ f w
+    feature_variance: Tensor | None  # [C, H, W, D] Σ f² w − (Σ f w)²
+    visible: Tensor  # [C, N] bool: contributed to some pixel
+    stats: RasterizationStats
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to rasterize. simd: "auto", "avx512", "avx2" or "baseline"; threads: 0 for torch's number."""
+
+    width: int
+    height: int
+    sh_degree: int = -1
+    near_plane: float = 0.01
+    variance: bool = True
+    depth: bool = True
+    threads: int = 0
+    simd: str = "auto"
+
+
+_default_simd = "auto"
+
+
+def simd_levels() -> list[str]:
+    """The SIMD levels this processor supports, best first."""
+    from perception import _core
+
+    return list(_core.rasterizer_simd_levels())
+
+
+def set_simd(level: str) -> None:
+    """Forces a SIMD level for calls that name none: "auto" (default), "avx512", "avx2" or "baseline"."""
+    global _default_simd
+    if level != "auto" and level not in simd_levels():
+        raise InputError(f"simd level '{level}' is not available; expected auto or one of {simd_levels()}")
+    _default_simd = level
+
+
+def _threads(settings: Settings) -> int:
+    import torch
+
+    return settings.threads if settings.threads > 0 else torch.get_num_threads()
+
+
+def _core_function(name: str, tensor: Tensor) -> Any:
+    import torch
+
+    from perception import _core
+
+    return getattr(_core, f"{name}_{'f64' if tensor.dtype == torch.float64 else 'f32'}")
+
+
+def _numpy(tensor: Tensor | None) -> Any:
+    """The tensor's memory as numpy, without a copy; None stays None."""
+    return None if tensor is None else tensor.detach().numpy()
+
+
+@dataclass
+class Forward:
+    """Result of `rasterize_forward`: images, and what `rasterize_backward` needs (frames)."""
+
+    colors: Tensor
+    alphas: Tensor
+    depths: Tensor | None
+    features: Tensor | None
+    feature_variance: Tensor | None
+    visible: Tensor
+    radii: Tensor
+    frames: Any
+
+
+def _core_inputs(inputs: tuple[Tensor | None, ...], background: Tensor | None, settings: Settings) -> Any:
+    means, quats, scales, opacities, colors, features, viewmats, ks = inputs
+    assert means is not None  # for the type checker
+    arrays = [_numpy(t) for t in (means, quats, scales, opacities, colors, features, viewmats, ks, background)]
+    return _core_function("RasterizerInputs", means)(
+        *arrays,
+        settings.width,
+        settings.height,
+        settings.sh_degree,
+        settings.near_plane,
+        _threads(settings),
+        settings.depth,
+        settings.variance,
+    )
+
+
+def rasterize_forward(
+    inputs: tuple[Tensor | None, ...], background: Tensor | None, settings: Settings
+) -> Forward:
+    """One forward pass, no autograd.
+
+    inputs: means [N,3], quats [N,4], scales [N,3], opacities [N], colors [N,3] or [N,K,3], features [N,D] or None,
+    viewmats [C,4,4], Ks [C,3,3]: contiguous CPU tensors of one dtype. background: [C,3] or None.
+    """
+    import torch
+
+    means, features, viewmats = inputs[0], inputs[5], inputs[6]
+    assert means is not None and viewmats is not None  # for the type checker
+    count, n = viewmats.shape[0], means.shape[0]
+    image = (count, settings.height, settings.width)
+    new = means.new_empty
+    dims = 0 if features is None else features.shape[1]
+    out = Forward(
+        colors=new((*image, 3)),
+        alphas=new(image),
+        depths=new(image) if settings.depth or dims else None,
+        features=None if features is None else new((*image, dims)),
+        feature_variance=new((*image, dims)) if features is not None and settings.variance else None,
+        visible=torch.zeros((count, n), dtype=torch.uint8),
+        radii=means.new_zeros((count, n)),
+        frames=None,
+    )
+    images = (out.colors, out.alphas, out.depths, out.features, out.feature_variance, out.visible, out.radii)
+    simd = _default_simd if settings.simd == "auto" else settings.simd
+    try:
+        out.frames = _core_function("rasterize_forward", means)(
+            _core_inputs(inputs, background, settings), *(_numpy(t) for t in images), simd
+        )
+    except ValueError as error:
+        raise InputError(f"rasterize: {error}") from None
+    return out
+
+
+def rasterize_backward(
+    inputs: tuple[Tensor | None, ...],
+    background: Tensor | None,
+    settings: Settings,
+    forward: Forward,
+    cotangents: tuple[Tensor | None, ...],
+    wanted: tuple[bool, ...],
+) -> tuple[list[Tensor | None], Tensor]:
+    """One backward pass, no autograd.
+
+    cotangents: dL/d colors, alphas, depths, features, feature_variance; None means zero. wanted: which of the first
+    seven inputs want a gradient. Returns those gradients and dL/d(2D mean) [C, N, 2] in pixels.
+    """
+    import torch
+
+    means, viewmats = inputs[0], inputs[6]
+    assert means is not None and viewmats is not None  # for the type checker
+    grads = [
+        torch.zeros_like(t, memory_format=torch.contiguous_format) if t is not None and w else None
+        for t, w in zip(inputs[:7], wanted, strict=True)
+    ]
+    mean2d = means.new_zeros((viewmats.shape[0], means.shape[0], 2))
+    images = (forward.colors, forward.alphas, forward.depths, forward.features, forward.feature_variance)
+    contiguous = [None if g is None else g.contiguous() for g in cotangents]
+    _core_function("rasterize_backward", means)(
+        _core_inputs(inputs, background, settings),
+        forward.frames,
+        *(_numpy(t) for t in (*images, *contiguous, *grads, mean2d)),
+    )
+    return grads, mean2d
+
+
+def _autograd_function() -> Any:
+    import torch
+
+    class RasterizeFunction(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, background: Tensor | None, settings: Settings, stats: RasterizationStats, *inputs: Any) -> Any:
+            contiguous = tuple(None if t is None else t.detach().contiguous() for t in inputs)
+            shade = None if background is None else background.detach().contiguous()
+            out = rasterize_forward(contiguous, shade, settings)
+            stats.radii = out.radii
+            images = (out.colors, out.alphas, out.depths, out.features, out.feature_variance)
+            ctx.settings, ctx.stats = settings, stats
+            if any(ctx.needs_input_grad):
+                ctx.frames = out.frames
+                ctx.save_for_backward(*contiguous, shade, *images)
+            ctx.set_materialize_grads(False)
+            visible = out.visible.view(torch.bool)
+            ctx.mark_non_differentiable(visible)
+            return (*images, visible)
+
+        @staticmethod
+        def backward(ctx: Any, *cotangents: Tensor | None) -> Any:
+            saved = ctx.saved_tensors
+            inputs, background, images = saved[:8], saved[8], saved[9:]
+            wanted = tuple(ctx.needs_input_grad[3:10])
+            state = Forward(*images, visible=None, radii=None, frames=ctx.frames)  # type: ignore[arg-type]
+            grads, mean2d = rasterize_backward(inputs, background, ctx.settings, state, cotangents[:5], wanted)
+            ctx.stats.mean2d_grad = mean2d.norm(dim=-1)
+            shade = None
+            if ctx.needs_input_grad[0] and cotangents[0] is not None:
+                shade = (cotangents[0] * (1 - state.alphas)[..., None]).sum(dim=(1, 2))
+            return (shade, None, None, *grads, None)
+
+    return RasterizeFunction
+
+
+_function: Any = None
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    sh_degree: int | None = None,
+    features: Tensor | None = None,
+    background: Tensor | None = None,
+    near_plane: float = 0.01,
+    *,
+    variance: bool = True,
+    depth: bool = True,
+    threads: int = 0,
+    simd: str = "auto",
+) -> Rasterization:
+    """Renders Gaussians into C cameras; differentiable in everything but Ks.
+
+    means [N,3] world, quats [N,4] wxyz of any norm, scales [N,3] > 0, opacities [N] in [0,1] (activated values),
+    colors [N,3] RGB, or [N,K,3] spherical-harmonic coefficients of degree `sh_degree` (0 to 3, K ≥ (sh_degree+1)²),
+    viewmats [C,4,4] camera_from_world, Ks [C,3,3] pixels (pixel centres at +0.5, no skew), features [N,D],
+    background [3] or [C,3]. float32 or float64, on the CPU. Gradients flow to all of them except Ks.
+
+    variance=False and depth=False leave out `feature_variance` and `depths` (None then) and save their time.
+    threads: 0 takes torch.get_num_threads(). The result is the same, bit for bit, for any number of threads.
+    """
+    global _function
+    if _function is None:
+        _function = _autograd_function()
+    tensors = {
+        "means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors,
+        "features": features, "viewmats": viewmats, "Ks": Ks, "background": background,
+    }  # fmt: skip
+    _check(tensors, width, height, sh_degree, near_plane)
+    if background is not None and background.ndim == 1:
+        background = background.expand(viewmats.shape[0], 3)
+    settings = Settings(
+        int(width), int(height), -1 if sh_degree is None else int(sh_degree), float(near_plane),
+        variance and features is not None, depth, threads, simd,
+    )  # fmt: skip
+    stats = RasterizationStats(radii=means.new_zeros((0,)))
+    out = _function.apply(
+        background, settings, stats, means, quats, scales, opacities, colors, features, viewmats, Ks
+    )
+    return Rasterization(*out, stats=stats)
+
+
+def _check(
+    tensors: dict[str, Tensor | None], width: int, height: int, sh_degree: int | None, near_plane: float
+) -> None:
+    """Names the first argument at fault."""
+    import torch
+
+    means = tensors["means"]
+    for name, t in tensors.items():
+        if t is None and name in ("features", "background"):
+            continue
+        if not isinstance(t, torch.Tensor):
+            raise InputError(f"rasterize: {name} is {type(t).__name__}, expected a torch.Tensor")
+        if t.device.type != "cpu":
+            raise InputError(f"rasterize: {name} is on {t.device}, expected the CPU; call .cpu()")
+        if t.dtype not in (torch.float32, torch.float64) or (means is not None and t.dtype != means.dtype):
+            raise InputError(
+                f"rasterize: {name} is {t.dtype}, expected {means.dtype if name != 'means' else 'float32 or float64'}"  # type: ignore[union-attr]
+            )
+    _check_shapes(tensors, sh_degree)
+    if not (1 <= width <= 1 << 20 and 1 <= height <= 1 << 20):
+        raise InputError(f"rasterize: image size {width} × {height}, expected 1 to 1048576 pixels a side")
+    if not (near_plane >= 0 and near_plane < float("inf")):
+        raise InputError(f"rasterize: near_plane is {near_plane}, expected a finite number ≥ 0")
+
+
+def _check_shapes(tensors: dict[str, Any], sh_degree: int | None) -> None:
+    n, c = tensors["means"].shape[:1], tensors["viewmats"].shape[:1]
+    colors = tensors["colors"]
+    color_shape: tuple[int, ...] = (*n, 3)
+    if sh_degree is not None:
+        if not 0 <= sh_degree <= 3:
+            raise InputError(f"rasterize: sh_degree is {sh_degree}, expected 0 to 3")
+        k = colors.shape[1] if colors.ndim == 3 else 0
+        color_shape = (*n, max(k, (sh_degree + 1) ** 2), 3)
+    expected: dict[str, tuple[int, ...]] = {
+        "means": (*n, 3), "quats": (*n, 4), "scales": (*n, 3), "opacities": (*n,), "colors": color_shape,
+        "viewmats": (*c, 4, 4), "Ks": (*c, 3, 3),
+    }  # fmt: skip
+    features, background = tensors["features"], tensors["background"]
+    if features is not None:
+        expected["features"] = (*n, features.shape[1] if features.ndim == 2 else 0)
+    if background is not None:
+        expected["background"] = (3,) if background.ndim == 1 else (*c, 3)
+    for name, shape in expected.items():
+        if tuple(tensors[name].shape) != shape:
+            raise InputError(f"rasterize: {name} has shape {list(tensors[name].shape)}, expected {list(shape)}")

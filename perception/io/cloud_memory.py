@@ -1,0 +1,28 @@
+"""Refusing what would not fit, before the machine starts to swap or kill."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from perception.errors import InputError
+
+
+def available_memory() -> int:
+    """Bytes that can be allocated without swapping, as the kernel estimates; elsewhere all there is."""
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def require_memory(needed: float, what: str, advice: str) -> None:
+    """InputError naming `what` and `advice` when `needed` bytes exceed nine tenths of what is free."""
+    free = available_memory()
+    if needed > 0.9 * free:
+        raise InputError(
+            f"{what}: needs about {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; {advice}"
+        )

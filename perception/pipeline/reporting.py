@@ -1,0 +1,236 @@
+"""A map as pictures and as a one-page report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from perception.errors import InputError
+from perception.gaussians.model import Gaussians
+from perception.gaussians.train import TrainingView, render_view
+from perception.instances.silhouettes import render_silhouettes
+from perception.io.photos import load_photo, scaled_K
+from perception.io.scene_cache import view_from_json
+from perception.io.store import GaussianMap
+from perception.pictures import features_to_rgb, instance_palette, outline, overlay
+from perception.pipeline.rendering import as_gaussians
+from perception.query import LoadedMap
+from perception.report import InstanceRow, QueryRow, ReportData, ViewRow, write_report
+from perception.types import View
+
+SHOWN = 3
+"""Held-out views shown beside their photos."""
+
+
+def write_map_report(
+    opened: LoadedMap, path: Path, queries: list[str], expected: dict[str, list[int]] | None = None
+) -> Path:
+    """The one-page report of a map, with the answers to `queries`; photos that are gone are left out."""
+    gmap, gaussians = opened.gmap, as_gaussians(opened.gmap)
+    info = gmap.info
+    curve = info["training"]["curve"]
+    album = _Album(gmap, gaussians)
+    data = ReportData(
+        title=(opened.path or path).stem,
+        subtitle=f"from {info['source']}",
+        figures=_figures(gmap),
+        seconds={name: value for name, value in info["seconds"].items() if name != "total"},
+        psnr_curve=[(entry["iteration"], entry["psnr"]) for entry in curve],
+        gaussians_curve=[(entry["iteration"], entry["gaussians"]) for entry in curve],
+        views=_view_rows(gmap, album),
+        overview=_overview(gmap, album),
+        instances=[_instance_row(opened, i, album) for i in range(len(gmap.instances))],
+        metric=opened.metric,
+        queries=[_query_row(opened, text, album, (expected or {}).get(text)) for text in queries],
+        warnings=[*info["scene"].get("warnings", []), *info["masks"].get("warnings", [])],
+        settings=_flat(info["config"]),
+        rerun=f"perception map {info['source']} -o {opened.path} --seed {info['seed']}",
+    )
+    try:
+        return write_report(path, data)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+class _Album:
+    """Photos, renders and silhouettes of the map's views, made when first asked for."""
+
+    def __init__(self, gmap: GaussianMap, gaussians: Gaussians):
+        self.gmap, self.gaussians = gmap, gaussians
+        self.views = {view.name: view for view in saved_views(gmap)}
+        self.max_side = int(gmap.info["config"]["photos"]["max_side"])
+        self._photos: dict[str, np.ndarray | None] = {}
+        self._ids: dict[str, np.ndarray] = {}
+
+    def photo(self, name: str) -> np.ndarray | None:
+        """[h, w, 3] uint8 at training size; None when it can no longer be read."""
+        if name not in self._photos:
+            try:
+                self._photos[name] = load_photo(self.views[name], self.max_side)
+            except InputError:
+                self._photos[name] = None
+        return self._photos[name]
+
+    def _camera(self, name: str, width: int, height: int) -> tuple[torch.Tensor, torch.Tensor]:
+        view = self.views[name]
+        pose = torch.from_numpy(view.camera_from_world.astype(np.float32))
+        return pose, torch.from_numpy(scaled_K(view, width, height).astype(np.float32))
+
+    def render(self, name: str, photo: np.ndarray) -> np.ndarray:
+        """The map from the photo's place, uint8."""
+        pose, K = self._camera(name, photo.shape[1], photo.shape[0])
+        view = TrainingView(name, torch.from_numpy(photo), None, K, pose)
+        return (render_view(self.gaussians, view) * 255 + 0.5).to(torch.uint8).numpy()
+
+    def ids(self, name: str, photo: np.ndarray) -> np.ndarray:
+        """Instance ids [h, w] from the photo's place, −1 = none."""
+        if name not in self._ids:
+            height, width = photo.shape[:2]
+            pose, K = self._camera(name, width, height)
+            found = render_silhouettes(self.gaussians, self.gmap.instance_ids, pose, K, width, height)
+            self._ids[name] = found.ids
+        return self._ids[name]
+
+
+def saved_views(gmap: GaussianMap) -> list[View]:
+    """The views a map was made from, with their lenses, as the map records them."""
+    return [view_from_json(entry) for entry in gmap.info["views"]]
+
+
+def _figures(gmap: GaussianMap) -> dict[str, str]:
+    info = gmap.info
+    figures = {"Gaussians": f"{len(gmap):,}", "Instances": str(len(gmap.instances))}
+    if "psnr" in info["quality"]:
+        figures |= {
+            "Held-out PSNR": f"{info['quality']['psnr']:.2f} dB",
+            "SSIM": f"{info['quality']['ssim']:.3f}",
+        }
+    figures["Time"] = f"{info['seconds']['total']:.0f} s"
+    figures["Peak memory"] = f"{info['peak_memory_mib']:.0f} MiB"
+    return figures
+
+
+def _view_rows(gmap: GaussianMap, album: _Album) -> list[ViewRow]:
+    scored = gmap.info["quality"].get("views", {})
+    names = list(scored)
+    shown = {names[i] for i in np.linspace(0, len(names) - 1, min(SHOWN, len(names))).round().astype(int)}
+    rows = []
+    for name in names:
+        photo = album.photo(name) if name in shown else None
+        render = album.render(name, photo) if photo is not None else None
+        rows.append(ViewRow(name, scored[name]["psnr"], scored[name]["ssim"], photo, render))
+    return rows
+
+
+def _overview(gmap: GaussianMap, album: _Album) -> dict[str, np.ndarray]:
+    """Instances and features over a photo in the middle of the walk."""
+    names = list(album.views)
+    name = names[len(names) // 2]
+    photo = album.photo(name)
+    if photo is None or not gmap.instances:
+        return {}
+    return {
+        f"instances in {name}": overlay(photo, album.ids(name, photo)),
+        "instances from above": instances_from_above(gmap),
+        "instance features (main components)": feature_picture(album, name, photo),
+    }
+
+
+def feature_picture(album: _Album, name: str, photo: np.ndarray) -> np.ndarray:
+    """Rendered features of a view, coloured by their three main components."""
+    from perception.gaussians.rasterize import rasterize
+
+    height, width = photo.shape[:2]
+    pose, K = album._camera(name, width, height)
+    g = album.gaussians
+    out = rasterize(
+        g.means,
+        g.quats,
+        g.scales,
+        g.opacities,
+        g.base_colors,
+        pose[None],
+        K[None],
+        width,
+        height,
+        features=g.features,
+    )
+    return features_to_rgb(out.features[0].numpy())
+
+
+def instances_from_above(gmap: GaussianMap, side: int = 480) -> np.ndarray:
+    """The opaque Gaussians' means seen along the mean of the cameras' downward axes, painted by instance."""
+    down = gmap.cameras["camera_from_world"][:, 1, :3].mean(axis=0)
+    down /= max(np.linalg.norm(down), 1e-9)
+    right = np.cross(down, [1.0, 0.2, 0.1])
+    right /= np.linalg.norm(right)
+    rows = np.flatnonzero((gmap.opacities > 0.3) & (gmap.instance_ids >= 0))
+    points = gmap.means[rows].astype(np.float64)
+    flat = np.stack([points @ right, points @ np.cross(down, right)], axis=1)
+    low, high = np.percentile(flat, [2, 98], axis=0)
+    pixel = ((flat - low) / max((high - low).max(), 1e-9) * (side - 1)).round().astype(int)
+    inside = ((pixel >= 0) & (pixel < side)).all(axis=1)
+    order = np.argsort(-(points @ down), kind="stable")  # lowest first, so that the highest is seen
+    order = order[inside[order]]
+    picture = np.full((side, side, 3), 255, np.uint8)
+    colors = instance_palette(gmap.instance_ids[rows[order]])
+    for dx in (0, 1):
+        for dy in (0, 1):
+            x, y = np.minimum(pixel[order, 0] + dx, side - 1), np.minimum(pixel[order, 1] + dy, side - 1)
+            picture[y, x] = colors
+    return picture
+
+
+def _best_crop(opened: LoadedMap, index: int, album: _Album, whole: bool) -> np.ndarray | None:
+    """The instance in the photo that shows it best: outlined in the whole photo, or cut out with a margin."""
+    hit = opened.hit(index)
+    if not hit.views:
+        return None
+    photo = album.photo(hit.views[0])
+    if photo is None:
+        return None
+    mask = album.ids(hit.views[0], photo) == hit.instance_id
+    if not mask.any():
+        return None
+    picture = outline(photo, mask)
+    if whole:
+        return picture
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    margin = 4 + max(len(rows), len(columns)) // 8
+    top, left = max(0, rows[0] - margin), max(0, columns[0] - margin)
+    return picture[top : rows[-1] + margin, left : columns[-1] + margin]
+
+
+def _instance_row(opened: LoadedMap, index: int, album: _Album) -> InstanceRow:
+    entry = opened.instances[index]
+    return InstanceRow(
+        entry["id"],
+        _best_crop(opened, index, album, whole=False),
+        entry.get("label"),
+        (),
+        entry["score"],
+        entry["obb"]["extent"],
+        entry["num_gaussians"],
+    )
+
+
+def _query_row(opened: LoadedMap, text: str, album: _Album, expected: list[int] | None) -> QueryRow:
+    hits = opened.query(text)
+    index = next(
+        (i for i, entry in enumerate(opened.instances) if hits and entry["id"] == hits[0].instance_id), None
+    )
+    picture = None if index is None else _best_crop(opened, index, album, whole=True)
+    return QueryRow(text, bool(hits), [(hit.instance_id, hit.score) for hit in hits], picture, expected)
+
+
+def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, object]:
+    flat: dict[str, object] = {}
+    for name, value in config.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat

@@ -1,0 +1,181 @@
+"""Picture masks against scipy, and the dataset runners on miniature copies of the layouts."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import binary_erosion
+
+from perception.errors import InputError
+from perception.evaluate.instances import evaluate_masks
+from perception.evaluate.layouts import run_lerf_mask, run_lerf_ovs, run_scannet
+from perception.evaluate.masks import (
+    boundary_iou,
+    evaluate_lerf_mask,
+    evaluate_lerf_ovs,
+    mask_boundary,
+    mask_iou,
+)
+from perception.export.formats import write_scannet
+
+
+def blob(seed, shape=(60, 90)):
+    rng = np.random.default_rng(seed)
+    return cv2.GaussianBlur(rng.random(shape), (0, 0), 6) > 0.5
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_boundary_iou_by_repeated_erosion(seed):
+    a, b = blob(seed), blob(seed + 50)
+    n = round(0.02 * np.hypot(60, 90))
+
+    def boundary(mask):
+        return mask & ~binary_erosion(mask, np.ones((3, 3)), iterations=n, border_value=0)
+
+    np.testing.assert_array_equal(mask_boundary(a), boundary(a))
+    p, q = boundary(a), boundary(b)
+    assert boundary_iou(a, b) == pytest.approx((p & q).sum() / (p | q).sum(), abs=1e-12)
+
+
+def test_iou_of_empty_masks():
+    none, full = np.zeros((4, 4), bool), np.ones((4, 4), bool)
+    assert (mask_iou(none, none), mask_iou(none, full), mask_iou(full, full)) == (1, 0, 1)
+
+
+def test_lerf_mask_averages_by_prompt_and_scores_the_missing_zero():
+    full = np.full((40, 40), 255, np.uint8)
+    half = full.copy()
+    half[:, 20:] = 0
+    truths = {("v1", "cup"): full, ("v2", "cup"): full, ("v1", "egg"): half}
+    predictions = {("v1", "cup"): full, ("v1", "egg"): cv2.resize(full, (10, 10))}
+    result = evaluate_lerf_mask(predictions, truths)
+    assert result["prompts"]["cup"]["miou"] == 0.5 and result["miou"] == pytest.approx((0.5 + 0.5) / 2)
+    assert result["missing"] == [["v2", "cup"]]
+    skipped = evaluate_lerf_mask(predictions, truths, missing="skip")
+    assert skipped["miou"] == pytest.approx((1 + 0.5) / 2)
+    assert skipped["protocol"]["missing_prediction"] == "skipped"
+
+
+def test_lerf_ovs_is_a_flat_mean_and_strict_at_a_quarter():
+    truth = np.zeros((10, 10), np.uint8)
+    truth[:, :] = 11
+    quarter = np.zeros((10, 10))
+    quarter[:5, :5] = 0.71
+    truths = {("f1", "a"): truth, ("f1", "b"): truth, ("f2", "a"): truth}
+    result = evaluate_lerf_ovs(
+        {("f1", "a"): quarter, ("f2", "a"): np.ones((10, 10))}, truths, selection="top-1"
+    )
+    assert result["miou"] == pytest.approx((0.25 + 0 + 1) / 3)
+    assert result["macc25"] == pytest.approx(1 / 3)
+    assert result["protocol"]["selection"] == "top-1" and result["protocol"]["occlusion"] == "not stated"
+
+
+def save(path, mask):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), mask.astype(np.uint8) * 255)
+
+
+def test_lerf_mask_directory(tmp_path):
+    data, pred = tmp_path / "data", tmp_path / "pred"
+    for scene in ("figurines", "ramen"):
+        for view in ("test_0", "test_1"):
+            save(data / scene / "test_mask" / view / "green apple.png", blob(1))
+    save(pred / "figurines/test_0/green apple.png", blob(1))
+    save(pred / "figurines/test_1/green apple.png", blob(2))
+    result, table = run_lerf_mask(pred, data)
+    want = (1 + mask_iou(blob(2), blob(1))) / 2
+    assert result["scenes"]["figurines"]["miou"] == pytest.approx(want)
+    assert result["scenes"]["ramen"]["miou"] == 0 and result["mean"]["miou"] == pytest.approx(want / 2)
+    assert "figurines" in table and "zero padding" in table
+    with pytest.raises(InputError, match="test_mask"):
+        run_lerf_mask(pred, pred)
+    with pytest.raises(InputError, match="no folder"):
+        run_lerf_mask(tmp_path / "none", data)
+
+
+def test_lerf_ovs_directory(tmp_path):
+    label = tmp_path / "label/teatime"
+    label.mkdir(parents=True)
+    square = [[10, 5], [29, 5], [29, 24], [10, 24]]
+    objects = [{"category": "sheep", "segmentation": square}]
+    (label / "frame_00001.json").write_text(
+        json.dumps({"info": {"height": 40, "width": 50}, "objects": objects})
+    )
+    mask = np.zeros((40, 50), bool)
+    mask[5:25, 10:30] = True
+    save(tmp_path / "pred/teatime/frame_00001/sheep.png", mask)
+    result, table = run_lerf_ovs(tmp_path / "pred", tmp_path, selection="top-1", occlusion="off")
+    assert result["mean"] == {"macc25": 1.0, "miou": 1.0}
+    assert "selection: top-1" in table
+    (label / "frame_00002.json").write_text("{}")
+    with pytest.raises(InputError, match="frame_00002"):
+        run_lerf_ovs(tmp_path / "pred", tmp_path)
+
+
+def runs(mask):
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]]))) + 1
+    edges[1::2] -= edges[::2]
+    return " ".join(map(str, edges))
+
+
+def test_scannet_directory_with_mask_files_and_run_lengths(tmp_path):
+    rng = np.random.default_rng(0)
+    truth = np.repeat([0, 3001, 3002, 5001, 7], 200)
+    labels = np.where(rng.random(1000) < 0.1, -1, np.repeat([-1, 4, 6, 8, 9], 200)).astype(np.int32)
+    scores = {4: 0.9, 6: 0.5, 8: 0.25, 9: 0.125}
+    gt, text, coded = (tmp_path / name for name in ("gt", "text", "coded"))
+    gt.mkdir()
+    coded.mkdir()
+    np.savetxt(gt / "scene0.txt", truth, fmt="%d")
+    write_scannet(
+        text, "scene0", labels, {i: {"score": s} for i, s in scores.items()}, {4: 3, 6: 3, 8: 5, 9: 5}
+    )
+    rows = [
+        {
+            "label_id": {4: 3, 6: 3, 8: 5, 9: 5}[i],
+            "confidence": s,
+            "segmentation": {"length": 1000, "counts": runs(labels == i)},
+        }
+        for i, s in scores.items()
+    ]
+    (coded / "scene0.json").write_text(json.dumps(rows))
+    first, table = run_scannet(text, gt, by_class=True)
+    second, _ = run_scannet(coded, gt, "scannetpp", by_class=True)
+    void = np.where(truth < 1000, 0, truth)
+    want = evaluate_masks(
+        [labels == i for i in scores],
+        list(scores.values()),
+        void,
+        classes=[3, 3, 5, 5],
+        gt_semantics=void // 1000,
+        by_class=True,
+    )
+    assert first["ap"] == second["ap"] == want["ap"] == pytest.approx(1.0 - 1 / 9, abs=0.2)
+    assert "class 3" in table
+    np.savetxt(gt / "scene1.txt", truth, fmt="%d")
+    halved, _ = run_scannet(text, gt, by_class=True)
+    assert halved["missing"] == ["scene1"] and halved["ap50"] == pytest.approx(0.5, abs=1e-9)
+
+
+def test_bad_scannet_predictions_are_told(tmp_path):
+    gt, pred = tmp_path / "gt", tmp_path / "pred"
+    gt.mkdir()
+    pred.mkdir()
+    with pytest.raises(InputError, match="no truth files"):
+        run_scannet(pred, gt)
+    np.savetxt(gt / "s.txt", np.full(10, 3001), fmt="%d")
+    (pred / "s.txt").write_text("mask.txt 3\n")
+    with pytest.raises(InputError, match="line 1"):
+        run_scannet(pred, gt)
+    (pred / "s.txt").write_text("mask.txt 3 0.5\n")
+    (pred / "mask.txt").write_text("1\n0\n")
+    with pytest.raises(InputError, match="2 rows, the truth has 10"):
+        run_scannet(pred, gt)
+    row = {"label_id": 3, "confidence": 1, "segmentation": {"length": 9, "counts": "1 9"}}
+    for data in ([row], {"a": 1}, [{"label_id": 3}]):
+        (pred / "s.json").write_text(json.dumps(data))
+        with pytest.raises(InputError, match=r"s\.json"):
+            run_scannet(pred, gt)

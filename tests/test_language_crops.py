@@ -1,0 +1,151 @@
+"""View choice, crop geometry and photo-by-photo description against brute force and a hand-made encoder."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from perception.errors import InputError
+from perception.instances.crops import (
+    FILL,
+    choose_views,
+    crop_levels,
+    expand_box,
+    letterbox,
+    mask_box,
+    soften_background,
+    view_scores,
+)
+from perception.instances.describe import describe_instances
+from perception.language.colors import palette
+
+
+class MeanColor:
+    """A hand-made encoder: the mean colour of a picture, scaled to length 1."""
+
+    identity, dim, templates, references = "mean-color", 3, ("{}",), None
+
+    def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        means = np.array([i.reshape(-1, 3).mean(0) for i in images], np.float32)
+        return means / np.linalg.norm(means, axis=1, keepdims=True)
+
+    def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
+        return np.eye(3, dtype=np.float32)[[len(t) % 3 for t in texts]]
+
+
+def test_view_score_is_the_papers() -> None:
+    scores = view_scores(np.array([[50, 0]]), np.array([100, 200]), np.array([[0.5, 1.0]]))
+    assert scores.tolist() == [[0.25, 0.0]]
+
+
+def test_best_views_first_ties_by_order_and_zeros_never() -> None:
+    scores = np.array([[0.1, 0.5, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0]])
+    first, second = choose_views(scores, 3)
+    assert first.tolist() == [1, 3, 0]
+    assert second.tolist() == []
+    with pytest.raises(InputError, match=r"expected a \[instances, views\] array"):
+        choose_views(np.zeros(3))
+
+
+def test_diversity_picks_the_greedy_optimum() -> None:
+    rng = np.random.default_rng(0)
+    scores = rng.uniform(0.1, 1.0, (1, 8))
+    directions = rng.normal(size=(1, 8, 3))
+    directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+    picked = choose_views(scores, 3, directions, diversity=0.8)[0].tolist()
+    done: list[int] = []
+    for _ in range(3):  # brute force over all views, straight from the docstring's formula
+
+        def gain(v: int) -> float:
+            near = max([0.0, *(float(directions[0, v] @ directions[0, u]) for u in done)])
+            return float(scores[0, v]) * (1 - 0.8 * near)
+
+        done.append(max((v for v in range(8) if v not in done), key=gain))
+    assert picked == done
+    assert (
+        choose_views(scores, 3, directions, diversity=0.0)[0].tolist() == np.argsort(-scores[0])[:3].tolist()
+    )
+
+
+def test_boxes_by_hand() -> None:
+    mask = np.zeros((40, 60), bool)
+    mask[10:20, 30:50] = True
+    assert mask_box(mask) == (30, 10, 50, 20)
+    assert mask_box(np.zeros((4, 4), bool)) is None
+    assert expand_box((30, 10, 50, 20), 0.3, 60, 40) == (24, 7, 56, 23)
+    assert expand_box((30, 10, 50, 20), 0.6, 60, 40) == (18, 4, 60, 26)
+
+
+@pytest.mark.parametrize(("height", "width"), [(4, 9), (9, 4), (5, 5), (1, 3)])
+def test_letterbox_keeps_every_pixel(height: int, width: int) -> None:
+    image = np.random.default_rng(1).integers(0, 255, (height, width, 3), dtype=np.uint8)
+    square = letterbox(image)
+    side = max(height, width)
+    assert square.shape == (side, side, 3)
+    top, left = (side - height) // 2, (side - width) // 2
+    assert np.array_equal(square[top : top + height, left : left + width], image)
+    outside = np.ones((side, side), bool)
+    outside[top : top + height, left : left + width] = False
+    assert np.all(square[outside] == FILL)
+
+
+def test_levels_grow_by_the_expansion() -> None:
+    photo = np.random.default_rng(2).integers(0, 255, (100, 100, 3), dtype=np.uint8)
+    mask = np.zeros((100, 100), bool)
+    mask[40:60, 45:55] = True
+    crops = crop_levels(photo, mask, levels=3, expansion=0.3)
+    assert [len(c) for c in crops] == [20, 32, 44]
+    assert np.array_equal(crops[1][:, 8:24], photo[34:66, 42:58])
+    assert crop_levels(photo, np.zeros((100, 100), bool)) == []
+
+
+@pytest.mark.parametrize("background", ["dim", "blur", "fill"])
+def test_softening_leaves_the_inside_and_changes_the_outside(background: str) -> None:
+    photo = np.random.default_rng(3).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    mask = np.zeros((64, 64), bool)
+    mask[20:44, 20:44] = True
+    soft = soften_background(photo, mask, background)  # type: ignore[arg-type]
+    assert np.array_equal(soft[26:38, 26:38], photo[26:38, 26:38])
+    assert soft[:12].std() < photo[:12].std()
+    with pytest.raises(InputError, match="expected plain, dim, blur or fill"):
+        soften_background(photo, mask, "swirl")  # type: ignore[arg-type]
+
+
+def test_description_is_the_mean_over_crops_whatever_the_order_of_photos() -> None:
+    rng = np.random.default_rng(4)
+    photos = rng.integers(20, 255, (4, 48, 64, 3), dtype=np.uint8)
+    ids = np.full((4, 48, 64), -1, np.int32)
+    ids[:, 5:20, 8:30], ids[:, 25:45, 30:60] = 0, 1
+    loaded: list[int] = []
+
+    def load(view: int) -> tuple[np.ndarray, np.ndarray]:
+        loaded.append(view)
+        return photos[view], ids[view]
+
+    choices = [np.array([2, 0]), np.array([3]), np.array([], np.int64)]
+    names = [f"{v}.jpg" for v in range(4)]
+    told: list[tuple[int, int]] = []
+    found = describe_instances(MeanColor(), choices, load, names, progress=lambda a, b: told.append((a, b)))
+    assert loaded == [0, 2, 3]
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    rows = [
+        MeanColor().encode_images(crop_levels(photos[v], ids[v] == 0, 3, 0.3)).astype(np.float64)
+        for v in (2, 0)
+    ]
+    mean = np.mean(list(itertools.chain(*rows)), axis=0)
+    assert np.allclose(found[0].embedding, mean / np.linalg.norm(mean), atol=1e-6)
+    assert found[0].views == ["2.jpg", "0.jpg"] and found[0].boxes == [(8, 5, 30, 20)] * 2
+    first = rows[0].mean(0)
+    assert np.allclose(found[0].per_view[0], first / np.linalg.norm(first), atol=1e-6)
+    assert not found[2].seen and not found[2].embedding.any()
+
+
+def test_palette_comes_from_the_mask_alone() -> None:
+    photo = np.full((60, 60, 3), (0, 0, 255), np.uint8)
+    ids = np.full((60, 60), -1, np.int32)
+    photo[20:40, 20:40], ids[20:40, 20:40] = (255, 0, 0), 0
+    found = describe_instances(MeanColor(), [np.array([0])], lambda _: (photo, ids), ["a.jpg"])
+    assert np.allclose(found[0].palette, palette(np.array([[255, 0, 0]], np.uint8)), atol=1e-4)
