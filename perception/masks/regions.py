@@ -17,7 +17,7 @@ from perception.masks.region_graph import RegionGraph, Watcher, agglomerate
 
 PHOTO_WEIGHTS = np.array([5.21, -0.86, 0.01, -5.22, 0.41, -0.32, 1.52, 0.83])
 # The second row judges by shape alone and can only forbid (the lower log odds count): a white wall ends at a
-# white floor. Its constant is 2 above the fitted one, since in the scenes fitted on colour mostly tells as well.
+# white floor. Its constant is 2 above the fitted one, since in the scenes fitted on colour mostly tells too.
 DEPTH_WEIGHTS = np.array(
     [
         [
