@@ -52,13 +52,13 @@ def score_photo(labels: np.ndarray, truth: np.ndarray, smallest: int = SMALLEST)
 def score_scene(scene: Path, spec: str, every: int = 1) -> dict[str, Any]:
     """Runs the source `spec` over every `every`-th photo of a truth scene and sums up."""
     source = make_source(spec)
-    views = list(_views(scene))[::every]
+    views = list(views_with_truth(scene))[::every]
     if not views:
         raise InputError(f"{scene}: expected images/ and masks_gt/ with equal stems, found none")
-    warnings = source.check(views)
+    warnings = source.check([view for view, _ in views])
     scores, seconds = [], 0.0
-    for view in views:
-        photo, truth = _read(view.photo), _read(_truth(scene, view.photo))
+    for view, truth in views:
+        photo = read_image(view.photo)
         start = perf_counter()
         labels = source.label_image(view, photo)
         seconds += perf_counter() - start
@@ -79,18 +79,17 @@ def score_scene(scene: Path, spec: str, every: int = 1) -> dict[str, Any]:
     }
 
 
-def _views(scene: Path) -> Iterator[View]:
+def views_with_truth(scene: Path) -> Iterator[tuple[View, np.ndarray]]:
+    """Every photo with its truth [h, w]; the camera is left out, since masks of one photo need none."""
     for photo in sorted((scene / "images").glob("*")):
-        if _truth(scene, photo).is_file():
-            height, width = _read(photo).shape[:2]
-            yield View(photo.name, photo, np.eye(3), width, height, np.eye(4))
+        truth = scene / "masks_gt" / f"{photo.stem}.png"
+        if truth.is_file():
+            ids = read_image(truth)
+            yield View(photo.name, photo, np.eye(3), ids.shape[1], ids.shape[0], np.eye(4)), ids
 
 
-def _truth(scene: Path, photo: Path) -> Path:
-    return scene / "masks_gt" / f"{photo.stem}.png"
-
-
-def _read(file: Path) -> np.ndarray:
+def read_image(file: Path) -> np.ndarray:
+    """The pixels as stored."""
     from PIL import Image
 
     with Image.open(file) as image:

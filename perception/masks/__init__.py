@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
-from perception.masks.source import MaskSource, make_source
+from perception.masks.source import GeometryMaskSource, MaskSource, make_source
+from perception.masks.store import compute_masks, load_labels
 
-__all__ = ["MaskSource", "make_source"]
+__all__ = ["GeometryMaskSource", "MaskSource", "compute_masks", "load_labels", "make_source"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -27,6 +27,15 @@ class MaskSource(Protocol):
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
         """photo: [h, w, 3] uint8 RGB, undistorted. Returns [h, w] int32, 0 = unlabelled."""
+        ...
+
+
+@runtime_checkable
+class GeometryMaskSource(MaskSource, Protocol):
+    """A source that does better once the map can say how far away each pixel is."""
+
+    def label_image_with_geometry(self, view: View, photo: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """depth: [h, w] z-depth of the view, 0 = none. Returns [h, w] int32, 0 = unlabelled."""
         ...
 
 
@@ -71,7 +80,7 @@ def configured_sam() -> str | None:
     return value
 
 
-def _read_toml(file: Path) -> dict:
+def _read_toml(file: Path) -> dict[str, Any]:
     try:
         import tomllib as toml
     except ModuleNotFoundError:  # Python 3.10

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.masks.source import MaskSource
+from perception.masks.source import GeometryMaskSource, MaskSource
 from perception.types import View
 
 _KEY = "perception-masks"
@@ -28,21 +28,25 @@ def compute_masks(
     load_photo: Callable[[View], np.ndarray],
     folder: Path,
     progress: Callable[[int, int], None] | None = None,
+    load_depth: Callable[[View], np.ndarray] | None = None,
+    depth_key: str = "",
 ) -> dict[str, Any]:
     """Writes the label image of every view below `folder`, skipping those already there; returns a report.
 
     load_photo: view -> [h, w, 3] uint8 RGB, undistorted. progress(done, total) is called after every photo.
+    load_depth: view -> [h, w] z-depth, 0 = none: the second round, for sources that know what to do with it
+    (GeometryMaskSource; others are asked as before). depth_key: changes whenever the depth does.
     Report: source, identity, photos, skipped, seconds, masks (mean per photo), empty (names), warnings.
     """
     warnings = source.check(views)
     start, skipped, empty, counts = perf_counter(), 0, [], []
     for done, view in enumerate(views, start=1):
-        key, file = _key(view, source), label_file(folder, view)
+        key, file = _key(view, source, depth_key), label_file(folder, view)
         if stored_key(file) == key:
             labels = load_labels(folder, view)
             skipped += 1
         else:
-            labels = source.label_image(view, load_photo(view))
+            labels = _label_image(source, view, load_photo(view), load_depth)
             write_labels(file, labels, key)
         counts.append(len(np.setdiff1d(labels, [0])))
         if not labels.any():
@@ -64,6 +68,14 @@ def compute_masks(
         "empty": empty,
         "warnings": warnings,
     }
+
+
+def _label_image(
+    source: MaskSource, view: View, photo: np.ndarray, load_depth: Callable[[View], np.ndarray] | None
+) -> np.ndarray:
+    if load_depth is not None and isinstance(source, GeometryMaskSource):
+        return source.label_image_with_geometry(view, photo, load_depth(view))
+    return source.label_image(view, photo)
 
 
 def label_file(folder: Path, view: View) -> Path:
@@ -119,11 +131,12 @@ def stored_key(file: Path) -> str | None:
         return None
 
 
-def _key(view: View, source: MaskSource) -> str:
+def _key(view: View, source: MaskSource, depth_key: str) -> str:
     """Everything a label image depends on, as a short digest."""
     digest = hashlib.sha256(
         f"{source.identity}\n{view.name} {view.width} {view.height} {view.lens}\n".encode()
     )
+    digest.update(depth_key.encode())
     digest.update(np.ascontiguousarray(view.K, dtype=np.float64).tobytes())
     if view.photo.is_file():
         status = view.photo.stat()
