@@ -121,6 +121,10 @@ def test_instances_from_files_with_scores_from_the_sidecar(tmp_path):
     labelled(tmp_path / "gt.ply", gt, semantic_id=np.repeat([4, 4, 9], 200))
     labelled(tmp_path / "pred.ply", pred, semantic_id=np.repeat([4, 4, 9], 200))
     flat, table = run_instances(tmp_path / "pred.ply", tmp_path / "gt.ply")
+    assert flat["void_points"] == {"negative": 0} and "void truth points" not in table
+    labelled(tmp_path / "void.ply", np.where(gt == 3, 0, gt))
+    part, void_table = run_instances(tmp_path / "pred.ply", tmp_path / "void.ply")
+    assert part["num_truth"] == 2 and "void truth points: 200 of id 0" in void_table
     assert flat["protocol"]["confidence"] == "constant 1.0" and "constant 1.0" in table
     scores = {i: 0.9 if i == 5 else 0.1 for i in (5, 6, 7, 8, 9, 4)}
     sidecar = {"instances": {str(i): {"score": s} for i, s in scores.items()}}

@@ -10,7 +10,7 @@ import pytest
 from perception.errors import InputError
 from perception.export.boxes import instance_boxes, oriented_box
 from perception.export.formats import instance_colors, write_boxes, write_scannet, write_split
-from perception.export.labels import ExportOptions, Shapes, check_overlap, export_labels
+from perception.export.labels import ExportOptions, check_overlap, export_labels
 from perception.export.run import Outputs, run_export, write_export
 from perception.export.smooth import SmoothOptions
 from perception.io.cloud import read_cloud, write_cloud
@@ -50,7 +50,7 @@ def test_densest_instance_sums_densities_of_the_candidates():
     scales, opacities = rng.uniform(0.01, 0.2, (300, 3)), rng.random(300)
     ids = rng.integers(0, 6, 300).astype(np.int32)
     options = ExportOptions(rule="densest", smooth=False)
-    got = export_labels(means, ids, Shapes(quats, scales, opacities), cloud, options)
+    got = export_labels(means, ids, opacities, cloud, options, quats=quats, scales=scales)
     # float64, one point at a time, with the definition's own inverse
     apart = np.linalg.norm(means[:, None] - means[None], axis=2)
     np.fill_diagonal(apart, np.inf)
@@ -79,11 +79,12 @@ def test_a_wall_of_large_gaussians_keeps_its_surface_under_the_densest_rule():
     # One wide flat Gaussian is the wall; a small thing floats 10 cm before it.
     means = np.array([[0.1, 0.5, 0], *([[0.8, 0.5 + 0.01 * i, 0.1] for i in range(5)])])
     scales = np.array([[0.5, 0.5, 0.005], *[[0.01, 0.01, 0.01]] * 5])
-    shapes = Shapes(np.tile([1.0, 0, 0, 0], (6, 1)), scales, np.full(6, 0.9))
+    quats, opacities = np.tile([1.0, 0, 0, 0], (6, 1)), np.full(6, 0.9)
     ids = np.array([0, 1, 1, 1, 1, 1], np.int32)
     plain = ExportOptions(smooth=False)
-    assert (export_labels(means, ids, shapes, wall, plain) == 1).mean() > 0.4
-    assert (export_labels(means, ids, shapes, wall, ExportOptions("densest", smooth=False)) == 0).all()
+    assert (export_labels(means, ids, None, wall, plain) == 1).mean() > 0.4
+    densest = ExportOptions(rule="densest", smooth=False)
+    assert (export_labels(means, ids, opacities, wall, densest, quats=quats, scales=scales) == 0).all()
 
 
 def test_smoothing_repairs_wrong_gaussians_and_nan_points_get_nothing():
@@ -132,12 +133,14 @@ def test_run_export_writes_all_that_was_asked_for(tmp_path):
         cloud.points,
         labels,
         {0: {"score": 0.5, "label": "cup"}},
+        classes={0: 4, 2: 9},
         options=ExportOptions(smooth=False, drop_noise=False),
         outputs=outputs,
     )
     back = read_cloud(tmp_path / "out.ply")
     np.testing.assert_array_equal(back.labels["instance_id"], labels)
     np.testing.assert_array_equal(back.colors, instance_colors(labels))
+    np.testing.assert_array_equal(back.labels["semantic_id"], np.array([0, 4, 0, 9])[labels + 1])
     assert result["points"] == 3000 and result["labelled"] == (labels >= 0).sum()
     assert "cup" in table and json.loads(json.dumps(result))["instances"]["0"]["label"] == "cup"
     names = {p.name for p in tmp_path.iterdir()}
@@ -164,6 +167,16 @@ def test_a_cloud_in_another_frame_is_told_with_its_distance():
         check_overlap(cloud.points + np.array([10, 0, 0]), cloud.points)
     with pytest.raises(InputError, match="NaN or infinite"):
         check_overlap(cloud.points, np.full((3, 3), np.nan))
+
+
+@pytest.mark.parametrize("graph", ["knn", "radius"])
+def test_one_point_and_duplicated_points_are_exported(graph):
+    means, ids = np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([3, 8], np.int32)
+    options = ExportOptions(smoothing=SmoothOptions(graph=graph))
+    assert export_labels(means, ids, None, PointCloud(np.array([[0.9, 0, 0]])), options).tolist() == [8]
+    twins = PointCloud(np.tile([[0.1, 0, 0]], (50, 1)))
+    assert export_labels(means, ids, None, twins, options).tolist() == [3] * 50
+    assert export_labels(means[:0], ids[:0], None, twins, options).tolist() == [-1] * 50
 
 
 def test_colours_are_fixed_by_id_and_distinct():

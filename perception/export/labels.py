@@ -15,15 +15,6 @@ from perception.types import PointCloud
 
 
 @dataclass(frozen=True)
-class Shapes:
-    """Forms of the Gaussians: quats [N, 4] wxyz, scales [N, 3] > 0, opacities [N] in (0, 1)."""
-
-    quats: np.ndarray
-    scales: np.ndarray
-    opacities: np.ndarray
-
-
-@dataclass(frozen=True)
 class ExportOptions:
     """rule: "nearest" mean (the paper), or "densest" instance, which asks for the Gaussians' shapes.
 
@@ -42,23 +33,40 @@ class ExportOptions:
     segments: Path | None = None
 
 
+@dataclass(frozen=True)
+class _Gaussians:
+    means: np.ndarray
+    ids: np.ndarray
+    opacities: np.ndarray | None
+    quats: np.ndarray | None
+    scales: np.ndarray | None
+
+    def rows(self, used: np.ndarray) -> _Gaussians:
+        parts = (self.means, self.ids, self.opacities, self.quats, self.scales)
+        return _Gaussians(*(None if part is None else part[used] for part in parts))  # type: ignore[arg-type]
+
+
 def export_labels(
     means: np.ndarray,
     instance_ids: np.ndarray,
-    shapes: Shapes | None,
+    opacities: np.ndarray | None,
     cloud: PointCloud,
     options: ExportOptions | None = None,
+    *,
+    quats: np.ndarray | None = None,
+    scales: np.ndarray | None = None,
 ) -> np.ndarray:
     """Instance of each point [P] int32, −1 = none.
 
-    means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise); shapes are needed by rule
-    "densest" only.
+    means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise). The rule "densest" also asks for
+    opacities [N] in (0, 1), quats [N, 4] wxyz and scales [N, 3] > 0.
     """
     options = options or ExportOptions()
     used = np.isfinite(means).all(axis=1)
     if options.drop_noise:
         used &= instance_ids >= 0
-    labels = _assigned(means, instance_ids, shapes, cloud.points, used, options)
+    gaussians = _Gaussians(means, instance_ids, opacities, quats, scales).rows(used)
+    labels = _assigned(gaussians, cloud.points, options)
     if not options.smooth or not (labels >= 0).any():
         return labels
     if options.segments is not None:
@@ -71,29 +79,16 @@ def export_labels(
     return np.where(np.isfinite(cloud.points).all(axis=1), smoothed, -1).astype(np.int32)
 
 
-def _assigned(
-    means: np.ndarray,
-    instance_ids: np.ndarray,
-    shapes: Shapes | None,
-    points: np.ndarray,
-    used: np.ndarray,
-    options: ExportOptions,
-) -> np.ndarray:
+def _assigned(g: _Gaussians, points: np.ndarray, options: ExportOptions) -> np.ndarray:
     if options.rule == "nearest":
-        owner = nearest_gaussian(points, means[used], max_distance=options.max_distance)
-        return np.append(instance_ids[used], -1).astype(np.int32)[owner]
+        owner = nearest_gaussian(points, g.means, max_distance=options.max_distance)
+        return np.append(g.ids, -1).astype(np.int32)[owner]
     if options.rule != "densest":
         raise InputError(f"assignment rule '{options.rule}' is unknown; expected nearest or densest")
-    if shapes is None:
+    if g.opacities is None or g.quats is None or g.scales is None:
         raise InputError("assignment rule 'densest' needs the Gaussians' rotations, scales and opacities")
     return densest_instance(
-        points,
-        means[used],
-        shapes.quats[used],
-        shapes.scales[used],
-        shapes.opacities[used],
-        instance_ids[used],
-        max_distance=options.max_distance,
+        points, g.means, g.quats, g.scales, g.opacities, g.ids, max_distance=options.max_distance
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.export.formats import Instances, instance_colors, write_boxes, write_scannet, write_split
-from perception.export.labels import ExportOptions, Shapes, check_overlap, export_labels
+from perception.export.labels import ExportOptions, check_overlap, export_labels
 from perception.io.cloud import read_cloud, write_cloud
 from perception.io.cloud_atomic import replacing
 from perception.types import PointCloud
@@ -43,14 +44,18 @@ def run_export(
     instance_ids: np.ndarray,
     instances: Instances,
     *,
-    shapes: Shapes | None = None,
+    opacities: np.ndarray | None = None,
+    quats: np.ndarray | None = None,
+    scales: np.ndarray | None = None,
+    classes: Mapping[int, int] | None = None,
     options: ExportOptions | None = None,
     outputs: Outputs | None = None,
 ) -> tuple[dict[str, Any], str]:
     """Label a cloud (a file or in memory) by the map's Gaussians and write it: (JSON-able result, table).
 
-    means [N, 3] and instance_ids [N] int32 (−1 = noise) in the cloud's frame; instances: {id: {"score",
-    "label"}}.
+    means [N, 3] and instance_ids [N] int32 (−1 = noise) in the cloud's frame; opacities, quats and scales as
+    in export_labels; instances: {id: {"score", "label"}}; classes: semantic id by instance id, written as
+    `semantic_id` (0 where unknown) and into the submission.
     """
     options, outputs = options or ExportOptions(), outputs or Outputs()
     if outputs.color not in ("original", "instance"):
@@ -58,12 +63,12 @@ def run_export(
     began = time.perf_counter()
     source = cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
     inside = check_overlap(means, source.points)
-    labels = export_labels(means, instance_ids, shapes, source, options)
+    labels = export_labels(means, instance_ids, opacities, source, options, quats=quats, scales=scales)
     painted = source
     if outputs.color == "instance":
         painted = PointCloud(source.points, instance_colors(labels), source.normals, source.faces)
-    sidecar = write_export(out, painted, labels, instances)
-    _write_others(outputs, Path(out).stem, painted, labels, instances)
+    sidecar = write_export(out, painted, labels, instances, classes)
+    _write_others(outputs, Path(out).stem, painted, labels, instances, classes)
     result = {
         "points": len(labels),
         "labelled": int((labels >= 0).sum()),
@@ -77,7 +82,12 @@ def run_export(
 
 
 def _write_others(
-    outputs: Outputs, scene: str, cloud: PointCloud, labels: np.ndarray, instances: Instances
+    outputs: Outputs,
+    scene: str,
+    cloud: PointCloud,
+    labels: np.ndarray,
+    instances: Instances,
+    classes: Mapping[int, int] | None,
 ) -> None:
     if outputs.split is not None:
         write_split(outputs.split, cloud, labels)
@@ -86,7 +96,7 @@ def _write_others(
             outputs.boxes, cloud.points, labels, instances, frame=outputs.frame, metric=outputs.metric
         )
     if outputs.scannet is not None:
-        write_scannet(outputs.scannet, scene, labels, instances)
+        write_scannet(outputs.scannet, scene, labels, instances, classes)
     if outputs.mcap is not None:
         from perception.export.mcap import write_mcap
 
@@ -110,6 +120,7 @@ def write_export(
     cloud: PointCloud,
     labels: np.ndarray,
     instances: Instances,
+    classes: Mapping[int, int] | None = None,
 ) -> dict[str, Any]:
     """Write the cloud with `instance_id` and its sidecar JSON (same stem); returns the sidecar.
 
@@ -118,6 +129,10 @@ def write_export(
     path = Path(path)
     labelled = PointCloud(cloud.points, cloud.colors, cloud.normals, cloud.faces)
     labelled.labels = {"instance_id": labels.astype(np.int32)}
+    if classes is not None:
+        known_ids, index = np.unique(labels, return_inverse=True)
+        semantic = np.array([classes.get(i, 0) for i in known_ids.tolist()], np.int32)
+        labelled.labels["semantic_id"] = semantic[index]
     ids, counts = np.unique(labels[labels >= 0], return_counts=True)
     sidecar: dict[str, Any] = {"instances": {}}
     for i, n in zip(ids.tolist(), counts.tolist(), strict=True):
