@@ -165,6 +165,8 @@ def test_a_cloud_in_another_frame_is_told_with_its_distance():
     assert check_overlap(np.asarray(cloud.points) + 0.5, cloud.points) == pytest.approx(1 / 8, abs=0.05)
     with pytest.raises(InputError, match=r"does not overlap the map: it lies 9\.\d+ units away"):
         check_overlap(cloud.points + np.array([10, 0, 0]), cloud.points)
+    with pytest.raises(InputError, match="no Gaussians"):
+        check_overlap(np.full((2, 3), np.nan), cloud.points)
     with pytest.raises(InputError, match="NaN or infinite"):
         check_overlap(cloud.points, np.full((3, 3), np.nan))
 

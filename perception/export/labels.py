@@ -93,12 +93,16 @@ def _assigned(g: _Gaussians, points: np.ndarray, options: ExportOptions) -> np.n
 
 
 def check_overlap(means: np.ndarray, points: np.ndarray) -> float:
-    """Share of the finite points inside the map's bounds; InputError when the cloud lies wholly outside the
-    map's bounds: another frame or another unit.
+    """Share of the finite points inside the map's bounds (1st to 99th percentile of its means).
+
+    InputError when the cloud lies wholly outside them: another frame or another unit.
     """
     finite = points[np.isfinite(points).all(axis=1)]
     if len(finite) == 0:
         raise InputError("cloud: all coordinates are NaN or infinite; nothing can be labelled")
+    means = means[np.isfinite(means).all(axis=1)]
+    if len(means) == 0:
+        raise InputError("map: holds no Gaussians; nothing can be labelled")
     low, high = np.percentile(means, 1, axis=0), np.percentile(means, 99, axis=0)
     cloud_low, cloud_high = finite.min(axis=0), finite.max(axis=0)
     gap = np.maximum(np.maximum(low - cloud_high, cloud_low - high), 0)

@@ -21,11 +21,11 @@ from perception.types import PointCloud
 
 @dataclass(frozen=True)
 class Outputs:
-    """What is written beside the labelled cloud. color: "original" or "instance". The rest are paths, None =
-    not.
+    """What is written beside the labelled cloud: paths, None = not.
 
-    split: folder for one cloud an instance; boxes: JSON; scannet: folder of a submission (scene = the cloud's
-    stem); mcap: ROS 2 bag file. frame and metric are the map's.
+    color: of the cloud's points, "original" or "instance". split: folder for one cloud an instance; boxes:
+    JSON; scannet: folder of a submission (scene = the cloud's stem); mcap: ROS 2 bag file. frame and metric
+    are the map's.
     """
 
     color: str = "original"
