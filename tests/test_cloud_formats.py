@@ -98,6 +98,16 @@ def test_ascii_ply_equals_binary(tmp_path):
     np.testing.assert_array_equal(a.labels["id"], b.labels["id"])
 
 
+def test_labels_stored_as_floats_are_whole_numbers_or_an_error(tmp_path):
+    vertex = {a: np.zeros(3) for a in "xyz"} | {"scalar_instance_id": np.float32([4, -1, 70000])}
+    write_ply(tmp_path / "a.ply", {"vertex": vertex})
+    assert read_cloud(tmp_path / "a.ply").labels["instance_id"].tolist() == [4, -1, 70000]
+    vertex["scalar_instance_id"] = np.float32([4, 0.5, 1])
+    write_ply(tmp_path / "a.ply", {"vertex": vertex})
+    with pytest.raises(InputError, match=r"value 0\.5 at index 1"):
+        read_cloud(tmp_path / "a.ply")
+
+
 def test_nan_and_infinite_points_stay_in_place(tmp_path):
     points = np.array([[0, 0, 0], [np.nan, 1, 2], [np.inf, 0, 0], [4, 5, 6]], np.float32)
     for suffix in ("ply", "pcd", "npz", "xyz"):

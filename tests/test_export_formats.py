@@ -10,7 +10,8 @@ import pytest
 from perception.errors import InputError
 from perception.export.boxes import instance_boxes, oriented_box
 from perception.export.formats import instance_colors, write_boxes, write_scannet, write_split
-from perception.export.run import ExportOptions, check_overlap, export_labels, write_export
+from perception.export.labels import ExportOptions, check_overlap, export_labels
+from perception.export.run import Outputs, run_export, write_export
 from perception.export.smooth import SmoothOptions
 from perception.io.cloud import read_cloud, write_cloud
 from perception.types import PointCloud
@@ -37,6 +38,53 @@ def test_export_takes_the_nearest_gaussian_and_drops_noise():
     limited = export_labels(means, ids, None, cloud, ExportOptions(smooth=False, max_distance=0.05))
     np.testing.assert_array_equal(limited, np.where(kept.min(axis=1) <= 0.05, dropped, -1))
     assert (export_labels(means, np.full(900, -1, np.int32), None, cloud) == -1).all()
+
+
+def test_densest_instance_sums_densities_of_the_candidates():
+    from scipy.spatial.transform import Rotation
+
+    rng = np.random.default_rng(3)
+    cloud, _ = scene(500)
+    means, quats = rng.random((300, 3)), rng.normal(size=(300, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    scales, opacities = rng.uniform(0.01, 0.2, (300, 3)), rng.random(300)
+    ids = rng.integers(0, 6, 300).astype(np.int32)
+    options = ExportOptions(rule="densest", smooth=False)
+    got = export_labels(means, ids, opacities, cloud, options, quats=quats, scales=scales)
+    # float64, one point at a time, with the definition's own inverse
+    apart = np.linalg.norm(means[:, None] - means[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    widen = np.median(apart.min(axis=1)) / 2
+    rotation = Rotation.from_quat(np.roll(quats, -1, axis=1)).as_matrix()
+    inverse = np.linalg.inv(
+        [r @ np.diag(s**2 + widen**2) @ r.T for r, s in zip(rotation, scales, strict=True)]
+    )
+    for point, label in zip(cloud.points, got, strict=True):
+        near = np.argsort(np.linalg.norm(means - point, axis=1))[:16]
+        total = np.zeros(6)
+        for i in near:
+            d = point - means[i]
+            total[ids[i]] += opacities[i] * np.exp(-0.5 * d @ inverse[i] @ d)
+        best = np.sort(total)[-2:]
+        assert label == total.argmax() or best[0] > best[1] * (1 - 1e-4)
+    with pytest.raises(InputError, match="rotations, scales"):
+        export_labels(means, ids, None, cloud, options)
+    with pytest.raises(InputError, match="nearest or densest"):
+        export_labels(means, ids, None, cloud, ExportOptions(rule="best"))
+
+
+def test_a_wall_of_large_gaussians_keeps_its_surface_under_the_densest_rule():
+    grid = np.stack(np.meshgrid(np.linspace(0, 1, 60), np.linspace(0, 1, 60)), axis=-1).reshape(-1, 2)
+    wall = PointCloud(np.concatenate([grid, np.zeros((3600, 1))], axis=1))
+    # One wide flat Gaussian is the wall; a small thing floats 10 cm before it.
+    means = np.array([[0.1, 0.5, 0], *([[0.8, 0.5 + 0.01 * i, 0.1] for i in range(5)])])
+    scales = np.array([[0.5, 0.5, 0.005], *[[0.01, 0.01, 0.01]] * 5])
+    quats, opacities = np.tile([1.0, 0, 0, 0], (6, 1)), np.full(6, 0.9)
+    ids = np.array([0, 1, 1, 1, 1, 1], np.int32)
+    plain = ExportOptions(smooth=False)
+    assert (export_labels(means, ids, None, wall, plain) == 1).mean() > 0.4
+    densest = ExportOptions(rule="densest", smooth=False)
+    assert (export_labels(means, ids, opacities, wall, densest, quats=quats, scales=scales) == 0).all()
 
 
 def test_smoothing_repairs_wrong_gaussians_and_nan_points_get_nothing():
@@ -68,6 +116,39 @@ def test_export_file_and_sidecar(tmp_path):
     assert sidecar["0"] == {"score": 0.25, "label": "mug", "num_points": int((labels == 0).sum())}
 
 
+def test_run_export_writes_all_that_was_asked_for(tmp_path):
+    pytest.importorskip("rosbags")
+    cloud, labels = scene()
+    write_cloud(tmp_path / "in.pcd", cloud)
+    outputs = Outputs(
+        color="instance",
+        split=tmp_path / "parts",
+        boxes=tmp_path / "boxes.json",
+        scannet=tmp_path / "submission",
+        mcap=tmp_path / "out.mcap",
+    )
+    result, table = run_export(
+        tmp_path / "out.ply",
+        tmp_path / "in.pcd",
+        cloud.points,
+        labels,
+        {0: {"score": 0.5, "label": "cup"}},
+        classes={0: 4, 2: 9},
+        options=ExportOptions(smooth=False, drop_noise=False),
+        outputs=outputs,
+    )
+    back = read_cloud(tmp_path / "out.ply")
+    np.testing.assert_array_equal(back.labels["instance_id"], labels)
+    np.testing.assert_array_equal(back.colors, instance_colors(labels))
+    np.testing.assert_array_equal(back.labels["semantic_id"], np.array([0, 4, 0, 9])[labels + 1])
+    assert result["points"] == 3000 and result["labelled"] == (labels >= 0).sum()
+    assert "cup" in table and json.loads(json.dumps(result))["instances"]["0"]["label"] == "cup"
+    names = {p.name for p in tmp_path.iterdir()}
+    assert names == {"in.pcd", "out.ply", "out.json", "parts", "boxes.json", "submission", "out.mcap"}
+    with pytest.raises(InputError, match="original or instance"):
+        run_export(tmp_path / "x.ply", cloud, cloud.points, labels, {}, outputs=Outputs(color="red"))
+
+
 def test_plyfile_reads_what_is_written(tmp_path):
     plyfile = pytest.importorskip("plyfile")
     cloud, labels = scene(200)
@@ -81,11 +162,23 @@ def test_plyfile_reads_what_is_written(tmp_path):
 
 def test_a_cloud_in_another_frame_is_told_with_its_distance():
     cloud, _ = scene()
-    check_overlap(np.asarray(cloud.points) + 0.5, cloud.points)
+    assert check_overlap(np.asarray(cloud.points) + 0.5, cloud.points) == pytest.approx(1 / 8, abs=0.05)
     with pytest.raises(InputError, match=r"does not overlap the map: it lies 9\.\d+ units away"):
         check_overlap(cloud.points + np.array([10, 0, 0]), cloud.points)
+    with pytest.raises(InputError, match="no Gaussians"):
+        check_overlap(np.full((2, 3), np.nan), cloud.points)
     with pytest.raises(InputError, match="NaN or infinite"):
         check_overlap(cloud.points, np.full((3, 3), np.nan))
+
+
+@pytest.mark.parametrize("graph", ["knn", "radius"])
+def test_one_point_and_duplicated_points_are_exported(graph):
+    means, ids = np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([3, 8], np.int32)
+    options = ExportOptions(smoothing=SmoothOptions(graph=graph))
+    assert export_labels(means, ids, None, PointCloud(np.array([[0.9, 0, 0]])), options).tolist() == [8]
+    twins = PointCloud(np.tile([[0.1, 0, 0]], (50, 1)))
+    assert export_labels(means, ids, None, twins, options).tolist() == [3] * 50
+    assert export_labels(means[:0], ids[:0], None, twins, options).tolist() == [-1] * 50
 
 
 def test_colours_are_fixed_by_id_and_distinct():

@@ -28,7 +28,7 @@ def mask_boundary(mask: np.ndarray, dilation_ratio: float = 0.02) -> np.ndarray:
     height, width = mask.shape
     iterations = max(round(dilation_ratio * float(np.hypot(height, width))), 1)
     padded = cv2.copyMakeBorder(mask.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
-    # n erosions by 3x3 equal one by a square of side 2n + 1; the frame of zeros keeps eating inwards with each.
+    # n erosions by 3x3 equal one by a square of side 2n + 1; the frame of zeros eats inwards with each.
     eroded = cv2.erode(padded, np.ones((3, 3), np.uint8), iterations=iterations)
     return mask & ~eroded[1:-1, 1:-1].astype(bool)
 

@@ -49,6 +49,8 @@ def run_instances(
         gt_semantics=gt.labels.get("semantic_id"),
         ignore=None if ignore is None else ignore != 0,
     )
+    result["void_points"] = {"negative": int((gt_ids < 0).sum())}
+    result["void_points"] |= {str(i): n for i in rules.void_ids if (n := int((gt_ids == i).sum()))}
     constant = rules.constant_score or confidence is None
     result["protocol"]["confidence"] = "constant 1.0" if constant else str(source)
     return result, instances_table(result)
@@ -89,6 +91,9 @@ def instances_table(result: dict[str, Any]) -> str:
         f"ignored points {'removed' if rules['remove_ignored'] else 'void'}, "
         f"void ids < 0 and {list(rules['void_ids'])}"
     )
+    void = {name: n for name, n in result.get("void_points", {}).items() if n}
+    if void:
+        lines.append("void truth points: " + ", ".join(f"{n} of id {name}" for name, n in void.items()))
     return "\n".join(lines)
 
 

@@ -125,7 +125,7 @@ def write_scannet(
         digits = np.where(labels == i, ord("1"), ord("0")).astype(np.uint8)
         with replacing(masks / name) as file:
             file.write(np.stack([digits, np.full_like(digits, ord("\n"))], axis=1).tobytes())
-        rows.append(f"predicted_masks/{name} {1 if classes is None else classes[i]} {score[i]:.6f}\n")
+        rows.append(f"predicted_masks/{name} {1 if classes is None else classes.get(i, 0)} {score[i]:.6f}\n")
     with replacing(folder / f"{scene}.txt") as file:
         file.write("".join(rows).encode())
     return folder / f"{scene}.txt"

@@ -71,7 +71,8 @@ def spacing(points: np.ndarray, sample: int = 20000) -> float:
 def mesh_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Vertex normals [P, 3] float32, faces weighted by area; zero where a vertex has no proper face."""
     corners = points[faces].astype(np.float64)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    with np.errstate(invalid="ignore"):
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros((len(points), 3))
     for axis in range(3):
         for corner in range(3):

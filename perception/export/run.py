@@ -1,90 +1,126 @@
-"""Instances of a Gaussian map onto a cloud: assignment, smoothing and the files the contract promises."""
+"""The files of an export: the labelled cloud the contract promises, and what else was asked for."""
 
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from perception.errors import InputError
-from perception.export.assign import nearest_gaussian
-from perception.export.smooth import SmoothOptions, read_segments, segment_cloud, vote
-from perception.io.cloud import write_cloud
+from perception.export.formats import Instances, instance_colors, write_boxes, write_scannet, write_split
+from perception.export.labels import ExportOptions, check_overlap, export_labels
+from perception.io.cloud import read_cloud, write_cloud
 from perception.io.cloud_atomic import replacing
 from perception.types import PointCloud
 
 
 @dataclass(frozen=True)
-class ExportOptions:
-    """drop_noise: Gaussians without an instance take no part, so every point gets a label (the paper's
-    released code).
+class Outputs:
+    """What is written beside the labelled cloud: paths, None = not.
 
-    max_distance: in map units; None = no limit, as in the paper. smooth: superpoint vote, on or off.
-    segments: a ScanNet *.segs.json used instead of an own segmentation.
+    color: of the cloud's points, "original" or "instance". split: folder for one cloud an instance; boxes:
+    JSON; scannet: folder of a submission (scene = the cloud's stem); mcap: ROS 2 bag file. frame and metric
+    are the map's.
     """
 
-    drop_noise: bool = True
-    max_distance: float | None = None
-    smooth: bool = True
-    smoothing: SmoothOptions = field(default_factory=SmoothOptions)
-    segments: Path | None = None
+    color: str = "original"
+    split: Path | None = None
+    boxes: Path | None = None
+    scannet: Path | None = None
+    mcap: Path | None = None
+    frame: str = "map"
+    metric: bool = False
 
 
-def export_labels(
+def run_export(
+    out: str | Path,
+    cloud: str | Path | PointCloud,
     means: np.ndarray,
     instance_ids: np.ndarray,
-    opacities: np.ndarray | None,
-    cloud: PointCloud,
+    instances: Instances,
+    *,
+    opacities: np.ndarray | None = None,
+    quats: np.ndarray | None = None,
+    scales: np.ndarray | None = None,
+    classes: Mapping[int, int] | None = None,
     options: ExportOptions | None = None,
-) -> np.ndarray:
-    """Instance of each point [P] int32, −1 = none.
+    outputs: Outputs | None = None,
+) -> tuple[dict[str, Any], str]:
+    """Label a cloud (a file or in memory) by the map's Gaussians and write it: (JSON-able result, table).
 
-    means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise), opacities [N] in (0, 1) or None.
+    means [N, 3] and instance_ids [N] int32 (−1 = noise) in the cloud's frame; opacities, quats and scales as
+    in export_labels; instances: {id: {"score", "label"}}; classes: semantic id by instance id, written as
+    `semantic_id` (0 where unknown) and into the submission.
     """
-    options = options or ExportOptions()
-    used = instance_ids >= 0 if options.drop_noise else np.ones(len(instance_ids), bool)
-    owner = nearest_gaussian(cloud.points, means[used], max_distance=options.max_distance)
-    labels = np.append(instance_ids[used], -1).astype(np.int32)[owner]
-    if not options.smooth or not (labels >= 0).any():
-        return labels
-    if options.segments is not None:
-        segments = read_segments(options.segments, len(labels))
-    else:
-        segments = segment_cloud(cloud, options.smoothing)
-    smoothed = vote(labels, segments)
-    if options.max_distance is not None:
-        smoothed[owner < 0] = -1  # a vote does not reach where the map has nothing
-    return np.where(np.isfinite(cloud.points).all(axis=1), smoothed, -1).astype(np.int32)
+    options, outputs = options or ExportOptions(), outputs or Outputs()
+    if outputs.color not in ("original", "instance"):
+        raise InputError(f"color is '{outputs.color}'; expected original or instance")
+    began = time.perf_counter()
+    source = cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
+    inside = check_overlap(means, source.points)
+    labels = export_labels(means, instance_ids, opacities, source, options, quats=quats, scales=scales)
+    painted = source
+    if outputs.color == "instance":
+        painted = PointCloud(source.points, instance_colors(labels), source.normals, source.faces)
+    sidecar = write_export(out, painted, labels, instances, classes)
+    _write_others(outputs, Path(out).stem, painted, labels, instances, classes)
+    result = {
+        "points": len(labels),
+        "labelled": int((labels >= 0).sum()),
+        "inside_map": inside,
+        "seconds": time.perf_counter() - began,
+        "rule": options.rule,
+        "smoothed": options.smooth,
+        **sidecar,
+    }
+    return result, _table(result)
 
 
-def check_overlap(means: np.ndarray, points: np.ndarray) -> None:
-    """InputError when the cloud lies wholly outside the map's bounds: another frame or another unit."""
-    finite = points[np.isfinite(points).all(axis=1)]
-    if len(finite) == 0:
-        raise InputError("cloud: all coordinates are NaN or infinite; nothing can be labelled")
-    low, high = np.percentile(means, 1, axis=0), np.percentile(means, 99, axis=0)
-    cloud_low, cloud_high = finite.min(axis=0), finite.max(axis=0)
-    gap = np.maximum(np.maximum(low - cloud_high, cloud_low - high), 0)
-    if gap.any():
-        raise InputError(
-            f"cloud: does not overlap the map: it lies {np.linalg.norm(gap):.3g} units away (cloud "
-            f"{_box(cloud_low, cloud_high)}, map {_box(low, high)}); bring it into the map's frame"
+def _write_others(
+    outputs: Outputs,
+    scene: str,
+    cloud: PointCloud,
+    labels: np.ndarray,
+    instances: Instances,
+    classes: Mapping[int, int] | None,
+) -> None:
+    if outputs.split is not None:
+        write_split(outputs.split, cloud, labels)
+    if outputs.boxes is not None:
+        write_boxes(
+            outputs.boxes, cloud.points, labels, instances, frame=outputs.frame, metric=outputs.metric
         )
+    if outputs.scannet is not None:
+        write_scannet(outputs.scannet, scene, labels, instances, classes)
+    if outputs.mcap is not None:
+        from perception.export.mcap import write_mcap
+
+        write_mcap(outputs.mcap, cloud, labels, instances, frame=outputs.frame)
 
 
-def _box(low: np.ndarray, high: np.ndarray) -> str:
-    return " x ".join(f"{a:.3g}..{b:.3g}" for a, b in zip(low, high, strict=True))
+def _table(result: dict[str, Any]) -> str:
+    lines = [f"{'id':>6}{'points':>12}{'score':>8}  label"]
+    rows = sorted(result["instances"].items(), key=lambda row: -row[1]["num_points"])
+    lines += [f"{i:>6}{r['num_points']:>12}{r['score']:>8.3f}  {r['label'] or ''}" for i, r in rows]
+    lines.append(f"{result['labelled']} of {result['points']} points labelled, {result['seconds']:.1f} s")
+    if result["inside_map"] < 0.5:
+        lines.append(
+            f"only {result['inside_map']:.0%} of the points lie inside the map: same frame and unit?"
+        )
+    return "\n".join(lines)
 
 
 def write_export(
     path: str | Path,
     cloud: PointCloud,
     labels: np.ndarray,
-    instances: Mapping[int, Mapping[str, Any]],
+    instances: Instances,
+    classes: Mapping[int, int] | None = None,
 ) -> dict[str, Any]:
     """Write the cloud with `instance_id` and its sidecar JSON (same stem); returns the sidecar.
 
@@ -93,6 +129,10 @@ def write_export(
     path = Path(path)
     labelled = PointCloud(cloud.points, cloud.colors, cloud.normals, cloud.faces)
     labelled.labels = {"instance_id": labels.astype(np.int32)}
+    if classes is not None:
+        known_ids, index = np.unique(labels, return_inverse=True)
+        semantic = np.array([classes.get(i, 0) for i in known_ids.tolist()], np.int32)
+        labelled.labels["semantic_id"] = semantic[index]
     ids, counts = np.unique(labels[labels >= 0], return_counts=True)
     sidecar: dict[str, Any] = {"instances": {}}
     for i, n in zip(ids.tolist(), counts.tolist(), strict=True):

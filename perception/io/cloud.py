@@ -99,7 +99,8 @@ def _read_ply_cloud(path: Path) -> PointCloud:
     for name, values in vertex.items():
         is_id = values.dtype.kind in "iu" or (values.dtype.kind == "f" and name.endswith(("_id", "label")))
         if name not in used and is_id and values.ndim == 1:
-            cloud.labels[name] = to_int32(values, f"{path}: property '{name}'")
+            # CloudCompare writes every label as a float named scalar_...
+            cloud.labels[name.removeprefix("scalar_")] = to_int32(values, f"{path}: property '{name}'")
     face = elements.get("face", {})
     for name in _FACE_NAMES:
         if name in face:
