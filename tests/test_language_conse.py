@@ -21,7 +21,7 @@ from perception.bench.truth import read_truth, truth_view_scores  # noqa: E402
 from perception.errors import InputError  # noqa: E402
 from perception.instances.crops import choose_views  # noqa: E402
 from perception.instances.describe import describe_instances  # noqa: E402
-from perception.language.conse import SIDE, TOP, ConseEncoder, class_names  # noqa: E402
+from perception.language.conse import SIDE, TOP, ConseEncoder, _cached, class_names  # noqa: E402
 from perception.language.minilm import MiniLM, _wheel_folder  # noqa: E402
 from perception.language.ranking import Ranker  # noqa: E402
 
@@ -109,12 +109,13 @@ def test_batching_changes_nothing(encoder: Any) -> None:
 
 def test_class_cache_is_used_and_survives_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    first = ConseEncoder().references
+    names, encode = [["mug", "cup"], ["plate"]], MiniLM().encode
+    first = _cached(names, encode)
     (file,) = (tmp_path / "perception").iterdir()
     stamp = file.read_bytes()
-    assert np.array_equal(ConseEncoder().references, first)
+    assert np.array_equal(_cached(names, encode), first)
     file.write_bytes(stamp[:1000])
-    assert np.array_equal(ConseEncoder().references, first)
+    assert np.array_equal(_cached(names, encode), first)
     assert file.read_bytes() == stamp
 
 
