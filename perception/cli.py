@@ -172,27 +172,34 @@ def _add_export(commands: Any) -> None:
     p.add_argument("--points", type=Path, metavar="CLOUD")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.ply")
     p.add_argument("--smooth", action=argparse.BooleanOptionalAction, default=True)
-    p.add_argument(
-        "--max-distance", type=float, metavar="D", help="leave points farther than D from any Gaussian at -1"
-    )
-    p.add_argument(
-        "--fill", action=argparse.BooleanOptionalAction, default=True, help="noise Gaussians do not vote"
-    )
+    p.add_argument("--rule", choices=("nearest", "densest"), default="nearest", help="nearest mean is the paper's")
+    p.add_argument("--max-distance", type=float, metavar="D", help="points farther than D from any Gaussian stay -1")
+    p.add_argument("--fill", action=argparse.BooleanOptionalAction, default=True, help="noise Gaussians do not vote")
+    p.add_argument("--segments", type=Path, metavar="X.segs.json", help="ScanNet segments instead of our own")
     p.add_argument("--color", choices=("original", "instance"), default="original")
+    p.add_argument("--split", type=Path, metavar="DIR", help="one cloud an instance")
+    p.add_argument("--boxes", type=Path, metavar="OUT.json", help="3D boxes")
+    p.add_argument("--scannet", type=Path, metavar="DIR", help="ScanNet submission layout")
+    p.add_argument("--mcap", type=Path, metavar="OUT.mcap", help="ROS 2 bag with cloud and detections")
 
 
 def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.export import ExportOptions, Outputs
+    from perception.io.store import read_info
     from perception.pipeline.exporting import export_map
 
-    return export_map(
-        args.map,
-        args.output,
-        args.points,
-        smooth=args.smooth,
+    info = read_info(args.map)
+    options = ExportOptions(
+        rule=args.rule,
+        drop_noise=args.fill,
         max_distance=args.max_distance,
-        fill=args.fill,
-        color=args.color,
+        smooth=args.smooth,
+        segments=args.segments,
     )
+    outputs = Outputs(
+        args.color, args.split, args.boxes, args.scannet, args.mcap, info.get("frame", "map"), bool(info.get("metric"))
+    )
+    return export_map(args.map, args.output, args.points, options, outputs)
 
 
 def _add_render(commands: Any) -> None:

@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.export import ExportOptions, export_labels, write_export
-from perception.export.run import check_overlap
+from perception.export import ExportOptions, Outputs, run_export
 from perception.gaussians.model import SH_C0
-from perception.io.cloud import read_cloud
 from perception.io.store import GaussianMap, read_map
 from perception.types import PointCloud
 
@@ -20,49 +18,34 @@ SURFACE_OPACITY = 0.5
 
 
 def export_map(
-    map_path: Path,
-    output: Path,
-    points: Path | None = None,
-    *,
-    smooth: bool = True,
-    max_distance: float | None = None,
-    fill: bool = True,
-    color: str = "original",
+    map_path: Path, output: Path, points: Path | None, options: ExportOptions, outputs: Outputs
 ) -> tuple[dict[str, Any], str]:
-    """Writes the labelled cloud and its sidecar JSON; returns facts and a line of text.
+    """Writes the labelled cloud, its sidecar JSON and what `outputs` asks for; returns facts and a table.
 
     Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids.
     """
     if output.suffix.lower() not in (".ply", ".pcd", ".npz"):
         raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected .ply, .pcd or .npz")
     gmap = read_map(map_path)
-    if points is None:
-        cloud, labels = surface_points(gmap)
-    else:
-        cloud = read_cloud(points)
-        check_overlap(gmap.means, cloud.points)
-        options = ExportOptions(drop_noise=fill, max_distance=max_distance, smooth=smooth)
-        labels = export_labels(gmap.means, gmap.instance_ids, gmap.opacities, cloud, options)
-    if color == "instance":
-        from perception.pictures import instance_palette
-
-        cloud.colors = instance_palette(labels)
-    sidecar = write_export(output, cloud, labels, {entry["id"]: entry for entry in gmap.instances})
-    labelled = int((labels >= 0).sum())
-    facts = {
-        "output": str(output),
-        "points": len(labels),
-        "labelled": labelled,
-        "instances": sidecar["instances"],
-    }
-    return (
-        facts,
-        f"{output}: {len(labels)} points, {labelled} labelled, {len(sidecar['instances'])} instances",
+    cloud: PointCloud | Path = points if points is not None else surface_points(gmap)
+    if points is None:  # every point is a Gaussian: nearest is itself
+        options = ExportOptions(drop_noise=False, smooth=False)
+    return run_export(
+        output,
+        cloud,
+        gmap.means,
+        gmap.instance_ids,
+        {entry["id"]: entry for entry in gmap.instances},
+        opacities=gmap.opacities,
+        quats=gmap.quats,
+        scales=gmap.scales,
+        options=options,
+        outputs=outputs,
     )
 
 
-def surface_points(gmap: GaussianMap) -> tuple[PointCloud, np.ndarray]:
-    """The means of opaque Gaussians with their colours, and their instance ids."""
+def surface_points(gmap: GaussianMap) -> PointCloud:
+    """The means of opaque Gaussians with their colours."""
     rows = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY)
     colors = np.clip((gmap.sh[rows, 0] * SH_C0 + 0.5) * 255 + 0.5, 0, 255).astype(np.uint8)
-    return PointCloud(gmap.means[rows], colors), gmap.instance_ids[rows]
+    return PointCloud(gmap.means[rows], colors)
