@@ -80,9 +80,7 @@ def box_on_floor(noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     y, x = np.mgrid[:120, :160] + 0.5
     rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
     tilt = np.deg2rad(35.0)  # the camera, 1 above the floor, looks down; world z is up, y is forward
-    world_from_camera = np.array(
-        [[1, 0, 0], [0, -np.sin(tilt), np.cos(tilt)], [0, -np.cos(tilt), -np.sin(tilt)]]
-    )
+    world_from_camera = np.array([[1, 0, 0], [0, -np.sin(tilt), np.cos(tilt)], [0, -np.cos(tilt), -np.sin(tilt)]])
     rays, eye = rays @ world_from_camera.T, np.array([0.0, 0.0, 1.0])
     with np.errstate(divide="ignore"):
         floor = np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], np.inf)

@@ -125,9 +125,7 @@ def test_subfolders_keep_equal_stems_apart(tmp_path):
     assert [source.label_image(v, photo(v))[0, 0] for v in views] == [1, 2]
 
 
-@pytest.mark.parametrize(
-    "spec", ["", "labels:", "sam:", "builtin:x", "auto:x", "nonsense", "labels:/no/such/folder"]
-)
+@pytest.mark.parametrize("spec", ["", "labels:", "sam:", "builtin:x", "auto:x", "nonsense", "labels:/no/such/folder"])
 def test_bad_specifications(spec):
     with pytest.raises(InputError):
         make_source(spec)
@@ -185,9 +183,7 @@ def test_photo_in_which_nothing_is_found_is_reported(tmp_path):
 
 def test_progress_counts_every_photo(tmp_path):
     seen: list[tuple[int, int]] = []
-    compute_masks(
-        [view("a.jpg"), view("b.jpg")], Counting(), photo, tmp_path, lambda *done: seen.append(done)
-    )
+    compute_masks([view("a.jpg"), view("b.jpg")], Counting(), photo, tmp_path, lambda *done: seen.append(done))
     assert seen == [(1, 2), (2, 2)]
 
 

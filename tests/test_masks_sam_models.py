@@ -88,7 +88,7 @@ HIGH_RES = {f"high_res_feats_{i}": np.zeros((1, 1, 2, 2), np.float32) for i in (
 # family: encoder input, encoder outputs, decoder, name of the masks, of the scores and of the points
 FAMILIES = {
     "SAM": (("x", (1, 3, 1024, 1024)), {}, SAM_DECODER, "masks", "iou_predictions", "point_coords"),
-    "SAM 2": (("image", (1, 3, 1024, 1024)), HIGH_RES, SAM2_DECODER, "masks", "iou_predictions", "point_coords"),  # noqa: E501
+    "SAM 2": (("image", (1, 3, 1024, 1024)), HIGH_RES, SAM2_DECODER, "masks", "iou_predictions", "point_coords"),
     "EfficientSAM": (
         ("batched_images", (1, 3, "h", "w")), {}, EFFICIENT_DECODER, "output_masks", "iou_predictions",
         "batched_point_coords",
@@ -121,9 +121,7 @@ def test_family_and_where_its_points_lie(tmp_path, family):
     model = open_sam(str(tmp_path))
     assert model.family == family and model.provider == "CPUExecutionProvider" and model.warnings == []
     _, given = model.decode(model.encode(photo()), np.array([[20.0, 30.0]]))
-    x, y = {"SAM": (256, 384), "SAM 2": (256, 512), "EfficientSAM": (20, 30), "SAM by optimum": (256, 384)}[
-        family
-    ]
+    x, y = {"SAM": (256, 384), "SAM 2": (256, 512), "EfficientSAM": (20, 30), "SAM by optimum": (256, 384)}[family]
     padded = family in ("SAM", "SAM 2")  # x, y, 0, 0, of which the first of four is dropped
     np.testing.assert_allclose(given[0], [y, 0, 0] if padded else [x, y], rtol=1e-6)
 
@@ -138,12 +136,8 @@ def test_normalisation_and_padding(tmp_path):
 
 
 def test_raw_encoder_takes_the_photo_as_it_is(tmp_path):
-    write_onnx(
-        tmp_path / "a_encoder.onnx", {"input_image": (("h", "w", 3), FLOAT)}, {"image_embeddings": EMBEDDING}
-    )
-    write_onnx(
-        tmp_path / "a_decoder.onnx", SAM_DECODER, {"masks": EMBEDDING, "iou_predictions": "point_coords"}
-    )
+    write_onnx(tmp_path / "a_encoder.onnx", {"input_image": (("h", "w", 3), FLOAT)}, {"image_embeddings": EMBEDDING})
+    write_onnx(tmp_path / "a_decoder.onnx", SAM_DECODER, {"masks": EMBEDDING, "iou_predictions": "point_coords"})
     model = open_sam(str(tmp_path / "a_encoder.onnx"))
     encoded = model.encode(photo(60, 80))
     assert encoded.used == (768, 1024)
@@ -151,9 +145,7 @@ def test_raw_encoder_takes_the_photo_as_it_is(tmp_path):
     np.testing.assert_allclose(given[0, 0], 384)
 
 
-@pytest.mark.parametrize(
-    "spec", ["{0}", "{0}/encoder.onnx", "{0}/decoder.onnx", "{0}/encoder.onnx,{0}/decoder.onnx"]
-)
+@pytest.mark.parametrize("spec", ["{0}", "{0}/encoder.onnx", "{0}/decoder.onnx", "{0}/encoder.onnx,{0}/decoder.onnx"])
 def test_ways_to_name_a_pair(tmp_path, spec):
     write_family(tmp_path, "SAM")
     assert open_sam(spec.format(tmp_path)).family == "SAM"
@@ -176,9 +168,7 @@ def test_photo_in_which_nothing_is_found(tmp_path):
 def test_identity_follows_the_weights(tmp_path):
     write_family(tmp_path, "SAM")
     before = make_source(f"sam:{tmp_path}").identity
-    write_onnx(
-        tmp_path / "encoder.onnx", {"x": ((1, 3, 1024, 1024), FLOAT)}, {"image_embeddings": EMBEDDING + 1}
-    )
+    write_onnx(tmp_path / "encoder.onnx", {"x": ((1, 3, 1024, 1024), FLOAT)}, {"image_embeddings": EMBEDDING + 1})
     assert make_source(f"sam:{tmp_path}").identity != before
 
 
@@ -199,9 +189,7 @@ def test_nothing_there(tmp_path):
 def test_one_half_of_a_pair(tmp_path, kept, missing):
     write_family(tmp_path, "SAM")
     (tmp_path / f"{missing}.onnx").unlink()
-    with pytest.raises(
-        InputError, match=f"is a {'decoder' if kept == 'decoder' else 'encoder'}.*{missing} is missing"
-    ):
+    with pytest.raises(InputError, match=f"is a {'decoder' if kept == 'decoder' else 'encoder'}.*{missing} is missing"):
         open_sam(str(tmp_path))
 
 

@@ -81,15 +81,11 @@ def local_decoder(segment_anything):
     from segment_anything.modeling import MaskDecoder
 
     class LocalDecoder(MaskDecoder):
-        def predict_masks(
-            self, image_embeddings, image_pe, sparse_prompt_embeddings, dense_prompt_embeddings
-        ):
+        def predict_masks(self, image_embeddings, image_pe, sparse_prompt_embeddings, dense_prompt_embeddings):
             masks, iou = super().predict_masks(
                 image_embeddings, image_pe, sparse_prompt_embeddings, dense_prompt_embeddings
             )
-            near = torch.einsum("pc,chw->phw", sparse_prompt_embeddings[:, 0], image_pe[0])[:, None] * (
-                2 / CHANNELS
-            )
+            near = torch.einsum("pc,chw->phw", sparse_prompt_embeddings[:, 0], image_pe[0])[:, None] * (2 / CHANNELS)
             near = torch.nn.functional.interpolate(near, scale_factor=4, mode="bilinear")
             cuts = torch.tensor([0.5, 0.2, 0.45, 0.7])[None, :, None, None]
             return 180.0 * (near - cuts) + 100.0 * masks, iou
@@ -205,9 +201,7 @@ def test_same_masks_in_the_same_order(segment_anything, sam, exported, changes, 
 
 def test_label_image_gives_every_pixel_to_the_best_mask(exported):
     image = photo(96, 128, seed=10)
-    masks = AutomaticMasks(
-        open_sam(str(exported)), SamSettings(points_per_side=10, stability=0.8, pred_iou=0.5)
-    )(image)
+    masks = AutomaticMasks(open_sam(str(exported)), SamSettings(points_per_side=10, stability=0.8, pred_iou=0.5))(image)
     labels = paint(masks, image.shape[:2])
     stack = np.stack([mask.unpack() for mask in masks.packed])
     scores = np.where(stack, (masks.pred_iou * masks.stability)[:, None, None], -np.inf)

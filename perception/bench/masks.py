@@ -102,9 +102,7 @@ def main(arguments: list[str] | None = None) -> int:
         prog="python -m perception.bench.masks", description=(__doc__ or "").split("\n")[0]
     )
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
-    parser.add_argument(
-        "--masks", default="builtin", help="a mask source as of `perception map` (default: builtin)"
-    )
+    parser.add_argument("--masks", default="builtin", help="a mask source as of `perception map` (default: builtin)")
     parser.add_argument("--every", type=int, default=1, help="take every n-th photo")
     options = parser.parse_args(arguments)
     try:

@@ -99,8 +99,7 @@ def _tangent(points: np.ndarray, axis: int, reach: int = 3) -> np.ndarray:
     chord = np.take(points, range(reach, points.shape[along]), along)
     chord = chord - np.take(points, range(points.shape[along] - reach), along)
     ahead, behind = (
-        np.pad(chord, [side if i == along else (0, 0) for i in range(3)], "edge")
-        for side in ((0, reach), (reach, 0))
+        np.pad(chord, [side if i == along else (0, 0) for i in range(3)], "edge") for side in ((0, reach), (reach, 0))
     )
     one_sided = np.where(np.abs(ahead[..., 2:]) <= np.abs(behind[..., 2:]), ahead, behind)
     smooth = np.abs(ahead[..., 2:] - behind[..., 2:]) < 0.01 * points[..., 2:]

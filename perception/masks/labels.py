@@ -91,9 +91,7 @@ def _check_header(file: Path, width: int, height: int) -> None:
     header = read_png_header(file)
     kind = _COLOUR_TYPES.get(header.colour_type, f"colour type {header.colour_type}")
     if kind not in ("grey", "palette") or header.bits not in (8, 16):
-        raise InputError(
-            f"{file}: a {header.bits}-bit {kind} image; a label image has one channel of 8 or 16 bit"
-        )
+        raise InputError(f"{file}: a {header.bits}-bit {kind} image; a label image has one channel of 8 or 16 bit")
     if (header.width, header.height) != (width, height):
         raise InputError(
             f"{file}: {header.width}×{header.height} pixels, but its photo has {width}×{height}; "

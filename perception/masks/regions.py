@@ -107,8 +107,6 @@ def _segment(photo: np.ndarray, depth: np.ndarray | None, K: np.ndarray | None) 
         smooth = cv2.INTER_LINEAR if ratio > 1 else cv2.INTER_NEAREST
         surface = depth_cues(cv2.resize(filled_depth(depth), size, interpolation=smooth), scaled)
     look = photo_cues(cv2.resize(photo, size, interpolation=cv2.INTER_CUBIC if ratio > 1 else cv2.INTER_AREA))
-    weights, threshold = (
-        (PHOTO_WEIGHTS, PHOTO_THRESHOLD) if surface is None else (DEPTH_WEIGHTS, DEPTH_THRESHOLD)
-    )
+    weights, threshold = (PHOTO_WEIGHTS, PHOTO_THRESHOLD) if surface is None else (DEPTH_WEIGHTS, DEPTH_THRESHOLD)
     labels = merge_regions(first_regions(look, surface), look, surface, weights, threshold)
     return cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST)

@@ -115,9 +115,7 @@ class AutomaticMasks:
         side = int(self.settings.points_per_side / self.settings.crop_points_downscale**layer)
         points = point_grid(side) * np.array([x1 - x0, y1 - y0])
         embedding = self.model.encode(window)
-        found = Masks.join(
-            [self._batch(embedding, batch, crop, photo.shape) for batch in self._batches(points, crop)]
-        )
+        found = Masks.join([self._batch(embedding, batch, crop, photo.shape) for batch in self._batches(points, crop)])
         found = found.take(box_nms(found.boxes, found.pred_iou, self.settings.box_nms))
         found.boxes = found.boxes + np.array([x0, y0, x0, y0])
         found.points = found.points + np.array([x0, y0])

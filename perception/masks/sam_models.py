@@ -230,9 +230,7 @@ def open_graph(path: Path) -> Graph:
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=wanted_providers())
     except Exception as error:  # onnxruntime's own exceptions share no public base class
-        raise InputError(
-            f"{path}: not an ONNX model that onnxruntime can open ({_first_line(error)})"
-        ) from error
+        raise InputError(f"{path}: not an ONNX model that onnxruntime can open ({_first_line(error)})") from error
     inputs = {_ROLES.get(argument.name, argument.name): argument for argument in session.get_inputs()}
     return Graph(path, session, inputs, _outputs([argument.name for argument in session.get_outputs()]))
 
@@ -265,9 +263,7 @@ def _candidates(path: Path) -> list[Path]:
         return files
     if not path.is_file():
         raise InputError(f"sam:{path}: no such file or folder; expected a SAM encoder and decoder as ONNX")
-    partners = [
-        path.with_name(path.name.replace(a, b)) for a, b in (("encoder", "decoder"), ("decoder", "encoder"))
-    ]
+    partners = [path.with_name(path.name.replace(a, b)) for a, b in (("encoder", "decoder"), ("decoder", "encoder"))]
     beside = [partner for partner in partners if partner != path and partner.is_file()]
     other = [file for file in sorted(path.parent.glob("*.onnx")) if file != path and "decoder" in file.name]
     return [path, *(beside or (other if len(other) == 1 else []))]
@@ -284,17 +280,13 @@ def _family(encoder: Graph, decoder: Graph) -> str:
 
 def _check_pair(encoder: Graph, decoder: Graph) -> None:
     known = {"points", "labels", "mask_input", "has_mask", "size"}
-    unmet = [
-        a.name for role, a in decoder.inputs.items() if role not in known and role not in encoder.outputs
-    ]
+    unmet = [a.name for role, a in decoder.inputs.items() if role not in known and role not in encoder.outputs]
     if unmet:
         raise InputError(f"{decoder.path}: needs {', '.join(unmet)}, which {encoder.path.name} does not give")
     lacking = [role for role in ("masks", "iou") if role not in decoder.outputs]
     if lacking:
         found = ", ".join(argument.name for argument in decoder.session.get_outputs())
-        raise InputError(
-            f"{decoder.path}: no output for {' and '.join(lacking)} (found {found}); not a SAM decoder"
-        )
+        raise InputError(f"{decoder.path}: no output for {' and '.join(lacking)} (found {found}); not a SAM decoder")
 
 
 def _provider_warnings(graph: Graph) -> list[str]:

@@ -92,9 +92,7 @@ def clean_mask(mask: np.ndarray, smallest: int) -> tuple[np.ndarray, bool]:
 def _without_small(mask: np.ndarray, smallest: int, holes: bool) -> tuple[np.ndarray, bool]:
     import cv2
 
-    count, regions, stats, _ = cv2.connectedComponentsWithStats(
-        (mask ^ holes).astype(np.uint8), connectivity=8
-    )
+    count, regions, stats, _ = cv2.connectedComponentsWithStats((mask ^ holes).astype(np.uint8), connectivity=8)
     areas = stats[1:, cv2.CC_STAT_AREA]
     small = np.flatnonzero(areas < smallest) + 1
     if not len(small):
@@ -119,7 +117,5 @@ class PackedMask:
 
     def unpack(self) -> np.ndarray:
         """[h, w] bool."""
-        flat = np.unpackbits(
-            np.frombuffer(zlib.decompress(self.bits), np.uint8), count=self.shape[0] * self.shape[1]
-        )
+        flat = np.unpackbits(np.frombuffer(zlib.decompress(self.bits), np.uint8), count=self.shape[0] * self.shape[1])
         return flat.reshape(self.shape).astype(bool)

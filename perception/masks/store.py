@@ -133,9 +133,7 @@ def stored_key(file: Path) -> str | None:
 
 def _key(view: View, source: MaskSource, depth_key: str) -> str:
     """Everything a label image depends on, as a short digest."""
-    digest = hashlib.sha256(
-        f"{source.identity}\n{view.name} {view.width} {view.height} {view.lens}\n".encode()
-    )
+    digest = hashlib.sha256(f"{source.identity}\n{view.name} {view.width} {view.height} {view.lens}\n".encode())
     digest.update(depth_key.encode())
     digest.update(np.ascontiguousarray(view.K, dtype=np.float64).tobytes())
     if view.photo.is_file():
