@@ -25,7 +25,7 @@ class PhotoConfig:
 class TrainConfig:
     """Length and step sizes of the optimisation (Kerbl et al. 2023, shortened: progress drives every schedule)."""
 
-    iterations: int = 6000
+    iterations: int = 3000
     time_limit: float | None = None
     budget: int = 100_000
     lr_means: float = 1.6e-4
@@ -111,8 +111,8 @@ class MapConfig:
 
 PRESETS: dict[str, list[str]] = {
     "default": [],
-    "fast": ["train.iterations=2500", "train.budget=50000"],
-    "quality": ["train.iterations=15000", "train.budget=300000", "photos.max_side=1280"],
+    "fast": ["train.iterations=1500", "train.budget=50000"],
+    "quality": ["train.iterations=12000", "train.budget=300000", "photos.max_side=1280"],
 }
 
 

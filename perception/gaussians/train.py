@@ -213,7 +213,7 @@ class Trainer:
         gradients = {name: tensor.grad for name, tensor in params.items() if tensor.grad is not None}
         self.optimiser.rates = self._rates(progress)
         self.record.skipped_gradients += sum(self.optimiser.step(visible, gradients).skipped.values())
-        if progress < config.densify.stop:
+        if progress < config.densify.stop and out.stats.mean2d_grad is not None:
             self.statistics.add(out.stats.mean2d_grad[0], out.stats.radii[0], visible, max(height, width))
         figures["loss"] = float(loss.detach())
         return figures

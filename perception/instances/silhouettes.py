@@ -62,6 +62,7 @@ def render_silhouettes(
             depth=False,
         )
         seen = out.visible[0]
+        assert out.features is not None  # features were given
         value, index = out.features[0].max(dim=2)
         wins = value > best
         best[wins] = value[wins]

@@ -106,7 +106,8 @@ def _through_lens(kind: str, gaussians: Gaussians, gmap: GaussianMap, view: View
     picture = _picture(kind, gaussians, gmap, wide)
     where = (rays * [fx, fy] + K[:2, 2] - 0.5).astype(np.float32).reshape(height, width, 2)
     nearest = picture.dtype != np.uint8  # ids and depths are not to be mixed
-    return cv2.remap(picture, where, None, cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC)
+    how = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC
+    return np.asarray(cv2.remap(picture, where[..., 0], where[..., 1], how))
 
 
 @torch.no_grad()
@@ -134,6 +135,7 @@ def _picture(kind: str, gaussians: Gaussians, gmap: GaussianMap, view: View) -> 
     if kind == "features":
         from perception.pictures import features_to_rgb
 
+        assert out.features is not None  # features were given
         return features_to_rgb(out.features[0].numpy())
     alpha = out.alphas[0]
     depth = torch.where(alpha > 0.5, out.depths[0] / alpha.clamp(min=1e-6), torch.zeros_like(alpha))

@@ -158,6 +158,7 @@ def feature_picture(album: _Album, name: str, photo: np.ndarray) -> np.ndarray:
         height,
         features=g.features,
     )
+    assert out.features is not None  # features were given
     return features_to_rgb(out.features[0].numpy())
 
 
