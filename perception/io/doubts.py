@@ -1,4 +1,4 @@
-"""Can the model be wrong although nearly every photo registered? Equal textures fold a scene: check what can be checked.
+"""Can a model be wrong although nearly every photo registered? Equal textures fold scenes: check what can be checked.
 
 The oracle is the verified pairs: each knows how many matches satisfy one epipolar geometry, and the model either has
 that geometry or contradicts it.
@@ -50,8 +50,8 @@ def doubts_about(models: list[Any], database: Path, photos: int) -> list[str]:
     wrong = len(overruled(pairs))
     if len(pairs) >= 5 and wrong > MAX_OVERRULED * len(pairs):
         warnings.append(
-            f"{wrong} of {len(pairs)} matched photo pairs contradict the model and are stronger than the pairs it rests "
-            "on: it may be folded (equal textures?)"
+            f"{wrong} of {len(pairs)} matched photo pairs contradict the model and are stronger than the pairs it rests"
+            " on: it may be folded (equal textures?)"
         )
     lonely, near = _unmatched_neighbors(best, {(pair.i, pair.j) for pair in pairs})
     if near >= 5 and lonely > MAX_UNMATCHED * near:
@@ -139,9 +139,7 @@ def _unmatched_neighbors(model: Any, matched: set[tuple[int, int]]) -> tuple[int
         return 0, 0
     distances = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     depth = np.median(np.linalg.norm(xyz[:: max(1, len(xyz) // 2000), None] - centers[None], axis=2), axis=0)
-    close = (distances < 0.1 * np.minimum.outer(depth, depth)) & (
-        forward @ forward.T > np.cos(np.radians(15))
-    )
+    close = (distances < 0.1 * np.minimum.outer(depth, depth)) & (forward @ forward.T > np.cos(np.radians(15)))
     pairs = [(ids[r], ids[c]) for r, c in zip(*np.nonzero(np.triu(close, 1)), strict=True)]
     alone = sum((i, j) not in matched and (j, i) not in matched for i, j in pairs)
     return alone, len(pairs)

@@ -172,9 +172,7 @@ def _camera_key(photo: Path) -> tuple[Any, ...]:
     return (*photo_size(photo), exif.get(0x010F), exif.get(0x0110), details.get(0x920A), details.get(0xA404))
 
 
-def _match(
-    database: Path, pair_file: Path, names: list[str], seed: int, progress: Progress
-) -> tuple[int, int]:
+def _match(database: Path, pair_file: Path, names: list[str], seed: int, progress: Progress) -> tuple[int, int]:
     pycolmap = load_pycolmap()
     pairs = _select_pairs(database, names)
     pair_file.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs))
@@ -219,9 +217,7 @@ def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
     for name in names:
         image = db.read_image_with_name(name)
         keypoints = db.read_keypoints(image.image_id)
-        keypoints = (
-            keypoints if isinstance(keypoints, np.ndarray) else pycolmap.keypoints_to_matrix(keypoints)
-        )
+        keypoints = keypoints if isinstance(keypoints, np.ndarray) else pycolmap.keypoints_to_matrix(keypoints)
         data = np.asarray(db.read_descriptors(image.image_id).data, dtype=np.float32)
         area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
         top = np.argsort(-area, kind="stable")[:COARSE_FEATURES]
@@ -245,8 +241,7 @@ def _mutual_matches(a: np.ndarray, b: np.ndarray, ratio: float = COARSE_RATIO) -
 
 def _key(photos: list[Path], lenses: list[Lens | None], seed: int) -> str:
     facts = [
-        (str(p.resolve()), p.stat().st_size, p.stat().st_mtime_ns, repr(l))
-        for p, l in zip(photos, lenses, strict=True)
+        (str(p.resolve()), p.stat().st_size, p.stat().st_mtime_ns, repr(l)) for p, l in zip(photos, lenses, strict=True)
     ]
     options: tuple[float, ...] = (
         MAX_IMAGE_SIDE,

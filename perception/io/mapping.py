@@ -1,4 +1,4 @@
-"""Incremental mapping (pycolmap) that trusts the strongest pairs first, so that equal textures do not fold the model."""
+"""Incremental mapping (pycolmap) that trusts the strongest pairs first: equal textures must not fold the model."""
 
 from __future__ import annotations
 

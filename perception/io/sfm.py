@@ -35,16 +35,12 @@ def reconstruct(folder: Path, workdir: Path, lens: Lens | None, seed: int, progr
     if not photos:
         raise InputError(f"{folder}: no photos found; expected .jpg, .png, .tif, .bmp or .webp files")
     if len(photos) < MIN_PHOTOS:
-        raise InputError(
-            f"{folder}: {len(photos)} photo(s) found, at least {MIN_PHOTOS} are needed (20 or more serve)"
-        )
+        raise InputError(f"{folder}: {len(photos)} photo(s) found, at least {MIN_PHOTOS} are needed (20 or more serve)")
     for photo in photos:
         check_photo(photo)
         if lens and photo_size(photo) != (lens.width, lens.height):
             found = "×".join(map(str, photo_size(photo)))
-            raise InputError(
-                f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}"
-            )
+            raise InputError(f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}")
     store = build_features(folder, photos, [lens] * len(photos), workdir, seed, progress)
     model, report = _map(store, photos, folder, lens is not None, seed, progress)
     for image in model.images.values():
@@ -102,9 +98,7 @@ def _report(
         "points": best.num_points3D(),
         "mean_reprojection_error_px": float(best.compute_mean_reprojection_error()),
         "mean_track_length": float(best.compute_mean_track_length()),
-        "cameras": [
-            f"{c.model} {c.width}×{c.height} " + " ".join(f"{p:.6g}" for p in c.params) for c in cameras
-        ],
+        "cameras": [f"{c.model} {c.width}×{c.height} " + " ".join(f"{p:.6g}" for p in c.params) for c in cameras],
         "pairs_matched": store.facts["pairs_matched"],
         "pairs_possible": store.facts["pairs_possible"],
         "seconds": seconds,
@@ -127,9 +121,7 @@ def _verified_matches(store: FeatureStore) -> dict[str, tuple[int, int]]:
     return result
 
 
-def _reason(
-    name: str, contradicted: set[str], others: list[set[str]], matches: dict[str, tuple[int, int]]
-) -> str:
+def _reason(name: str, contradicted: set[str], others: list[set[str]], matches: dict[str, tuple[int, int]]) -> str:
     features, best = matches.get(name, (0, 0))
     if name in contradicted:
         return "most of its verified matches contradict every pose found for it (equal textures?)"
