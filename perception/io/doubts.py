@@ -1,7 +1,12 @@
-"""Can the model be wrong although nearly every photo registered? Equal textures fold a scene: check what can be checked."""
+"""Can a model be wrong although nearly every photo registered? Equal textures fold scenes: check what can be checked.
+
+The oracle is the verified pairs: each knows how many matches satisfy one epipolar geometry, and the model either has
+that geometry or contradicts it.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +14,24 @@ import numpy as np
 
 from perception.io.lens import load_pycolmap
 
-MAX_UNREGISTERED, MAX_SECOND_MODEL, MAX_INCONSISTENT, MAX_UNMATCHED = 0.15, 0.30, 0.15, 0.30
+MAX_UNREGISTERED, MAX_SECOND_MODEL, MAX_OVERRULED, MAX_UNMATCHED = 0.15, 0.30, 0.02, 0.30
 EPIPOLAR_TOLERANCE = 4.0 / 1000
 """Sampson distance in normalised image coordinates: 4 pixels at a focal length of 1000."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two registered photos with verified matches. share: of the matches that satisfy the model's epipolar geometry."""
+
+    i: int
+    j: int
+    inliers: int
+    share: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the model has the relative pose that the matches tell."""
+        return self.share >= 0.5
 
 
 def doubts_about(models: list[Any], database: Path, photos: int) -> list[str]:
@@ -26,13 +46,14 @@ def doubts_about(models: list[Any], database: Path, photos: int) -> list[str]:
         warnings.append(
             f"the photos split into {len(models)} unconnected models (photos: {sizes}); the largest is used"
         )
-    verified = _inlier_shares(best, database)
-    wrong = sum(share < 0.5 for share in verified.values())
-    if len(verified) >= 5 and wrong > MAX_INCONSISTENT * len(verified):
+    pairs = verified_pairs(best, database)
+    wrong = len(overruled(pairs))
+    if len(pairs) >= 5 and wrong > MAX_OVERRULED * len(pairs):
         warnings.append(
-            f"{wrong} of {len(verified)} matched photo pairs contradict the model: it may be folded (equal textures?)"
+            f"{wrong} of {len(pairs)} matched photo pairs contradict the model and are stronger than the pairs it rests"
+            " on: it may be folded (equal textures?)"
         )
-    lonely, near = _unmatched_neighbors(best, set(verified))
+    lonely, near = _unmatched_neighbors(best, {(pair.i, pair.j) for pair in pairs})
     if near >= 5 and lonely > MAX_UNMATCHED * near:
         warnings.append(
             f"{lonely} of {near} photo pairs that the model puts at one place, looking the same way, do not match: "
@@ -41,24 +62,56 @@ def doubts_about(models: list[Any], database: Path, photos: int) -> list[str]:
     return warnings
 
 
-def _inlier_shares(model: Any, database: Path) -> dict[tuple[int, int], float]:
-    """(image, image) -> share of the verified matches that satisfy the model's epipolar geometry."""
+def overruled(pairs: list[Pair]) -> list[Pair]:
+    """The contradicted pairs whose photos no chain of agreeing pairs joins that are all at least as strong.
+
+    Equal textures make verified pairs too, so contradicted pairs alone prove nothing. But a model that keeps a weak
+    pair and contradicts a stronger one has chosen badly.
+    """
+    parent: dict[int, int] = {}
+
+    def root(image: int) -> int:
+        while parent.setdefault(image, image) != image:
+            parent[image] = parent[parent[image]]
+            image = parent[image]
+        return image
+
+    found = []
+    for pair in sorted(pairs, key=lambda p: (-p.inliers, not p.agrees)):
+        if pair.agrees:
+            parent[root(pair.i)] = root(pair.j)
+        elif root(pair.i) != root(pair.j):
+            found.append(pair)
+    return found
+
+
+def outvoted_photos(pairs: list[Pair]) -> set[int]:
+    """Photos most of whose verified matches lie in pairs that contradict the model."""
+    votes: dict[int, int] = {}
+    for pair in pairs:
+        for image in (pair.i, pair.j):
+            votes[image] = votes.get(image, 0) + (pair.inliers if pair.agrees else -pair.inliers)
+    return {image for image, vote in votes.items() if vote < 0}
+
+
+def verified_pairs(model: Any, database: Path, min_inliers: int = 0) -> list[Pair]:
+    """The verified pairs of at least `min_inliers` matches between registered photos, judged by the model."""
     pycolmap = load_pycolmap()
     db = pycolmap.Database.open(database)
-    pairs, geometries = db.read_two_view_geometries()
+    keys, geometries = db.read_two_view_geometries()
     db.close()
     registered = set(model.reg_image_ids())
     poses = {i: model.images[i].cam_from_world().matrix() for i in registered}
     rays: dict[int, np.ndarray] = {i: _normalised(model.images[i]) for i in registered}
-    shares = {}
-    for pair, geometry in zip(pairs, geometries, strict=True):
-        i, j = pycolmap.pair_id_to_image_pair(pair)
-        if i not in registered or j not in registered or len(geometry.inlier_matches) < 30:
-            continue
-        a, b = rays[i][geometry.inlier_matches[:, 0]], rays[j][geometry.inlier_matches[:, 1]]
-        distance = _sampson(a, b, poses[i], poses[j])
-        shares[(i, j)] = float((distance < EPIPOLAR_TOLERANCE).mean())
-    return shares
+    pairs = []
+    for key, geometry in zip(keys, geometries, strict=True):
+        i, j = pycolmap.pair_id_to_image_pair(key)
+        count = len(geometry.inlier_matches)
+        if i in registered and j in registered and count >= max(1, min_inliers):
+            a, b = rays[i][geometry.inlier_matches[:, 0]], rays[j][geometry.inlier_matches[:, 1]]
+            distance = _sampson(a, b, poses[i], poses[j])
+            pairs.append(Pair(i, j, count, float((distance < EPIPOLAR_TOLERANCE).mean())))
+    return pairs
 
 
 def _normalised(image: Any) -> np.ndarray:
@@ -86,9 +139,7 @@ def _unmatched_neighbors(model: Any, matched: set[tuple[int, int]]) -> tuple[int
         return 0, 0
     distances = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     depth = np.median(np.linalg.norm(xyz[:: max(1, len(xyz) // 2000), None] - centers[None], axis=2), axis=0)
-    close = (distances < 0.1 * np.minimum.outer(depth, depth)) & (
-        forward @ forward.T > np.cos(np.radians(15))
-    )
+    close = (distances < 0.1 * np.minimum.outer(depth, depth)) & (forward @ forward.T > np.cos(np.radians(15)))
     pairs = [(ids[r], ids[c]) for r, c in zip(*np.nonzero(np.triu(close, 1)), strict=True)]
     alone = sum((i, j) not in matched and (j, i) not in matched for i, j in pairs)
     return alone, len(pairs)

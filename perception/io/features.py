@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sqlite3
 import time
 from collections.abc import Callable
+from contextlib import closing
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -22,9 +24,11 @@ Progress = Callable[[str, float], None]
 
 MAX_IMAGE_SIDE = 1600
 """Larger photos are shrunk for feature extraction only; keypoints come back in full-resolution pixels."""
-UPSAMPLE_BELOW = 900
-"""SIFT starts one octave below the photo (doubled size) when the long side is under this: four times the cost."""
-MAX_FEATURES = 2048
+MAX_FEATURES, MIN_FEATURES = 2048, 450
+"""Photos with fewer than MIN_FEATURES are extracted again one octave below (doubled size), at four times the cost."""
+PEAK_THRESHOLD = 0.004
+MIN_INLIERS = 20
+"""Verified matches that a pair of photos must have."""
 EXHAUSTIVE_BELOW = 20
 NEIGHBORS = 4
 """Neighbours by name that are always matched: photos are usually taken in order."""
@@ -131,16 +135,33 @@ def _extract(
         options.use_gpu = False
         options.max_image_size = MAX_IMAGE_SIDE
         options.sift.max_num_features = MAX_FEATURES
-        options.sift.first_octave = -1 if max(photo_size(photos[members[0]])) < UPSAMPLE_BELOW else 0
+        options.sift.peak_threshold = PEAK_THRESHOLD
+        options.sift.first_octave = 0
         reader = pycolmap.ImageReaderOptions()
         if lens is not None:
             reader.camera_model = lens.model
             reader.camera_params = ", ".join(map(repr, lens.params))
-        pycolmap.extract_features(
-            database, root, [names[i] for i in members], pycolmap.CameraMode.SINGLE, reader, options
-        )
+        chosen = [names[i] for i in members]
+        pycolmap.extract_features(database, root, chosen, pycolmap.CameraMode.SINGLE, reader, options)
+        poor = _forget_poor(database, chosen)
+        if poor:
+            options.sift.first_octave = -1
+            pycolmap.extract_features(database, root, poor, pycolmap.CameraMode.SINGLE, reader, options)
         done += len(members)
         progress("features", done / len(photos))
+
+
+def _forget_poor(database: Path, names: list[str]) -> list[str]:
+    """The photos with few features, which are deleted (pycolmap extracts what has none; it cannot delete for one)."""
+    db = load_pycolmap().Database.open(database)
+    ids = {name: db.read_image_with_name(name).image_id for name in names}
+    poor = [name for name in names if db.num_keypoints_for_image(ids[name]) < MIN_FEATURES]
+    db.close()
+    with closing(sqlite3.connect(database)) as tables, tables:
+        for name in poor:
+            for table in ("keypoints", "descriptors"):
+                tables.execute(f"DELETE FROM {table} WHERE image_id = ?", (ids[name],))
+    return poor
 
 
 def _camera_key(photo: Path) -> tuple[Any, ...]:
@@ -151,9 +172,7 @@ def _camera_key(photo: Path) -> tuple[Any, ...]:
     return (*photo_size(photo), exif.get(0x010F), exif.get(0x0110), details.get(0x920A), details.get(0xA404))
 
 
-def _match(
-    database: Path, pair_file: Path, names: list[str], seed: int, progress: Progress
-) -> tuple[int, int]:
+def _match(database: Path, pair_file: Path, names: list[str], seed: int, progress: Progress) -> tuple[int, int]:
     pycolmap = load_pycolmap()
     pairs = _select_pairs(database, names)
     pair_file.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs))
@@ -163,6 +182,7 @@ def _match(
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     verification.ransac.max_num_trials = 2000
+    verification.min_num_inliers = MIN_INLIERS
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = pair_file
     pycolmap.match_image_pairs(database, matching, pairing, verification)
@@ -197,9 +217,7 @@ def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
     for name in names:
         image = db.read_image_with_name(name)
         keypoints = db.read_keypoints(image.image_id)
-        keypoints = (
-            keypoints if isinstance(keypoints, np.ndarray) else pycolmap.keypoints_to_matrix(keypoints)
-        )
+        keypoints = keypoints if isinstance(keypoints, np.ndarray) else pycolmap.keypoints_to_matrix(keypoints)
         data = np.asarray(db.read_descriptors(image.image_id).data, dtype=np.float32)
         area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
         top = np.argsort(-area, kind="stable")[:COARSE_FEATURES]
@@ -223,13 +241,14 @@ def _mutual_matches(a: np.ndarray, b: np.ndarray, ratio: float = COARSE_RATIO) -
 
 def _key(photos: list[Path], lenses: list[Lens | None], seed: int) -> str:
     facts = [
-        (str(p.resolve()), p.stat().st_size, p.stat().st_mtime_ns, repr(l))
-        for p, l in zip(photos, lenses, strict=True)
+        (str(p.resolve()), p.stat().st_size, p.stat().st_mtime_ns, repr(l)) for p, l in zip(photos, lenses, strict=True)
     ]
     options: tuple[float, ...] = (
         MAX_IMAGE_SIDE,
-        UPSAMPLE_BELOW,
         MAX_FEATURES,
+        MIN_FEATURES,
+        PEAK_THRESHOLD,
+        MIN_INLIERS,
         EXHAUSTIVE_BELOW,
         NEIGHBORS,
         seed,

@@ -7,7 +7,6 @@ finish, so poses differ in the last digits between runs and machines.
 from __future__ import annotations
 
 import json
-import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -18,12 +17,12 @@ from perception.io.colmap import views_of_model
 from perception.io.doubts import doubts_about
 from perception.io.features import FeatureStore, Progress, build_features
 from perception.io.lens import lens_from_camera, load_pycolmap
+from perception.io.mapping import map_photos
 from perception.io.photos import check_photo, list_photos, photo_size
 from perception.io.triangulate import cloud_of
 from perception.types import Lens, Scene
 
 MIN_PHOTOS = 3
-MIN_MODEL_SIZE = 3
 
 
 def reconstruct(folder: Path, workdir: Path, lens: Lens | None, seed: int, progress: Progress) -> Scene:
@@ -36,16 +35,12 @@ def reconstruct(folder: Path, workdir: Path, lens: Lens | None, seed: int, progr
     if not photos:
         raise InputError(f"{folder}: no photos found; expected .jpg, .png, .tif, .bmp or .webp files")
     if len(photos) < MIN_PHOTOS:
-        raise InputError(
-            f"{folder}: {len(photos)} photo(s) found, at least {MIN_PHOTOS} are needed (20 or more serve)"
-        )
+        raise InputError(f"{folder}: {len(photos)} photo(s) found, at least {MIN_PHOTOS} are needed (20 or more serve)")
     for photo in photos:
         check_photo(photo)
         if lens and photo_size(photo) != (lens.width, lens.height):
             found = "×".join(map(str, photo_size(photo)))
-            raise InputError(
-                f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}"
-            )
+            raise InputError(f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}")
     store = build_features(folder, photos, [lens] * len(photos), workdir, seed, progress)
     model, report = _map(store, photos, folder, lens is not None, seed, progress)
     for image in model.images.values():
@@ -63,52 +58,27 @@ def _map(
     recover(done)
     if not done.is_dir():
         started = time.perf_counter()
-        models = _incremental(store, fixed, seed, len(photos), progress)
+        models, contradicted = map_photos(store, fixed, seed, len(photos), progress)
         if not models:
             raise InputError(
                 f"{folder}: none of the {len(photos)} photos could be registered; take sharp, overlapping photos of a "
                 "textured scene from different places"
             )
         seconds = {**store.facts["seconds"], "mapping": time.perf_counter() - started}
-        report = _report(models, store, photos, folder, seconds)
+        report = _report(models, contradicted, store, photos, folder, seconds)
         with atomic_directory(done) as new:
             models[0].write(new)
             (new / "report.json").write_text(json.dumps(report))
     return pycolmap.Reconstruction(done), json.loads((done / "report.json").read_text())
 
 
-def _incremental(store: FeatureStore, fixed: bool, seed: int, count: int, progress: Progress) -> list[Any]:
-    """All models, largest first (pycolmap's numbering is no ranking)."""
-    pycolmap = load_pycolmap()
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = seed
-    options.min_model_size = MIN_MODEL_SIZE
-    # Global adjustment at every 40 % of growth, not 10 %: most of the time of mapping goes there.
-    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
-    options.ba_global_max_refinements = 3
-    options.ba_refine_focal_length = options.ba_refine_extra_params = not fixed
-    registered = 2
-
-    def next_image() -> None:
-        nonlocal registered
-        registered += 1
-        progress("mapping", min(1.0, registered / count))
-
-    out = store.folder / "mapping"
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir()
-    try:
-        found = pycolmap.incremental_mapping(
-            store.database, store.image_root, out, options, next_image_callback=next_image
-        )
-    finally:
-        shutil.rmtree(out, ignore_errors=True)
-    models = [model for model in found.values() if model.num_reg_images() >= MIN_MODEL_SIZE]
-    return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-
-
 def _report(
-    models: list[Any], store: FeatureStore, photos: list[Path], folder: Path, seconds: dict[str, float]
+    models: list[Any],
+    contradicted: set[str],
+    store: FeatureStore,
+    photos: list[Path],
+    folder: Path,
+    seconds: dict[str, float],
 ) -> dict[str, Any]:
     best = models[0]
     inside = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
@@ -117,7 +87,7 @@ def _report(
     for name, photo in zip(store.names, photos, strict=True):
         if name not in inside[0]:
             shown = photo.relative_to(folder).as_posix()
-            left_out.append({"name": shown, "why": _reason(name, inside[1:], matches)})
+            left_out.append({"name": shown, "why": _reason(name, contradicted, inside[1:], matches)})
     cameras = [lens_from_camera(best.cameras[key]) for key in sorted(best.cameras)]
     return {
         "input": "photos",
@@ -128,9 +98,7 @@ def _report(
         "points": best.num_points3D(),
         "mean_reprojection_error_px": float(best.compute_mean_reprojection_error()),
         "mean_track_length": float(best.compute_mean_track_length()),
-        "cameras": [
-            f"{c.model} {c.width}×{c.height} " + " ".join(f"{p:.6g}" for p in c.params) for c in cameras
-        ],
+        "cameras": [f"{c.model} {c.width}×{c.height} " + " ".join(f"{p:.6g}" for p in c.params) for c in cameras],
         "pairs_matched": store.facts["pairs_matched"],
         "pairs_possible": store.facts["pairs_possible"],
         "seconds": seconds,
@@ -153,8 +121,10 @@ def _verified_matches(store: FeatureStore) -> dict[str, tuple[int, int]]:
     return result
 
 
-def _reason(name: str, others: list[set[str]], matches: dict[str, tuple[int, int]]) -> str:
+def _reason(name: str, contradicted: set[str], others: list[set[str]], matches: dict[str, tuple[int, int]]) -> str:
     features, best = matches.get(name, (0, 0))
+    if name in contradicted:
+        return "most of its verified matches contradict every pose found for it (equal textures?)"
     if any(name in other for other in others):
         return "registered in another, smaller model that does not connect to the largest"
     if features < 100:

@@ -34,9 +34,7 @@ def triangulated_cloud(
     Under MIN_POINTS points, random ones in the views' frusta take their place, and a warning says so.
     """
     started = time.perf_counter()
-    store = build_features(
-        root, [v.photo for v in views], [view_lens(v) for v in views], workdir, seed, progress
-    )
+    store = build_features(root, [v.photo for v in views], [view_lens(v) for v in views], workdir, seed, progress)
     featured = time.perf_counter()
     points, colors, error = _triangulate(views, store, seed)
     facts: dict[str, Any] = {
