@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import os
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -76,11 +77,13 @@ def _cameras(path: Path) -> list[View]:
 
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a transforms.json with the cameras to render")
+    frames = read_frames(path)
+    folder = os.path.commonpath([str(PurePosixPath(name).parent) for name, _, _ in frames]) if frames else ""
     views = []
-    for name, camera_from_world, lens in read_frames(path):
+    for name, camera_from_world, lens in frames:
         (fx, fy, cx, cy), width, height = pinhole_from_lens(lens)
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-        short = Path(name).name if name.startswith(("/", "..")) else name
+        short = PurePosixPath(name).relative_to(folder).as_posix()
         views.append(
             View(short, path, K, width, height, camera_from_world, None if is_pinhole(lens) else lens)
         )
