@@ -15,8 +15,9 @@ import numpy as np
 from perception.io.lens import load_pycolmap
 
 MAX_UNREGISTERED, MAX_SECOND_MODEL, MAX_OVERRULED, MAX_UNMATCHED = 0.15, 0.30, 0.02, 0.30
-EPIPOLAR_TOLERANCE = 4.0 / 1000
-"""Sampson distance in normalised image coordinates: 4 pixels at a focal length of 1000."""
+EPIPOLAR_TOLERANCE, TOLERANCE_PIXELS = 4.0 / 1000, 4.0
+"""Sampson distance in normalised image coordinates; for short focal lengths, that of TOLERANCE_PIXELS if larger (the
+error that verification allows)."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,9 @@ def verified_pairs(model: Any, database: Path, min_inliers: int = 0) -> list[Pai
     registered = set(model.reg_image_ids())
     poses = {i: model.images[i].cam_from_world().matrix() for i in registered}
     rays: dict[int, np.ndarray] = {i: _normalised(model.images[i]) for i in registered}
+    tolerance = {
+        i: max(EPIPOLAR_TOLERANCE, TOLERANCE_PIXELS / model.images[i].camera.mean_focal_length()) for i in registered
+    }
     pairs = []
     for key, geometry in zip(keys, geometries, strict=True):
         i, j = pycolmap.pair_id_to_image_pair(key)
@@ -110,7 +114,7 @@ def verified_pairs(model: Any, database: Path, min_inliers: int = 0) -> list[Pai
         if i in registered and j in registered and count >= max(1, min_inliers):
             a, b = rays[i][geometry.inlier_matches[:, 0]], rays[j][geometry.inlier_matches[:, 1]]
             distance = _sampson(a, b, poses[i], poses[j])
-            pairs.append(Pair(i, j, count, float((distance < EPIPOLAR_TOLERANCE).mean())))
+            pairs.append(Pair(i, j, count, float((distance < max(tolerance[i], tolerance[j])).mean())))
     return pairs
 
 

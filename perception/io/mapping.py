@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from perception.io.doubts import MAX_OVERRULED, Pair, outvoted_photos, overruled, verified_pairs
+from perception.io.doubts import Pair, outvoted_photos, overruled, verified_pairs
 from perception.io.features import MIN_INLIERS, FeatureStore, Progress
 from perception.io.lens import load_pycolmap
 
 MIN_MODEL_SIZE = 3
+Found = tuple[list[Any], set[str]]
+"""Models, largest first, and the names of the photos left out because most of their matches contradict the largest."""
+ACCEPTED_OVERRULED = 0.005
 LEVELS = (MIN_INLIERS, 2 * MIN_INLIERS, 4 * MIN_INLIERS, 8 * MIN_INLIERS)
 """Pairs with fewer verified matches are left out in turn until a model stands that overrules no stronger pair."""
 
 
-def map_photos(
-    store: FeatureStore, fixed: bool, seed: int, count: int, progress: Progress
-) -> tuple[list[Any], set[str]]:
+def map_photos(store: FeatureStore, fixed: bool, seed: int, count: int, progress: Progress) -> Found:
     """All models, largest first (pycolmap's numbering is no ranking), and names of photos left out as contradicted.
 
     fixed: the intrinsics in the database are kept as they are.
@@ -32,63 +34,72 @@ def map_photos(
 
 
 class _Mapping:
-    """One database copy, from which contradicted pairs are taken out, and the models made of it."""
+    """Models of one set of verified pairs, and the choice among them."""
 
     def __init__(
         self, store: FeatureStore, folder: Path, fixed: bool, seed: int, count: int, progress: Progress
     ) -> None:
-        self.original, self.image_root, self.folder = store.database, store.image_root, folder
-        self.database = folder / "database.db"
-        shutil.copyfile(store.database, self.database)
+        self.database, self.image_root, self.folder = store.database, store.image_root, folder
         self.fixed, self.seed, self.count, self.progress = fixed, seed, count, progress
         self.told, self.runs = 0.0, 0
 
-    def run(self) -> tuple[list[Any], set[str]]:
-        models, level = self._strongest_first()
-        if not models:
-            return [], set()
-        if level > LEVELS[0]:
-            self._forget([p for p in verified_pairs(models[0], self.database) if not p.agrees])
-            again = self._map(LEVELS[0])
-            if again and _faults(again[0], self.original) <= _faults(models[0], self.original):
-                models = again
-        return self._without_outvoted(models)
-
-    def _strongest_first(self) -> tuple[list[Any], int]:
-        """The first model of LEVELS that overrules almost nothing; else the one that overrules least."""
-        tried = []
-        for level in LEVELS:
-            models = self._map(level)
-            if not models or (tried and models[0].num_reg_images() < tried[0][1][0].num_reg_images() / 2):
-                break
-            faults = _faults(models[0], self.database)
-            tried.append((faults, models, level))
-            if faults <= MAX_OVERRULED / 4:
+    def run(self) -> Found:
+        """Stops at the first model that overrules almost nothing; else the one that explains most matches is taken."""
+        tried: list[tuple[int, Found]] = []
+        for found in self._candidates():
+            pairs = verified_pairs(found[0][0], self.database)
+            tried.append((sum(pair.inliers for pair in pairs if pair.agrees), found))
+            if len(overruled(pairs)) <= ACCEPTED_OVERRULED * len(pairs):
                 break
         if not tried:
-            return [], LEVELS[0]
-        _, models, level = min(tried, key=lambda item: item[0])
-        return models, level
+            return [], set()
+        return max(tried, key=lambda item: item[0])[1]
 
-    def _without_outvoted(self, models: list[Any]) -> tuple[list[Any], set[str]]:
+    def _candidates(self) -> Iterator[Found]:
+        """A model of the pairs of each level, then one of all pairs but those that the former contradicts."""
+        for level in LEVELS:
+            models = self._map(self.database, level)
+            if not models:
+                return
+            found = self._without_outvoted(models)
+            yield found
+            pairs = verified_pairs(found[0][0], self.database)
+            wrong = [pair for pair in pairs if not pair.agrees]
+            again = self._map(self._database_without(wrong), LEVELS[0]) if wrong else []
+            if again:
+                yield self._without_outvoted(again)
+
+    def _database_without(self, pairs: list[Pair]) -> Path:
+        copy = self.folder / f"pairs-{self.runs}.db"
+        shutil.copyfile(self.database, copy)
+        db = load_pycolmap().Database.open(copy)
+        for pair in pairs:
+            db.delete_matches(pair.i, pair.j)
+            db.delete_two_view_geometry(pair.i, pair.j)
+        db.close()
+        return copy
+
+    def _without_outvoted(self, models: list[Any]) -> Found:
         """Photos that most of their matches contradict are taken out, tried once more, and left out if need be."""
         best = models[0]
-        wrong = outvoted_photos(verified_pairs(best, self.original))
-        if not wrong or best.num_reg_images() - len(wrong) < MIN_MODEL_SIZE:
+        pairs = verified_pairs(best, self.database)
+        wrong = outvoted_photos(pairs)
+        if not wrong or len(wrong) > best.num_reg_images() / 4:
             return models, set()
         _take_out(best, wrong)
-        source = self.folder / "kept"
+        source = self.folder / f"kept-{self.runs}"
         source.mkdir()
         best.write(source)
-        again = self._map(LEVELS[0], source)
+        others = [p for p in pairs if not p.agrees and p.i not in wrong and p.j not in wrong]
+        again = self._map(self._database_without(others), LEVELS[0], source)
         best = again[0] if again and again[0].num_reg_images() >= best.num_reg_images() else best
-        still = outvoted_photos(verified_pairs(best, self.original))
+        still = outvoted_photos(verified_pairs(best, self.database))
         still |= wrong - set(best.reg_image_ids())
         names = {best.images[image].name for image in still}
         _take_out(best, still & set(best.reg_image_ids()))
         return [best, *models[1:]], names
 
-    def _map(self, min_inliers: int, source: Path | None = None) -> list[Any]:
+    def _map(self, database: Path, min_inliers: int, source: Path | None = None) -> list[Any]:
         pycolmap = load_pycolmap()
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = self.seed
@@ -112,7 +123,7 @@ class _Mapping:
             self.progress("mapping", self.told)
 
         found = pycolmap.incremental_mapping(
-            self.database,
+            database,
             self.image_root,
             out,
             options,
@@ -121,19 +132,6 @@ class _Mapping:
         )
         models = [model for model in found.values() if model.num_reg_images() >= MIN_MODEL_SIZE]
         return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-
-    def _forget(self, pairs: list[Pair]) -> None:
-        db = load_pycolmap().Database.open(self.database)
-        for pair in pairs:
-            db.delete_two_view_geometry(pair.i, pair.j)
-            db.delete_matches(pair.i, pair.j)
-        db.close()
-
-
-def _faults(model: Any, database: Path) -> float:
-    """Share of the verified pairs that the model overrules in favour of weaker ones."""
-    pairs = verified_pairs(model, database)
-    return len(overruled(pairs)) / max(1, len(pairs))
 
 
 def _take_out(model: Any, images: set[int]) -> None:
