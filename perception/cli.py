@@ -23,9 +23,7 @@ class _Parser(argparse.ArgumentParser):
 
 def build_parser() -> argparse.ArgumentParser:
     """All subcommands and their options."""
-    parser = _Parser(
-        prog="perception", description="From photos to a 3D instance map that answers text prompts."
-    )
+    parser = _Parser(prog="perception", description="From photos to a 3D instance map that answers text prompts.")
     parser.add_argument("--version", action="version", version=f"perception {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
     for add in (_add_demo, _add_map, _add_export, _add_query, _add_render, _add_eval, _add_info, _add_bench):
@@ -61,9 +59,7 @@ Run = Callable[[argparse.Namespace], tuple[dict[str, Any], str]]
 def _command(commands: Any, name: str, run: Run, summary: str) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = commands.add_parser(name, help=summary, description=summary)
     parser.set_defaults(run=run)
-    parser.add_argument(
-        "--json", action="store_true", help="print one JSON object on stdout and nothing else there"
-    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else there")
     return parser
 
 
@@ -105,9 +101,7 @@ _SHORTCUTS = {
 def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.config import load_config
 
-    given = [
-        f"{key}={getattr(args, name)}" for name, key in _SHORTCUTS.items() if getattr(args, name) is not None
-    ]
+    given = [f"{key}={getattr(args, name)}" for name, key in _SHORTCUTS.items() if getattr(args, name) is not None]
     config = load_config(args.config, args.pairs + given, args.preset)
     from perception.pipeline.mapping import build_map
     from perception.progress import Progress
@@ -140,9 +134,7 @@ def _add_query(commands: Any) -> None:
     p.add_argument("text", nargs="+", metavar="TEXT")
     p.add_argument("--top", type=int, default=3, metavar="K")
     p.add_argument("--min-score", type=float, metavar="X")
-    p.add_argument(
-        "--points", type=Path, metavar="OUT.ply", help="write the hits' points, labelled by instance_id"
-    )
+    p.add_argument("--points", type=Path, metavar="OUT.ply", help="write the hits' points, labelled by instance_id")
 
 
 def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -153,21 +145,15 @@ def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     answers = [(text, opened.query(text, args.top, args.min_score)) for text in args.text]
     if args.points:
         write_hits(args.points, opened.gmap, [hit for _, hits in answers for hit in hits])
-    results = [
-        {"text": text, "present": bool(hits), "hits": [h.to_json() for h in hits]} for text, hits in answers
-    ]
-    return {"results": results, "frame": opened.frame, "metric": opened.metric}, query_text(
-        answers, opened.metric
-    )
+    results = [{"text": text, "present": bool(hits), "hits": [h.to_json() for h in hits]} for text, hits in answers]
+    return {"results": results, "frame": opened.frame, "metric": opened.metric}, query_text(answers, opened.metric)
 
 
 # ------------------------------------------------------------- export, render
 
 
 def _add_export(commands: Any) -> None:
-    p = _command(
-        commands, "export", _export, "instances onto a point cloud or mesh, or onto the map's own points"
-    )
+    p = _command(commands, "export", _export, "instances onto a point cloud or mesh, or onto the map's own points")
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("--points", type=Path, metavar="CLOUD")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.ply")
@@ -205,13 +191,9 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 def _add_render(commands: Any) -> None:
     p = _command(commands, "render", _render, "pictures of the map from given cameras")
     p.add_argument("map", type=Path, metavar="MAP")
-    p.add_argument(
-        "--cameras", type=Path, metavar="transforms.json", help="default: the map's held-out views"
-    )
+    p.add_argument("--cameras", type=Path, metavar="transforms.json", help="default: the map's held-out views")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
-    p.add_argument(
-        "--what", default="rgb", metavar="KINDS", help="comma-separated: rgb, depth, instances, features"
-    )
+    p.add_argument("--what", default="rgb", metavar="KINDS", help="comma-separated: rgb, depth, instances, features")
 
 
 def _render(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -251,9 +233,7 @@ def _eval_images(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _add_demo(commands: Any) -> None:
-    p = _command(
-        commands, "demo", _demo, "photos -> SfM -> map -> export -> text query, on a scene it makes itself"
-    )
+    p = _command(commands, "demo", _demo, "photos -> SfM -> map -> export -> text query, on a scene it makes itself")
     p.add_argument("-o", "--output", type=Path, default=Path("perception-demo"), metavar="DIR")
 
 

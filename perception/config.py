@@ -1,4 +1,4 @@
-"""The mapper's settings: typed, with defaults that need no file; a TOML file or KEY=VALUE pairs override single fields."""
+"""The mapper's settings: typed, defaults need no file; a TOML file or KEY=VALUE pairs override single fields."""
 
 from __future__ import annotations
 
@@ -161,9 +161,7 @@ def set_value(config: Any, key: str, value: Any, where: str = "--set", prefix: s
     return dataclasses.replace(config, **{head: _parse(value, hints[head], f"{where} {prefix}{key}")})
 
 
-def load_config(
-    file: Path | None = None, pairs: list[str] | None = None, preset: str = "default"
-) -> MapConfig:
+def load_config(file: Path | None = None, pairs: list[str] | None = None, preset: str = "default") -> MapConfig:
     """Defaults, then the preset, then the TOML file, then KEY=VALUE pairs; checked as a whole."""
     if preset not in PRESETS:
         raise InputError(f"--preset: found '{preset}', expected one of: {', '.join(PRESETS)}")

@@ -75,9 +75,7 @@ class LoadedMap:
         spec = self.gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
         encoder = make_encoder("conse" if spec == "auto" else spec)
         if encoder is None:
-            raise InputError(
-                f"{self.path}: was mapped without an encoder; map again with language.encoder=conse"
-            )
+            raise InputError(f"{self.path}: was mapped without an encoder; map again with language.encoder=conse")
         check_encoder(identity, encoder.identity)
         return Ranker(descriptions, encoder, [entry.get("label") for entry in self.instances])
 
@@ -106,9 +104,7 @@ class LoadedMap:
         if self.gmap.language:
             counts = self.gmap.language["view_counts"]
             stop = int(counts[: instance + 1].sum())
-            views = tuple(
-                str(name) for name in self.gmap.language["view_names"][stop - int(counts[instance]) : stop]
-            )
+            views = tuple(str(name) for name in self.gmap.language["view_names"][stop - int(counts[instance]) : stop])
         return Hit(
             entry["id"],
             score,

@@ -16,7 +16,7 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with transforms.json, images/ and labels/ of the demo's tabletop: 12 photos of 128 × 96, exact poses.
 
-    The label images carry other ids in every photo, as a segmenter's would. gt_points.ply and scene.json hold the truth.
+    The label images carry other ids in every photo, as a segmenter's would. truth/ holds the truth.
     """
     import cv2
     import numpy as np

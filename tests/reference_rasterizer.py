@@ -89,9 +89,7 @@ def _camera(means, quats, scales, opacities, colors, viewmat, k, width, height, 
         mean = (w.T @ f)[:, None] / w.sum(0)[:, None, None].clamp(min=1e-300)
         centred = (f[None] - mean) ** 2  # two passes: Var = Σ w (f - m)² + A (1 - A) m²
         total = w.sum(0)[:, None]
-        out["feature_variance"] = (
-            torch.einsum("np,pnd->pd", w, centred) + total * t[:, None] * mean[:, 0] ** 2
-        )
+        out["feature_variance"] = torch.einsum("np,pnd->pd", w, centred) + total * t[:, None] * mean[:, 0] ** 2
     return out, visible
 
 

@@ -86,12 +86,8 @@ def test_every_thing_is_seen_and_every_query_has_its_answer(made: tuple[Path, De
 
 def test_same_seed_same_photos_other_seed_other_photos(made: tuple[Path, DemoTruth], tmp_path: Path) -> None:
     folder, truth = made
-    again = make_photos(
-        tmp_path / "again" / "photos", views=5, width=160, height=120, seed=3, light_samples=2
-    )
-    other = make_photos(
-        tmp_path / "other" / "photos", views=3, width=160, height=120, seed=4, light_samples=2
-    )
+    again = make_photos(tmp_path / "again" / "photos", views=5, width=160, height=120, seed=3, light_samples=2)
+    other = make_photos(tmp_path / "other" / "photos", views=3, width=160, height=120, seed=4, light_samples=2)
     for name in truth.names:
         assert (folder / name).read_bytes() == (tmp_path / "again" / "photos" / name).read_bytes()
     np.testing.assert_array_equal(again.points, truth.points)

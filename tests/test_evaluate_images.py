@@ -26,9 +26,7 @@ def pair(h=48, w=61, seed=0):
 @pytest.mark.parametrize("seed", range(3))
 def test_agrees_with_scikit_image(seed):
     prediction, truth = pair(seed=seed)
-    assert psnr(prediction, truth) == pytest.approx(
-        peak_signal_noise_ratio(truth, prediction, data_range=1), abs=1e-9
-    )
+    assert psnr(prediction, truth) == pytest.approx(peak_signal_noise_ratio(truth, prediction, data_range=1), abs=1e-9)
     want = structural_similarity(
         truth,
         prediction,

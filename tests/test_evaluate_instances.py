@@ -180,9 +180,7 @@ def test_confidence_order_matters_and_segment3d_drops_it():
     low_first = evaluate(pred, {0: 0.1, 2: 0.9, 3: 0.9, 4: 0.9, 5: 0.9}, gt)["ap50"]
     high_first = evaluate(pred, {0: 0.9, 2: 0.1, 3: 0.1, 4: 0.1, 5: 0.1}, gt)["ap50"]
     assert high_first > low_first
-    flat = [
-        evaluate(pred, {0: s, 2: 0.5, 3: 0.5, 4: 0.5, 5: 0.5}, gt, "segment3d")["ap50"] for s in (0.1, 0.9)
-    ]
+    flat = [evaluate(pred, {0: s, 2: 0.5, 3: 0.5, 4: 0.5, 5: 0.5}, gt, "segment3d")["ap50"] for s in (0.1, 0.9)]
     assert flat[0] == flat[1]
 
 

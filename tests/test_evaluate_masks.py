@@ -65,9 +65,7 @@ def test_lerf_ovs_is_a_flat_mean_and_strict_at_a_quarter():
     quarter = np.zeros((10, 10))
     quarter[:5, :5] = 0.71
     truths = {("f1", "a"): truth, ("f1", "b"): truth, ("f2", "a"): truth}
-    result = evaluate_lerf_ovs(
-        {("f1", "a"): quarter, ("f2", "a"): np.ones((10, 10))}, truths, selection="top-1"
-    )
+    result = evaluate_lerf_ovs({("f1", "a"): quarter, ("f2", "a"): np.ones((10, 10))}, truths, selection="top-1")
     assert result["miou"] == pytest.approx((0.25 + 0 + 1) / 3)
     assert result["macc25"] == pytest.approx(1 / 3)
     assert result["protocol"]["selection"] == "top-1" and result["protocol"]["occlusion"] == "not stated"
@@ -101,9 +99,7 @@ def test_lerf_ovs_directory(tmp_path):
     label.mkdir(parents=True)
     square = [[10, 5], [29, 5], [29, 24], [10, 24]]
     objects = [{"category": "sheep", "segmentation": square}]
-    (label / "frame_00001.json").write_text(
-        json.dumps({"info": {"height": 40, "width": 50}, "objects": objects})
-    )
+    (label / "frame_00001.json").write_text(json.dumps({"info": {"height": 40, "width": 50}, "objects": objects}))
     mask = np.zeros((40, 50), bool)
     mask[5:25, 10:30] = True
     save(tmp_path / "pred/teatime/frame_00001/sheep.png", mask)
@@ -130,9 +126,7 @@ def test_scannet_directory_with_mask_files_and_run_lengths(tmp_path):
     gt.mkdir()
     coded.mkdir()
     np.savetxt(gt / "scene0.txt", truth, fmt="%d")
-    write_scannet(
-        text, "scene0", labels, {i: {"score": s} for i, s in scores.items()}, {4: 3, 6: 3, 8: 5, 9: 5}
-    )
+    write_scannet(text, "scene0", labels, {i: {"score": s} for i, s in scores.items()}, {4: 3, 6: 3, 8: 5, 9: 5})
     rows = [
         {
             "label_id": {4: 3, 6: 3, 8: 5, 9: 5}[i],

@@ -56,9 +56,7 @@ def test_densest_instance_sums_densities_of_the_candidates():
     np.fill_diagonal(apart, np.inf)
     widen = np.median(apart.min(axis=1)) / 2
     rotation = Rotation.from_quat(np.roll(quats, -1, axis=1)).as_matrix()
-    inverse = np.linalg.inv(
-        [r @ np.diag(s**2 + widen**2) @ r.T for r, s in zip(rotation, scales, strict=True)]
-    )
+    inverse = np.linalg.inv([r @ np.diag(s**2 + widen**2) @ r.T for r, s in zip(rotation, scales, strict=True)])
     for point, label in zip(cloud.points, got, strict=True):
         near = np.argsort(np.linalg.norm(means - point, axis=1))[:16]
         total = np.zeros(6)
@@ -231,9 +229,7 @@ def test_split_covers_the_labelled_points_in_order(tmp_path):
 
 def test_scannet_submission_layout(tmp_path):
     _, labels = scene(500)
-    path = write_scannet(
-        tmp_path, "scene0000_00", labels, {0: {"score": 0.2}, 1: {"score": 0.9}, 2: {"score": 0.5}}
-    )
+    path = write_scannet(tmp_path, "scene0000_00", labels, {0: {"score": 0.2}, 1: {"score": 0.9}, 2: {"score": 0.5}})
     rows = [line.split() for line in path.read_text().splitlines()]
     assert [(row[1], float(row[2])) for row in rows] == [("1", 0.9), ("1", 0.5), ("1", 0.2)]
     for row, i in zip(rows, (1, 2, 0), strict=True):
@@ -246,9 +242,7 @@ def test_mcap_is_read_back_by_rosbags(tmp_path):
 
     cloud, labels = scene(400)
     path = tmp_path / "out.mcap"
-    write_mcap(
-        path, cloud, labels, {0: {"score": 0.25, "label": "mug"}}, frame="world", stamp_ns=3_000_000_007
-    )
+    write_mcap(path, cloud, labels, {0: {"score": 0.25, "label": "mug"}}, frame="world", stamp_ns=3_000_000_007)
     messages = {}
     with highlevel.AnyReader([path]) as reader:
         for connection, time, raw in reader.messages():

@@ -157,9 +157,7 @@ def test_weights_are_scannets():
     edges = np.array([[0, 1], [1, 0], [0, 2]], np.int32)
     # 0 -> 1: n_b·d = .6 > 0, convex; 1 -> 0: n_b·d = 0, not; 0 -> 2: cos -.8, n_b·d = −1.4, not
     np.testing.assert_allclose(scannet_weights(points, normals, edges), [0.04, 0.2, 1.8], rtol=1e-6)
-    np.testing.assert_allclose(
-        scannet_weights(points, normals, edges, oriented=False), [0.2, 0.2, 0.2], rtol=1e-6
-    )
+    np.testing.assert_allclose(scannet_weights(points, normals, edges, oriented=False), [0.2, 0.2, 0.2], rtol=1e-6)
 
 
 def test_estimated_normals_of_a_sphere_point_outwards_or_inwards():
@@ -183,9 +181,7 @@ def test_knn_and_radius_edges_equal_brute_force():
     distance[np.isnan(distance)] = np.inf
     np.fill_diagonal(distance, np.inf)
     near = np.argsort(distance, axis=1)[:, :5]
-    want = {
-        (min(a, b), max(a, b)) for a in range(250) for b in near[a].tolist() if np.isfinite(distance[a, b])
-    }
+    want = {(min(a, b), max(a, b)) for a in range(250) for b in near[a].tolist() if np.isfinite(distance[a, b])}
     got = [tuple(e) for e in knn_edges(points, 5).tolist()]
     assert len(got) == len(set(got)) and set(got) == want
     pairs = {(a, b) for a, b in np.argwhere(distance <= 0.12).tolist() if a < b}

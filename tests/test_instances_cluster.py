@@ -78,6 +78,6 @@ def test_by_falling_size() -> None:
 
 def test_split_keeps_connected_lines_whole() -> None:
     line = np.stack([np.linspace(0, 1, 60), np.zeros(60), np.zeros(60)], axis=1)
-    two = np.concatenate([line, line + [0, 5, 0]])
+    two = np.concatenate([line, line + np.array([0, 5, 0])])
     ids = split_disconnected(two, np.full((120, 3), 0.001), np.zeros(120, np.int64), 10)
     assert len(set(ids)) == 2 and len(set(ids[:60])) == 1 and len(set(ids[60:])) == 1

@@ -39,9 +39,7 @@ def write_transforms(folder, count=3, **changes):
     for index in range(count):
         picture(folder / "images" / f"{index}.png", seed=index)
         pose = inverse_se3(look_at(np.array([index, -3.0, 1.0]), np.zeros(3), np.array([0, 0, 1.0])))
-        frames.append(
-            {"file_path": f"images/{index}.png", "transform_matrix": pose @ np.diag([1, -1, -1, 1])}
-        )
+        frames.append({"file_path": f"images/{index}.png", "transform_matrix": pose @ np.diag([1, -1, -1, 1])})
     data = {"w": 60, "h": 40, "fl_x": 50.0, "fl_y": 51.0, "cx": 29.0, "cy": 21.0, "frames": frames, **changes}
     file = folder / "transforms.json"
     file.write_text(json.dumps(data, default=lambda matrix: matrix.tolist()))
@@ -70,9 +68,7 @@ def test_transforms_poses_and_intrinsics_survive(tmp_path, monkeypatch):
     for index, view in enumerate(scene.views):
         expected = look_at(np.array([index, -3.0, 1.0]), np.zeros(3), np.array([0, 0, 1.0]))
         np.testing.assert_allclose(view.camera_from_world, expected, atol=1e-12)
-    assert (
-        scene.report["points_from"] == "random" and scene.report["warnings"]
-    )  # noise photos: nothing matches
+    assert scene.report["points_from"] == "random" and scene.report["warnings"]  # noise photos: nothing matches
     assert len(scene.points) == triangulate.FALLBACK_POINTS and not scene.metric
 
 
@@ -174,9 +170,7 @@ def test_camera_file_against_opencv(tmp_path):
     assert lens == DISTORTED
     ray = np.array([[0.2, -0.1, 1.0]])
     K = np.array([[90, 0, 48.5], [0, 91, 40.5], [0, 0, 1]])
-    expected, _ = cv2.projectPoints(
-        ray, np.zeros(3), np.zeros(3), K, np.array([0.06, -0.05, 0.001, -0.002, 0])
-    )
+    expected, _ = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), K, np.array([0.06, -0.05, 0.001, -0.002, 0]))
     np.testing.assert_allclose(camera_from_lens(lens).img_from_cam(ray)[0], expected[0, 0] + 0.5, atol=1e-9)
 
 
@@ -204,9 +198,7 @@ def test_undistortion_equals_pycolmap(tmp_path):
     view = make_view("a.png", tmp_path / "a.png", DISTORTED, np.eye(4), tmp_path)
     pycolmap = load_pycolmap()
     bitmap = pycolmap.Bitmap.from_array(array)
-    expected, _ = pycolmap.undistort_image(
-        pycolmap.UndistortCameraOptions(), bitmap, camera_from_lens(DISTORTED)
-    )
+    expected, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, camera_from_lens(DISTORTED))
     difference = np.abs(load_photo(view).astype(int) - expected.to_array())
     assert difference.max() <= 8 and difference.mean() < 0.6  # cv2 interpolates on a 1/32 pixel grid
 

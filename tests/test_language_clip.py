@@ -249,17 +249,13 @@ def test_bad_models_are_told_in_one_line(clip_folder: tuple[Path, Any], tmp_path
     with pytest.raises(InputError, match="expected conse"):
         make_encoder("clap")
     hidden = tmp_path / "vision_hidden.onnx"
-    _export(
-        model.vision_model.embeddings, torch.zeros(1, 3, SIDE, SIDE), hidden, ["pixel_values"], ["hidden"]
-    )
+    _export(model.vision_model.embeddings, torch.zeros(1, 3, SIDE, SIDE), hidden, ["pixel_values"], ["hidden"])
     with pytest.raises(InputError, match="no output holds one embedding a row"):
         ClipEncoder(hidden, text).encode_images(_pictures())
 
 
 def test_a_silent_fall_back_from_cuda_is_told() -> None:
-    with pytest.raises(
-        InputError, match="device cuda asked for, onnxruntime runs it on CPUExecutionProvider"
-    ):
+    with pytest.raises(InputError, match="device cuda asked for, onnxruntime runs it on CPUExecutionProvider"):
         check_provider(Path("m.onnx"), ["CPUExecutionProvider"], "cuda", True)
     with pytest.warns(RuntimeWarning, match="running on the CPU"):
         check_provider(Path("m.onnx"), ["CPUExecutionProvider"], "auto", True)

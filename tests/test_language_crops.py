@@ -65,9 +65,7 @@ def test_diversity_picks_the_greedy_optimum() -> None:
 
         done.append(max((v for v in range(8) if v not in done), key=gain))
     assert picked == done
-    assert (
-        choose_views(scores, 3, directions, diversity=0.0)[0].tolist() == np.argsort(-scores[0])[:3].tolist()
-    )
+    assert choose_views(scores, 3, directions, diversity=0.0)[0].tolist() == np.argsort(-scores[0])[:3].tolist()
 
 
 def test_boxes_by_hand() -> None:
@@ -131,10 +129,7 @@ def test_description_is_the_mean_over_crops_whatever_the_order_of_photos() -> No
     found = describe_instances(MeanColor(), choices, load, names, progress=lambda a, b: told.append((a, b)))
     assert loaded == [0, 2, 3]
     assert told == [(1, 3), (2, 3), (3, 3)]
-    rows = [
-        MeanColor().encode_images(crop_levels(photos[v], ids[v] == 0, 3, 0.3)).astype(np.float64)
-        for v in (2, 0)
-    ]
+    rows = [MeanColor().encode_images(crop_levels(photos[v], ids[v] == 0, 3, 0.3)).astype(np.float64) for v in (2, 0)]
     mean = np.mean(list(itertools.chain(*rows)), axis=0)
     assert np.allclose(found[0].embedding, mean / np.linalg.norm(mean), atol=1e-6)
     assert found[0].views == ["2.jpg", "0.jpg"] and found[0].boxes == [(8, 5, 30, 20)] * 2

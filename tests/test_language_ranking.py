@@ -178,11 +178,7 @@ def test_shares_follow_the_painted_fraction() -> None:
     red, white = [200, 25, 30], [250, 250, 250]
     mixed = np.stack([palette(np.array([red] * n + [white] * (10 - n), np.uint8)) for n in (0, 3, 10)])
     share = color_share(mixed, "red")
-    assert (
-        share[0] < 0.02
-        and share[1] == pytest.approx(0.3, abs=0.02)
-        and share[2] == pytest.approx(1, abs=0.01)
-    )
+    assert share[0] < 0.02 and share[1] == pytest.approx(0.3, abs=0.02) and share[2] == pytest.approx(1, abs=0.01)
     assert np.argmax(color_match(mixed, ["red", "white"])) == 1
     assert np.argmax(color_match(mixed, ["white"])) == 0
 

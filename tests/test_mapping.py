@@ -1,4 +1,4 @@
-"""The whole pipeline on a small scene with exact truth: what it writes, what it finds, how it resumes, how it refuses."""
+"""The whole pipeline on a small scene with exact truth: what it writes, finds, resumes and refuses."""
 
 from __future__ import annotations
 
@@ -48,7 +48,9 @@ def test_the_map_holds_what_the_contract_says(finished: Path) -> None:
     assert info["num_gaussians"] == len(gmap) <= 6000
     assert info["num_instances"] == len(instances) > 3
     assert set(instances[0]) >= {"id", "label", "score", "num_gaussians", "centroid", "obb", "aabb"}
-    assert [entry["num_gaussians"] for entry in instances] == np.bincount(gmap.instance_ids[gmap.instance_ids >= 0]).tolist()
+    assert [entry["num_gaussians"] for entry in instances] == np.bincount(
+        gmap.instance_ids[gmap.instance_ids >= 0]
+    ).tolist()
     assert all(0 <= entry["score"] <= 1 for entry in instances)
     assert {"poses", "masks", "train", "instances", "total"} <= set(info["seconds"])
     assert len(info["quality"]["views"]) == 2 and info["config"]["train"]["budget"] == 6000
@@ -92,7 +94,9 @@ def test_render_writes_every_kind(finished: Path, small_scene: Path, tmp_path: P
     assert depth.dtype == np.uint16 and 300 < np.median(depth[depth > 0]) < 3000  # metres in thousandths
 
 
-def test_the_same_seed_gives_the_same_map_whatever_the_threads(finished: Path, small_scene: Path, tmp_path: Path) -> None:
+def test_the_same_seed_gives_the_same_map_whatever_the_threads(
+    finished: Path, small_scene: Path, tmp_path: Path
+) -> None:
     import torch
 
     before = torch.get_num_threads()
@@ -155,7 +159,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     _spoil(change, scene, out)
     if change == "missing":
         source = tmp_path / "nowhere"
-    code = main(["map", str(source), "-o", str(out), "--masks", f"labels:{scene / 'labels'}", *[f"--set={s}" for s in SETTINGS]])
+    code = main(
+        ["map", str(source), "-o", str(out), "--masks", f"labels:{scene / 'labels'}", *[f"--set={s}" for s in SETTINGS]]
+    )
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
     assert code == 2 and len(lines) == 1 and told in lines[0]
     assert change == "exists" or not out.exists()
@@ -180,12 +186,18 @@ def _spoil(change: str, scene: Path, out: Path) -> None:
         photo.write_bytes(photo.read_bytes()[:900])
 
 
-def test_a_map_of_another_version_is_refused(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_map_of_another_version_is_refused(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     other = tmp_path / "other.gsmap"
     shutil.copytree(finished, other)
     info = json.loads((other / "map.json").read_text())
     (other / "map.json").write_text(json.dumps({**info, "format_version": 99}))
-    for command in (["info", str(other)], ["query", str(other), "mug"], ["export", str(other), "-o", str(tmp_path / "x.ply")]):
+    for command in (
+        ["info", str(other)],
+        ["query", str(other), "mug"],
+        ["export", str(other), "-o", str(tmp_path / "x.ply")],
+    ):
         assert main(command) == 2
         assert "format_version is 99" in capsys.readouterr().err
     assert main(["info", str(finished), "--json"]) == 0

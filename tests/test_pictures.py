@@ -11,9 +11,7 @@ from perception import pictures
 
 def test_palette_is_stable_separated_and_grey_for_none() -> None:
     colors = pictures.instance_palette(24)
-    np.testing.assert_array_equal(
-        pictures.instance_palette([7, -1, 3]), [colors[7], pictures.GREY, colors[3]]
-    )
+    np.testing.assert_array_equal(pictures.instance_palette([7, -1, 3]), [colors[7], pictures.GREY, colors[3]])
     lab = rgb2lab(np.concatenate([colors, pictures.GREY[None]])[None] / 255.0)[0]
     distance = deltaE_ciede2000(lab[:, None], lab[None])[np.triu_indices(25, 1)]
     assert distance.min() > 5  # told apart side by side; 2.3 is about the least difference seen

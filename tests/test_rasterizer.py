@@ -44,8 +44,7 @@ def scene(n=60, width=37, height=29, dims=5, cameras=2, sh_degree=None, dtype=to
 def leaves(inputs, skip=("Ks",)):
     """The same scene with every differentiable input a leaf of its own."""
     return {
-        k: v.clone().requires_grad_() if isinstance(v, torch.Tensor) and k not in skip else v
-        for k, v in inputs.items()
+        k: v.clone().requires_grad_() if isinstance(v, torch.Tensor) and k not in skip else v for k, v in inputs.items()
     }
 
 
@@ -76,9 +75,7 @@ def test_double_build_equals_the_naive_rasterizer(simd, dims, sh_degree):
     for name, t in ours_in.items():
         if isinstance(t, torch.Tensor) and t.requires_grad:
             expected = theirs_in[name].grad
-            torch.testing.assert_close(
-                t.grad, expected, rtol=1e-8, atol=1e-9 * float(expected.abs().max()), msg=name
-            )
+            torch.testing.assert_close(t.grad, expected, rtol=1e-8, atol=1e-9 * float(expected.abs().max()), msg=name)
 
 
 @pytest.mark.parametrize("sh_degree", [None, 0, 1, 2, 3])
@@ -153,10 +150,7 @@ def test_float_build_follows_the_double_build():
         # Flips at the 1/255 threshold are the outliers; everything else is rounding.
         assert float(error.mean()) < 1e-3, name
         assert (
-            float(
-                error.quantile(0.95) if error.numel() < 1e6 else error.kthvalue(int(0.95 * error.numel()))[0]
-            )
-            < 1e-4
+            float(error.quantile(0.95) if error.numel() < 1e6 else error.kthvalue(int(0.95 * error.numel()))[0]) < 1e-4
         ), name
         assert float((error > 0.1).double().mean()) < 2e-3, name
 

@@ -151,15 +151,11 @@ def test_tiny_features_keep_their_digits():
     expected = perception.rasterize(**cast(inputs, torch.float32))
     out = perception.rasterize(**cast({**inputs, "features": inputs["features"] * 2.0**-30}, torch.float32))
     assert torch.equal(out.features * 2.0**30, expected.features)
-    torch.testing.assert_close(
-        out.feature_variance * 2.0**60, expected.feature_variance, rtol=1e-5, atol=1e-7
-    )
+    torch.testing.assert_close(out.feature_variance * 2.0**60, expected.feature_variance, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-@pytest.mark.parametrize(
-    "name", ["means", "quats", "scales", "opacities", "colors", "features", "viewmats", "Ks"]
-)
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "colors", "features", "viewmats", "Ks"])
 def test_non_finite_input_is_named(name, value):
     inputs = scene(n=500, cameras=1)
     inputs[name].view(-1)[inputs[name].numel() // 2] = value

@@ -86,11 +86,7 @@ def test_what_is_right_and_what_is_wrong(tmp_path: Path) -> None:
 
 def test_nothing_but_a_title_is_a_page(tmp_path: Path) -> None:
     tree = _tree(write_report(tmp_path / "r.html", ReportData("only")))
-    assert (
-        not list(tree.iter("h2"))
-        and not list(tree.iter("img"))
-        and tree.find("body/main/header/h1") is not None
-    )
+    assert not list(tree.iter("h2")) and not list(tree.iter("img")) and tree.find("body/main/header/h1") is not None
 
 
 def test_many_large_pictures_stay_under_the_limit(tmp_path: Path) -> None:

@@ -37,9 +37,7 @@ def imports_of(path: Path) -> set[str]:
             parts = node.module.split(".")
             found |= {parts[1]} if len(parts) > 1 else {alias.name for alias in node.names}
         elif isinstance(node, ast.Import):
-            found |= {
-                alias.name.split(".")[1] for alias in node.names if alias.name.startswith("perception.")
-            }
+            found |= {alias.name.split(".")[1] for alias in node.names if alias.name.startswith("perception.")}
     return found - {"__version__", "InputError"}
 
 

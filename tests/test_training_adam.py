@@ -119,16 +119,12 @@ def test_keep_and_append_carry_the_state():
     assert len(ours) == 6 and all(p.requires_grad and p.is_leaf for p in ours.params.values())
     more = tensors(30, seed=2)
     long.step(None, more)
-    ours.step(
-        None, {n: torch.cat([g[order], torch.ones(2, *SHAPES[n], dtype=g.dtype)]) for n, g in more.items()}
-    )
+    ours.step(None, {n: torch.cat([g[order], torch.ones(2, *SHAPES[n], dtype=g.dtype)]) for n, g in more.items()})
     for name, param in ours.params.items():
         assert torch.equal(param[:4], long.params[name][order])
     # Zero state at global step 2, unit gradient: m = .1 / (1 − .9²), v = .001 / (1 − .999²).
     moved = tensors(2, seed=8)["means"] - ours.params["means"][4:].detach()
-    assert torch.allclose(
-        moved, torch.full_like(moved, 1.6e-4 * (0.1 / 0.19) / (0.001 / (1 - 0.999**2)) ** 0.5)
-    )
+    assert torch.allclose(moved, torch.full_like(moved, 1.6e-4 * (0.1 / 0.19) / (0.001 / (1 - 0.999**2)) ** 0.5))
 
 
 def test_resume_goes_on_with_the_same_bits():

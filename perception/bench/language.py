@@ -68,9 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     --json.
     """
     parser = argparse.ArgumentParser(prog="perception bench language", description=__doc__)
-    parser.add_argument(
-        "scenes", nargs="+", help="folders with scene.json, transforms.json, masks_gt, gt_points.ply"
-    )
+    parser.add_argument("scenes", nargs="+", help="folders with scene.json, transforms.json, masks_gt, gt_points.ply")
     parser.add_argument("--encoder", default="conse")
     parser.add_argument("--background", default="plain", choices=["plain", "dim", "blur", "fill"])
     parser.add_argument("--views", type=int, default=5)
@@ -107,22 +105,17 @@ def measure_scene(folder: str, options: argparse.Namespace) -> dict[str, Any]:
     return report | {"seconds": round(time.perf_counter() - start, 1)}
 
 
-def score_queries(
-    scene: TruthScene, descriptions: list[InstanceDescription], encoder: Encoder
-) -> dict[str, Any]:
+def score_queries(scene: TruthScene, descriptions: list[InstanceDescription], encoder: Encoder) -> dict[str, Any]:
     """Accuracy over the scene's prompts and false positives over ABSENT at the default threshold."""
     queries = scene.queries()
     ranker = Ranker(descriptions, encoder)
     answers = [ranker.rank(text) for text, _ in queries]
     top1, top3 = _accuracy([[i for i, _ in a.hits] for a in answers], [q for _, q in queries])
     blind = [
-        InstanceDescription(d.embedding, d.per_view, np.zeros_like(d.palette), d.views, d.boxes)
-        for d in descriptions
+        InstanceDescription(d.embedding, d.per_view, np.zeros_like(d.palette), d.views, d.boxes) for d in descriptions
     ]
     grey = Ranker(blind, encoder)
-    blind1, blind3 = _accuracy(
-        [[i for i, _ in grey.rank(t).hits] for t, _ in queries], [q for _, q in queries]
-    )
+    blind1, blind3 = _accuracy([[i for i, _ in grey.rank(t).hits] for t, _ in queries], [q for _, q in queries])
     said = [
         a.present and any(i in right for i, s in a.hits[:3] if s >= PRESENT)
         for a, (_, right) in zip(answers, queries, strict=True)
@@ -186,9 +179,7 @@ def _chance(sizes: list[int], count: int) -> tuple[float, float]:
     def hit(m: int, k: int) -> float:
         return 1.0 - float(np.prod([(count - m - j) / (count - j) for j in range(min(k, count))]).clip(0))
 
-    return round(float(np.mean([hit(m, 1) for m in sizes])), 3), round(
-        float(np.mean([hit(m, 3) for m in sizes])), 3
-    )
+    return round(float(np.mean([hit(m, 1) for m in sizes])), 3), round(float(np.mean([hit(m, 3) for m in sizes])), 3)
 
 
 if __name__ == "__main__":

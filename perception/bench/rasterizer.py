@@ -48,9 +48,7 @@ def synthetic_scene(n: int = 50_000, width: int = 640, height: int = 480) -> dic
     import torch
 
     g = torch.Generator().manual_seed(0)
-    means = (torch.rand((n, 3), generator=g) - 0.5) * torch.tensor([8.0, 6.0, 6.0]) + torch.tensor(
-        [0.0, 0.0, 5.0]
-    )
+    means = (torch.rand((n, 3), generator=g) - 0.5) * torch.tensor([8.0, 6.0, 6.0]) + torch.tensor([0.0, 0.0, 5.0])
     return {
         "means": means,
         "quats": torch.randn((n, 4), generator=g),
@@ -73,9 +71,7 @@ def load_scene(path: Path) -> dict[str, Any]:
     try:
         data = np.load(path)
         scene: dict[str, Any] = {k: torch.from_numpy(data[k].astype(np.float32)) for k in SPLAT_KEYS}
-        scene["viewmats"], scene["Ks"] = (
-            torch.from_numpy(data[k].astype(np.float32))[None] for k in ("viewmat", "K")
-        )
+        scene["viewmats"], scene["Ks"] = (torch.from_numpy(data[k].astype(np.float32))[None] for k in ("viewmat", "K"))
         scene["width"], scene["height"] = int(data["width"]), int(data["height"])
     except (OSError, KeyError, ValueError) as error:
         raise InputError(
@@ -190,9 +186,7 @@ def table(report: dict[str, Any]) -> str:
 def main(argv: list[str] | None = None) -> int:
     """Command line; prints the table and writes the JSON where asked."""
     parser = argparse.ArgumentParser(prog="perception.bench.rasterizer", description=__doc__)
-    parser.add_argument(
-        "scenes", nargs="*", type=Path, help="splats .npz files; a synthetic scene when absent"
-    )
+    parser.add_argument("scenes", nargs="*", type=Path, help="splats .npz files; a synthetic scene when absent")
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--json", type=Path)

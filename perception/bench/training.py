@@ -40,9 +40,7 @@ def _torch_photometric(x: Any, y: Any, beta: float) -> Any:
     row = (taps / taps.sum())[None, None, None].expand(15, 1, 1, 11)
     a, b = x.permute(2, 0, 1), y.permute(2, 0, 1)
     maps = torch.cat([a, b, a * a, b * b, a * b])[None]
-    maps = conv2d(
-        conv2d(maps, row, padding=(0, 5), groups=15), row.transpose(2, 3), padding=(5, 0), groups=15
-    )
+    maps = conv2d(conv2d(maps, row, padding=(0, 5), groups=15), row.transpose(2, 3), padding=(5, 0), groups=15)
     mx, my, xx, yy, xy = maps[0].split(3)
     c1, c2 = 0.01**2, 0.03**2
     ssim = (2 * mx * my + c1) * (2 * (xy - mx * my) + c2)
@@ -111,9 +109,7 @@ def instance_case(height: int, width: int, depth: int, count: int) -> Contenders
     assigned = assign_labels(image)
     return {
         "compiled": lambda: torch.autograd.grad(instance_loss(features, image).value, features),
-        "compiled, labels kept": lambda: torch.autograd.grad(
-            instance_loss(features, assigned).value, features
-        ),
+        "compiled, labels kept": lambda: torch.autograd.grad(instance_loss(features, assigned).value, features),
         "torch index_add": lambda: torch.autograd.grad(_torch_instance(features, flat, count), features),
     }
 

@@ -38,10 +38,7 @@ class TruthScene:
     def queries(self) -> list[tuple[str, set[int]]]:
         """Prompts that some visible instance answers, with the positions in `ids` of all that do."""
         position = {int(i): n for n, i in enumerate(self.ids)}
-        found = [
-            (q["text"], {position[i] for i in q["instance_ids"] if i in position})
-            for q in self.about["queries"]
-        ]
+        found = [(q["text"], {position[i] for i in q["instance_ids"] if i in position}) for q in self.about["queries"]]
         return [(text, answers) for text, answers in found if answers]
 
 

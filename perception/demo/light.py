@@ -131,12 +131,8 @@ def bake(around: list[Caster], part: Part, rng: np.random.Generator, samples: in
     start = points + 1e-3 * normals
     light = _lamp(around, start, normals, rng, samples) + _sky(around, start, normals, rng, samples)
     light = light.reshape(rows, columns, 3).astype(np.float32)
-    wide = np.concatenate(
-        [light[:, -4:], light, light[:, :4]], 1
-    )  # the chart of a round thing closes on itself
-    wide = cv2.GaussianBlur(
-        wide if wide.shape[1] > 12 else light, (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE
-    )
+    wide = np.concatenate([light[:, -4:], light, light[:, :4]], 1)  # the chart of a round thing closes on itself
+    wide = cv2.GaussianBlur(wide if wide.shape[1] > 12 else light, (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
     light = wide[:, 4:-4] if wide.shape[1] > columns else wide
     height, width = part.paint.shape[:2]
     light = cv2.resize(light, (width, height), interpolation=cv2.INTER_LINEAR)

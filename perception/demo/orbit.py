@@ -41,9 +41,7 @@ def orbit(views: int, width: int, height: int) -> list[Camera]:
         angles = np.radians(np.linspace(-swing, swing, count) if count > 1 else np.zeros(count))
         for i, angle in enumerate(angles[:: -1 if k % 2 else 1]):
             sway = 0.03 * np.sin(2.1 * i + k)  # nobody's hand draws a perfect circle
-            eye = np.array(
-                [(radius + sway) * np.sin(angle), -(radius + sway) * np.cos(angle), lift + 0.6 * sway]
-            )
+            eye = np.array([(radius + sway) * np.sin(angle), -(radius + sway) * np.cos(angle), lift + 0.6 * sway])
             target = np.array(aim) + np.array([0.12 * np.sin(angle) * (k == 2), 0, 0.4 * sway])
             cameras.append(Camera(intrinsics(width, height), look_at(eye, target), width, height))
     return cameras[:views]

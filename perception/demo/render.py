@@ -129,14 +129,10 @@ def _sample(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     square."""
     side = int(np.ceil(np.sqrt(len(x))))
     map_x, map_y = (np.pad(a, (0, side * side - len(a))).reshape(side, side) for a in (x, y))
-    return cv2.remap(picture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).reshape(-1, 3)[
-        : len(x)
-    ]
+    return cv2.remap(picture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).reshape(-1, 3)[: len(x)]
 
 
-def _add_highlight(
-    part: Part, sampled: np.ndarray, u: np.ndarray, v: np.ndarray, eye: np.ndarray
-) -> np.ndarray:
+def _add_highlight(part: Part, sampled: np.ndarray, u: np.ndarray, v: np.ndarray, eye: np.ndarray) -> np.ndarray:
     """Blinn-Phong gleam of the lamp, only where the baked light says that the lamp is seen."""
     points, normals = part.shape.point_normal(u, v)
     points, normals = to_world(part.shape, points), normals @ part.shape.rotation.T

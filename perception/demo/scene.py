@@ -42,9 +42,7 @@ def make_photos(
     top.
     """
     if views < 3 or width < 64 or height < 48:
-        raise InputError(
-            f"demo photos: {views} views of {width}x{height} asked; at least 3 views of 64x48 are needed"
-        )
+        raise InputError(f"demo photos: {views} views of {width}x{height} asked; at least 3 views of 64x48 are needed")
     folder = Path(folder)
     truth_folder = folder.parent / "truth"
     folder.mkdir(parents=True, exist_ok=True)
@@ -59,9 +57,7 @@ def make_photos(
         cv2.imwrite(str(truth_folder / "labels" / f"{i:03d}.png"), picture.ids)
         return picture
 
-    with ThreadPoolExecutor(
-        tabletop.WORKERS
-    ) as pool:  # numpy and OpenCV let go of the interpreter lock in their loops
+    with ThreadPoolExecutor(tabletop.WORKERS) as pool:  # numpy and OpenCV let go of the interpreter lock in their loops
         pictures = list(pool.map(shoot, range(views)))
     points, normals, colors, ids = _surface(bodies, np.random.default_rng((seed, views)))
     seen = _times_seen(points, normals, ids, cameras, pictures) >= 2
@@ -105,9 +101,7 @@ def _surface(bodies: list[Body], rng: np.random.Generator) -> tuple[np.ndarray, 
             v = np.arccos(1 - 2 * v) / np.pi  # even over a ball
         p, n = part.shape.point_normal(u, v)
         rows, across = part.lit.shape[:2]
-        color = part.lit[
-            np.minimum(v * rows, rows - 1).astype(int), np.minimum(u * across, across - 1).astype(int)
-        ]
+        color = part.lit[np.minimum(v * rows, rows - 1).astype(int), np.minimum(u * across, across - 1).astype(int)]
         for column, value in zip(
             columns,
             (to_world(part.shape, p), n @ part.shape.rotation.T, color, np.full(count, body.id)),

@@ -71,9 +71,7 @@ def _room(rng: np.random.Generator) -> list[Body]:
     width, depth = TABLE
     top = tex.wood(rng, 900, 1270, 6, "#c9925a", "#7d4a24")
     edge = tex.wood(rng, 48, 1270, 1, "#b37d49", "#6f4120")
-    plank = things.box_parts(
-        np.array([0, 0, -0.02]), (width, depth, 0.04), np.eye(3), [top, edge, edge], (6, 48)
-    )
+    plank = things.box_parts(np.array([0, 0, -0.02]), (width, depth, 0.04), np.eye(3), [top, edge, edge], (6, 48))
     plank[0].light_texels = (120, 168)
     for part in plank[1:]:
         part.casts = False
@@ -81,9 +79,7 @@ def _room(rng: np.random.Generator) -> list[Body]:
     for x in (-1, 1):
         for y in (-1, 1):
             center = np.array([x * (width / 2 - 0.06), y * (depth / 2 - 0.06), (FLOOR - 0.04) / 2])
-            plank += things.box_parts(
-                center, (0.055, 0.055, -FLOOR - 0.04), np.eye(3), [leg], (12, 4), casts=False
-            )
+            plank += things.box_parts(center, (0.055, 0.055, -FLOOR - 0.04), np.eye(3), [leg], (12, 4), casts=False)
     paper = tex.wallpaper(rng, 900, 1550, "#b9cdc4", ["#9db8ac", "#86a699", "#d3dfd8", "#c7a86b", "#7b978f"])
     other = tex.wallpaper(rng, 900, 1100, "#cfc3ae", ["#b7a88d", "#a3957a", "#e0d7c6", "#8a9a86", "#b98a5e"])
     tall, middle = 2.0, FLOOR + 1.0
@@ -93,9 +89,7 @@ def _room(rng: np.random.Generator) -> list[Body]:
         _wall([0, -1, 0], [-1, 0, 0], [SIDE, WALL - 1.2, middle], 2.4, tall, other[:, ::-1].copy(), (40, 48)),
     ]
     boards = tex.wood(rng, 1100, 1400, 11, "#9c7a56", "#5b4027")
-    floor = Part(
-        Sheet(2 * SIDE, 2.4, spin(0), np.array([0, WALL - 1.2, FLOOR])), boards, 0.0, (40, 48), casts=False
-    )
+    floor = Part(Sheet(2 * SIDE, 2.4, spin(0), np.array([0, WALL - 1.2, FLOOR])), boards, 0.0, (40, 48), casts=False)
     return [
         Body(11, "table", ["table", "wooden table"], plank, is_stuff=True),
         Body(12, "wall", ["wall", "wallpaper"], walls, is_stuff=True),
@@ -105,9 +99,7 @@ def _room(rng: np.random.Generator) -> list[Body]:
 
 
 def _wall(along, normal, center, width, height, paint, texels) -> Part:  # type: ignore[no-untyped-def]
-    return Part(
-        Sheet(width, height, rotation_from_axes(along, normal), np.array(center)), paint, 0.0, texels, False
-    )
+    return Part(Sheet(width, height, rotation_from_axes(along, normal), np.array(center)), paint, 0.0, texels, False)
 
 
 def _posters(rng: np.random.Generator) -> list[Body]:

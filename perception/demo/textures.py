@@ -64,9 +64,7 @@ def wood(rng: np.random.Generator, height: int, width: int, planks: int, light: 
     return np.clip(np.concatenate(rows), 0, 1)
 
 
-def _plank(
-    rng: np.random.Generator, height: int, width: int, light: np.ndarray, dark: np.ndarray
-) -> np.ndarray:
+def _plank(rng: np.random.Generator, height: int, width: int, light: np.ndarray, dark: np.ndarray) -> np.ndarray:
     y, x = np.mgrid[0:height, 0:width].astype(np.float32)
     warp = noise(rng, height, width, (2, 4), 3) * height * 0.05
     for _ in range(int(rng.integers(1, 4))):  # knots bend the grain around them
@@ -88,18 +86,14 @@ def directions(height: int, width: int) -> np.ndarray:
     lat = (np.arange(height) + 0.5) / height * np.pi
     lon = (np.arange(width) + 0.5) / width * 2 * np.pi
     sin = np.sin(lat)[:, None]
-    return np.stack(
-        [sin * np.cos(lon), sin * np.sin(lon), np.broadcast_to(np.cos(lat)[:, None], (height, width))], -1
-    )
+    return np.stack([sin * np.cos(lon), sin * np.sin(lon), np.broadcast_to(np.cos(lat)[:, None], (height, width))], -1)
 
 
 def basketball(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
     """Orange pebbled leather with the black ribs of a basketball."""
     x, y, z = np.moveaxis(directions(height, width), -1, 0)
     pebbles = noise(rng, height, width, (height / 5, width / 5), 1)
-    skin = blend(
-        0.5 + 0.22 * pebbles + 0.16 * noise(rng, height, width, (6, 12), 4), rgb("#d9681d"), rgb("#a8430c")
-    )
+    skin = blend(0.5 + 0.22 * pebbles + 0.16 * noise(rng, height, width, (6, 12), 4), rgb("#d9681d"), rgb("#a8430c"))
     bow = np.abs(np.arccos(np.clip(np.abs(y), 0, 1)) - 0.85 + 0.12 * x * x)
     rib = np.minimum(np.minimum(np.abs(x), np.abs(z)), bow)
     return blend(1.6 - rib / 0.022, skin, rgb("#17120f"))
@@ -128,16 +122,12 @@ def soccer_ball(rng: np.random.Generator, height: int, width: int) -> np.ndarray
     best = np.partition(score, -2, axis=-1)
     seam = (best[..., -1] - best[..., -2]) < 0.004
     grime = 0.10 * noise(rng, height, width, (8, 16), 5)[..., None]
-    ball = np.where(
-        (face < 12)[..., None], rgb("#16181c") + 0.3 * np.abs(grime), rgb("#eeece6") - np.abs(grime)
-    )
+    ball = np.where((face < 12)[..., None], rgb("#16181c") + 0.3 * np.abs(grime), rgb("#eeece6") - np.abs(grime))
     ball[seam] = rgb("#6d6a66")
     return np.clip(ball, 0, 1).astype(np.float32)
 
 
-def peel(
-    rng: np.random.Generator, height: int, width: int, light: str, dark: str, pores: float = 4
-) -> np.ndarray:
+def peel(rng: np.random.Generator, height: int, width: int, light: str, dark: str, pores: float = 4) -> np.ndarray:
     """The skin of a fruit: pores and blotches, darker at the two poles."""
     dots = noise(rng, height, width, (height / pores, width / pores), 1)
     skin = blend(0.35 + 0.16 * dots + 0.22 * noise(rng, height, width, (4, 8), 4), rgb(light), rgb(dark))
@@ -146,20 +136,14 @@ def peel(
     return blend(0.9 * pole, skin, rgb("#4c5a1e"))
 
 
-def glaze(
-    rng: np.random.Generator, height: int, width: int, color: str, specks: list[str], count: int
-) -> np.ndarray:
+def glaze(rng: np.random.Generator, height: int, width: int, color: str, specks: list[str], count: int) -> np.ndarray:
     """Fired ceramic: one colour with clouds and specks."""
     base = np.broadcast_to(rgb(color), (height, width, 3))
-    cloud = 0.055 * noise(rng, height, width, (4, 8), 5)[..., None] + 0.02 * rng.standard_normal(
-        (height, width, 1)
-    )
+    cloud = 0.055 * noise(rng, height, width, (4, 8), 5)[..., None] + 0.02 * rng.standard_normal((height, width, 1))
     return np.clip(speckle(rng, base * (1 + cloud), count, (1, 2), specks), 0, 1).astype(np.float32)
 
 
-def draw_text(
-    picture: np.ndarray, text: str, center: tuple[float, float], size: int, color: str
-) -> np.ndarray:
+def draw_text(picture: np.ndarray, text: str, center: tuple[float, float], size: int, color: str) -> np.ndarray:
     """Text written on a copy of the picture, centred at (x, y) pixels, `size` pixels high."""
     image = Image.fromarray((np.clip(picture, 0, 1) * 255).astype(np.uint8))
     font = ImageFont.load_default(size=size)
@@ -167,9 +151,7 @@ def draw_text(
     return np.asarray(image, np.float32) / 255
 
 
-def wallpaper(
-    rng: np.random.Generator, height: int, width: int, ground: str, leaves: list[str]
-) -> np.ndarray:
+def wallpaper(rng: np.random.Generator, height: int, width: int, ground: str, leaves: list[str]) -> np.ndarray:
     """Plaster-toned paper with scattered leaves, no two alike, so that no feature is mistaken for another."""
     paper = np.broadcast_to(rgb(ground), (height, width, 3)) * (
         1 + 0.035 * noise(rng, height, width, (height / 40, width / 40), 5)[..., None]
@@ -204,9 +186,7 @@ def landscape(
     border = max(4, width // 24)
     art[:border] = art[-3 * border :] = rgb("#f4efe2")
     art[:, :border] = art[:, -border:] = rgb("#f4efe2")
-    return draw_text(
-        np.clip(art, 0, 1), title, (width / 2, height - 1.5 * border), int(1.9 * border), "#22303c"
-    )
+    return draw_text(np.clip(art, 0, 1), title, (width / 2, height - 1.5 * border), int(1.9 * border), "#22303c")
 
 
 def mosaic(rng: np.random.Generator, height: int, width: int, colors: list[str]) -> np.ndarray:

@@ -29,9 +29,7 @@ def mug(rng: np.random.Generator, id: int, name: str, place: Place, turn: float,
         np.stack([outward, up, np.cross(outward, up)], 1), _at(place, 0.05) + 0.0455 * outward,
     )  # fmt: skip
     grip = np.ascontiguousarray(paint[110:150, :60])
-    return Body(
-        id, name, [name, "coffee mug"], [Part(cup, paint, 0.5, (40, 48)), Part(handle, grip, 0.5, (12, 32))]
-    )
+    return Body(id, name, [name, "coffee mug"], [Part(cup, paint, 0.5, (40, 48)), Part(handle, grip, 0.5, (12, 32))])
 
 
 def mug_paint(rng: np.random.Generator, color: str, ink: str, hearts: bool) -> np.ndarray:
@@ -155,9 +153,7 @@ def book(rng: np.random.Generator, id: int, name: str, place: Place, turn: float
     spine = tex.glaze(rng, 100, 560, "#0d4f4a", ["#1c8a78"], 200)
     spine = tex.draw_text(spine, "BIRDS OF THE NORTH", (280, 50), 38, "#f2d98a")
     lines = tex.noise(rng, 100, 560, (50, 3), 2)
-    pages = tex.blend(
-        0.35 + 0.25 * lines, tex.rgb("#f1e8d2") * np.ones((100, 560, 3), np.float32), tex.rgb("#a8946a")
-    )
+    pages = tex.blend(0.35 + 0.25 * lines, tex.rgb("#f1e8d2") * np.ones((100, 560, 3), np.float32), tex.rgb("#a8946a"))
     for edge in (slice(0, 8), slice(-8, None)):
         pages[edge] = tex.rgb("#0a3330")
     parts = box_parts(
@@ -202,9 +198,7 @@ def _ribs(rng: np.random.Generator, height: int, width: int, count: int) -> np.n
     """Cactus skin: light ridges set with pale spines, dark valleys."""
     u = (np.arange(width) + 0.5) / width * count
     ridge = (0.5 + 0.5 * np.cos(2 * np.pi * u))[None] * np.ones((height, 1))
-    skin = tex.blend(
-        ridge + 0.12 * tex.noise(rng, height, width, (8, 8), 4), tex.rgb("#1f4a26"), tex.rgb("#5f9a4a")
-    )
+    skin = tex.blend(ridge + 0.12 * tex.noise(rng, height, width, (8, 8), 4), tex.rgb("#1f4a26"), tex.rgb("#5f9a4a"))
     rows = np.arange(6, height - 4, 13)
     for k in range(count):
         for y in rows + int(rng.integers(0, 7)):
@@ -218,9 +212,7 @@ def clock(rng: np.random.Generator, id: int, name: str, center: np.ndarray) -> B
     import cv2
 
     facing = rotation_from_axes([1, 0, 0], [0, -1, 0])
-    case = Lathe(
-        np.array([(0.132, 0.0), (0.135, 0.02), (0.128, 0.03), (0.120, 0.029), (0.117, 0.018)]), facing, center
-    )
+    case = Lathe(np.array([(0.132, 0.0), (0.135, 0.02), (0.128, 0.03), (0.120, 0.029), (0.117, 0.018)]), facing, center)
     dial = tex.glaze(rng, 480, 480, "#f3f1ea", ["#dedacd", "#c8c4b8"], 120)
     for i in range(60):
         a = np.radians(6 * i)

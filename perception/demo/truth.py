@@ -69,9 +69,7 @@ class DemoTruth:
             "queries": [{"text": text, "instance_ids": ids} for text, ids in self.queries],
         }
         (self.folder / "scene.json").write_text(json.dumps(scene, indent=1))
-        (self.folder / "transforms.json").write_text(
-            json.dumps(_transforms(self.names, self.cameras), indent=1)
-        )
+        (self.folder / "transforms.json").write_text(json.dumps(_transforms(self.names, self.cameras), indent=1))
         _write_points(self.folder / "gt_points.ply", self)
 
 

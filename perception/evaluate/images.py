@@ -39,9 +39,7 @@ def ssim(prediction: np.ndarray, truth: np.ndarray, padding: str = "valid") -> f
     """
     x, y = (np.asarray(image, np.float64) for image in (prediction, truth))
     if min(x.shape[:2]) < _WINDOW:
-        raise InputError(
-            f"pictures are {x.shape[1]}x{x.shape[0]} pixels; SSIM needs at least {_WINDOW} a side"
-        )
+        raise InputError(f"pictures are {x.shape[1]}x{x.shape[0]} pixels; SSIM needs at least {_WINDOW} a side")
     border = {"valid": cv2.BORDER_REFLECT, "same": cv2.BORDER_CONSTANT}[padding]
     taps = cv2.getGaussianKernel(_WINDOW, _SIGMA, cv2.CV_64F)
 
@@ -76,9 +74,7 @@ def pictures(folder: str | Path) -> dict[str, Path]:
     for path in sorted(p for p in folder.rglob("*") if p.suffix.lower() in _SUFFIXES):
         stem = path.relative_to(folder).with_suffix("").as_posix()
         if stem in found:
-            raise InputError(
-                f"{folder}: two pictures share the stem '{stem}' ({found[stem].name}, {path.name})"
-            )
+            raise InputError(f"{folder}: two pictures share the stem '{stem}' ({found[stem].name}, {path.name})")
         found[stem] = path
     return found
 

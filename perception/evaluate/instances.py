@@ -101,9 +101,7 @@ def evaluate(
         values, index = np.unique(pred_ids, return_inverse=True)
         modes = mode_by_group(index, np.asarray(pred_semantics)[keep], len(values))
         classes = dict(zip(values.tolist(), modes.tolist(), strict=True))
-    scores = (
-        None if rules.constant_score or pred_scores is None else {int(k): v for k, v in pred_scores.items()}
-    )
+    scores = None if rules.constant_score or pred_scores is None else {int(k): v for k, v in pred_scores.items()}
     return evaluate_overlaps([overlap_of_ids(pred_ids, scores, truth, classes)], rules)
 
 
@@ -122,9 +120,7 @@ def evaluate_masks(
     order.
     """
     rules = get_protocol(protocol, **changes)
-    return evaluate_overlaps(
-        [mask_overlap(rules, masks, scores, gt_ids, classes, gt_semantics, ignore)], rules
-    )
+    return evaluate_overlaps([mask_overlap(rules, masks, scores, gt_ids, classes, gt_semantics, ignore)], rules)
 
 
 def mask_overlap(
@@ -139,9 +135,7 @@ def mask_overlap(
     """Overlap of one scene's masks (each bool [N]) with its truth under a protocol; see evaluate_masks."""
     for i, mask in enumerate(masks):
         if len(mask) != len(gt_ids):
-            raise InputError(
-                f"prediction mask {i} has {len(mask)} points, truth has {len(gt_ids)}; they must agree"
-            )
+            raise InputError(f"prediction mask {i} has {len(mask)} points, truth has {len(gt_ids)}; they must agree")
     keep, truth = _truth(rules, np.asarray(gt_ids), gt_semantics, ignore)
     kept = [np.asarray(mask, bool)[keep] for mask in masks]
     if rules.by_class and classes is None:
@@ -192,14 +186,9 @@ def evaluate_overlaps(scenes: Sequence[Overlap], rules: Protocol) -> dict[str, A
                 pairs += matches.pairs
     mean = _nanmean(table, axis=0)
     result: dict[str, Any] = _summary(mean, thresholds, len(rules.thresholds))
-    result["per_threshold"] = [
-        {"iou": round(t, 10), "ap": _number(a)} for t, a in zip(thresholds, mean, strict=True)
-    ]
+    result["per_threshold"] = [{"iou": round(t, 10), "ap": _number(a)} for t, a in zip(thresholds, mean, strict=True)]
     if rules.by_class:
-        rows = {
-            str(c): _summary(row, thresholds, len(rules.thresholds))
-            for c, row in zip(labels, table, strict=True)
-        }
+        rows = {str(c): _summary(row, thresholds, len(rules.thresholds)) for c, row in zip(labels, table, strict=True)}
         result["classes"] = rows
     result["matches_at_50"] = pairs
     result["truth"] = [row for number, scene in enumerate(scenes) for row in _best(scene, number)]
@@ -214,9 +203,7 @@ def _summary(ap: np.ndarray, thresholds: Sequence[float], averaged: int) -> dict
         name: [i for i, t in enumerate(thresholds) if np.isclose(t, iou)]
         for name, iou in (("ap50", 0.5), ("ap25", 0.25))
     }
-    return {"ap": _number(_nanmean(ap[:averaged]))} | {
-        k: _number(ap[v[0]]) if v else None for k, v in at.items()
-    }
+    return {"ap": _number(_nanmean(ap[:averaged]))} | {k: _number(ap[v[0]]) if v else None for k, v in at.items()}
 
 
 def _nanmean(values: np.ndarray, axis: int | None = None) -> Any:

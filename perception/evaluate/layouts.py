@@ -48,27 +48,21 @@ def read_lerf_polygons(folder: str | Path) -> dict[tuple[str, str], np.ndarray]:
             size = (int(data["info"]["height"]), int(data["info"]["width"]))
             for thing in data["objects"]:
                 mask = masks.setdefault((path.stem, thing["category"]), np.zeros(size, bool))
-                polygon = (
-                    np.asarray(thing["segmentation"], np.float64).reshape(-1, 2).round().astype(np.int32)
-                )
+                polygon = np.asarray(thing["segmentation"], np.float64).reshape(-1, 2).round().astype(np.int32)
                 mask |= cv2.fillPoly(np.zeros(size, np.uint8), [polygon], (1,)).astype(bool)
         except (ValueError, KeyError, TypeError) as error:
             raise InputError(f"{path}: is no LERF-OVS label file ({error!r})") from error
     return masks
 
 
-def run_lerf_mask(
-    prediction: str | Path, dataset: str | Path, *, missing: str = "zero"
-) -> tuple[dict[str, Any], str]:
+def run_lerf_mask(prediction: str | Path, dataset: str | Path, *, missing: str = "zero") -> tuple[dict[str, Any], str]:
     """LERF-mask over the scenes of a dataset folder (or one scene): (result, table).
 
     dataset: <scene>/test_mask/<view>/<prompt>.*; prediction: <scene>/<view>/<prompt>.*, or with test_mask
     between.
     """
     scenes = {
-        name: evaluate_lerf_mask(
-            _predicted(prediction, name, "test_mask"), read_mask_folder(folder), missing=missing
-        )
+        name: evaluate_lerf_mask(_predicted(prediction, name, "test_mask"), read_mask_folder(folder), missing=missing)
         for name, folder in _scenes(dataset, "test_mask").items()
     }
     return _scene_result(scenes, ("miou", "mbiou"))
@@ -181,9 +175,7 @@ def _read_prediction(folder: Path, scene: str, points: int) -> _Prediction | Non
             classes.append(int(label))
             scores.append(float(score))
         except ValueError as error:
-            raise InputError(
-                f"{text}: line {number} is '{line}'; expected: mask file, class, confidence"
-            ) from error
+            raise InputError(f"{text}: line {number} is '{line}'; expected: mask file, class, confidence") from error
         mask = _read_ids(folder / name)
         if len(mask) != points:
             raise InputError(f"{folder / name}: has {len(mask)} rows, the truth has {points}")
@@ -205,9 +197,7 @@ def _read_rle(path: Path, points: int) -> _Prediction:
             if int(coded["length"]) != points or (
                 len(runs) and (runs.min() < 1 or runs.sum(axis=1).max() > points + 1)
             ):
-                raise InputError(
-                    f"{path}: a mask is coded for {coded['length']} points, the truth has {points}"
-                )
+                raise InputError(f"{path}: a mask is coded for {coded['length']} points, the truth has {points}")
             mask = np.zeros(points, bool)
             for start, length in runs.tolist():
                 mask[start - 1 : start - 1 + length] = True

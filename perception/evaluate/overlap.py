@@ -87,9 +87,7 @@ def compact(ids: np.ndarray, void_ids: Sequence[int] = ()) -> tuple[np.ndarray, 
     if ids.ndim != 1 or ids.dtype.kind not in "iu":
         raise InputError(f"instance ids must be whole numbers [N]; found {ids.dtype} {list(ids.shape)}")
     ids = ids.astype(np.int64)
-    if len(ids) and 0 <= (high := int(ids.max())) < max(
-        4 * len(ids), 1 << 16
-    ):  # no sorting: mark what occurs
+    if len(ids) and 0 <= (high := int(ids.max())) < max(4 * len(ids), 1 << 16):  # no sorting: mark what occurs
         seen = np.zeros(high + 2, bool)  # the last cell stands for all negative ids
         seen[np.where(ids < 0, high + 1, ids)] = True
         seen[[v for v in void_ids if 0 <= v <= high] + [high + 1]] = False
@@ -132,9 +130,7 @@ def overlap_of_ids(
     table = np.bincount(both[both >= 0], minlength=len(ids) * (g + 1)).reshape(len(ids), g + 1)
     missing = [i for i in ids.tolist() if pred_scores is not None and i not in pred_scores]
     if missing:
-        raise InputError(
-            f"prediction: no score for instance {missing[0]} ({len(missing)} such); give one for each"
-        )
+        raise InputError(f"prediction: no score for instance {missing[0]} ({len(missing)} such); give one for each")
     scores = [1.0 if pred_scores is None else pred_scores[i] for i in ids.tolist()]
     classes = [OBJECT if pred_classes is None else pred_classes[i] for i in ids.tolist()]
     return _overlap(ids, scores, classes, table, truth)
@@ -164,9 +160,7 @@ def overlap_of_masks(
 
 def _same_length(predicted: int, true: int) -> None:
     if predicted != true:
-        raise InputError(
-            f"prediction has {predicted} points, truth has {true}; both must be the same points in order"
-        )
+        raise InputError(f"prediction has {predicted} points, truth has {true}; both must be the same points in order")
 
 
 def _overlap(
@@ -174,9 +168,7 @@ def _overlap(
 ) -> Overlap:
     confidence = np.asarray(scores, np.float64).reshape(len(ids))
     if not np.isfinite(confidence).all():
-        raise InputError(
-            f"prediction: score of instance {ids[~np.isfinite(confidence)][0]} is not a finite number"
-        )
+        raise InputError(f"prediction: score of instance {ids[~np.isfinite(confidence)][0]} is not a finite number")
     return Overlap(
         pred_ids=ids,
         pred_scores=confidence,

@@ -63,9 +63,7 @@ def read_scores(path: str | Path) -> dict[int, float]:
         rows = json.loads(path.read_text(encoding="utf-8"))["instances"]
         return {int(key): float(row["score"]) for key, row in rows.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f'{path}: expected {{"instances": {{"<id>": {{"score": number}}}}}} ({error!r})'
-        ) from error
+        raise InputError(f'{path}: expected {{"instances": {{"<id>": {{"score": number}}}}}} ({error!r})') from error
 
 
 def _ids(cloud: PointCloud, path: str | Path) -> Any:

@@ -29,9 +29,7 @@ def nearest_gaussian(
         raise InputError(f"max_distance is {max_distance}; expected a length that is not negative")
     tree = Neighbors(means if len(finite) == len(means) else means[finite])
     for begin in range(0, len(points), chunk):
-        found = tree.query(
-            points[begin : begin + chunk], 1, np.inf if max_distance is None else max_distance
-        )[0][:, 0]
+        found = tree.query(points[begin : begin + chunk], 1, np.inf if max_distance is None else max_distance)[0][:, 0]
         result[begin : begin + chunk] = np.where(found >= 0, finite[found], -1)
     return result
 

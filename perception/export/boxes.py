@@ -43,9 +43,7 @@ def oriented_box(points: np.ndarray, trim: float = 0.0) -> OrientedBox:
     outline = _hull(points) if trim == 0 else points[:: len(points) // 4096 + 1]
     axes = np.stack(_candidates(outline))
     local = np.einsum("cij,pj->cpi", axes, outline)
-    low, high = (
-        np.quantile(local, [trim, 1 - trim], axis=1) if trim else (local.min(axis=1), local.max(axis=1))
-    )
+    low, high = np.quantile(local, [trim, 1 - trim], axis=1) if trim else (local.min(axis=1), local.max(axis=1))
     extent = high - low
     # A floor of a thousandth of the longest side, so that flat instances compare by their area.
     volume = np.maximum(extent, np.maximum(extent.max(axis=1, keepdims=True) * 1e-3, 1e-12)).prod(axis=1)

@@ -41,9 +41,7 @@ def _color(i: int) -> tuple[int, ...]:
     return tuple(round(255 * c) for c in rgb)
 
 
-def write_split(
-    folder: str | Path, cloud: PointCloud, labels: np.ndarray, suffix: str = ".ply"
-) -> list[Path]:
+def write_split(folder: str | Path, cloud: PointCloud, labels: np.ndarray, suffix: str = ".ply") -> list[Path]:
     """One file for each instance, "<id><suffix>" in a new or empty folder, points in the cloud's order."""
     folder = Path(folder)
     _new_folder(folder)

@@ -96,9 +96,7 @@ def list_normals(points: np.ndarray, lists: np.ndarray) -> np.ndarray:
     """
     normals = np.empty((len(points), 3), np.float32)
     first = np.flatnonzero(np.isfinite(points).all(axis=1))[:1]
-    local = (points - points[first].sum(axis=0)).astype(
-        np.float32
-    )  # about some point: large coordinates stay exact
+    local = (points - points[first].sum(axis=0)).astype(np.float32)  # about some point: large coordinates stay exact
     _core.plane_normals(local, np.ascontiguousarray(lists), normals, cores())
     return normals
 
@@ -108,9 +106,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return np.where(length > 0, vectors / np.maximum(length, 1e-300), 0).astype(np.float32)
 
 
-def scannet_weights(
-    points: np.ndarray, normals: np.ndarray, edges: np.ndarray, *, oriented: bool = True
-) -> np.ndarray:
+def scannet_weights(points: np.ndarray, normals: np.ndarray, edges: np.ndarray, *, oriented: bool = True) -> np.ndarray:
     """Weights [E] float32 of edges (a, b): 1 − n_a·n_b, squared when the pair is convex, n_b·(p_b − p_a) > 0.
 
     Not oriented: normals of unknown sign; 1 − |n_a·n_b| and no convexity. A missing (zero) normal weighs 1.

@@ -87,9 +87,7 @@ def _assigned(g: _Gaussians, points: np.ndarray, options: ExportOptions) -> np.n
         raise InputError(f"assignment rule '{options.rule}' is unknown; expected nearest or densest")
     if g.opacities is None or g.quats is None or g.scales is None:
         raise InputError("assignment rule 'densest' needs the Gaussians' rotations, scales and opacities")
-    return densest_instance(
-        points, g.means, g.quats, g.scales, g.opacities, g.ids, max_distance=options.max_distance
-    )
+    return densest_instance(points, g.means, g.quats, g.scales, g.opacities, g.ids, max_distance=options.max_distance)
 
 
 def check_overlap(means: np.ndarray, points: np.ndarray) -> float:

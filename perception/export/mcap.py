@@ -85,9 +85,7 @@ def typestore() -> Any:
     return store
 
 
-def point_cloud2(
-    store: Any, cloud: PointCloud, labels: np.ndarray, frame: str, stamp: tuple[int, int]
-) -> Any:
+def point_cloud2(store: Any, cloud: PointCloud, labels: np.ndarray, frame: str, stamp: tuple[int, int]) -> Any:
     """sensor_msgs/PointCloud2 with x y z (float32), rgb packed as in PCL when known, instance_id (int32)."""
     columns = {axis: (cloud.points[:, i].astype("<f4"), _FLOAT32) for i, axis in enumerate("xyz")}
     if cloud.colors is not None:
@@ -137,9 +135,7 @@ def detections(
         found.append(
             t["vision_msgs/msg/Detection3D"](
                 header=header,
-                results=[
-                    t["vision_msgs/msg/ObjectHypothesisWithPose"](hypothesis=hypothesis, pose=with_pose)
-                ],
+                results=[t["vision_msgs/msg/ObjectHypothesisWithPose"](hypothesis=hypothesis, pose=with_pose)],
                 bbox=t["vision_msgs/msg/BoundingBox3D"](center=pose, size=size),
                 id=str(i),
             )

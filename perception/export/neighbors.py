@@ -43,9 +43,7 @@ class Neighbors:
         shifted = np.asarray(points) - self.center if self.center.any() else points
         return np.ascontiguousarray(shifted, dtype=np.float32)
 
-    def query(
-        self, queries: np.ndarray, k: int = 1, max_distance: float = np.inf
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def query(self, queries: np.ndarray, k: int = 1, max_distance: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
         """The k nearest of queries [Q, 3]: indices [Q, k] int32 and distances [Q, k] float32, nearest first.
 
         −1 and infinity where fewer than k points lie within max_distance, or the query is not finite. Equal

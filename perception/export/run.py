@@ -92,9 +92,7 @@ def _write_others(
     if outputs.split is not None:
         write_split(outputs.split, cloud, labels)
     if outputs.boxes is not None:
-        write_boxes(
-            outputs.boxes, cloud.points, labels, instances, frame=outputs.frame, metric=outputs.metric
-        )
+        write_boxes(outputs.boxes, cloud.points, labels, instances, frame=outputs.frame, metric=outputs.metric)
     if outputs.scannet is not None:
         write_scannet(outputs.scannet, scene, labels, instances, classes)
     if outputs.mcap is not None:
@@ -109,9 +107,7 @@ def _table(result: dict[str, Any]) -> str:
     lines += [f"{i:>6}{r['num_points']:>12}{r['score']:>8.3f}  {r['label'] or ''}" for i, r in rows]
     lines.append(f"{result['labelled']} of {result['points']} points labelled, {result['seconds']:.1f} s")
     if result["inside_map"] < 0.5:
-        lines.append(
-            f"only {result['inside_map']:.0%} of the points lie inside the map: same frame and unit?"
-        )
+        lines.append(f"only {result['inside_map']:.0%} of the points lie inside the map: same frame and unit?")
     return "\n".join(lines)
 
 

@@ -69,9 +69,7 @@ def segment_cloud(cloud: PointCloud, options: SmoothOptions | None = None) -> np
     """Superpoints [P] int32 of a cloud or mesh. Points that are not finite become segments of their own."""
     options = options or SmoothOptions()
     points = cloud.points
-    require_memory(
-        _BYTES_PER_POINT * len(points), "smoothing", "export without it (--no-smooth) or split the cloud"
-    )
+    require_memory(_BYTES_PER_POINT * len(points), "smoothing", "export without it (--no-smooth) or split the cloud")
     faces = cloud.faces if cloud.faces is not None and len(cloud.faces) else None
     kind = ("mesh" if faces is not None else "knn") if options.graph == "auto" else options.graph
     edges, lists = _graph(points, faces, kind, options)
@@ -98,9 +96,7 @@ def _graph(
     """(edges [E, 2], the nearest neighbours [P, k] where the graph came from them)."""
     if kind == "mesh":
         if faces is None:
-            raise InputError(
-                "smoothing over mesh edges was asked for, but the cloud has no faces; use graph knn"
-            )
+            raise InputError("smoothing over mesh edges was asked for, but the cloud has no faces; use graph knn")
         return mesh_edges(faces, len(points)), None
     if kind == "knn":
         lists = neighbor_lists(points, max(options.neighbors + 1, NORMAL_NEIGHBORS))
@@ -110,9 +106,7 @@ def _graph(
     raise InputError(f"graph '{kind}' is unknown; expected auto, mesh, knn or radius")
 
 
-def _normals(
-    cloud: PointCloud, faces: np.ndarray | None, lists: np.ndarray | None
-) -> tuple[np.ndarray, bool]:
+def _normals(cloud: PointCloud, faces: np.ndarray | None, lists: np.ndarray | None) -> tuple[np.ndarray, bool]:
     """(normals [P, 3], whether their sign means anything)."""
     if cloud.normals is not None:
         return np.nan_to_num(cloud.normals), True
@@ -129,9 +123,7 @@ def vote(labels: np.ndarray, segments: np.ndarray) -> np.ndarray:
     labels [P] int32 (−1 = none), segments [P] int32 >= 0. "None" has a vote like any other label.
     """
     if len(labels) != len(segments):
-        raise InputError(
-            f"{len(segments)} segment ids for {len(labels)} points; they must be the same points in order"
-        )
+        raise InputError(f"{len(segments)} segment ids for {len(labels)} points; they must be the same points in order")
     if len(labels) == 0:
         return labels.astype(np.int32)
     key = np.sort((segments.astype(np.int64) << 32) | (labels.astype(np.int64) + (1 << 31)))

@@ -31,9 +31,7 @@ class Statistics:
     def zeros(count: int) -> Statistics:
         return Statistics(torch.zeros(count), torch.zeros(count), torch.zeros(count))
 
-    def add(
-        self, gradient_px: torch.Tensor, radius_px: torch.Tensor, visible: torch.Tensor, long_side: int
-    ) -> None:
+    def add(self, gradient_px: torch.Tensor, radius_px: torch.Tensor, visible: torch.Tensor, long_side: int) -> None:
         """One view's figures: gradient_px [N] per pixel, radius_px [N] pixels, visible [N] bool."""
         self.gradient += torch.where(visible, gradient_px * (0.5 * long_side), 0.0)
         self.seen += visible

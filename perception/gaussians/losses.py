@@ -90,13 +90,9 @@ def photometric(
     image = target if isinstance(target, Tensor) else torch.from_numpy(np.ascontiguousarray(target))
     if render.ndim != 3 or render.shape != image.shape:
         found = f"{list(render.shape)} and {list(image.shape)}"
-        raise InputError(
-            f"photometric loss: render and target have shapes {found}, expected one shape [H, W, C]"
-        )
+        raise InputError(f"photometric loss: render and target have shapes {found}, expected one shape [H, W, C]")
     if render.numel() == 0 or render.shape[2] > 16:
-        raise InputError(
-            f"photometric loss: images are {list(render.shape)}, expected 1 to 16 channels, not empty"
-        )
+        raise InputError(f"photometric loss: images are {list(render.shape)}, expected 1 to 16 channels, not empty")
     if not 0 <= beta <= 1:
         raise InputError(f"photometric loss: beta is {beta}, expected 0 to 1")
     _ready("render", render)
@@ -171,9 +167,7 @@ class _Prototypes(Function):
     """features [P, D] -> (L_pos, prototypes [M, D])."""
 
     @staticmethod
-    def forward(
-        ctx: Any, features: Tensor, labels: LabelAssignment, per_pixel: bool
-    ) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, features: Tensor, labels: LabelAssignment, per_pixel: bool) -> tuple[Tensor, Tensor]:
         count, width = len(labels.ids), features.shape[1]
         means = torch.empty(count, width, dtype=torch.float64)
         scatter = torch.empty(count, dtype=torch.float64)
@@ -270,9 +264,7 @@ def instance_loss(
         labels = assign_labels(labels, fraction, seed)
     if labels.shape != tuple(features.shape[:2]):
         found = f"{list(labels.shape)} and {list(features.shape)}"
-        raise InputError(
-            f"instance loss: labels and features have shapes {found}, expected [H, W] and [H, W, D]"
-        )
+        raise InputError(f"instance loss: labels and features have shapes {found}, expected [H, W] and [H, W, D]")
     _ready("features", features)
     flat = features.reshape(-1, features.shape[2]).contiguous()
     pos, prototypes = _Prototypes.apply(flat, labels, per_pixel)

@@ -51,9 +51,7 @@ class SparseAdam:
         eps: float = 1e-15,
     ) -> None:
         if set(params) != set(rates):
-            raise InputError(
-                f"SparseAdam: params {sorted(params)} and rates {sorted(rates)} name different tensors"
-            )
+            raise InputError(f"SparseAdam: params {sorted(params)} and rates {sorted(rates)} name different tensors")
         self.params = {name: _checked(name, tensor) for name, tensor in params.items()}
         self.rates: dict[str, Rate] = dict(rates)
         self.betas, self.eps, self.steps = betas, eps, 0
@@ -72,9 +70,7 @@ class SparseAdam:
         """
         if visible is not None:
             if visible.shape != (len(self),):
-                raise InputError(
-                    f"SparseAdam: visible has shape {list(visible.shape)}, expected [{len(self)}]"
-                )
+                raise InputError(f"SparseAdam: visible has shape {list(visible.shape)}, expected [{len(self)}]")
             visible = visible.detach().to(torch.uint8).contiguous()
         self.steps += 1
         updated, skipped = {}, {}
@@ -87,9 +83,7 @@ class SparseAdam:
     def _step_one(self, name: str, param: Tensor, grad: Tensor, visible: Tensor | None) -> tuple[int, int]:
         if grad.shape != param.shape or grad.dtype != param.dtype:
             found = f"{list(grad.shape)} {grad.dtype}"
-            raise InputError(
-                f"SparseAdam: gradient of {name} is {found}, expected {list(param.shape)} {param.dtype}"
-            )
+            raise InputError(f"SparseAdam: gradient of {name} is {found}, expected {list(param.shape)} {param.dtype}")
         if not param.numel():
             return 0, 0
         rows = (len(param), -1)
@@ -141,9 +135,7 @@ class SparseAdam:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Takes over a `state_dict`; the number of rows may differ from the present one."""
         if set(state["params"]) != set(self.params):
-            raise InputError(
-                f"SparseAdam: state has {sorted(state['params'])}, expected {sorted(self.params)}"
-            )
+            raise InputError(f"SparseAdam: state has {sorted(state['params'])}, expected {sorted(self.params)}")
         for table, key in ((self.params, "params"), (self._first, "first"), (self._second, "second")):
             for name, tensor in state[key].items():
                 table[name] = _leaf_like(table[name], tensor.detach().clone().contiguous())
@@ -165,7 +157,5 @@ def _checked(name: str, tensor: Tensor) -> Tensor:
     fine = tensor.is_leaf and tensor.device.type == "cpu" and tensor.dtype in (torch.float32, torch.float64)
     if not fine or tensor.ndim < 1 or not tensor.is_contiguous():
         found = f"{tensor.dtype} {list(tensor.shape)} on {tensor.device}, leaf={tensor.is_leaf}"
-        raise InputError(
-            f"SparseAdam: {name} is {found}, expected a contiguous float leaf [N, ...] on the CPU"
-        )
+        raise InputError(f"SparseAdam: {name} is {found}, expected a contiguous float leaf [N, ...] on the CPU")
     return tensor

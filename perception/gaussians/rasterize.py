@@ -109,9 +109,7 @@ class Forward:
 def _core_inputs(inputs: tuple[Tensor | None, ...], background: Tensor | None, settings: Settings) -> Any:
     means, quats, scales, opacities, colors, features, viewmats, ks = inputs
     assert means is not None  # for the type checker
-    arrays = [
-        _numpy(t) for t in (means, quats, scales, opacities, colors, features, viewmats, ks, background)
-    ]
+    arrays = [_numpy(t) for t in (means, quats, scales, opacities, colors, features, viewmats, ks, background)]
     return _core_function("RasterizerInputs", means)(
         *arrays,
         settings.width,
@@ -124,9 +122,7 @@ def _core_inputs(inputs: tuple[Tensor | None, ...], background: Tensor | None, s
     )
 
 
-def rasterize_forward(
-    inputs: tuple[Tensor | None, ...], background: Tensor | None, settings: Settings
-) -> Forward:
+def rasterize_forward(inputs: tuple[Tensor | None, ...], background: Tensor | None, settings: Settings) -> Forward:
     """One forward pass, no autograd.
 
     inputs: means [N,3], quats [N,4], scales [N,3], opacities [N], colors [N,3] or [N,K,3], features [N,D] or
@@ -165,9 +161,7 @@ def count_pairs(inputs: tuple[Tensor | None, ...], settings: Settings) -> int:
     """Contributing (Gaussian, pixel) pairs of a scene; inputs as for `rasterize_forward`."""
     assert inputs[0] is not None  # for the type checker
     frames = rasterize_forward(inputs, None, settings).frames
-    return int(
-        _core_function("rasterizer_count_pairs", inputs[0])(_core_inputs(inputs, None, settings), frames)
-    )
+    return int(_core_function("rasterizer_count_pairs", inputs[0])(_core_inputs(inputs, None, settings), frames))
 
 
 def rasterize_backward(
@@ -231,9 +225,7 @@ def _autograd_function() -> Any:
             wanted = tuple(ctx.needs_input_grad[3:10])
             none = images[0].new_empty(0)
             state = Forward(*images, visible=none, radii=none, frames=ctx.frames)  # type: ignore[misc]
-            grads, mean2d = rasterize_backward(
-                inputs, background, ctx.settings, state, cotangents[:5], wanted
-            )
+            grads, mean2d = rasterize_backward(inputs, background, ctx.settings, state, cotangents[:5], wanted)
             ctx.stats.mean2d_grad = mean2d.norm(dim=-1)
             shade = None
             if ctx.needs_input_grad[0] and cotangents[0] is not None:
@@ -292,9 +284,7 @@ def rasterize(
         variance and features is not None, depth, threads, simd,
     )  # fmt: skip
     stats = RasterizationStats(radii=means.new_zeros((0,)))
-    out = _function.apply(
-        background, settings, stats, means, quats, scales, opacities, colors, features, viewmats, Ks
-    )
+    out = _function.apply(background, settings, stats, means, quats, scales, opacities, colors, features, viewmats, Ks)
     return Rasterization(*out, stats=stats)  # type: ignore[misc]
 
 
@@ -342,6 +332,4 @@ def _check_shapes(tensors: dict[str, Any], sh_degree: int | None) -> None:
         expected["background"] = (3,) if background.ndim == 1 else (*c, 3)
     for name, shape in expected.items():
         if tuple(tensors[name].shape) != shape:
-            raise InputError(
-                f"rasterize: {name} has shape {list(tensors[name].shape)}, expected {list(shape)}"
-            )
+            raise InputError(f"rasterize: {name} has shape {list(tensors[name].shape)}, expected {list(shape)}")

@@ -1,4 +1,4 @@
-"""Optimises Gaussians against photos and instance masks (OpenSplat3D eq. 11: L = L_RGB + λ_inst L_inst2D + λ_var L_var).
+"""Optimises Gaussians against photos and masks: L = L_RGB + λ_inst L_inst2D + λ_var L_var (OpenSplat3D §3.2).
 
 Every schedule is driven by progress in [0, 1], the larger of iterations done and time spent, so a time limit shortens
 the whole course instead of cutting its end. Randomness is a function of (seed, iteration): a run resumed from a
@@ -142,9 +142,7 @@ class Trainer:
 
     def _sync(self) -> None:
         """The optimiser owns the tensors; the model is a view of them."""
-        self.gaussians = Gaussians(
-            **{name: tensor.detach() for name, tensor in self.optimiser.params.items()}
-        )
+        self.gaussians = Gaussians(**{name: tensor.detach() for name, tensor in self.optimiser.params.items()})
 
     # ------------------------------------------------------------------ steps
 
@@ -292,9 +290,7 @@ class Trainer:
         views = self.held_out or self.views
         if limit is not None and len(views) > limit:
             views = [views[i] for i in np.linspace(0, len(views) - 1, limit).round().astype(int)]
-        return {
-            "psnr": float(np.mean([psnr(render_view(self.gaussians, view), view.photo) for view in views]))
-        }
+        return {"psnr": float(np.mean([psnr(render_view(self.gaussians, view), view.photo) for view in views]))}
 
     def _note(self, progress: float) -> None:
         self.record.curve.append(

@@ -59,9 +59,7 @@ def _hdbscan(features: np.ndarray, config: InstanceConfig, seed: int) -> tuple[n
         return np.zeros(len(features), np.int64), np.ones(len(features), np.float32)
     chosen = np.arange(len(features))
     if len(features) > config.max_clustered:
-        chosen = np.sort(
-            np.random.default_rng(seed).choice(len(features), config.max_clustered, replace=False)
-        )
+        chosen = np.sort(np.random.default_rng(seed).choice(len(features), config.max_clustered, replace=False))
     share = len(chosen) / len(features)
     model = hdbscan.HDBSCAN(
         min_cluster_size=max(2, round(config.min_cluster_size * share)),
@@ -106,9 +104,7 @@ def split_disconnected(means: np.ndarray, scales: np.ndarray, ids: np.ndarray, s
         spacing = 3 * float(np.quantile(distance[:, 1], 0.95))
         reach = np.maximum(spacing, 2 * (radius[rows][:, None] + radius[rows][neighbour]))
         source, column = np.nonzero(distance <= np.minimum(reach, 4 * spacing))
-        links = coo_matrix(
-            (np.ones(len(source)), (source, neighbour[source, column])), shape=(len(rows), len(rows))
-        )
+        links = coo_matrix((np.ones(len(source)), (source, neighbour[source, column])), shape=(len(rows), len(rows)))
         _, part = connected_components(links, directed=False)
         for piece, size in enumerate(np.bincount(part)):
             if size >= smallest:

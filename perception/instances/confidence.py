@@ -45,9 +45,7 @@ class Agreement:
         return np.where(self.weight > 0, self.total / np.maximum(self.weight, 1), 1.0)
 
 
-def scores(
-    ids: np.ndarray, membership: np.ndarray, opacities: np.ndarray, agreement: Agreement
-) -> np.ndarray:
+def scores(ids: np.ndarray, membership: np.ndarray, opacities: np.ndarray, agreement: Agreement) -> np.ndarray:
     """[M] float64 in [0, 1]: one score an instance, as told above."""
     count = len(agreement.views)
     member = ids >= 0

@@ -19,9 +19,7 @@ Box = tuple[int, int, int, int]
 FILL = 127  # letterbox grey: the middle of the range, near zero after any encoder's normalisation
 
 
-def view_scores(
-    mask_pixels: np.ndarray, image_pixels: np.ndarray, visible_fraction: np.ndarray
-) -> np.ndarray:
+def view_scores(mask_pixels: np.ndarray, image_pixels: np.ndarray, visible_fraction: np.ndarray) -> np.ndarray:
     """Score [I, V] of every instance in every view.
 
     mask_pixels [I, V], image_pixels [V] in pixels; visible_fraction [I, V] in [0, 1] (visible / all

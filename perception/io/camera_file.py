@@ -30,9 +30,7 @@ def read_camera(path: Path) -> Lens:
         )
     name = data.get("distortion_model", "plumb_bob")
     if name not in _COUNTS:
-        raise InputError(
-            f"{path}: distortion_model '{name}' is not known; expected one of {', '.join(_COUNTS)}"
-        )
+        raise InputError(f"{path}: distortion_model '{name}' is not known; expected one of {', '.join(_COUNTS)}")
     values = _data(data, "distortion_coefficients")
     found = len(values) if isinstance(values, (list, tuple)) else 0
     if found not in _COUNTS[name]:
@@ -63,9 +61,7 @@ def _load(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(f"{path}: not a readable YAML file; expected ROS camera_info") from error
     if not isinstance(data, dict):
-        raise InputError(
-            f"{path}: expected a ROS camera_info mapping with image_width, image_height, camera_matrix"
-        )
+        raise InputError(f"{path}: expected a ROS camera_info mapping with image_width, image_height, camera_matrix")
     return data
 
 

@@ -33,9 +33,7 @@ def read_cloud(path: str | Path) -> PointCloud:
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise InputError(
-            f"{path}: unknown point cloud format '{path.suffix}'; expected {', '.join(_READERS)}"
-        )
+        raise InputError(f"{path}: unknown point cloud format '{path.suffix}'; expected {', '.join(_READERS)}")
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; expected a point cloud")
     needed = _BYTES_PER_BYTE.get(path.suffix.lower(), 4) * path.stat().st_size

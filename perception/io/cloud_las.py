@@ -17,9 +17,7 @@ def read_las(path: Path) -> PointCloud:
     try:
         import laspy
     except ImportError as error:
-        raise InputError(
-            f"{path}: LAS and LAZ need the package 'laspy'; run: pip install 'laspy[lazrs]'"
-        ) from error
+        raise InputError(f"{path}: LAS and LAZ need the package 'laspy'; run: pip install 'laspy[lazrs]'") from error
     try:
         las = laspy.read(path)
     except (laspy.errors.LaspyException, ValueError, OSError) as error:

@@ -23,6 +23,4 @@ def require_memory(needed: float, what: str, advice: str) -> None:
     """InputError naming `what` and `advice` when `needed` bytes exceed nine tenths of what is free."""
     free = available_memory()
     if needed > 0.9 * free:
-        raise InputError(
-            f"{what}: needs about {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; {advice}"
-        )
+        raise InputError(f"{what}: needs about {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; {advice}")

@@ -93,9 +93,7 @@ def _from_compressed(data: bytes, dtype: np.dtype, points: int, path: Path) -> n
         raise InputError(f"{path}: is cut short within the compressed block")
     packed, full = (int(n) for n in np.frombuffer(data, "<u4", 2))
     if len(data) < 8 + packed or full != points * dtype.itemsize:
-        raise InputError(
-            f"{path}: compressed block of {packed} bytes for {full} does not fit {points} points"
-        )
+        raise InputError(f"{path}: compressed block of {packed} bytes for {full} does not fit {points} points")
     plain = lzf_decompress(data[8 : 8 + packed], full)
     if plain is None:
         raise InputError(f"{path}: compressed block is damaged")
@@ -154,9 +152,7 @@ def _to_cloud(rows: np.ndarray, path: Path) -> PointCloud:
             cloud.colors = np.stack([packed >> 16, packed >> 8, packed], axis=1).astype(np.uint8)
         elif field.ndim == 1 and field.dtype.kind in "iu" and not name.startswith("_"):
             if field.size and (field.max() > limits.max or field.min() < limits.min):
-                raise InputError(
-                    f"{path}: field '{name}' holds {field.max()}, which is not a 32-bit whole number"
-                )
+                raise InputError(f"{path}: field '{name}' holds {field.max()}, which is not a 32-bit whole number")
             cloud.labels[name] = field.astype(np.int32)
     return cloud
 

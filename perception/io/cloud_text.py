@@ -56,9 +56,7 @@ def _table(path: Path) -> np.ndarray:
         rows = [len(line.split()) for line in stripped.splitlines() if line.strip()]
         uneven = [i for i, n in enumerate(rows) if n != width]
         if uneven:
-            raise InputError(
-                f"{path}: row {uneven[0] + 1} has {rows[uneven[0]]} numbers; expected {width} as before"
-            )
+            raise InputError(f"{path}: row {uneven[0] + 1} has {rows[uneven[0]]} numbers; expected {width} as before")
     return numbers.reshape(-1, width)
 
 

@@ -25,14 +25,10 @@ def read_workspace(folder: Path, workdir: Path, seed: int, progress: Progress) -
     found = {path: _read_model(path) for path in _models(folder)}
     path, model = max(found.items(), key=lambda item: item[1].num_reg_images())
     if model.num_reg_images() == 0:
-        raise InputError(
-            f"{path}: the sparse model is empty (no registered photo); run structure from motion again"
-        )
+        raise InputError(f"{path}: the sparse model is empty (no registered photo); run structure from motion again")
     views, missing, notes = views_of_model(model, folder / "images", path)
     if not views:
-        raise InputError(
-            f"{folder / 'images'}: none of the {model.num_reg_images()} photos of {path} is there"
-        )
+        raise InputError(f"{folder / 'images'}: none of the {model.num_reg_images()} photos of {path} is there")
     report: dict[str, Any] = {
         "input": "colmap",
         "model": path.relative_to(folder).as_posix(),
@@ -56,9 +52,7 @@ def read_workspace(folder: Path, workdir: Path, seed: int, progress: Progress) -
     return Scene(views, points, colors, report=report)
 
 
-def views_of_model(
-    model: Any, images: Path, source: Path
-) -> tuple[list[View], list[dict[str, str]], list[str]]:
+def views_of_model(model: Any, images: Path, source: Path) -> tuple[list[View], list[dict[str, str]], list[str]]:
     """Views sorted by name, photos left out with the reason, notes."""
     views, missing, notes = [], [], set()
     lenses = {camera_id: lens_from_camera(camera) for camera_id, camera in model.cameras.items()}
@@ -129,6 +123,4 @@ def _refuse_nan_text(path: Path) -> None:
     for line in lines:
         fields = line.split()
         if len(fields) == 10 and any(value.lower().lstrip("+-") in ("nan", "inf") for value in fields[1:8]):
-            raise InputError(
-                f"{file}: the pose of {fields[9]} is not finite (NaN); repair or remove that photo"
-            )
+            raise InputError(f"{file}: the pose of {fields[9]} is not finite (NaN); repair or remove that photo")

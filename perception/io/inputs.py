@@ -33,15 +33,11 @@ def load_scene(
     tell = progress or _silent
     started = time.perf_counter()
     if not source.exists():
-        raise InputError(
-            f"{source}: no such file or folder; expected photos, a COLMAP workspace or transforms.json"
-        )
+        raise InputError(f"{source}: no such file or folder; expected photos, a COLMAP workspace or transforms.json")
     file = source / "transforms.json" if source.is_dir() else source
     photos_only = source.is_dir() and not is_workspace(source) and not file.is_file()
     if camera_file is not None and not photos_only:
-        raise InputError(
-            f"{camera_file}: a camera file goes with a folder of photos; {source} brings its own cameras"
-        )
+        raise InputError(f"{camera_file}: a camera file goes with a folder of photos; {source} brings its own cameras")
     workdir.mkdir(parents=True, exist_ok=True)
     if photos_only:
         scene = reconstruct(source, workdir, _lens(camera_file), seed, tell)

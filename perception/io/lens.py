@@ -31,9 +31,7 @@ def load_pycolmap() -> Any:
 
 def lens_from_camera(camera: Any) -> Lens:
     """The lens of a pycolmap camera."""
-    return Lens(
-        camera.model_name, tuple(float(x) for x in camera.params), int(camera.width), int(camera.height)
-    )
+    return Lens(camera.model_name, tuple(float(x) for x in camera.params), int(camera.width), int(camera.height))
 
 
 def camera_from_lens(lens: Lens, camera_id: int = 1) -> Any:
@@ -49,9 +47,7 @@ def camera_from_lens(lens: Lens, camera_id: int = 1) -> Any:
         )
         valid = camera.verify_params() and np.isfinite(lens.params).all()
     except (ValueError, RuntimeError) as error:
-        raise InputError(
-            f"camera model {lens.model} is not known to pycolmap, or its parameters do not fit"
-        ) from error
+        raise InputError(f"camera model {lens.model} is not known to pycolmap, or its parameters do not fit") from error
     if not valid or camera.mean_focal_length() <= 0:
         raise InputError(f"camera {lens.model}: the parameters {list(lens.params)} are not valid")
     return camera

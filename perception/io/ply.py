@@ -67,14 +67,10 @@ def read_ply(path: str | Path) -> dict[str, Element]:
                 return _read_ascii(file.read(), tables, path)
             return {table.name: _read_binary(file, table, order, path) for table in tables}
     except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror or error}); expected a PLY file"
-        ) from error
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); expected a PLY file") from error
 
 
-def write_ply(
-    path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]], *, ascii: bool = False
-) -> None:
+def write_ply(path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]], *, ascii: bool = False) -> None:
     """Write elements of scalar properties [rows] and list properties [rows, k], in the order given.
 
     Binary little endian unless `ascii`. The file appears complete or not at all.
@@ -135,9 +131,7 @@ def _read_binary(file: BinaryIO, table: _Table, order: str, path: Path) -> Eleme
     if len(raw) == dtype.itemsize * table.rows:
         rows = np.frombuffer(raw, dtype)
         if all((rows[f"{name}\0count"] == n).all() for name, n in lengths.items()):
-            return {
-                p.name: rows[p.name].astype(dtype[p.name].base.newbyteorder("=")) for p in table.properties
-            }
+            return {p.name: rows[p.name].astype(dtype[p.name].base.newbyteorder("=")) for p in table.properties}
     if not table.has_list:
         found = len(raw) // max(dtype.itemsize, 1)
         raise InputError(
@@ -178,9 +172,7 @@ def _read_ragged(file: BinaryIO, table: _Table, order: str, path: Path) -> Eleme
                 column.append(np.frombuffer(data, dtype, n, at) if n else np.empty(0, dtype))
                 at += n * dtype.itemsize
     except (struct.error, ValueError) as error:
-        raise InputError(
-            f"{path}: is cut short within element '{table.name}' ({table.rows} rows expected)"
-        ) from error
+        raise InputError(f"{path}: is cut short within element '{table.name}' ({table.rows} rows expected)") from error
     file.seek(start + at)
     return {p.name: _column(columns[p.name], p) for p in table.properties}
 

@@ -99,9 +99,7 @@ def read_map(path: Path) -> GaussianMap:
     except (OSError, KeyError, ValueError, EOFError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(
-            f"{path}: the map is damaged ({error}); build it again with `perception map`"
-        ) from error
+        raise InputError(f"{path}: the map is damaged ({error}); build it again with `perception map`") from error
     for name in ("features", "instance_ids", "membership"):
         found = len(getattr(gmap, name))
         if found != count:
@@ -122,9 +120,7 @@ def read_info(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{file}: cannot be read as a map's facts ({error})") from error
     if version != FORMAT_VERSION:
-        raise InputError(
-            f"{file}: format_version is {version}, this program reads {FORMAT_VERSION}; rebuild the map"
-        )
+        raise InputError(f"{file}: format_version is {version}, this program reads {FORMAT_VERSION}; rebuild the map")
     return info
 
 
@@ -146,9 +142,7 @@ def write_gaussian_ply(path: Path, gmap: GaussianMap) -> None:
         table[f"scale_{i}"] = gmap.log_scales[:, i]
     for i in range(4):
         table[f"rot_{i}"] = gmap.quats[:, i]
-    write_ply(
-        path, {"vertex": {name: np.ascontiguousarray(column, np.float32) for name, column in table.items()}}
-    )
+    write_ply(path, {"vertex": {name: np.ascontiguousarray(column, np.float32) for name, column in table.items()}})
 
 
 def _read_sh(rows: dict[str, np.ndarray]) -> np.ndarray:

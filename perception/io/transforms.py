@@ -43,9 +43,7 @@ def read_transforms(file: Path, workdir: Path, seed: int, progress: Progress) ->
         raise InputError(f"{file}: 'frames' is empty; expected at least one posed photo")
     photos, missing = _photos(file, frames)
     if not photos:
-        raise InputError(
-            f"{file}: none of the {len(frames)} photos it lists exists (first: {missing[0]['name']})"
-        )
+        raise InputError(f"{file}: none of the {len(frames)} photos it lists exists (first: {missing[0]['name']})")
     root = _common_root(list(photos.values()))
     views, notes = _views(file, data, frames, photos, root)
     report: dict[str, Any] = {
@@ -69,11 +67,10 @@ def read_transforms(file: Path, workdir: Path, seed: int, progress: Progress) ->
 
 
 def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:
-    """(file_path, camera_from_world [4, 4], lens) of every frame, in file order; photos need not exist if w, h are given."""
+    """(file_path, camera_from_world [4, 4], lens) of every frame, in file order; with w, h photos need not exist."""
     data = _load(file)
     return [
-        (str(frame["file_path"]), _pose(file, frame), _lens(file, {**data, **frame}, None))
-        for frame in data["frames"]
+        (str(frame["file_path"]), _pose(file, frame), _lens(file, {**data, **frame}, None)) for frame in data["frames"]
     ]
 
 
@@ -156,18 +153,14 @@ def _lens(file: Path, values: dict[str, Any], photo: Path | None) -> Lens:
     fx, fy = _focals(values, what, width, height)
     cx, cy = _number(values, "cx", what), _number(values, "cy", what)
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-    k1, k2, k3, k4, p1, p2 = (
-        _number(values, key, what) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")
-    )
+    k1, k2, k3, k4, p1, p2 = (_number(values, key, what) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model = str(values.get("camera_model") or "OPENCV").upper()
     name: str
     extra: tuple[float, ...]
     if values.get("is_fisheye") or model in _FISHEYE:
         name, extra = "OPENCV_FISHEYE", (k1, k2, k3, k4)
     elif model not in _PERSPECTIVE:
-        raise InputError(
-            f"{what}: camera_model '{model}' is not supported; expected one of {_PERSPECTIVE + _FISHEYE}"
-        )
+        raise InputError(f"{what}: camera_model '{model}' is not supported; expected one of {_PERSPECTIVE + _FISHEYE}")
     elif k3 or k4:
         name, extra = "FULL_OPENCV", (k1, k2, p1, p2, k3, k4, 0.0, 0.0)
     elif any((k1, k2, p1, p2)) and "PINHOLE" not in model:
@@ -187,9 +180,7 @@ def _focals(values: dict[str, Any], what: str, width: float, height: float) -> t
     fx = fy if fx is None else fx
     fy = fx if fy is None else fy
     if fx is None or fy is None or min(fx, fy) <= 0:
-        raise InputError(
-            f"{what} has no focal length; expected fl_x (pixels) or camera_angle_x (radians), above 0"
-        )
+        raise InputError(f"{what} has no focal length; expected fl_x (pixels) or camera_angle_x (radians), above 0")
     return fx, fy
 
 

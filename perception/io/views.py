@@ -25,14 +25,10 @@ def make_view(name: str, photo: Path, lens: Lens, camera_from_world: np.ndarray,
 def rigid_pose(matrix: np.ndarray, what: str) -> np.ndarray:
     """[4, 4] with an exact rotation; small numerical slack is repaired, anything else is an InputError."""
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError(
-            f"{what} is not a finite 4×4 matrix (NaN or missing values); repair or remove that frame"
-        )
+        raise InputError(f"{what} is not a finite 4×4 matrix (NaN or missing values); repair or remove that frame")
     rotation = nearest_rotation(matrix[:3, :3])
     if np.abs(matrix[:3, :3] - rotation).max() > 1e-2:
-        raise InputError(
-            f"{what} is not a rigid transform (scaled, sheared or mirrored); repair or remove that frame"
-        )
+        raise InputError(f"{what} is not a rigid transform (scaled, sheared or mirrored); repair or remove that frame")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, matrix[:3, 3]
     return pose
@@ -45,9 +41,7 @@ def fit_lens(lens: Lens, photo: Path, source: Path) -> tuple[Lens, str | None]:
     if size == (lens.width, lens.height) or _stored_size(photo) == (lens.width, lens.height):
         return lens, None
     if size[0] * lens.height == size[1] * lens.width:
-        note = (
-            f"{photo.name}: photo {size[0]}×{size[1]}, camera {lens.width}×{lens.height}: intrinsics scaled"
-        )
+        note = f"{photo.name}: photo {size[0]}×{size[1]}, camera {lens.width}×{lens.height}: intrinsics scaled"
         return rescale_lens(lens, *size), note
     raise InputError(
         f"{source}: {photo.name} is {size[0]}×{size[1]} but its camera says {lens.width}×{lens.height}; "

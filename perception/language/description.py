@@ -51,12 +51,8 @@ def to_arrays(descriptions: Sequence[InstanceDescription], encoder: str) -> dict
     boxes = [box for d in descriptions for box in d.boxes]
     return {
         "encoder": np.array(encoder),
-        "embeddings": np.array([d.embedding for d in descriptions], np.float32).reshape(
-            len(descriptions), dim
-        ),
-        "palettes": np.array([d.palette for d in descriptions], np.float32).reshape(
-            len(descriptions), PALETTE, 4
-        ),
+        "embeddings": np.array([d.embedding for d in descriptions], np.float32).reshape(len(descriptions), dim),
+        "palettes": np.array([d.palette for d in descriptions], np.float32).reshape(len(descriptions), PALETTE, 4),
         "view_counts": np.array([len(d.views) for d in descriptions], np.int64),
         "view_names": np.array(views, dtype=np.str_),
         "view_boxes": np.array(boxes, np.int32).reshape(len(boxes), 4),
@@ -71,9 +67,7 @@ def from_arrays(arrays: dict[str, np.ndarray]) -> tuple[list[InstanceDescription
     counts = arrays["view_counts"]
     stops = np.cumsum(counts)
     if len(stops) and stops[-1] != len(arrays["view_names"]):
-        raise InputError(
-            f"embeddings: {stops[-1]} views counted, {len(arrays['view_names'])} named; damaged file"
-        )
+        raise InputError(f"embeddings: {stops[-1]} views counted, {len(arrays['view_names'])} named; damaged file")
     descriptions = []
     for n, stop in enumerate(stops):
         part = slice(int(stop - counts[n]), int(stop))

@@ -40,9 +40,7 @@ def open_session(path: Path, device: Device = "auto") -> Any:
     options.log_severity_level = 3
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # a provider that is absent is judged below, on the session itself
+            warnings.simplefilter("ignore")  # a provider that is absent is judged below, on the session itself
             session = ort.InferenceSession(str(path), options, providers=providers)
     except Exception as error:  # onnxruntime's exceptions share no public base class
         first = str(error).strip().splitlines()[0][:160]

@@ -38,9 +38,7 @@ class Preprocess:
         else:
             scale = self.size / min(height, width)
             # Both reference pipelines floor the long side.
-            size = [
-                self.size if side == min(height, width) else int(scale * side) for side in (width, height)
-            ]
+            size = [self.size if side == min(height, width) else int(scale * side) for side in (width, height)]
             picture = picture.resize((size[0], size[1]), resample)
             left, top = (size[0] - self.size) // 2, (size[1] - self.size) // 2
             picture = picture.crop((left, top, left + self.size, top + self.size))
@@ -114,11 +112,7 @@ def _from_configs(model: Path) -> Preprocess | None:
 def _from_transformers(config: dict[str, Any]) -> Preprocess:
     size = config.get("crop_size") if config.get("do_center_crop") else None
     size = size or config.get("size", 224)
-    squash = (
-        isinstance(config.get("size"), dict)
-        and "height" in config["size"]
-        and not config.get("do_center_crop")
-    )
+    squash = isinstance(config.get("size"), dict) and "height" in config["size"] and not config.get("do_center_crop")
     if isinstance(size, dict):
         size = size.get("height") or size.get("shortest_edge") or 224
     normalise = config.get("do_normalize", True)

@@ -62,8 +62,7 @@ class Ranker:
         )
         if rows.shape[1] != encoder.dim:
             raise InputError(
-                f"embeddings have {rows.shape[1]} dimensions, "
-                f"those of encoder '{encoder.identity}' {encoder.dim}"
+                f"embeddings have {rows.shape[1]} dimensions, those of encoder '{encoder.identity}' {encoder.dim}"
             )
         mean = rows[self._seen].mean(axis=0) if self._seen.any() else np.zeros(encoder.dim, np.float32)
         self._rows = unit_rows(rows - BETA * mean) if self._seen.sum() > 1 else rows

@@ -70,9 +70,7 @@ def find_tokenizer(model: Path, length: int | None) -> Tokenizer:
             vocabulary = json.loads((folder / "vocab.json").read_text(encoding="utf-8"))
             return _finish(clip_bpe(vocabulary, _merges(lines)), model, length)
     if siglip:
-        raise InputError(
-            f"{model}: SigLIP needs its tokenizer.json beside the model; found none in {model.parent}"
-        )
+        raise InputError(f"{model}: SigLIP needs its tokenizer.json beside the model; found none in {model.parent}")
     vocabulary, merges = packaged_clip_vocabulary()
     return _finish(clip_bpe(vocabulary, merges), model, length)
 
@@ -125,9 +123,7 @@ def packaged_clip_vocabulary() -> tuple[dict[str, int], list[tuple[str, str]]]:
 def clip_vocabulary(merges: list[tuple[str, str]]) -> dict[str, int]:
     """Ids in OpenAI's order: 256 bytes, the same ending a word, the merges, then the two marks."""
     letters = _byte_letters()
-    words = (
-        letters + [letter + "</w>" for letter in letters] + ["".join(pair) for pair in merges] + [START, END]
-    )
+    words = letters + [letter + "</w>" for letter in letters] + ["".join(pair) for pair in merges] + [START, END]
     return {word: n for n, word in enumerate(words)}
 
 

@@ -63,9 +63,7 @@ def run_demo(output: Path, progress: Progress | None = None) -> tuple[dict[str, 
         "units_per_metre": scale,
         "peak_memory_mib": gmap.info["peak_memory_mib"],
     }
-    facts["report"] = str(
-        write_map_report(opened, output / "report.html", [query["text"] for query in queries])
-    )
+    facts["report"] = str(write_map_report(opened, output / "report.html", [query["text"] for query in queries]))
     (output / "demo.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     return facts, demo_text(facts)
 
@@ -89,9 +87,7 @@ def _centres(camera_from_world: np.ndarray) -> np.ndarray:
     return -np.einsum("nji,nj->ni", camera_from_world[:, :3, :3], camera_from_world[:, :3, 3])
 
 
-def _ask(
-    opened: LoadedMap, text: str, ids: list[int], truth: DemoTruth, labels: np.ndarray
-) -> dict[str, Any]:
+def _ask(opened: LoadedMap, text: str, ids: list[int], truth: DemoTruth, labels: np.ndarray) -> dict[str, Any]:
     """A prompt, its answer, and whether the answer is right: the true object under most of the first hit's points."""
     hits = opened.query(text, top_k=1)
     found = None
@@ -122,9 +118,7 @@ def demo_text(facts: dict[str, Any]) -> str:
     ]
     for query in facts["queries"]:
         if query["present"]:
-            answer = (
-                f"instance {query['instance_id']} (score {query['score']:.2f}), which is the {query['found']}"
-            )
+            answer = f"instance {query['instance_id']} (score {query['score']:.2f}), which is the {query['found']}"
         else:
             answer = "not present"
         lines.append(f'"{query["text"]}": {answer}: {"right" if query["right"] else "wrong"}')

@@ -39,9 +39,7 @@ def find_instances(
     has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
     if not has_labels:
         empty = np.full(len(means), -1, np.int32)
-        return FoundInstances(
-            empty, np.zeros(len(means), np.float32), [], {}, {"warnings": ["no photo has masks"]}
-        )
+        return FoundInstances(empty, np.zeros(len(means), np.float32), [], {}, {"warnings": ["no photo has masks"]})
 
     progress.log(f"clustering {len(means)} Gaussians")
     clusters = cluster_gaussians(

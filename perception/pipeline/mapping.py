@@ -96,9 +96,7 @@ def build_map(
 
 def _prepare(source: Path, output: Path, resume: bool) -> Path:
     if not source.exists():
-        raise InputError(
-            f"{source}: does not exist; give a folder of photos, a COLMAP workspace or a transforms.json"
-        )
+        raise InputError(f"{source}: does not exist; give a folder of photos, a COLMAP workspace or a transforms.json")
     if output.exists():
         raise InputError(f"{output}: exists already; choose another -o or remove it first")
     work = work_folder(output)
@@ -136,9 +134,7 @@ def _masks(views: list[View], work: Path, config: MapConfig, progress: Progress)
     return report
 
 
-def _photos(
-    views: list[View], config: MapConfig, labels: Path | None, progress: Progress
-) -> list[TrainingView]:
+def _photos(views: list[View], config: MapConfig, labels: Path | None, progress: Progress) -> list[TrainingView]:
     return load_all(views, config.photos.max_side, labels, _stage(progress, "photos"))
 
 
@@ -242,9 +238,7 @@ def _assemble(
         "held_out": np.array([view.name in held for view in scene.views]),
     }
     arrays = {name: tensor.detach().numpy() for name, tensor in vars(gaussians).items()}
-    arrays["quats"] = arrays["quats"] / np.maximum(
-        np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12
-    )
+    arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)
     return GaussianMap(
         **arrays,
         instance_ids=found.ids,
@@ -283,9 +277,7 @@ def _tell_scene(scene: Scene, progress: Progress) -> None:
 def _tell_result(gmap: GaussianMap, output: Path, progress: Progress) -> None:
     info = gmap.info
     quality = info["quality"]
-    scored = (
-        f", held-out PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.3f}" if "psnr" in quality else ""
-    )
+    scored = f", held-out PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.3f}" if "psnr" in quality else ""
     progress.log(
         f"{output}: {len(gmap)} Gaussians, {len(gmap.instances)} instances{scored}, "
         f"{info['seconds']['total']:.0f} s, peak {info['peak_memory_mib']:.0f} MiB"

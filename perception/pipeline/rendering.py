@@ -19,9 +19,7 @@ from perception.types import View
 KINDS = ("rgb", "depth", "instances", "features")
 
 
-def render_map(
-    map_path: Path, output: Path, cameras: Path | None, what: list[str]
-) -> tuple[dict[str, Any], str]:
+def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[str]) -> tuple[dict[str, Any], str]:
     """Writes one picture per camera and kind: `NAME.png` for a single kind, `KIND/NAME.png` for several.
 
     rgb: 8-bit PNG. depth: 16-bit PNG, thousandths of the map's unit along the optical axis, 0 = nothing.
@@ -84,9 +82,7 @@ def _cameras(path: Path) -> list[View]:
         (fx, fy, cx, cy), width, height = pinhole_from_lens(lens)
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
         short = PurePosixPath(name).relative_to(folder).as_posix()
-        views.append(
-            View(short, path, K, width, height, camera_from_world, None if is_pinhole(lens) else lens)
-        )
+        views.append(View(short, path, K, width, height, camera_from_world, None if is_pinhole(lens) else lens))
     return views
 
 

@@ -220,9 +220,7 @@ def _instance_row(opened: LoadedMap, index: int, album: _Album) -> InstanceRow:
 
 def _query_row(opened: LoadedMap, text: str, album: _Album, expected: list[int] | None) -> QueryRow:
     hits = opened.query(text)
-    index = next(
-        (i for i, entry in enumerate(opened.instances) if hits and entry["id"] == hits[0].instance_id), None
-    )
+    index = next((i for i, entry in enumerate(opened.instances) if hits and entry["id"] == hits[0].instance_id), None)
     picture = None if index is None else _best_crop(opened, index, album, whole=True)
     return QueryRow(text, bool(hits), [(hit.instance_id, hit.score) for hit in hits], picture, expected)
 

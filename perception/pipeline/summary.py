@@ -59,7 +59,8 @@ def query_text(answers: list[tuple[str, list[Hit]]], metric: bool) -> str:
             a, b, c = hit.obb.extent
             name = f" ({hit.label})" if hit.label else ""
             lines.append(
-                f'"{text}" {rank}. instance {hit.instance_id}{name}  score {hit.score:.2f}  at {x:.3f} {y:.3f} {z:.3f}{unit}'
+                f'"{text}" {rank}. instance {hit.instance_id}{name}  score {hit.score:.2f}'
+                f"  at {x:.3f} {y:.3f} {z:.3f}{unit}"
                 f"  size {a:.3f} x {b:.3f} x {c:.3f}{unit}  {len(hit.points)} points"
             )
     return "\n".join(lines)

@@ -99,9 +99,7 @@ def _views(data: ReportData, inline: Inline) -> str:
             (view.render, "render " + ", ".join(text for text in quality if text)),
         ]
         if view.photo.shape == view.render.shape:
-            cells.append(
-                (error_map(view.photo, view.render), "error: black is none, bright is a quarter of the range")
-            )
+            cells.append((error_map(view.photo, view.render), "error: black is none, bright is a quarter of the range"))
         figures = "".join(
             f"<figure>{inline(picture, caption)}<figcaption>{escape(caption)}</figcaption></figure>"
             for picture, caption in cells
@@ -180,10 +178,6 @@ def _instance(row: InstanceRow, inline: Inline, scale: float = 1.0) -> str:
 
 def _settings(data: ReportData) -> str:
     rerun = f"<pre>{escape(data.rerun)}</pre>" if data.rerun else ""
-    rows = "".join(
-        f"<tr><td>{escape(str(k))}</td><td>{escape(str(v))}</td></tr>" for k, v in data.settings.items()
-    )
-    table = (
-        f'<details><summary>All settings</summary><div class="scroll"><table>{rows}</table></div></details>'
-    )
+    rows = "".join(f"<tr><td>{escape(str(k))}</td><td>{escape(str(v))}</td></tr>" for k, v in data.settings.items())
+    table = f'<details><summary>All settings</summary><div class="scroll"><table>{rows}</table></div></details>'
     return _section("Make it again", rerun + (table if rows else ""))
