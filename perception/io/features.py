@@ -128,6 +128,7 @@ def _extract(
     groups: dict[Any, list[int]] = {}
     for index, photo in enumerate(photos):
         groups.setdefault(lenses[index] or _camera_key(photo), []).append(index)
+    pycolmap.Database.open(database).close()  # creates it
     done = 0
     for members in groups.values():
         lens = lenses[members[0]]
@@ -142,6 +143,8 @@ def _extract(
             reader.camera_model = lens.model
             reader.camera_params = ", ".join(map(repr, lens.params))
         chosen = [names[i] for i in members]
+        # Extraction alone numbers photos as its threads finish, and later random choices hang on the numbers.
+        pycolmap.import_images(database, root, pycolmap.CameraMode.SINGLE, chosen, reader)
         pycolmap.extract_features(database, root, chosen, pycolmap.CameraMode.SINGLE, reader, options)
         poor = _forget_poor(database, chosen)
         if poor:

@@ -12,6 +12,8 @@ from perception.io.features import MIN_INLIERS, FeatureStore, Progress
 from perception.io.lens import load_pycolmap
 
 MIN_MODEL_SIZE = 3
+REPEATABLE_PHOTOS = 150
+"""Up to so many photos one thread maps, which repeats bit for bit and costs next to nothing at that size."""
 Found = tuple[list[Any], set[str]]
 """Models, largest first, and the names of the photos left out because most of their matches contradict the largest."""
 ACCEPTED_OVERRULED = 0.005
@@ -103,6 +105,8 @@ class _Mapping:
         pycolmap = load_pycolmap()
         options = pycolmap.IncrementalPipelineOptions()
         options.random_seed = self.seed
+        if self.count <= REPEATABLE_PHOTOS:
+            options.num_threads = 1
         options.min_num_matches = min_inliers
         options.min_model_size = MIN_MODEL_SIZE
         options.multiple_models = source is None

@@ -1,7 +1,7 @@
 """Structure from motion from a folder of photos: features, matching, incremental mapping (pycolmap), and its doubts.
 
-The seed fixes every random choice. What does not repeat bit for bit: bundle adjustment adds up in the order its threads
-finish, so poses differ in the last digits between runs and machines.
+The seed fixes every random choice: up to mapping.REPEATABLE_PHOTOS photos the same machine gives the same poses bit for
+bit. Larger sets are mapped by several threads, and poses differ between runs, also in the choice of unit and origin.
 """
 
 from __future__ import annotations
