@@ -117,13 +117,14 @@ def test_a_seed_repeats(corner, run, tmp_path):
         np.testing.assert_array_equal(a.camera_from_world, b.camera_from_world)
 
 
-def test_a_wrecked_model_is_doubted(run):
+@pytest.mark.parametrize("wrecked", [1, VIEWS // 2])
+def test_a_wrecked_model_is_doubted(run, wrecked):
     pycolmap = load_pycolmap()
     (store,) = run[2].glob("features-*")
     model = pycolmap.Reconstruction(store / "model")
     assert doubts.doubts_about([model], store / "database.db", VIEWS) == []
     half_turn = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(np.diag([-1.0, -1.0, 1.0])), np.zeros(3))
-    for image in sorted(model.images.values(), key=lambda image: image.name)[VIEWS // 2 :]:
+    for image in sorted(model.images.values(), key=lambda image: image.name)[-wrecked:]:
         frame = model.frames[image.frame_id]
         frame.rig_from_world = pycolmap.Rigid3d((frame.rig_from_world.matrix() @ matrix_4x4(half_turn))[:3])
     warnings = doubts.doubts_about([model], store / "database.db", VIEWS)

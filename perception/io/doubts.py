@@ -14,7 +14,7 @@ import numpy as np
 
 from perception.io.lens import load_pycolmap
 
-MAX_UNREGISTERED, MAX_SECOND_MODEL, MAX_OVERRULED, MAX_UNMATCHED = 0.15, 0.30, 0.02, 0.30
+MAX_UNREGISTERED, MAX_SECOND_MODEL, MAX_OVERRULED, MAX_UNMATCHED = 0.15, 0.30, 0.005, 0.30
 EPIPOLAR_TOLERANCE, TOLERANCE_PIXELS = 4.0 / 1000, 4.0
 """Sampson distance in normalised image coordinates; for short focal lengths, that of TOLERANCE_PIXELS if larger (the
 error that verification allows)."""

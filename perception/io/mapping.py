@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from perception.io.doubts import Pair, outvoted_photos, overruled, verified_pairs
+from perception.io.doubts import MAX_OVERRULED, Pair, outvoted_photos, overruled, verified_pairs
 from perception.io.features import MIN_INLIERS, FeatureStore, Progress
 from perception.io.lens import load_pycolmap
 
@@ -16,7 +16,6 @@ REPEATABLE_PHOTOS = 150
 """Up to so many photos one thread maps, which repeats bit for bit and costs next to nothing at that size."""
 Found = tuple[list[Any], set[str]]
 """Models, largest first, and the names of the photos left out because most of their matches contradict the largest."""
-ACCEPTED_OVERRULED = 0.005
 LEVELS = (MIN_INLIERS, 2 * MIN_INLIERS, 4 * MIN_INLIERS, 8 * MIN_INLIERS)
 """Pairs with fewer verified matches are left out in turn until a model stands that overrules no stronger pair."""
 
@@ -51,7 +50,7 @@ class _Mapping:
         for found in self._candidates():
             pairs = verified_pairs(found[0][0], self.database)
             tried.append((sum(pair.inliers for pair in pairs if pair.agrees), found))
-            if len(overruled(pairs)) <= ACCEPTED_OVERRULED * len(pairs):
+            if len(overruled(pairs)) <= MAX_OVERRULED * len(pairs):
                 break
         if not tried:
             return [], set()
