@@ -14,10 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import perception
 from perception.cli import main
 from perception.config import load_config
+from perception.io.cloud import read_cloud
 from perception.io.store import read_map
 from perception.pipeline.mapping import build_map, work_folder
+from perception.pipeline.reporting import write_map_report
 
 SETTINGS = [
     "train.iterations=400",
@@ -37,7 +40,7 @@ def settings(scene: Path, *more: str):
 @pytest.fixture(scope="module")
 def finished(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("maps") / "small.gsmap"
-    build_map(small_scene / "transforms.json", path, settings(small_scene))
+    build_map(small_scene / "transforms.json", path, settings(small_scene, "language.encoder=conse"))
     return path
 
 
@@ -80,6 +83,43 @@ def test_instances_agree_with_the_truth(finished: Path, small_scene: Path, tmp_p
 
     result, _ = run_instances(out, truth)
     assert result["ap25"] > 0.4
+
+
+def test_query_answers_as_the_contract_says(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cloud = tmp_path / "hits.ply"
+    command = ["query", str(finished), "a ball", "--top", "2", "--min-score", "0", "--points", str(cloud), "--json"]
+    assert main(command) == 0
+    answer = json.loads(capsys.readouterr().out)
+    (result,) = answer["results"]
+    assert (result["text"], result["present"], answer["metric"]) == ("a ball", True, False)
+    assert len(result["hits"]) == 2 and result["hits"][0]["score"] >= result["hits"][1]["score"]
+    assert set(result["hits"][0]) >= {"instance_id", "score", "num_points", "centroid", "obb"}
+
+    gmap = read_map(finished)
+    hit = perception.load_map(finished).query("a ball", top_k=1, min_score=0)[0]
+    assert np.array_equal(hit.points, gmap.means[gmap.instance_ids == hit.instance_id])
+    local = (hit.points - hit.obb.center) @ hit.obb.rotation.T
+    assert (np.abs(local) <= hit.obb.extent / 2 + 1e-5).all()
+    held = read_cloud(cloud)
+    assert set(held.labels["instance_id"]) == {entry["instance_id"] for entry in result["hits"]}
+    assert perception.load_map(finished).query("a ball", min_score=1.01) == []
+    assert main(["query", str(finished), " "]) == 2
+
+
+def test_a_users_label_answers_to_its_name(finished: Path, tmp_path: Path) -> None:
+    named = tmp_path / "named.gsmap"
+    shutil.copytree(finished, named)
+    facts = json.loads((named / "instances.json").read_text())
+    facts["instances"][2]["label"] = "grandma's cup"
+    (named / "instances.json").write_text(json.dumps(facts))
+    hit = perception.load_map(named).query("Grandma's cup", top_k=1)[0]
+    assert (hit.instance_id, hit.score) == (facts["instances"][2]["id"], 1.0)
+
+
+def test_the_report_is_one_page_that_needs_nothing_else(finished: Path, tmp_path: Path) -> None:
+    page = write_map_report(perception.load_map(finished), tmp_path / "report.html", ["a ball"]).read_text()
+    assert "http" not in page.replace("http://www.w3.org", "")
+    assert page.count("data:image") > len(read_map(finished).instances) // 2
 
 
 def test_render_writes_every_kind(finished: Path, small_scene: Path, tmp_path: Path) -> None:

@@ -72,7 +72,6 @@ class Trainer:
         self.config = config
         self.views = views
         self.held_out = held_out
-        self.coarse = [view.halved() for view in views] if config.train.coarse_until > 0 else []
         self.extent = scene_extent(views)
         self.record = TrainRecord()
         self.iteration = 0
@@ -81,6 +80,8 @@ class Trainer:
         self.statistics = Statistics.zeros(len(gaussians))
         self.optimiser = SparseAdam(vars(gaussians), self._rates(0.0))
         self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
+        halves = config.train.coarse_until > 0 or (self.has_labels and config.losses.half_resolution)
+        self.coarse = [view.halved() for view in views] if halves else []
         self._trials: list[float] = []
         self._sh_settled = config.train.sh_degree == 0
         self._started = time.monotonic()
@@ -158,8 +159,13 @@ class Trainer:
     def step(self) -> dict[str, float]:
         """One iteration: a view, its losses, Adam, and now and then densification or one harmonic more."""
         progress = self.progress
-        view = self._pick(progress)
-        losses = self._descend(view, progress)
+        losses_config = self.config.losses
+        with_features = (
+            self.has_labels and progress >= losses_config.start and self.iteration % losses_config.every == 0
+        )
+        coarse = progress < self.config.train.coarse_until or (with_features and losses_config.half_resolution)
+        view = self._pick(coarse)
+        losses = self._descend(view, progress, with_features)
         self.iteration += 1
         every = self.config.densify.every
         if self.iteration % every == 0:
@@ -171,17 +177,15 @@ class Trainer:
             self._note(progress)
         return losses
 
-    def _pick(self, progress: float) -> TrainingView:
+    def _pick(self, coarse: bool) -> TrainingView:
         epoch, place = divmod(self.iteration, len(self.views))
         if place == 0 or len(self._order) == 0:
             self._order = np.random.default_rng([self.config.seed, epoch]).permutation(len(self.views))
-        views = self.coarse if self.coarse and progress < self.config.train.coarse_until else self.views
-        return views[self._order[place]]
+        return (self.coarse if coarse else self.views)[self._order[place]]
 
-    def _descend(self, view: TrainingView, progress: float) -> dict[str, float]:
+    def _descend(self, view: TrainingView, progress: float, with_features: bool) -> dict[str, float]:
         config = self.config
         params = {name: tensor.detach().requires_grad_() for name, tensor in vars(self.gaussians).items()}
-        with_features = self.has_labels and progress >= config.losses.start
         height, width = view.photo.shape[:2]
         background = None
         if config.train.random_background:
