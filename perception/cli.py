@@ -26,7 +26,17 @@ def build_parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="perception", description="From photos to a 3D instance map that answers text prompts.")
     parser.add_argument("--version", action="version", version=f"perception {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
-    for add in (_add_demo, _add_map, _add_export, _add_query, _add_render, _add_eval, _add_info, _add_bench):
+    for add in (
+        _add_demo,
+        _add_map,
+        _add_export,
+        _add_query,
+        _add_render,
+        _add_eval,
+        _add_info,
+        _add_report,
+        _add_bench,
+    ):
         add(commands)
     return parser
 
@@ -123,6 +133,21 @@ def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     info = read_info(args.map)
     return info, info_text(args.map, info)
+
+
+def _add_report(commands: Any) -> None:
+    p = _command(commands, "report", _report, "one self-contained page: held-out views, curves, instances, answers")
+    p.add_argument("map", type=Path, metavar="MAP")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.html")
+    p.add_argument("--ask", action="append", default=[], metavar="TEXT", help="a prompt to answer on the page")
+
+
+def _report(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.pipeline.reporting import write_map_report
+    from perception.query import load_map
+
+    page = write_map_report(load_map(args.map), args.output, args.ask)
+    return {"report": str(page)}, str(page)
 
 
 # ---------------------------------------------------------------------- query

@@ -17,8 +17,10 @@ import pytest
 import perception
 from perception.cli import main
 from perception.config import load_config
+from perception.demo import load_truth
 from perception.io.cloud import read_cloud
 from perception.io.store import read_map
+from perception.pipeline.demo import truth_in_map_frame
 from perception.pipeline.mapping import build_map, work_folder
 from perception.pipeline.reporting import write_map_report
 
@@ -120,6 +122,14 @@ def test_the_report_is_one_page_that_needs_nothing_else(finished: Path, tmp_path
     page = write_map_report(perception.load_map(finished), tmp_path / "report.html", ["a ball"]).read_text()
     assert "http" not in page.replace("http://www.w3.org", "")
     assert page.count("data:image") > len(read_map(finished).instances) // 2
+    assert main(["report", str(finished), "-o", str(tmp_path / "again.html")]) == 0
+
+
+def test_the_truth_is_brought_into_the_maps_frame(finished: Path, small_scene: Path) -> None:
+    """With the true poses given, the demo's alignment must be the identity."""
+    truth = load_truth(small_scene / "truth")
+    cloud, scale = truth_in_map_frame(truth, read_map(finished))
+    assert np.isclose(scale, 1, atol=1e-6) and np.allclose(cloud.points, truth.points, atol=1e-4)
 
 
 def test_render_writes_every_kind(finished: Path, small_scene: Path, tmp_path: Path) -> None:

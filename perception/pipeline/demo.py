@@ -17,7 +17,7 @@ from perception.export import export_labels, write_export
 from perception.geometry import align_similarity
 from perception.io.store import GaussianMap, read_map
 from perception.pipeline.mapping import build_map
-from perception.pipeline.reporting import write_map_report
+from perception.pipeline.reporting import map_picture, write_map_report
 from perception.progress import Progress
 from perception.query import LoadedMap
 from perception.types import PointCloud
@@ -64,6 +64,9 @@ def run_demo(output: Path, progress: Progress | None = None) -> tuple[dict[str, 
         "peak_memory_mib": gmap.info["peak_memory_mib"],
     }
     facts["report"] = str(write_map_report(opened, output / "report.html", [query["text"] for query in queries]))
+    from PIL import Image
+
+    Image.fromarray(map_picture(opened, truth.queries[0][0])).save(output / "demo.jpg", quality=88)
     (output / "demo.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     return facts, demo_text(facts)
 

@@ -15,7 +15,7 @@ from perception.instances.silhouettes import render_silhouettes
 from perception.io.photos import load_photo, scaled_K
 from perception.io.scene_cache import view_from_json
 from perception.io.store import GaussianMap
-from perception.pictures import features_to_rgb, instance_palette, outline, overlay
+from perception.pictures import features_to_rgb, instance_palette, montage, outline, overlay
 from perception.pipeline.rendering import as_gaussians
 from perception.query import LoadedMap
 from perception.report import InstanceRow, QueryRow, ReportData, ViewRow, write_report
@@ -93,6 +93,21 @@ class _Album:
             found = render_silhouettes(self.gaussians, self.gmap.instance_ids, pose, K, width, height)
             self._ids[name] = found.ids
         return self._ids[name]
+
+
+def map_picture(opened: LoadedMap, text: str) -> np.ndarray:
+    """Four pictures in a row from the photo that answers `text` best: photo, render, instances, answer."""
+    album = _Album(opened.gmap, as_gaussians(opened.gmap))
+    hits = opened.query(text, top_k=1)
+    names = list(album.views)
+    name = hits[0].views[0] if hits and hits[0].views else names[len(names) // 2]
+    photo = album.photo(name)
+    if photo is None:
+        raise InputError(f"{album.views[name].photo}: cannot be read any more; the picture needs the photo")
+    ids = album.ids(name, photo)
+    answer = outline(photo, ids == hits[0].instance_id) if hits else photo
+    titles = ["photo", "the map from the same place", "instances", f'"{text}"']
+    return montage([photo, album.render(name, photo), overlay(photo, ids), answer], 4, titles)
 
 
 def saved_views(gmap: GaussianMap) -> list[View]:
