@@ -10,7 +10,7 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 Contenders = dict[str, Callable[[], Any]]
@@ -154,7 +154,7 @@ def adam_case(rows: int) -> Contenders:
     }
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Prints the tables, or one JSON object with --json."""
     parser = argparse.ArgumentParser(prog="python -m perception.bench.training", description=__doc__)
     parser.add_argument("--height", type=int, default=480)
@@ -165,7 +165,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=0, help="0: all processors")
     parser.add_argument("--turns", type=int, default=11)
     parser.add_argument("--json", action="store_true")
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
 
     # Idle workers of torch's OpenMP pool spin and would take the processor from the contender after torch.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
