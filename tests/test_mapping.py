@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -164,7 +163,8 @@ def test_killed_and_resumed_is_the_run_that_was_never_killed(finished: Path, sma
     pairs = [f"--set={pair}" for pair in [*SETTINGS, "train.checkpoint_seconds=0.01"]]
     command = [sys.executable, "-m", "perception.cli", "map", str(small_scene / "transforms.json"), "-o", str(out)]
     command += ["--masks", f"labels:{small_scene / 'labels'}", *pairs]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env={**os.environ, "OMP_WAIT_POLICY": "passive"})
+    # Not in the repository's root, where the sources without their compiled core would be found first.
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, cwd=tmp_path)
     checkpoint = work_folder(out) / "checkpoint.pt"
     while process.poll() is None and not checkpoint.exists():
         time.sleep(0.01)

@@ -70,7 +70,6 @@ class Trainer:
         self, gaussians: Gaussians, views: list[TrainingView], config: MapConfig, held_out: list[TrainingView]
     ):
         self.config = config
-        self.views = views
         self.held_out = held_out
         self.extent = scene_extent(views)
         self.record = TrainRecord()
@@ -79,13 +78,20 @@ class Trainer:
         self.gaussians = gaussians
         self.statistics = Statistics.zeros(len(gaussians))
         self.optimiser = SparseAdam(vars(gaussians), self._rates(0.0))
-        self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
-        halves = config.train.coarse_until > 0 or (self.has_labels and config.losses.half_resolution)
-        self.coarse = [view.halved() for view in views] if halves else []
+        self.coarse: list[TrainingView] = []
+        self.has_labels = False
+        self.show(views)
         self._trials: list[float] = []
         self._sh_settled = config.train.sh_degree == 0
         self._started = time.monotonic()
         self._order: np.ndarray = np.zeros(0, dtype=np.int64)
+
+    def show(self, views: list[TrainingView]) -> None:
+        """Trains on `views` from here on: the same photos, whose masks may have come since."""
+        self.views = views
+        self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
+        halves = self.config.train.coarse_until > 0 or (self.has_labels and self.config.losses.half_resolution)
+        self.coarse = [view.halved() for view in views] if halves else []
 
     # ------------------------------------------------------------------ state
 
@@ -147,9 +153,9 @@ class Trainer:
 
     # ------------------------------------------------------------------ steps
 
-    def run(self, on_step: Callable[[Trainer, dict[str, float]], None]) -> TrainRecord:
-        """Trains to the end; `on_step` sees every iteration (progress bars, checkpoints)."""
-        while self.progress < 1.0:
+    def run(self, on_step: Callable[[Trainer, dict[str, float]], None], until: float = 1.0) -> TrainRecord:
+        """Trains until progress `until`; `on_step` sees every iteration (progress bars, checkpoints)."""
+        while self.progress < until:
             figures = self.step()
             on_step(self, figures)
         self.record.seconds, self.record.iterations = self.elapsed, self.iteration
@@ -296,6 +302,12 @@ class Trainer:
             views = [views[i] for i in np.linspace(0, len(views) - 1, limit).round().astype(int)]
         return {"psnr": float(np.mean([psnr(render_view(self.gaussians, view), view.photo) for view in views]))}
 
+    @torch.no_grad()
+    def depth(self, name: str) -> np.ndarray:
+        """[H, W] float32 depth along the optical axis of training view `name` as the map now has it, 0 = nothing."""
+        view = next(view for view in self.views if view.name == name)
+        return depth_image(self.gaussians, view.camera_from_world, view.K, *view.photo.shape[1::-1]).numpy()
+
     def _note(self, progress: float) -> None:
         self.record.curve.append(
             {
@@ -326,6 +338,26 @@ def render_view(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
         depth=False,
     )
     return out.colors[0].clamp(0, 1)
+
+
+@torch.no_grad()
+def depth_image(
+    gaussians: Gaussians, camera_from_world: torch.Tensor, K: torch.Tensor, width: int, height: int
+) -> torch.Tensor:
+    """Expected depth [H, W] along the optical axis where the map is more than half opaque, 0 elsewhere."""
+    out = rasterize(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.base_colors,
+        camera_from_world[None],
+        K[None],
+        width,
+        height,
+    )
+    alpha = out.alphas[0]
+    return torch.where(alpha > 0.5, out.depths[0] / alpha.clamp(min=1e-6), torch.zeros_like(alpha))
 
 
 def psnr(image: torch.Tensor, photo: torch.Tensor) -> float:

@@ -22,7 +22,7 @@ from perception.progress import Progress
 from perception.query import LoadedMap
 from perception.types import PointCloud
 
-SETTINGS = ["train.iterations=1500", "train.budget=40000"]
+SETTINGS = ["train.iterations=2000", "train.budget=40000"]
 """The demo's own settings: a small scene within four minutes on two cores."""
 
 

@@ -18,11 +18,12 @@ from perception.io.inputs import load_scene
 from perception.io.photos import load_photo
 from perception.io.scene_cache import load_saved_scene, save_scene, view_json
 from perception.io.store import GaussianMap, write_map
-from perception.masks import make_source
+from perception.masks import MaskSource, make_source
+from perception.masks.source import GeometryMaskSource
 from perception.masks.store import compute_masks
 from perception.pipeline.checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from perception.pipeline.instances import find_instances
-from perception.pipeline.photos import load_all, split_views
+from perception.pipeline.photos import load_all, split_views, with_labels
 from perception.pipeline.record import Stages, peak_memory_mib, versions
 from perception.progress import Progress
 from perception.types import Scene, View
@@ -55,13 +56,23 @@ def build_map(
     _tell_scene(scene, progress)
     training, held_out = split_views(scene.views, config.photos.holdout)
 
-    with stages("masks"):
-        mask_report = _masks(training, work, config, progress)
+    source_of_masks = make_source(config.masks, cache_dir=work)
     with stages("photos"):
-        views = _photos(training, config, work / "masks", progress)
-        held = _photos(held_out, config, None, progress)
+        views = _photos(training, config, progress)
+        held = _photos(held_out, config, progress)
+    trainer = Trainer(_initial(scene, config), views, config, held)
+    session = _Session(trainer, work, fingerprint(source, config), config, progress)
+    depth = None
+    if isinstance(source_of_masks, GeometryMaskSource):  # its masks wait for the map's own geometry
+        with stages("train"):
+            session.train(until=config.losses.geometry_start)
+        depth = trainer.depth
+    with stages("masks"):
+        mask_report = _masks(training, source_of_masks, work, config, depth, progress)
+        views = [with_labels(view, of, work / "masks") for view, of in zip(views, training, strict=True)]
+        trainer.show(views)
     with stages("train"):
-        trainer = _train(scene, views, held, work, fingerprint(source, config), config, progress)
+        session.train()
     gaussians = trainer.gaussians
     with stages("instances"):
         found = find_instances(gaussians, views, scene, config, progress)
@@ -120,47 +131,51 @@ def _scene(source: Path, work: Path, config: MapConfig, progress: Progress) -> S
     return scene
 
 
-def _masks(views: list[View], work: Path, config: MapConfig, progress: Progress) -> dict[str, Any]:
-    source = make_source(config.masks, cache_dir=work)
+def _masks(
+    views: list[View],
+    source: MaskSource,
+    work: Path,
+    config: MapConfig,
+    depth: Callable[[str], np.ndarray] | None,
+    progress: Progress,
+) -> dict[str, Any]:
     report = compute_masks(
         views,
         source,
         lambda view: load_photo(view, config.photos.max_side),
         work / "masks",
         _stage(progress, f"masks ({source.name})"),
+        load_depth=None if depth is None else lambda view: depth(view.name),
+        depth_key="" if depth is None else f"progress {config.losses.geometry_start}",
     )
     for warning in report["warnings"]:
         progress.log(f"warning: {warning}")
     return report
 
 
-def _photos(views: list[View], config: MapConfig, labels: Path | None, progress: Progress) -> list[TrainingView]:
-    return load_all(views, config.photos.max_side, labels, _stage(progress, "photos"))
+def _photos(views: list[View], config: MapConfig, progress: Progress) -> list[TrainingView]:
+    return load_all(views, config.photos.max_side, _stage(progress, "photos"))
 
 
-def _train(
-    scene: Scene,
-    views: list[TrainingView],
-    held_out: list[TrainingView],
-    work: Path,
-    mark: str,
-    config: MapConfig,
-    progress: Progress,
-) -> Trainer:
-    trainer = Trainer(_initial(scene, config), views, config, held_out)
-    path = work / "checkpoint.pt"
-    state = load_checkpoint(path, mark)
-    if state is not None:
-        trainer.load(state)
-        progress.log(f"resuming at iteration {trainer.iteration}")
-    watch = _Watch(path, mark, config, progress)
-    try:
-        trainer.run(watch)
-    except KeyboardInterrupt:
-        save_checkpoint(path, trainer.state(), mark)
-        raise
-    save_checkpoint(path, trainer.state(), mark)
-    return trainer
+class _Session:
+    """Training in legs, each ending in a checkpoint; takes up where an interrupted run left off."""
+
+    def __init__(self, trainer: Trainer, work: Path, mark: str, config: MapConfig, progress: Progress):
+        self.trainer, self.mark, self.path = trainer, mark, work / "checkpoint.pt"
+        self.watch = _Watch(self.path, mark, config, progress)
+        state = load_checkpoint(self.path, mark)
+        if state is not None:
+            trainer.load(state)
+            progress.log(f"resuming at iteration {trainer.iteration}")
+
+    def train(self, until: float = 1.0) -> None:
+        """Trains until `until`; a leg that is behind us already is skipped, and its checkpoint left as it is."""
+        if self.trainer.progress >= until:
+            return
+        try:
+            self.trainer.run(self.watch, until)
+        finally:
+            save_checkpoint(self.path, self.trainer.state(), self.mark)
 
 
 def _initial(scene: Scene, config: MapConfig) -> Gaussians:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,28 +23,29 @@ def split_views(views: list[View], holdout: int) -> tuple[list[View], list[View]
     return [view for i, view in enumerate(views) if i % holdout != 0], held
 
 
-def training_view(view: View, max_side: int, labels_folder: Path | None = None) -> TrainingView:
-    """Decodes one photo, and its label image when `labels_folder` is given."""
+def training_view(view: View, max_side: int) -> TrainingView:
+    """Decodes one photo."""
     photo = load_photo(view, max_side)
     height, width = photo.shape[:2]
-    labels = None
-    if labels_folder is not None:
-        labels = torch.from_numpy(np.ascontiguousarray(load_labels(labels_folder, view), dtype=np.int32))
     return TrainingView(
         view.name,
         torch.from_numpy(photo),
-        labels,
+        None,
         torch.from_numpy(scaled_K(view, width, height).astype(np.float32)),
         torch.from_numpy(view.camera_from_world.astype(np.float32)),
     )
 
 
-def load_all(
-    views: list[View], max_side: int, labels_folder: Path | None, progress: Callable[[int, int], None]
-) -> list[TrainingView]:
-    """All of `views`, decoded; memory is 3 bytes a pixel, and 4 more with labels."""
+def with_labels(decoded: TrainingView, view: View, folder: Path) -> TrainingView:
+    """The decoded photo with its label image from `folder`."""
+    labels = np.ascontiguousarray(load_labels(folder, view), dtype=np.int32)
+    return replace(decoded, labels=torch.from_numpy(labels))
+
+
+def load_all(views: list[View], max_side: int, progress: Callable[[int, int], None]) -> list[TrainingView]:
+    """All of `views`, decoded; memory is 3 bytes a pixel."""
     loaded = []
     for done, view in enumerate(views, start=1):
-        loaded.append(training_view(view, max_side, labels_folder))
+        loaded.append(training_view(view, max_side))
         progress(done, len(views))
     return loaded

@@ -12,6 +12,7 @@ import torch
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians
 from perception.gaussians.rasterize import rasterize
+from perception.gaussians.train import depth_image
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.store import GaussianMap, read_map
 from perception.types import View
@@ -116,6 +117,9 @@ def _picture(kind: str, gaussians: Gaussians, gmap: GaussianMap, view: View) -> 
     if kind == "instances":
         found = render_silhouettes(gaussians, gmap.instance_ids, pose, K, view.width, view.height)
         return (found.ids + 1).astype(np.uint16)
+    if kind == "depth":
+        depth = depth_image(gaussians, pose, K, view.width, view.height)
+        return (depth * 1000).round().clamp(0, 65535).numpy().astype(np.uint16)
     out = rasterize(
         gaussians.means,
         gaussians.quats,
@@ -136,9 +140,7 @@ def _picture(kind: str, gaussians: Gaussians, gmap: GaussianMap, view: View) -> 
 
         assert out.features is not None  # features were given
         return features_to_rgb(out.features[0].numpy())
-    alpha = out.alphas[0]
-    depth = torch.where(alpha > 0.5, out.depths[0] / alpha.clamp(min=1e-6), torch.zeros_like(alpha))
-    return (depth * 1000).round().clamp(0, 65535).numpy().astype(np.uint16)
+    raise ValueError(f"unknown kind of picture: {kind}")
 
 
 def _write(path: Path, image: np.ndarray) -> None:
