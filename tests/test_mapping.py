@@ -17,8 +17,10 @@ import perception
 from perception.cli import main
 from perception.config import load_config
 from perception.demo import load_truth
+from perception.gaussians.train import Trainer
 from perception.io.cloud import read_cloud
 from perception.io.store import read_map
+from perception.pipeline import mapping
 from perception.pipeline.demo import truth_in_map_frame
 from perception.pipeline.mapping import build_map, work_folder
 from perception.pipeline.reporting import write_map_report
@@ -174,6 +176,24 @@ def test_killed_and_resumed_is_the_run_that_was_never_killed(finished: Path, sma
     assert main(command[3:]) == 2  # the unfinished run is named, not overwritten
     assert main([*command[3:], "--resume", "--json"]) == 0
     assert (finished / "gaussians.ply").read_bytes() == (out / "gaussians.ply").read_bytes()
+
+
+def test_built_in_masks_are_made_from_the_maps_own_depth(small_scene: Path, tmp_path: Path) -> None:
+    """They wait for the geometry, and a run that is interrupted around them ends in the same map."""
+    config = load_config(None, [*SETTINGS, "masks=builtin", "train.iterations=200"])
+    whole = build_map(small_scene / "transforms.json", tmp_path / "whole.gsmap", config)
+    assert whole.info["masks"]["source"] == "builtin" and whole.info["masks"]["photos"] == 10
+
+    def stop(trainer: Trainer, figures: dict[str, float]) -> None:
+        if trainer.iteration == 150:
+            raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(mapping._Watch, "__call__", lambda self, trainer, figures: stop(trainer, figures))
+        build_map(small_scene / "transforms.json", tmp_path / "cut.gsmap", config)
+    again = build_map(small_scene / "transforms.json", tmp_path / "cut.gsmap", config, resume=True)
+    assert again.info["masks"]["skipped"] == 10
+    assert np.array_equal(whole.means, again.means) and np.array_equal(whole.instance_ids, again.instance_ids)
 
 
 def test_resume_refuses_other_settings(small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

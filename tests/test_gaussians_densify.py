@@ -1,0 +1,89 @@
+"""Growth and pruning: the budget holds, clones keep the light, splits keep the place, depth is the plane's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from perception.config import DensifyConfig
+from perception.gaussians.densify import Statistics, densify, rotation_matrices, target_count
+from perception.gaussians.model import Gaussians, from_points
+from perception.gaussians.train import depth_image
+
+CONFIG = DensifyConfig()
+
+
+def cloud(count: int = 50, seed: int = 0) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    points, colors = rng.uniform(-1, 1, (count, 3)), rng.integers(0, 256, (count, 3)).astype(np.uint8)
+    return from_points(points, colors, feature_dim=4, seed=seed, opacity=0.5)
+
+
+def statistics(count: int, gradient: float = 1.0) -> Statistics:
+    return Statistics(torch.full((count,), gradient), torch.ones(count), torch.ones(count))
+
+
+@pytest.mark.parametrize("allowed", [0, 10, 50, 51, 70, 1000])
+@pytest.mark.parametrize("extent", [1e-6, 1e6])  # all are split, all are cloned
+def test_the_budget_holds(allowed: int, extent: float) -> None:
+    change = densify(cloud(), statistics(50), allowed, extent, CONFIG, seed=1)
+    assert len(change.keep) + len(change.born) == min(100, max(50, allowed))
+
+
+def test_nothing_grows_below_the_threshold() -> None:
+    change = densify(cloud(), statistics(50, CONFIG.grad_threshold / 2), 1000, 1.0, CONFIG, seed=1)
+    assert change.keep.tolist() == list(range(50)) and len(change.born) == 0
+
+
+def test_a_clone_and_its_original_hide_as_much_as_before() -> None:
+    gaussians = cloud()
+    before = gaussians.opacities.clone()
+    densify(gaussians, statistics(50), 1000, 1e6, CONFIG, seed=1)
+    torch.testing.assert_close(1 - (1 - gaussians.opacities) ** 2, before)
+
+
+def test_the_halves_of_a_split_lie_about_its_place() -> None:
+    gaussians = cloud(2000, seed=3)
+    gaussians.means.zero_()
+    gaussians.log_scales.copy_(torch.log(torch.tensor([0.3, 0.2, 0.1])).expand(2000, 3))
+    gaussians.quats.copy_(torch.tensor([0.3, -0.5, 0.1, 2.0]).expand(2000, 4))
+    born = densify(gaussians, statistics(2000), 10**6, 1e-6, CONFIG, seed=5).born
+    turn = Rotation.from_quat([-0.5, 0.1, 2.0, 0.3]).as_matrix()
+    expected = turn @ np.diag([0.09, 0.04, 0.01]) @ turn.T
+    # 4000 draws: the relative error of a variance is about sqrt(2 / 4000) = 2 %; 4 of those, of the largest.
+    assert np.allclose(np.cov(born.means.numpy().T), expected, atol=0.09 * 0.09)
+    torch.testing.assert_close(born.scales, torch.tensor([0.3, 0.2, 0.1]).expand(4000, 3) / 1.6)
+
+
+def test_the_faint_the_unseen_and_the_broken_are_pruned() -> None:
+    gaussians, seen = cloud(), statistics(50, 0.0)
+    gaussians.opacity_logits[3] = -9.0
+    seen.seen[7] = 0
+    gaussians.means[11, 1] = float("nan")
+    kept = densify(gaussians, seen, 1000, 1.0, CONFIG, seed=1).keep.tolist()
+    assert kept == [i for i in range(50) if i not in (3, 7, 11)]
+
+
+def test_growth_is_a_ramp() -> None:
+    counts = [target_count(p, 100, 1100, CONFIG) for p in (0.0, CONFIG.start, 0.325, CONFIG.stop, 1.0)]
+    assert counts == [100, 100, 600, 1100, 1100]
+
+
+def test_rotations_are_those_of_scipy() -> None:
+    quats = torch.from_numpy(np.random.default_rng(0).normal(size=(20, 4)))
+    expected = Rotation.from_quat(quats.numpy()[:, [1, 2, 3, 0]]).as_matrix()
+    np.testing.assert_allclose(rotation_matrices(quats).numpy(), expected, atol=1e-12)
+    torch.testing.assert_close(rotation_matrices(torch.zeros(1, 4)), torch.eye(3)[None])
+
+
+def test_depth_of_a_plane_is_its_distance() -> None:
+    x, y = np.meshgrid(np.linspace(-2, 2, 60), np.linspace(-2, 2, 60))
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, 3.0)], axis=1)
+    wall = from_points(points, np.zeros((x.size, 3), np.uint8), feature_dim=1, seed=0, opacity=0.9)
+    wall.log_scales[:, 2] = -9.0
+    K = torch.tensor([[50.0, 0, 24], [0, 50, 18], [0, 0, 1]])
+    depth = depth_image(wall, torch.eye(4), K, 48, 36)
+    torch.testing.assert_close(depth, torch.full((36, 48), 3.0), atol=1e-4, rtol=0)
+    assert (depth_image(wall, torch.diag(torch.tensor([1.0, 1, -1, 1])), K, 48, 36) == 0).all()
