@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 import signal
@@ -17,6 +18,7 @@ import perception
 from perception.cli import main
 from perception.config import load_config
 from perception.demo import load_truth
+from perception.errors import InputError
 from perception.gaussians.train import Trainer
 from perception.io.cloud import read_cloud
 from perception.io.store import read_map
@@ -197,7 +199,6 @@ def test_built_in_masks_are_made_from_the_maps_own_depth(small_scene: Path, tmp_
 
 
 def test_resume_refuses_other_settings(small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from perception.errors import InputError
     from perception.pipeline.checkpoint import fingerprint, load_checkpoint, save_checkpoint
 
     config = settings(small_scene)
@@ -235,6 +236,23 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
     assert code == 2 and len(lines) == 1 and told in lines[0]
     assert change == "exists" or not out.exists()
+    assert not work_folder(out).exists()
+
+
+def test_a_full_disk_is_one_line(small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1 << 20))
+    with pytest.raises(InputError, match="1 MiB free"):
+        build_map(small_scene / "transforms.json", tmp_path / "full.gsmap", settings(small_scene))
+    monkeypatch.undo()
+
+    def fail(*args: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(mapping, "save_checkpoint", fail)
+    with pytest.raises(InputError, match="the disk is full"):
+        build_map(small_scene / "transforms.json", tmp_path / "full.gsmap", settings(small_scene, "train.iterations=2"))
+    assert not (tmp_path / "full.gsmap").exists()
 
 
 def _spoil(change: str, scene: Path, out: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import time
 from collections.abc import Callable
@@ -29,6 +30,9 @@ from perception.progress import Progress
 from perception.types import Scene, View
 
 WORK_SUFFIX = ".work"
+CHECKPOINT = "checkpoint.pt"
+LEAST_DISK = 256 << 20
+"""Bytes a small run writes to its work folder: features, masks, checkpoint, map."""
 
 
 def work_folder(output: Path) -> Path:
@@ -42,12 +46,25 @@ def build_map(
     """Builds a map from photos, a COLMAP workspace or a transforms.json, and writes it to `output`.
 
     Raises InputError for bad input. What was done is kept in `work_folder(output)` until the map is written; with
-    `resume` a run goes on from there.
+    `resume` a run goes on from there. A run refused before it trained leaves nothing behind.
     """
-    progress = progress or Progress(quiet=True)
     if config.device == "cuda":
         raise InputError("--device cuda: this build has no CUDA rasterizer; use --device cpu or auto")
+    fresh = not work_folder(output).exists()
     work = _prepare(source, output, resume)
+    try:
+        return _build(source, output, work, config, progress or Progress(quiet=True))
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
+    except InputError:
+        if fresh and not (work / CHECKPOINT).exists():
+            shutil.rmtree(work, ignore_errors=True)
+        raise
+
+
+def _build(source: Path, output: Path, work: Path, config: MapConfig, progress: Progress) -> GaussianMap:
     stages = Stages()
     started = time.monotonic()
 
@@ -117,6 +134,14 @@ def _prepare(source: Path, output: Path, resume: bool) -> Path:
         work.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{work}: cannot be made ({error.strerror}); choose a writable -o") from error
+    # Libraries below abort the process when the disk fills up under them, so it is looked at first.
+    free = shutil.disk_usage(work).free
+    if free < LEAST_DISK:
+        if not any(work.iterdir()):
+            work.rmdir()
+        raise InputError(
+            f"{output}: the disk has {free >> 20} MiB free, at least {LEAST_DISK >> 20} are needed; free some"
+        )
     return work
 
 
@@ -161,7 +186,7 @@ class _Session:
     """Training in legs, each ending in a checkpoint; takes up where an interrupted run left off."""
 
     def __init__(self, trainer: Trainer, work: Path, mark: str, config: MapConfig, progress: Progress):
-        self.trainer, self.mark, self.path = trainer, mark, work / "checkpoint.pt"
+        self.trainer, self.mark, self.path = trainer, mark, work / CHECKPOINT
         self.watch = _Watch(self.path, mark, config, progress)
         state = load_checkpoint(self.path, mark)
         if state is not None:
