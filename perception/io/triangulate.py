@@ -86,6 +86,7 @@ def _triangulate(views: list[View], store: Any, seed: int) -> tuple[np.ndarray, 
     db.close()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
+    options.num_threads = 1  # several threads add up in another order each time
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     with TemporaryDirectory(dir=store.folder) as out:
         model = pycolmap.triangulate_points(model, store.database, store.image_root, out, True, options)
