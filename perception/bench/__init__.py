@@ -1,1 +1,9 @@
-"""Measurements anyone can rerun."""
+"""Measurements anyone can rerun: `perception bench NAME`. Each module has `main(arguments)`."""
+
+BENCHES = (
+    "rasterizer",
+    "training",
+    "masks",
+    "language",
+)
+"""Names on the command line; a dash in a name is an underscore in its module's."""

@@ -1,0 +1,102 @@
+"""`perception map`, `info`, `report`, `demo`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from perception.cli.parser import command
+
+
+def register(commands: Any) -> None:
+    """Adds this module's subcommands."""
+    _add_map(commands)
+    _add_info(commands)
+    _add_report(commands)
+    _add_demo(commands)
+
+
+def _add_map(commands: Any) -> None:
+    p = command(commands, "map", _map, "build a map from photos, a COLMAP workspace or a transforms.json")
+    p.add_argument("input", type=Path, metavar="INPUT")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="MAP")
+    p.add_argument("--masks", metavar="SOURCE", help="auto, builtin, sam:PATH or labels:DIR")
+    p.add_argument("--config", type=Path, metavar="FILE.toml")
+    p.add_argument("--preset", default="default", help="fast, default or quality")
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
+    p.add_argument("--camera", type=Path, metavar="FILE.yaml", help="fixed intrinsics, ROS camera_info")
+    p.add_argument("--max-side", metavar="PX", help="long side in pixels at which the map is trained")
+    p.add_argument("--budget", metavar="N", help="most Gaussians the map may have")
+    p.add_argument("--iterations", metavar="N")
+    p.add_argument("--time-limit", metavar="S", help="seconds of training; all schedules shrink to fit")
+    p.add_argument("--holdout", metavar="N", help="every N-th view is kept for scoring, 0 trains on all")
+    p.add_argument("--seed", metavar="S")
+    p.add_argument("--device", help="auto, cpu or cuda")
+    p.add_argument("--resume", action="store_true", help="go on with an interrupted run")
+
+
+_SHORTCUTS = {
+    "masks": "masks",
+    "camera": "photos.camera",
+    "max_side": "photos.max_side",
+    "budget": "train.budget",
+    "iterations": "train.iterations",
+    "time_limit": "train.time_limit",
+    "holdout": "photos.holdout",
+    "seed": "seed",
+    "device": "device",
+}
+
+
+def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.config import load_config
+
+    given = [f"{key}={getattr(args, name)}" for name, key in _SHORTCUTS.items() if getattr(args, name) is not None]
+    config = load_config(args.config, args.pairs + given, args.preset)
+    from perception.pipeline.mapping import build_map
+    from perception.progress import Progress
+
+    gmap = build_map(args.input, args.output, config, resume=args.resume, progress=Progress())
+    from perception.pipeline.summary import map_facts
+
+    return map_facts(args.output, gmap.info, len(gmap), len(gmap.instances)), ""
+
+
+def _add_info(commands: Any) -> None:
+    p = command(commands, "info", _info, "what a map holds, how it was made, how good it is")
+    p.add_argument("map", type=Path, metavar="MAP")
+
+
+def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.io.store import read_info
+    from perception.pipeline.summary import info_text
+
+    info = read_info(args.map)
+    return info, info_text(args.map, info)
+
+
+def _add_report(commands: Any) -> None:
+    p = command(commands, "report", _report, "one self-contained page: held-out views, curves, instances, answers")
+    p.add_argument("map", type=Path, metavar="MAP")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.html")
+    p.add_argument("--ask", action="append", default=[], metavar="TEXT", help="a prompt to answer on the page")
+
+
+def _report(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.pipeline.reporting import write_map_report
+    from perception.query import load_map
+
+    page = write_map_report(load_map(args.map), args.output, args.ask)
+    return {"report": str(page)}, str(page)
+
+
+def _add_demo(commands: Any) -> None:
+    p = command(commands, "demo", _demo, "photos -> SfM -> map -> export -> text query, on a scene it makes itself")
+    p.add_argument("-o", "--output", type=Path, default=Path("perception-demo"), metavar="DIR")
+
+
+def _demo(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.pipeline.demo import run_demo
+
+    return run_demo(args.output)

@@ -1,0 +1,27 @@
+"""What every subcommand shares: one clear line on bad usage, and `--json`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import Any
+
+from perception.errors import InputError
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse with one clear line and exit code 2 on bad usage."""
+
+    def error(self, message: str) -> Any:  # type: ignore[override]
+        raise InputError(f"{self.prog}: {message} (see {self.prog} --help)")
+
+
+Run = Callable[[argparse.Namespace], tuple[dict[str, Any], str]]
+
+
+def command(commands: Any, name: str, run: Run, summary: str) -> argparse.ArgumentParser:
+    """A new subcommand. `run` takes the parsed arguments and returns (what --json prints, the words for people)."""
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=summary, description=summary)
+    parser.set_defaults(run=run)
+    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else there")
+    return parser

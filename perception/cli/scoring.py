@@ -1,0 +1,59 @@
+"""`perception eval` and `perception bench`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from perception.cli.parser import Parser, command
+from perception.errors import InputError
+
+
+def register(commands: Any) -> None:
+    """Adds this module's subcommands."""
+    _add_eval(commands)
+    _add_bench(commands)
+
+
+def _add_eval(commands: Any) -> None:
+    parser = commands.add_parser("eval", help="score predictions by the field's own rules")
+    kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True, parser_class=Parser)
+    p = command(kinds, "instances", _eval_instances, "AP, AP50, AP25 of labelled clouds")
+    p.add_argument("prediction", type=Path, metavar="PRED.ply")
+    p.add_argument("truth", type=Path, metavar="GT.ply")
+    p.add_argument("--protocol", default="scannet", choices=("scannet", "mask3d", "scannetpp"))
+    p = command(kinds, "images", _eval_images, "PSNR and SSIM per view and mean")
+    p.add_argument("prediction", type=Path, metavar="PRED_DIR")
+    p.add_argument("truth", type=Path, metavar="GT_DIR")
+
+
+def _eval_instances(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.evaluate import run_instances
+
+    return run_instances(args.prediction, args.truth, protocol=args.protocol)
+
+
+def _eval_images(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.evaluate import run_images
+
+    return run_images(args.prediction, args.truth)
+
+
+def _add_bench(commands: Any) -> None:
+    from perception.bench import BENCHES
+
+    p = command(commands, "bench", _bench, "measure speed against error on this machine")
+    p.add_argument("name", metavar="NAME", help=", ".join(BENCHES))
+    p.add_argument("rest", nargs=argparse.REMAINDER, metavar="...")
+
+
+def _bench(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    import importlib
+
+    from perception.bench import BENCHES
+
+    if args.name not in BENCHES:
+        raise InputError(f"bench: found '{args.name}', expected one of: {', '.join(BENCHES)}")
+    importlib.import_module(f"perception.bench.{args.name.replace('-', '_')}").main(args.rest)
+    return {}, ""
