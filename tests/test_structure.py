@@ -18,8 +18,9 @@ LAYERS = [
     {"masks", "demo"},
     {"gaussians"},
     {"language", "instances"},
-    {"query", "export", "evaluate", "report", "models"},
+    {"query", "export", "evaluate", "report", "models", "editing"},
     {"pipeline", "bench"},
+    {"viewer"},
     {"cli"},
 ]
 HEIGHT = {name: height for height, layer in enumerate(LAYERS) for name in layer}
