@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import socket
 import threading
 from collections.abc import Callable
@@ -26,7 +28,8 @@ class Viewer:
         viser = _viser()
         _check_port(host, port)
         self.session = Session(path)
-        self.server = viser.ViserServer(host=host, port=port, label=f"perception · {path.name}", verbose=False)
+        with contextlib.redirect_stdout(io.StringIO()):  # viser greets on stdout, which belongs to --json
+            self.server = viser.ViserServer(host=host, port=port, label=f"perception · {path.name}", verbose=False)
         self.url = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0', '::') else host}:{port}"
         self._drawing = threading.Lock()
         self._overlays: dict[str, list[Any]] = {"cameras": [], "boxes": [], "names": []}
@@ -51,7 +54,7 @@ class Viewer:
     # ------------------------------------------------------------------ drawing
 
     def _frame_map(self) -> None:
-        """Up, the first camera, and the scale: the page's numbers are half precision, so the map is brought to size 10."""
+        """Up, the first camera, and the scale: the page keeps half precision, so the map is brought to size 10."""
         gmap = self.session.editor.original
         low, high = np.percentile(gmap.means, [5, 95], axis=0) if len(gmap) else (np.zeros(3), np.ones(3))
         self.scale = 10 / max(float(np.linalg.norm(high - low)), 1e-9)
@@ -168,7 +171,7 @@ class Viewer:
         self.panel.refresh()
         self.redraw()
 
-    def guarded(self, action: Callable[[], None], client: Any = None, edited: bool = False) -> None:
+    def guarded(self, action: Callable[[], object], client: Any = None, edited: bool = False) -> None:
         """Runs what a control asks for; what is wrong is told in the page, and everything is drawn anew."""
         try:
             action()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from perception.viewer.paint import MODES
@@ -69,18 +70,15 @@ class Panel:
                 self._name = self.gui.add_text("name", "", hint="Enter renames")
                 rename = self.gui.add_button("Rename")
             rename.on_click(lambda _: form.submit())
-            actions = {
-                "Hide": lambda: editor.hide(session.chosen()),
-                "Merge selected": lambda: session.select(editor.merge(session.selected)),
-                "Split into parts": lambda: editor.split(session.chosen()),
-                "Remove from list": lambda: editor.remove(session.chosen()),
-            }
-            self._buttons = {}
-            for words, action in actions.items():
-                self._buttons[words] = self.gui.add_button(words)
-                self._buttons[words].on_click(
-                    lambda event, action=action: self.viewer.guarded(action, event.client, edited=True)
-                )
+            self._actions(
+                "instance",
+                {
+                    "Hide": lambda: editor.hide(session.chosen()),
+                    "Merge": lambda: session.select(editor.merge(session.selected)),
+                    "Split": lambda: editor.split(session.chosen()),
+                    "Remove": lambda: editor.remove(session.chosen()),
+                },
+            )
             export = self.gui.add_button("Download points (PLY)")
         form.on_submit(
             lambda event: self.viewer.guarded(
@@ -89,19 +87,18 @@ class Panel:
         )
         export.on_click(lambda event: self.viewer.guarded(lambda: self._export(event.client), event.client))
 
+    def _actions(self, label: str, actions: dict[str, Callable[[], object]]) -> None:
+        """A row of buttons, each an edit."""
+        row = self.gui.add_button_group(label, tuple(actions))
+        row.on_click(lambda event: self.viewer.guarded(actions[row.value], event.client, edited=True))
+
     def _build_history(self) -> None:
         editor = self.session.editor
         with self.gui.add_folder("Corrections"):
-            for words, action, edits in (
-                ("Undo", editor.undo, True),
-                ("Redo", editor.redo, True),
-                ("Show hidden", self._unhide, True),
-                ("Delete floaters", editor.delete_floaters, True),
-                ("Save into the map", editor.save, False),
-            ):
-                self.gui.add_button(words).on_click(
-                    lambda event, action=action, edits=edits: self.viewer.guarded(action, event.client, edits)  # type: ignore[misc]
-                )
+            self._actions("history", {"Undo": editor.undo, "Redo": editor.redo})
+            self._actions("map", {"Show hidden": self._unhide, "Delete floaters": editor.delete_floaters})
+            save = self.gui.add_button("Save into the map")
+            save.on_click(lambda event: self.viewer.guarded(editor.save, event.client))
             self._history = self.gui.add_markdown("")
 
     def _unhide(self) -> None:

@@ -25,9 +25,9 @@ def responses(
     away = means - origin
     width = PIXEL * np.abs(away @ direction)
     radii = np.sqrt(scales**2 + (width**2)[:, None])
-    world_from_own = Rotation.from_quat(quats[:, [1, 2, 3, 0]])
-    o = world_from_own.apply(-away, inverse=True) / radii
-    d = world_from_own.apply(np.broadcast_to(direction, means.shape), inverse=True) / radii
+    world_from_own = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
+    o = np.einsum("nij,ni->nj", world_from_own, -away) / radii
+    d = np.einsum("nij,i->nj", world_from_own, direction) / radii
     dd = np.einsum("ni,ni->n", d, d)
     t = -np.einsum("ni,ni->n", o, d) / dd
     nearest = o + t[:, None] * d

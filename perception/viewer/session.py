@@ -46,7 +46,7 @@ class Session:
         return self._opened[1]
 
     def ask(self, text: str, top_k: int = 5) -> list[Hit]:
-        """Ranked hits, which become what is highlighted; empty when the text is not present. Hidden ones are left out."""
+        """Ranked hits, which are then highlighted; empty when the text is not present. Hidden ones are left out."""
         with self._lock:
             hidden = {entry["id"] for entry in self.editor.instances if entry.get("hidden")}
             found = self._loaded().query(text, top_k + len(hidden))
