@@ -18,7 +18,7 @@ class Panel:
         self.viewer = viewer
         self.session = viewer.session
         self.gui = viewer.server.gui
-        self.gui.configure_theme(control_layout="fixed", control_width="large", show_share_button=False)
+        self.gui.configure_theme(control_width="large", show_share_button=False)
         self._facts = self.gui.add_markdown("")
         self._build_ask()
         self._build_show()
