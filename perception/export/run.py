@@ -14,8 +14,8 @@ import numpy as np
 from perception.errors import InputError
 from perception.export.formats import Instances, instance_colors, write_boxes, write_scannet, write_split
 from perception.export.labels import ExportOptions, check_overlap, export_labels
+from perception.io.atomic import replacing
 from perception.io.cloud import read_cloud, write_cloud
-from perception.io.cloud_atomic import replacing
 from perception.types import PointCloud
 
 
