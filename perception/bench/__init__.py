@@ -10,6 +10,5 @@ BENCHES = (
     "scannetpp",
     "clouds",
     "smoothing",
-    "export",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""

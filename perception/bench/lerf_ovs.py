@@ -30,8 +30,8 @@ from perception.errors import InputError
 from perception.evaluate.layouts import read_lerf_polygons, run_lerf_ovs
 
 SELECTION = {
-    "top-1": "the map's own words, best instance whether or not it says present",
-    "relative": "the map's own words, all instances >= .85 of the best score after shifting the least to 0",
+    "top-1": "top-1 by the map's own words: best instance whether or not it says present",
+    "relative": "relative by the map's own words: all instances >= .85 of the best score after shifting the least to 0",
 }
 
 
