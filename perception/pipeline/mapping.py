@@ -71,7 +71,7 @@ def _build(source: Path, output: Path, work: Path, config: MapConfig, progress: 
     with stages("poses"):
         scene = _scene(source, work, config, progress)
     _tell_scene(scene, progress)
-    training, held_out = split_views(scene.views, config.photos.holdout)
+    training, held_out = split_views(scene.views, config.photos.holdout, config.photos.held_out)
 
     source_of_masks = make_source(config.masks, cache_dir=work)
     with stages("photos"):
