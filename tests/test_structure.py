@@ -19,7 +19,7 @@ LAYERS = [
     {"gaussians"},
     {"language", "instances"},
     {"query", "export", "evaluate", "report", "models"},
-    {"pipeline", "bench"},
+    {"pipeline", "bench", "serve"},
     {"cli"},
 ]
 HEIGHT = {name: height for height, layer in enumerate(LAYERS) for name in layer}

@@ -109,6 +109,11 @@ def write_ply(path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]]
                 _packed(properties).tofile(file)
 
 
+def ply_bytes(elements: Mapping[str, Mapping[str, np.ndarray]]) -> bytes:
+    """What `write_ply` would write, binary, for those who send it elsewhere."""
+    return _header(elements, False).encode("ascii") + b"".join(_packed(p).tobytes() for p in elements.values())
+
+
 def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_Table]]:
     if file.readline(16).strip() != b"ply":
         raise InputError(f"{path}: is not a PLY file: its first line is not 'ply'")

@@ -5,6 +5,7 @@ Servers (HTTP, DDS, ROS) only convert messages; waiting, refusing, timing out an
 
 from __future__ import annotations
 
+import asyncio
 import queue
 import threading
 import time
@@ -132,8 +133,19 @@ class QueryEngine:
         except FutureTimeout as error:
             if isinstance(error, AnswerTimeout):
                 raise
-            if future.cancel():
-                self._figures.count("timed_out")
+            future.cancel()  # drops it if it has not begun
+            self._figures.count("timed_out")
+            raise AnswerTimeout(f"no answer within {seconds:g} s") from None
+
+    async def awaited(self, future: Future[T], timeout: float | None = None) -> T:
+        """`wait` for servers that run an event loop."""
+        seconds = self.timeout if timeout is None else timeout
+        try:
+            return await asyncio.wait_for(asyncio.wrap_future(future), seconds)  # cancels what has not begun
+        except (TimeoutError, asyncio.TimeoutError) as error:
+            if isinstance(error, AnswerTimeout):
+                raise
+            self._figures.count("timed_out")
             raise AnswerTimeout(f"no answer within {seconds:g} s") from None
 
     # --------------------------------------------------------------- reloading

@@ -35,6 +35,10 @@ _NEIGHBORS = 3
 _LEAST_COLOR = 0.05
 
 
+class UnknownInstance(InputError):
+    """The map has no instance with this id."""
+
+
 class LoadedMap:
     """A map opened for questions, by any number of threads at once.
 
@@ -176,11 +180,11 @@ class LoadedMap:
 
     def get(self, instance_id: int, *, frame: Frame | None = None) -> Hit:
         """The instance with this id; InputError when there is none."""
-        return self._in(frame, self.hit(self._position(instance_id)))
+        return self._in(frame, self.hit(self.position(instance_id)))
 
     def describe(self, instance_id: int, *, frame: Frame | None = None) -> Description:
         """What the map knows of an instance: its hit, colours, bounds and the three instances nearest to it."""
-        position = self._position(instance_id)
+        position = self.position(instance_id)
         hit = self._in(frame, self.hit(position))
         scale = 1.0 if frame is None else float(np.cbrt(np.linalg.det(frame.from_map[:3, :3])))
         beside = self._space.neighbors(instance_id, _NEIGHBORS)
@@ -210,6 +214,23 @@ class LoadedMap:
             self._covariance(position),
             self.frame,
         )
+
+    def position(self, instance_id: int) -> int:
+        """The place of this id in instances.json; InputError when there is none."""
+        place = self._places.get(instance_id)
+        if place is None:
+            raise UnknownInstance(f"instance {instance_id}: the map has none such; it has {len(self.instances)}")
+        return place
+
+    def best_view(self, position: int) -> tuple[str, tuple[int, int, int, int]] | None:
+        """The photo that shows the instance best and its tight box (x0, y0, x1, y1) there, in pixels of the size the
+        map was trained at; None when no photo does."""
+        names = self._views(position)
+        if not names:
+            return None
+        start = int(self._view_stops[position]) - len(names)
+        x0, y0, x1, y1 = (int(value) for value in self._held.language["view_boxes"][start])
+        return names[0], (x0, y0, x1, y1)
 
     # --------------------------------------------------------------- internals
 
@@ -267,12 +288,6 @@ class LoadedMap:
 
     def _id(self, position: int) -> int:
         return int(self.instances[position]["id"])
-
-    def _position(self, instance_id: int) -> int:
-        place = self._places.get(instance_id)
-        if place is None:
-            raise InputError(f"instance {instance_id}: the map has no such instance; it has {len(self.instances)}")
-        return place
 
     @cached_property
     def _places(self) -> dict[int, int]:
