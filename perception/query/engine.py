@@ -13,6 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeout
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,6 +27,8 @@ from perception.query.opened import LoadedMap, load_map
 from perception.query.requests import Reply, Request
 
 T = TypeVar("T")
+_SELDOM = 32
+"""A new map that cannot be opened is tried again at most this many looks later."""
 _REMEMBERED = 1000
 """Latencies kept for the health figures."""
 
@@ -183,22 +186,24 @@ class QueryEngine:
         return gmap
 
     def _watch(self, every: float) -> None:
+        """Looks, and takes over. A map that cannot be opened may still be on its way (someone copies it file by file),
+        so it is tried again, less and less often."""
         tried: Any = None
+        wait, left = every, 0.0
         while not self._closed.wait(every):
+            left -= every
             try:
                 signature = map_signature(self.path)
             except InputError as error:
                 self._problem, tried = str(error), None
                 continue
-            if signature in (self._signature, tried):
-                if signature == self._signature:
-                    self._problem = None
-                continue
-            tried = signature
-            try:
-                self.reload()
-            except InputError:
-                continue  # told in health; tried again when the directory changes
+            if signature == self._signature:
+                self._problem = None
+            elif signature != tried or left <= 0:
+                wait = every if signature != tried else min(2 * wait, _SELDOM * every)
+                tried, left = signature, wait
+                with suppress(InputError):  # told in health
+                    self.reload()
 
     # ------------------------------------------------------------------ health
 
