@@ -18,9 +18,20 @@ LAYERS = [
     {"masks", "demo"},
     {"gaussians"},
     {"language", "instances"},
-    {"query", "export", "evaluate", "report", "models", "editing"},
+    {
+        "query",
+        "export",
+        "evaluate",
+        "report",
+        "models",
+        "editing",
+    },
     {"pipeline", "bench"},
-    {"viewer"},
+    {
+        "serve",
+        "node",
+        "viewer",
+    },
     {"cli"},
 ]
 HEIGHT = {name: height for height, layer in enumerate(LAYERS) for name in layer}
