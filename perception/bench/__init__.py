@@ -5,5 +5,6 @@ BENCHES = (
     "training",
     "masks",
     "language",
+    "queries",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""

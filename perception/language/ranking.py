@@ -75,6 +75,10 @@ class Ranker:
         self._label_rows = self._encode([self._names[i] for i in self._named])
         self._label_null = _middle_and_spread(self._label_rows @ texts.T)
 
+    def over(self, descriptions: Sequence[InstanceDescription]) -> Ranker:
+        """The same encoder over other instances, without labels."""
+        return Ranker(descriptions, self._encoder)
+
     def rank(self, prompt: str, min_score: float | None = None) -> Answer:
         """Score every instance for one prompt; see the module's docstring."""
         text = check_texts([prompt])[0]
