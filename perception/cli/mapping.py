@@ -33,6 +33,7 @@ def _add_map(commands: Any) -> None:
     p.add_argument("--holdout", metavar="N", help="every N-th view is kept for scoring, 0 trains on all")
     p.add_argument("--seed", metavar="S")
     p.add_argument("--device", help="auto, cpu or cuda")
+    p.add_argument("--labels-from", type=Path, metavar="OLD.gsmap", help="carry over the names given to its instances")
     p.add_argument("--resume", action="store_true", help="go on with an interrupted run")
 
 
@@ -57,7 +58,9 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.pipeline.mapping import build_map
     from perception.progress import Progress
 
-    gmap = build_map(args.input, args.output, config, resume=args.resume, progress=Progress())
+    gmap = build_map(
+        args.input, args.output, config, resume=args.resume, progress=Progress(), labels_from=args.labels_from
+    )
     from perception.pipeline.summary import map_facts
 
     return map_facts(args.output, gmap.info, len(gmap), len(gmap.instances)), ""
