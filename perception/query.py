@@ -77,7 +77,15 @@ class LoadedMap:
         if encoder is None:
             raise InputError(f"{self.path}: was mapped without an encoder; map again with language.encoder=conse")
         check_encoder(identity, encoder.identity)
-        return Ranker(descriptions, encoder, [entry.get("label") for entry in self.instances])
+        labels = [entry.get("label") for entry in self.instances]
+        return Ranker(descriptions, encoder, labels, self._shapes)
+
+    def _shapes(self) -> np.ndarray:
+        from perception.instances.shapes import shape_scores
+
+        ids = [entry["id"] for entry in self.instances]
+        poses = self.gmap.cameras.get("camera_from_world", np.zeros((0, 4, 4)))
+        return shape_scores(self.gmap.means, self.gmap.instance_ids, ids, poses)
 
     def query(self, text: str, top_k: int = 3, min_score: float | None = None) -> list[Hit]:
         """The instances that answer `text`, best first, at most top_k; empty when it is not present.

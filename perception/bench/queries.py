@@ -106,7 +106,7 @@ def _figures(
     answers = [ranker.rank(text) for text, _ in queries]
     found = [bool({i for i, _ in a.hits[:3]} & ids) for a, ids in zip(answers, right, strict=True)]
     top1, top3 = accuracy([[i for i, _ in a.hits] for a in answers], right)
-    grey = ranker.over([_colorless(d) for d in descriptions])
+    grey = ranker.over([_colorless(d) for d in descriptions], ranker.shapes)
     blind1, blind3 = accuracy([[i for i, _ in grey.rank(text).hits] for text, _ in queries], right)
     chance1, chance3 = chance([len(ids) for ids in right], len(owners))
     near = [t for t in HOUSEHOLD if not {singular(w) for w in t.split()} & words]

@@ -35,6 +35,9 @@ class ClipEncoder:
     """
 
     references: np.ndarray | None = None
+    # Untried on real weights: none can be had here. The probes of the map and LERF's phrases are all there is.
+    margin: float = 0.0
+    canonical: tuple[str, ...] = ("object", "things", "stuff", "texture")
     templates: tuple[str, ...] = ("an image of {}", "a photo of a {}", "{}")
 
     def __init__(self, image: Path, text: Path, device: Device = "auto") -> None:
