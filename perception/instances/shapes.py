@@ -134,8 +134,8 @@ def boxiness(points: np.ndarray) -> float:
     _, turned, low, high, size = best
     inside = np.minimum(turned - low, high - turned)  # distance to the nearer of two faces, along each axis
     nearest = np.abs(inside / np.sqrt(size.min() * np.median(size))).min(axis=1)
-    corners = np.abs(inside[:, :2] / size[:2]).max(axis=1) < 0.15  # a box has upright edges, a cylinder has none
-    return ramp(float(nearest.mean()), 0.11, 0.06) * ramp(float(corners.mean()), 0.01, 0.05)
+    corners = np.abs(inside[:, :2] / size[:2]).max(axis=1) < 0.12  # a box has upright edges, a cylinder has none
+    return ramp(float(nearest.mean()), 0.11, 0.06) * ramp(float(corners.mean()), 0.02, 0.08)
 
 
 def ramp(x: float, zero: float, one: float) -> float:
@@ -163,7 +163,7 @@ def _room(bodies: dict[int, Body], cameras: np.ndarray) -> dict[str, dict[int, f
         n for n, b in bodies.items() if ground is not None and level[n] > 0.5 and b.center[2] < ground + 0.05 * span
     ]
     floor = max(floors, key=lambda n: bodies[n].area, default=None)
-    typical = float(np.median([b.area for b in bodies.values()]))
+    typical = min(float(np.median([b.area for b in bodies.values()])), 0.03 * wide)
     for n, b in bodies.items():
         size = b.area / max(largest, 1e-9)
         scores["wall"][n] = upright[n] * ramp(size, 0.15, 0.35) * ramp(b.high - b.low, 0.2 * span, 0.4 * span)
