@@ -87,6 +87,12 @@ class LoadedMap:
         poses = self.gmap.cameras.get("camera_from_world", np.zeros((0, 4, 4)))
         return shape_scores(self.gmap.means, self.gmap.instance_ids, ids, poses)
 
+    def likely_names(self, count: int = 3) -> list[list[str]]:
+        """The likeliest names of every instance, best first, in the order of `instances`."""
+        from perception.language.naming import likely_names
+
+        return likely_names(self._ranker, count) if self.instances else []
+
     def query(self, text: str, top_k: int = 3, min_score: float | None = None) -> list[Hit]:
         """The instances that answer `text`, best first, at most top_k; empty when it is not present.
 

@@ -69,6 +69,7 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 def _add_info(commands: Any) -> None:
     p = command(commands, "info", _info, "what a map holds, how it was made, how good it is")
     p.add_argument("map", type=Path, metavar="MAP")
+    p.add_argument("--sheet", type=Path, metavar="OUT.png", help="picture of every instance with its likeliest names")
 
 
 def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -76,6 +77,11 @@ def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.pipeline.summary import info_text
 
     info = read_info(args.map)
+    if args.sheet is not None:
+        from perception.pipeline.reporting import write_sheet
+        from perception.query import load_map
+
+        write_sheet(load_map(args.map), args.sheet)
     return info, info_text(args.map, info)
 
 

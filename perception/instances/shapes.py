@@ -101,7 +101,7 @@ def measure(points: np.ndarray) -> Body | None:
     normal = _plane_normal(points, center)
     in_plane = level_frame(normal)
     local = (points - center) @ in_plane.T
-    spread = np.percentile(local, 90, axis=0) - np.percentile(local, 10, axis=0)
+    spread = np.percentile(local, 75, axis=0) - np.percentile(local, 25, axis=0)
     extent = np.percentile(local, 97, axis=0) - np.percentile(local, 3, axis=0)
     thickness = spread[2] / max(float(np.sqrt(spread[0] * spread[1])), 1e-9)
     top, share, footprint = _slab(points)
@@ -145,7 +145,7 @@ def ramp(x: float, zero: float, one: float) -> float:
 
 def _room(bodies: dict[int, Body], cameras: np.ndarray) -> dict[str, dict[int, float]]:
     """Scores of the kinds that need the other instances for comparison, by name and position."""
-    flat = {n: ramp(b.thickness, 0.25, 0.1) for n, b in bodies.items()}
+    flat = {n: ramp(b.thickness, 0.35, 0.2) for n, b in bodies.items()}
     level = {n: flat[n] * ramp(abs(float(b.normal[2])), 0.85, 0.95) for n, b in bodies.items()}
     upright = {n: flat[n] * ramp(abs(float(b.normal[2])), 0.3, 0.15) for n, b in bodies.items()}
     span = max(b.high for b in bodies.values()) - min(b.low for b in bodies.values()) + 1e-9

@@ -34,7 +34,7 @@ PRESENT = 0.8  # default least score of a hit; the probes are harder than the us
 QUANTILE, NORMAL_QUANTILE = 0.8, 0.8416  # Φ(.8416) = .8
 BETA = 0.5  # share of the map's mean embedding that is taken away
 SHAPE_WEIGHT = 6.0  # spreads between no and a full match of shape, for kinds that geometry alone decides
-SHAPE_HINT = 2.0  # the same for kinds that are only likelier with a shape: not every box is closed
+SHAPE_HINT = 3.0  # the same for kinds that are only likelier with a shape: not every box is closed
 TEMPERATURE = 10.0  # LERF's
 COLOR_WEIGHT = 0.1  # relevancy between no and a full colour match
 LABEL_MARGIN = 2.0  # a label means the prompt from 2 + Φ⁻¹(score) spreads above what probes mean to it
@@ -67,7 +67,7 @@ class Ranker:
         if labels is not None and len(labels) != len(descriptions):
             raise InputError(f"labels: expected one per instance ({len(descriptions)}), found {len(labels)}")
         self._encoder, self._measure_shapes = encoder, shapes
-        self._seen = np.array([d.seen for d in descriptions], bool)
+        self.seen = np.array([d.seen for d in descriptions], bool)
         rows = np.array([d.embedding for d in descriptions], np.float32).reshape(
             len(descriptions), len(descriptions[0].embedding) if descriptions else encoder.dim
         )
@@ -75,8 +75,8 @@ class Ranker:
             raise InputError(
                 f"embeddings have {rows.shape[1]} dimensions, those of encoder '{encoder.identity}' {encoder.dim}"
             )
-        mean = rows[self._seen].mean(axis=0) if self._seen.any() else np.zeros(encoder.dim, np.float32)
-        self._rows = unit_rows(rows - BETA * mean) if self._seen.sum() > 1 else rows
+        mean = rows[self.seen].mean(axis=0) if self.seen.any() else np.zeros(encoder.dim, np.float32)
+        self._rows = unit_rows(rows - BETA * mean) if self.seen.sum() > 1 else rows
         self._plain = rows
         self._canonical = self._encode(encoder.canonical)
         self._palettes = np.array([d.palette for d in descriptions])
@@ -113,7 +113,7 @@ class Ranker:
         scores = np.array([_phi(x) for x in z])
         if len(self._canonical):
             scores = np.minimum(scores, 2 * PRESENT * self._against_canonical(row))
-        scores[~self._seen] = 0.0
+        scores[~self.seen] = 0.0
         return self._with_labels(scores, text)
 
     @cached_property
@@ -146,6 +146,10 @@ class Ranker:
             scores[i] = 1.0 if same else max(scores[i], _phi(float(z[n]) - LABEL_MARGIN))
         return scores
 
+    def relevancy(self, texts: Sequence[str]) -> np.ndarray:
+        """How well each text fits each instance [T, I], colours, shapes and labels left aside."""
+        return self._relevancy(self._encode(texts))
+
     def _relevancy(self, texts: np.ndarray) -> np.ndarray:
         """x [T, I] of text embeddings [T, D] in units of a usual prompt's spread."""
         return (texts @ self._rows.T) * (self._usual_spread / self._spreads(texts))[:, None]
@@ -169,9 +173,9 @@ class Ranker:
         """Median of the probes' best relevancies in this map, and the spread that puts their quantile at
         .8.
         """
-        if not self._seen.any():
+        if not self.seen.any():
             return 0.0, 1.0
-        best = self._relevancy(probe_rows)[:, self._seen].max(axis=1)
+        best = self._relevancy(probe_rows)[:, self.seen].max(axis=1)
         middle, high = np.quantile(best, [0.5, QUANTILE])
         return float(middle), max(float(high - middle) / NORMAL_QUANTILE, 1e-6)
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 import re
 
 KINDS = ("floor", "ceiling", "wall", "table", "picture", "rug", "ball", "box")
-HINTS = ("ball", "box", "rug")
-"""Kinds for which a shape is a hint and no proof: a football may be flat, a box open, a carpet rolled."""
+HINTS = ("ball", "box", "rug", "table")
+"""Kinds for which a shape is a hint and no proof: a football may be flat, a box open, a desk heaped."""
 
 # Words of each kind. A carton is a box whose lid may be a gable; a desk is a table with another name.
 _WORDS = {
