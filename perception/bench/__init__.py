@@ -11,5 +11,6 @@ BENCHES = (
     "scannetpp",
     "clouds",
     "smoothing",
+    "queries",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""

@@ -16,10 +16,12 @@ from perception.errors import InputError
 _MODULES = (
     "mapping",
     "asking",
-    "serving",
+    "labels",
     "clouds",
     "scoring",
+    "serving",
     "viewing",
+    "models",
 )
 """Files of this package that add subcommands, in the order of --help."""
 
