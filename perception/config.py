@@ -14,10 +14,14 @@ from perception.errors import InputError
 
 @dataclass(frozen=True)
 class PhotoConfig:
-    """What is read: long side in pixels at which the map is trained, and every `holdout`-th view kept for scoring."""
+    """What is read: long side in pixels at which the map is trained, and every `holdout`-th view kept for scoring.
+
+    held_out: a text file of photo names (with or without suffix), one a line, that are kept for scoring instead.
+    """
 
     max_side: int = 800
     holdout: int = 8
+    held_out: str | None = None
     camera: str | None = None
 
 

@@ -18,8 +18,20 @@ LAYERS = [
     {"masks", "demo"},
     {"gaussians"},
     {"language", "instances"},
-    {"query", "export", "evaluate", "report", "models"},
+    {
+        "query",
+        "export",
+        "evaluate",
+        "report",
+        "models",
+        "editing",
+    },
     {"pipeline", "bench"},
+    {
+        "serve",
+        "node",
+        "viewer",
+    },
     {"cli"},
 ]
 HEIGHT = {name: height for height, layer in enumerate(LAYERS) for name in layer}

@@ -5,5 +5,11 @@ BENCHES = (
     "training",
     "masks",
     "language",
+    "view",
+    "lerf-mask",
+    "lerf-ovs",
+    "scannetpp",
+    "clouds",
+    "smoothing",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""

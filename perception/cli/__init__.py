@@ -7,13 +7,21 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
 from perception import __version__
-from perception.cli import asking, clouds, mapping, scoring
 from perception.cli.parser import Parser
 from perception.errors import InputError
 
-_MODULES = (mapping, asking, clouds, scoring)
+_MODULES = (
+    "mapping",
+    "asking",
+    "serving",
+    "clouds",
+    "scoring",
+    "viewing",
+)
+"""Files of this package that add subcommands, in the order of --help."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -21,8 +29,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser = Parser(prog="perception", description="From photos to a 3D instance map that answers text prompts.")
     parser.add_argument("--version", action="version", version=f"perception {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
-    for module in _MODULES:
-        module.register(commands)
+    for name in _MODULES:
+        import_module(f"perception.cli.{name}").register(commands)
     return parser
 
 
@@ -30,6 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code: 0, 2 for bad usage or input, 130 on Ctrl-C."""
     # Threads of torch's OpenMP that spin while they wait would take the cores from the kernels' own threads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    args = argparse.Namespace()
     try:
         args = build_parser().parse_args(argv)
         result, text = args.run(args)
@@ -41,7 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("interrupted; what was done is kept, repeat the command with --resume", file=sys.stderr)
+        told = "interrupted; what was done is kept, repeat the command with --resume"
+        print(getattr(args, "interrupted", told), file=sys.stderr)
         return 130
     except BrokenPipeError:
         return 0

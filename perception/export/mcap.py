@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from perception.boxes import instance_boxes
 from perception.errors import InputError, missing_extra
-from perception.export.boxes import instance_boxes
-from perception.io.cloud_atomic import replacing
+from perception.io.atomic import replacing
 from perception.types import PointCloud
 
 # vision_msgs 4 (ROS 2 Humble and later), which rosbags does not carry itself.
