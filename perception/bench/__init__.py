@@ -5,5 +5,10 @@ BENCHES = (
     "training",
     "masks",
     "language",
+    "map",
+    "switches",
+    "scaling",
+    "ablation",
+    "export",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""

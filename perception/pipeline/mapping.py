@@ -77,7 +77,7 @@ def _build(source: Path, output: Path, work: Path, config: MapConfig, progress: 
     with stages("photos"):
         views = _photos(training, config, progress)
         held = _photos(held_out, config, progress)
-    trainer = Trainer(_initial(scene, config), views, config, held)
+    trainer = Trainer(initial_gaussians(scene, config), views, config, held)
     session = _Session(trainer, work, fingerprint(source, config), config, progress)
     depth = None
     if isinstance(source_of_masks, GeometryMaskSource):  # its masks wait for the map's own geometry
@@ -203,7 +203,8 @@ class _Session:
             save_checkpoint(self.path, self.trainer.state(), self.mark)
 
 
-def _initial(scene: Scene, config: MapConfig) -> Gaussians:
+def initial_gaussians(scene: Scene, config: MapConfig) -> Gaussians:
+    """One Gaussian a point of the sparse cloud, a random part of them where there are more than the budget."""
     points, colors = scene.points, scene.point_colors
     if len(points) > config.train.budget:
         keep = np.random.default_rng(config.seed).choice(len(points), config.train.budget, replace=False)
