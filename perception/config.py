@@ -245,6 +245,9 @@ def check(config: MapConfig) -> None:
         ),
     ]
     limit = config.train.time_limit
+    train = config.train
+    rules.append(("train.cooldown", train.cooldown, 0 <= train.cooldown <= 0.5, "0 to 0.5"))
+    rules.append(("train.stop_psnr", train.stop_psnr, train.stop_psnr is None or train.stop_psnr > 0, "dB above 0"))
     rules.append(("train.time_limit", limit, limit is None or limit > 0, "seconds above 0"))
     for name, value, fine, expected in rules:
         if not fine:

@@ -103,6 +103,14 @@ class Trainer:
         limit = self.config.train.time_limit
         return min(1.0, share if limit is None else max(share, self.elapsed / limit))
 
+    @property
+    def expected_iterations(self) -> int:
+        """How many iterations the run will have had, as far as can be told now."""
+        share = self.iteration / self.config.train.iterations + self._jump
+        if self.progress > share:  # the clock rules
+            return max(self.iteration, round(self.iteration / max(self.progress, 1e-6)))
+        return round(self.iteration + (1 - self.progress) * self.config.train.iterations)
+
     def state(self) -> dict[str, Any]:
         """Everything a resumed run needs."""
         return {

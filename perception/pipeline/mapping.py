@@ -235,9 +235,7 @@ class _Watch:
     def _draw(self, trainer: Trainer, now: float) -> None:
         assert self.first is not None
         speed = (trainer.iteration - self.first[1]) / max(now - self.first[0], 1e-6)
-        total = self.config.train.iterations
-        if trainer.progress > trainer.iteration / total:  # the clock rules: say how far it lets us come
-            total = max(trainer.iteration, round(trainer.iteration / max(trainer.progress, 1e-6)))
+        total = trainer.expected_iterations
         curve = trainer.record.curve
         self.progress.update(
             "train",
@@ -248,6 +246,7 @@ class _Watch:
             gaussians=len(trainer.gaussians),
             it_s=f"{speed:.1f}",
             left_s=round((total - trainer.iteration) / max(speed, 1e-6)),
+            MiB=round(peak_memory_mib()),
         )
 
 
