@@ -12,5 +12,10 @@ BENCHES = (
     "clouds",
     "smoothing",
     "queries",
+    "map",
+    "switches",
+    "scaling",
+    "ablation",
+    "export",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""

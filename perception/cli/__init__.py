@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -36,6 +37,13 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _resume(argv: Sequence[str] | None) -> str:
+    """The command that goes on where this one stopped; only `map` needs to be told."""
+    words = [str(word) for word in (sys.argv[1:] if argv is None else argv)]
+    more = ["--resume"] if words[:1] == ["map"] and "--resume" not in words else []
+    return shlex.join(["perception", *words, *more])
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code: 0, 2 for bad usage or input, 130 on Ctrl-C."""
     # Threads of torch's OpenMP that spin while they wait would take the cores from the kernels' own threads.
@@ -54,6 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         told = "interrupted; what was done is kept, repeat the command with --resume"
         print(getattr(args, "interrupted", told), file=sys.stderr)
+        print(f"interrupted; what was done is kept, go on with: {_resume(argv)}", file=sys.stderr)
         return 130
     except BrokenPipeError:
         return 0

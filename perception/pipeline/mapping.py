@@ -90,7 +90,7 @@ def _build(
     with stages("photos"):
         views = _photos(training, config, progress)
         held = _photos(held_out, config, progress)
-    trainer = Trainer(_initial(scene, config), views, config, held)
+    trainer = Trainer(initial_gaussians(scene, config), views, config, held)
     session = _Session(trainer, work, fingerprint(source, config), config, progress)
     depth = None
     if isinstance(source_of_masks, GeometryMaskSource):  # its masks wait for the map's own geometry
@@ -218,7 +218,8 @@ class _Session:
             save_checkpoint(self.path, self.trainer.state(), self.mark)
 
 
-def _initial(scene: Scene, config: MapConfig) -> Gaussians:
+def initial_gaussians(scene: Scene, config: MapConfig) -> Gaussians:
+    """One Gaussian a point of the sparse cloud, a random part of them where there are more than the budget."""
     points, colors = scene.points, scene.point_colors
     if len(points) > config.train.budget:
         keep = np.random.default_rng(config.seed).choice(len(points), config.train.budget, replace=False)
@@ -249,9 +250,7 @@ class _Watch:
     def _draw(self, trainer: Trainer, now: float) -> None:
         assert self.first is not None
         speed = (trainer.iteration - self.first[1]) / max(now - self.first[0], 1e-6)
-        total = self.config.train.iterations
-        if trainer.progress > trainer.iteration / total:  # the clock rules: say how far it lets us come
-            total = max(trainer.iteration, round(trainer.iteration / max(trainer.progress, 1e-6)))
+        total = trainer.expected_iterations
         curve = trainer.record.curve
         self.progress.update(
             "train",
@@ -262,6 +261,7 @@ class _Watch:
             gaussians=len(trainer.gaussians),
             it_s=f"{speed:.1f}",
             left_s=round((total - trainer.iteration) / max(speed, 1e-6)),
+            MiB=round(peak_memory_mib()),
         )
 
 
