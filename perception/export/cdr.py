@@ -24,8 +24,8 @@ _MORE = {
     "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections\n",
     "rcl_interfaces/srv/GetParameters_Request": "string[] names\n",
     "rcl_interfaces/srv/GetParameters_Response": "rcl_interfaces/ParameterValue[] values\n",
-    "nav_msgs/srv/LoadMap_Request": "string map_url\n",
-    "nav_msgs/srv/LoadMap_Response": "nav_msgs/OccupancyGrid map\nuint8 result\n",
+    "std_srvs/srv/Trigger_Request": "uint8 structure_needs_at_least_one_member\n",
+    "std_srvs/srv/Trigger_Response": "bool success\nstring message\n",
 }
 
 
@@ -39,7 +39,7 @@ def typestore() -> Any:
     store = get_typestore(Stores.ROS2_JAZZY)
     types: dict[str, Any] = {}
     for name, definition in _MORE.items():
-        types |= get_types_from_msg(definition, name)
+        types[name] = next(iter(get_types_from_msg(definition, name).values()))
     store.register(types)
     return store
 
