@@ -66,14 +66,19 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 def _add_info(commands: Any) -> None:
     p = command(commands, "info", _info, "what a map holds, how it was made, how good it is")
     p.add_argument("map", type=Path, metavar="MAP")
+    p.add_argument("--verify", action="store_true", help="read every byte and compare it with the checksums")
 
 
 def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.store import read_info
+    from perception.io.store import read_info, verify_map
     from perception.pipeline.summary import info_text
 
     info = read_info(args.map)
-    return info, info_text(args.map, info)
+    if not args.verify:
+        return info, info_text(args.map, info)
+    states = verify_map(args.map)
+    lines = [f"{name}: {state}" for name, state in states.items()]
+    return {**info, "verified": states}, "\n".join([info_text(args.map, info), *lines])
 
 
 def _add_report(commands: Any) -> None:

@@ -16,6 +16,7 @@ from perception.errors import InputError
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
 from perception.io.inputs import load_scene
+from perception.io.map_lock import writing
 from perception.io.photos import load_photo
 from perception.io.scene_cache import load_saved_scene, save_scene, view_json
 from perception.io.store import GaussianMap, write_map
@@ -52,16 +53,17 @@ def build_map(
         raise InputError("--device cuda: this build has no CUDA rasterizer; use --device cpu or auto")
     fresh = not work_folder(output).exists()
     work = _prepare(source, output, resume)
-    try:
-        return _build(source, output, work, config, progress or Progress(quiet=True))
-    except OSError as error:
-        if error.errno != errno.ENOSPC:
+    with writing(output):
+        try:
+            return _build(source, output, work, config, progress or Progress(quiet=True))
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise
+            raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
+        except InputError:
+            if fresh and not (work / CHECKPOINT).exists():
+                shutil.rmtree(work, ignore_errors=True)
             raise
-        raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
-    except InputError:
-        if fresh and not (work / CHECKPOINT).exists():
-            shutil.rmtree(work, ignore_errors=True)
-        raise
 
 
 def _build(source: Path, output: Path, work: Path, config: MapConfig, progress: Progress) -> GaussianMap:
