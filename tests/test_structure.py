@@ -19,6 +19,7 @@ LAYERS = [
     {"gaussians"},
     {"language", "instances"},
     {"query", "export", "evaluate", "report", "models"},
+    {"node"},
     {"pipeline", "bench"},
     {"cli"},
 ]

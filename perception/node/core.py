@@ -26,11 +26,13 @@ _MOST_NAMES = 32
 
 class Transport(Protocol):
     """What the core needs of DDS or rclpy. `publish` is called from any thread and does not raise for a slow or
-    absent reader; `warnings` are told in the health message."""
+    absent reader; `warnings` (what is wrong now) and `figures` (counts) are told in the health message."""
 
     def publish(self, topic: channels.Topic, message: Message) -> None: ...
 
     def warnings(self) -> list[str]: ...
+
+    def figures(self) -> dict[str, Any]: ...
 
 
 class Core:
@@ -44,9 +46,8 @@ class Core:
         engine.on_reload(lambda _: self._submit(self._send_map))
 
     def start(self) -> None:
-        """Sends the cloud of the map and the first health message."""
+        """Sends the cloud of the map."""
         self._submit(self._send_map)
-        self.send_health()
 
     # ------------------------------------------------------------------ topics
 
@@ -141,7 +142,7 @@ class Core:
     def send_health(self) -> None:
         """The health message: the engine's figures, what was refused here, what the transport warns of."""
         refused = {f"refused_{kind}": count for kind, count in self._refused.items()}
-        facts = {**self._engine.health(), **refused}
+        facts = {**self._engine.health(), **refused, **self._transport.figures()}
         told = answers.diagnostics(self._config.namespace, facts, self._transport.warnings(), self._stamps.next())
         self._transport.publish(channels.HEALTH, told)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 import struct
+import threading
 from collections.abc import Iterator
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -29,23 +30,14 @@ class Participant:
 
     def __init__(self, domain: int, network: str | None = None) -> None:
         dds = self._dds = _Modules()
-        settings = network_settings(network)
-        before = os.environ.get("CYCLONEDDS_URI", "")
-        if before:
-            settings = f"{settings},{before}"  # what the user sets there has the last word
-        os.environ["CYCLONEDDS_URI"] = settings
         try:
+            _open_domain(dds, domain, network)
             self.participant = dds.domain.DomainParticipant(domain)
         except dds.core.DDSException as error:
             raise InputError(
                 f"node: DDS cannot start on domain {domain}, network {network or 'as the system has it'} ({error}); "
                 "check that the interface exists and is up (`ip addr`), or give --network localhost"
             ) from error
-        finally:
-            if before:
-                os.environ["CYCLONEDDS_URI"] = before
-            else:
-                del os.environ["CYCLONEDDS_URI"]
         self._publications = dds.builtin.BuiltinDataReader(
             self.participant, dds.builtin.BuiltinTopicDcpsPublication
         )
@@ -77,6 +69,10 @@ class Participant:
         found = self._publications.read(10_000, condition=condition)
         return sum(1 for one in found if one.topic_name == name and one.participant_key != own)
 
+    def close(self) -> None:
+        """Leaves the network: others learn it now and not when the lease ends. Writers and readers end with it."""
+        self.participant.__del__()  # CycloneDDS has no other name for it; harmless when repeated
+
     def _qos(self, latched: bool) -> Any:
         policy, duration = self._dds.qos.Policy, self._dds.util.duration
         return self._dds.qos.Qos(
@@ -85,6 +81,18 @@ class Participant:
             policy.History.KeepLast(1 if latched else DEPTH),
             policy.DataRepresentation(use_cdrv0_representation=True),
         )
+
+
+_OPENING = threading.Lock()
+_DOMAINS: dict[int, Any] = {}
+
+
+def _open_domain(dds: _Modules, domain: int, network: str | None) -> None:
+    """Settles how this process sits on a domain; the first to come decides for the rest of its life."""
+    with _OPENING:
+        if domain not in _DOMAINS:
+            own = os.environ.get("CYCLONEDDS_URI", "")  # what the user sets there has the last word
+            _DOMAINS[domain] = dds.domain.Domain(domain, ",".join(filter(None, [network_settings(network), own])))
 
 
 class Writer:
