@@ -85,6 +85,19 @@ def test_an_answer_that_does_not_come_is_told_and_not_computed(path: Path) -> No
         assert done == [] and engine.health()["timed_out"] == 2
 
 
+def test_questions_nobody_waits_for_make_room(path: Path) -> None:
+    with engine_of(path, workers=1, queue_size=2, timeout=30) as engine:
+        end = held(engine)
+        given_up, too_late = engine.submit("mug"), engine.submit("lamp", timeout=0.01)
+        assert given_up.cancel()
+        time.sleep(0.05)
+        kept = [engine.submit("teapot"), engine.submit("violin")]
+        with pytest.raises(AnswerTimeout):
+            too_late.result(10)
+        end.set()
+        assert [engine.wait(future).hits[0].instance_id for future in kept] == [3, 6]
+
+
 def test_bad_questions_and_defects_do_not_end_the_engine(path: Path) -> None:
     with engine_of(path, workers=1) as engine:
         for text in ("", " ", "x" * 1_000_000):
