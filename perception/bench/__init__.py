@@ -5,5 +5,6 @@ BENCHES = (
     "training",
     "masks",
     "language",
+    "query",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""
