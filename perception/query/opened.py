@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -21,16 +19,12 @@ from perception.query.hit import Description, Hit, Neighbor
 from perception.query.requests import Request
 from perception.query.space import Space
 from perception.query.where import Where, place, tidy
+from perception.query.words import Encoders, Words
 from perception.types import OrientedBox
 
 if TYPE_CHECKING:
-    from perception.language.base import Encoder
-    from perception.language.ranking import Answer, Ranker
+    from perception.language.ranking import Answer
 
-    Encoders = Callable[[str], Encoder | None]
-
-_REMEMBERED = 256
-"""Prompts whose ranking is kept: planners ask the same thing again and again."""
 _NEIGHBORS = 3
 _LEAST_COLOR = 0.05
 
@@ -50,13 +44,12 @@ class LoadedMap:
     """
 
     def __init__(self, held: GaussianMap | MapFiles, path: Path | None = None, encoders: Encoders | None = None):
-        self._held, self.path, self._encoders = held, path, encoders
+        self._held, self.path = held, path
+        self._words = Words(held, path, encoders)
         self._lock = threading.RLock()
-        self._ranked: OrderedDict[tuple[str, float | None], Answer] = OrderedDict()
         self._covariances: dict[int, np.ndarray] = {}
         self._made_gmap: GaussianMap | None = None
         self._made_space: Space | None = None
-        self._made_ranker: Ranker | InputError | None = None
 
     # ------------------------------------------------------------------- facts
 
@@ -98,11 +91,7 @@ class LoadedMap:
     @property
     def problem(self) -> str | None:
         """Why prompts cannot be answered (no embeddings, no encoder), one line; None when they can."""
-        try:
-            _ = self._ranker
-        except InputError as error:
-            return str(error)
-        return None
+        return self._words.problem
 
     def warm(self) -> None:
         """Does now what the first questions would wait for."""
@@ -130,7 +119,7 @@ class LoadedMap:
         Request(text, top_k, min_score)
         if not self.instances:
             return []
-        answer = self._rank(text, min_score)
+        answer = self._words.rank(text, min_score)
         if where is None:
             if not answer.present:
                 return []
@@ -234,19 +223,6 @@ class LoadedMap:
 
     # --------------------------------------------------------------- internals
 
-    def _rank(self, text: str, min_score: float | None) -> Answer:
-        key = (" ".join(text.split()), min_score)
-        with self._lock:
-            if key in self._ranked:
-                self._ranked.move_to_end(key)
-                return self._ranked[key]
-        answer = self._ranker.rank(text, min_score)
-        with self._lock:
-            self._ranked[key] = answer
-            if len(self._ranked) > _REMEMBERED:
-                self._ranked.popitem(last=False)
-        return answer
-
     def _query_where(
         self, answer: Answer, top_k: int, min_score: float | None, where: Where, frame: Frame | None
     ) -> list[Hit]:
@@ -335,36 +311,6 @@ class LoadedMap:
             if self._made_space is None:
                 self._made_space = Space(self._held.instance_index())
             return self._made_space
-
-    @property
-    def _ranker(self) -> Ranker:
-        with self._lock:
-            if isinstance(self._made_ranker, InputError):
-                raise InputError(str(self._made_ranker))
-            if self._made_ranker is None:
-                try:
-                    self._made_ranker = self._make_ranker()
-                except InputError as error:
-                    self._made_ranker = error
-                    raise
-            return self._made_ranker
-
-    def _make_ranker(self) -> Ranker:
-        from perception.language import make_encoder
-        from perception.language.description import check_encoder, from_arrays
-        from perception.language.ranking import Ranker
-
-        if not self._held.language:
-            raise InputError(
-                f"{self.path}: holds no language embeddings; map again with an encoder (language.encoder=…)"
-            )
-        descriptions, identity = from_arrays(self._held.language)
-        spec = self.info.get("config", {}).get("language", {}).get("encoder", "auto")
-        encoder = (self._encoders or make_encoder)("conse" if spec == "auto" else spec)
-        if encoder is None:
-            raise InputError(f"{self.path}: was mapped without an encoder; map again with language.encoder=conse")
-        check_encoder(identity, encoder.identity)
-        return Ranker(descriptions, encoder, [entry.get("label") for entry in self.instances])
 
 
 def load_map(path: str | Path, encoders: Encoders | None = None) -> LoadedMap:
