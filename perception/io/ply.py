@@ -15,7 +15,7 @@ from typing import BinaryIO
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.cloud_atomic import replacing
+from perception.io.atomic import replacing
 
 Element = dict[str, np.ndarray]
 

@@ -23,7 +23,7 @@ from perception.query.words import Encoders, Words
 from perception.types import OrientedBox
 
 if TYPE_CHECKING:
-    from perception.language.ranking import Answer
+    from perception.language.ranking import Answer, Ranker
 
 _NEIGHBORS = 3
 _LEAST_COLOR = 0.05
@@ -45,7 +45,7 @@ class LoadedMap:
 
     def __init__(self, held: GaussianMap | MapFiles, path: Path | None = None, encoders: Encoders | None = None):
         self._held, self.path = held, path
-        self._words = Words(held, path, encoders)
+        self._words = Words(held, path, encoders, lambda: self._index)
         self._lock = threading.RLock()
         self._covariances: dict[int, np.ndarray] = {}
         self._made_gmap: GaussianMap | None = None
@@ -93,10 +93,16 @@ class LoadedMap:
         """Why prompts cannot be answered (no embeddings, no encoder), one line; None when they can."""
         return self._words.problem
 
+    @property
+    def ranker(self) -> Ranker:
+        """What ranks the instances for a prompt; InputError when the map has no words."""
+        return self._words.ranker
+
     def warm(self) -> None:
         """Does now what the first questions would wait for."""
         _ = self._space
         if self.problem is None and self.instances:
+            _ = self.ranker.shapes
             self.query("thing")
 
     # --------------------------------------------------------------- questions
@@ -186,6 +192,12 @@ class LoadedMap:
             self._colors(position),
             tuple(Neighbor(i, labels.get(i), gap * scale) for gap, i in beside),
         )
+
+    def likely_names(self, count: int = 3) -> list[list[str]]:
+        """The likeliest names of every instance, best first, in the order of `instances`."""
+        from perception.language.naming import likely_names
+
+        return likely_names(self.ranker, count) if self.instances else []
 
     def hit(self, position: int, score: float | None = None) -> Hit:
         """The instance at place `position` of instances.json; score: its own confidence when None."""

@@ -10,7 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from perception.errors import InputError
+from perception.io.instance_index import InstanceIndex
 from perception.io.map_files import MapFiles
 from perception.io.store import GaussianMap
 from perception.language.base import Encoder, make_encoder
@@ -26,8 +29,16 @@ REMEMBERED = 256
 class Words:
     """Ranks the instances of an opened map for prompts; thread-safe."""
 
-    def __init__(self, held: GaussianMap | MapFiles, path: Path | None, encoders: Encoders | None) -> None:
-        self._held, self._path, self._encoders = held, path, encoders or make_encoder
+    def __init__(
+        self,
+        held: GaussianMap | MapFiles,
+        path: Path | None,
+        encoders: Encoders | None,
+        index: Callable[[], InstanceIndex],
+    ) -> None:
+        """index: gives the points of the instances when a prompt first names a shape."""
+        self._held, self._path, self._index = held, path, index
+        self._encoders = encoders or make_encoder
         self._lock = threading.RLock()
         self._made: Ranker | InputError | None = None
         self._ranked: OrderedDict[tuple[str, float | None], Answer] = OrderedDict()
@@ -36,7 +47,7 @@ class Words:
     def problem(self) -> str | None:
         """Why prompts cannot be ranked (no embeddings, no encoder), one line; None when they can."""
         try:
-            _ = self._ranker
+            _ = self.ranker
         except InputError as error:
             return str(error)
         return None
@@ -48,7 +59,7 @@ class Words:
             if key in self._ranked:
                 self._ranked.move_to_end(key)
                 return self._ranked[key]
-        ranker = self._ranker
+        ranker = self.ranker
         with _one_thread():
             answer = ranker.rank(text, min_score)
         with self._lock:
@@ -58,7 +69,8 @@ class Words:
         return answer
 
     @property
-    def _ranker(self) -> Ranker:
+    def ranker(self) -> Ranker:
+        """Made once; InputError when the map has no words, the same one every time."""
         with self._lock:
             if self._made is None:
                 try:
@@ -83,7 +95,16 @@ class Words:
         if encoder is None:
             raise InputError(f"{self._path}: was mapped without an encoder; map again with language.encoder=conse")
         check_encoder(identity, encoder.identity)
-        return Ranker(descriptions, encoder, [entry.get("label") for entry in self._held.instances])
+        labels = [entry.get("label") for entry in self._held.instances]
+        return Ranker(descriptions, encoder, labels, self._shapes)
+
+    def _shapes(self) -> np.ndarray:
+        from perception.instances.shapes import shape_scores
+
+        index = self._index()
+        owners = np.repeat(index.ids, np.diff(index.starts))
+        poses = self._held.cameras.get("camera_from_world", np.zeros((0, 4, 4)))
+        return shape_scores(index.points, owners, [entry["id"] for entry in self._held.instances], poses)
 
 
 @contextmanager
