@@ -17,6 +17,7 @@ class HashEncoder:
     """Every text its own random direction: exact names fit, everything else is unrelated."""
 
     identity, dim, templates, references = "hash-test", 256, ("{}",), None
+    margin, canonical = 0.0, ()
 
     def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
         rows = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import os
 import signal
@@ -12,7 +13,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -72,36 +73,44 @@ def ask(port: int, name: str, timeout: float = 10.0) -> dict[str, Any]:
 def test_clients_recover_from_a_server_killed_and_restarted_under_load(tmp_path: Path) -> None:
     """Eight clients ask without pause and repeat what failed; every answer that comes is the right one."""
     path = write_map_of(tmp_path / "a.gsmap", gaussians=900)
-    failures, stop = [0] * 8, threading.Event()
+    failures, answers, stop = [0] * 8, [[] for _ in range(8)], threading.Event()
 
-    with served(path) as (first, port):
+    def client(port: int, number: int) -> None:
+        while not stop.is_set():
+            name = NAMES[(number + len(answers[number])) % len(NAMES)]
+            try:
+                result = ask(port, name)["results"][0]
+            except (OSError, http.client.HTTPException, json.JSONDecodeError):  # refused, reset, cut off
+                failures[number] += 1
+                time.sleep(0.02)
+                continue
+            answers[number].append(result["text"] == name and result["hits"][0]["instance_id"] == NAMES.index(name))
 
-        def client(number: int) -> list[bool]:
-            right = []
-            while not (stop.is_set() and right):
-                name = NAMES[(number + len(right)) % len(NAMES)]
-                try:
-                    result = ask(port, name)["results"][0]
-                except (OSError, urllib.error.URLError, json.JSONDecodeError):  # refused, reset, cut off
-                    failures[number] += 1
-                    time.sleep(0.02)
-                    continue
-                right.append(result["text"] == name and result["hits"][0]["instance_id"] == NAMES.index(name))
-            return right
-
-        with ThreadPoolExecutor(8) as pool:
-            clients = [pool.submit(client, number) for number in range(8)]
-            time.sleep(0.5)
+    with served(path) as (first, port), ThreadPoolExecutor(8) as pool:
+        try:
+            clients = [pool.submit(client, port, number) for number in range(8)]
+            _until(lambda: min(map(len, answers)) >= 2)
             first.send_signal(signal.SIGKILL)
             first.wait()
+            _until(lambda: min(failures) >= 1)
+            before = [len(right) for right in answers]
             with served(path, port) as (_, again):
                 assert again == port
-                before = list(failures)
-                time.sleep(0.5)
+                _until(lambda: all(len(right) >= held + 2 for right, held in zip(answers, before, strict=True)))
                 stop.set()
-                answers = [client.result(60) for client in clients]
-    assert min(before) > 0, "the kill should have been felt"
-    assert all(all(right) and len(right) > 1 for right in answers)
+                for done in clients:
+                    done.result(60)
+        finally:
+            stop.set()
+    assert all(all(right) for right in answers)
+
+
+def _until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    """Waits for other threads; the bound only ends a test that has failed."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it never happened"
+        time.sleep(0.01)
 
 
 def test_what_is_no_http_does_not_end_the_server(tmp_path: Path) -> None:
