@@ -1,4 +1,4 @@
-"""The parts of `bench query` on a small map: every answer right, none lost or crossed, and a wrong server is found out."""
+"""The parts of `bench query` on a small map: right answers are found right, lost and crossed ones are counted."""
 
 from __future__ import annotations
 
