@@ -5,6 +5,7 @@ BENCHES = (
     "training",
     "masks",
     "language",
+    "query",
     "view",
     "lerf-mask",
     "lerf-ovs",

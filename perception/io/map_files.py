@@ -97,7 +97,7 @@ class MapFiles:
         except FileNotFoundError as error:
             raise InputError(f"{file}: is missing; the map is damaged, build it again or copy it anew") from error
         except _DAMAGE as error:
-            raise InputError(f"{file}: cannot be read ({error}); the map is damaged, build it again") from error
+            raise InputError(f"{file}: cannot be read ({_short(error)}); the map is damaged, build it again") from error
         kind = "i" if name == "instance_ids" else "f"
         if array.ndim != sides or array.dtype.kind != kind:
             raise InputError(f"{file}: holds {array.dtype} of shape {list(array.shape)}; the map is damaged")
@@ -178,7 +178,7 @@ class MapFiles:
         except InputError:
             raise
         except _DAMAGE as error:
-            raise InputError(f"{file}: cannot be read ({error}); the map is damaged, build it again") from error
+            raise InputError(f"{file}: cannot be read ({_short(error)}); the map is damaged, build it again") from error
 
 
 def read_info(path: Path) -> dict[str, Any]:
@@ -259,6 +259,11 @@ def _check_instance(entry: dict[str, Any]) -> None:
     label = entry.get("label")
     if label is not None and not isinstance(label, str):
         raise ValueError(f"instance {entry['id']}: label is {type(label).__name__}, expected a text or null")
+
+
+def _short(error: Exception) -> str:
+    """numpy explains at length, over several lines."""
+    return " ".join(str(error).split())[:120] or type(error).__name__
 
 
 def _bytes(file: Path) -> bytes | None:
