@@ -20,7 +20,7 @@ LAYERS = [
     {"language", "instances"},
     {"query", "export", "evaluate", "report", "models"},
     {"node"},
-    {"pipeline", "bench"},
+    {"pipeline", "bench", "launch"},
     {"cli"},
 ]
 HEIGHT = {name: height for height, layer in enumerate(LAYERS) for name in layer}
