@@ -62,7 +62,8 @@ def deserialize(kind: str, data: bytes) -> dict[str, Any]:
 
 def plain(message: Any) -> dict[str, Any]:
     """A rosbags message as the dict of its fields."""
-    return {field.name: _plain(getattr(message, field.name)) for field in dataclasses.fields(message)}
+    names = [field.name for field in dataclasses.fields(message) if not field.name.startswith("__")]
+    return {name: _plain(getattr(message, name)) for name in names}
 
 
 def _plain(value: Any) -> Any:
