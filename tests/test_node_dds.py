@@ -168,7 +168,7 @@ def test_bad_prompts_on_the_topic_are_answered_too(asker: NodeClient) -> None:
     assert "nonsense" in answer.facts["error"]["message"]
 
 
-def test_malformed_messages_are_counted_and_survived(asker: NodeClient) -> None:
+def test_malformed_messages_are_survived(asker: NodeClient) -> None:
     seat = Participant(DOMAIN, "localhost")
     prompts = seat.writer("rt/steady/prompt", channels.PROMPT.kind)
     requests = seat.writer("rq/steady/queryRequest", f"{channels.QUERY.kind}_Request", headed=True)
@@ -183,8 +183,9 @@ def test_malformed_messages_are_counted_and_survived(asker: NodeClient) -> None:
         prompts.write(data)
         requests.write(data, (1, 1))
     requests.write(good)  # without the header, as rmw_fastrtps sends it
-    told = take_until(health, channels.HEALTH.kind, lambda m: int(health_values(m)["malformed"]) >= 20)
-    assert told["status"][0]["level"] == 0
+    # CycloneDDS drops what does not fit the type's structure; a text that is no UTF-8 comes through to us.
+    told = take_until(health, channels.HEALTH.kind, lambda m: int(health_values(m)["malformed"]) >= 1)
+    assert told["status"][0]["level"] == 0 and health_values(told)["failed"] == "0"
     assert asker.query(["laptop"], WAIT)[0]["present"]
     seat.close()
 
@@ -256,19 +257,18 @@ def test_clients_recover_from_a_node_killed_under_load(map_path: Path) -> None:
                 return
         own.close()
 
+    def wait_for_more() -> None:
+        goal = answered[0] + 30
+        while answered[0] < goal and thread.is_alive():
+            time.sleep(0.01)
+
     thread = threading.Thread(target=ask)
     thread.start()
     try:
-        for _ in range(2):
-            goal = answered[0] + 20
-            while answered[0] < goal and thread.is_alive():
-                time.sleep(0.01)
-            node.kill()  # not asked: dead at once, in the middle of whatever it does
-            node.communicate()
-            node = start(map_path, "mortal")
-        goal = answered[0] + 20
-        while answered[0] < goal and thread.is_alive():
-            time.sleep(0.01)
+        wait_for_more()
+        end(node)  # not asked: dead at once, in the middle of whatever it does
+        node = start(map_path, "mortal")
+        wait_for_more()
     finally:
         stop.set()
         thread.join(2 * WAIT)
@@ -333,9 +333,9 @@ def test_reload_service_says_what_it_did(tmp_path: Path) -> None:
         write_small_map(path, LABELS[:2], seed=9)
         told = reload()
         assert told["success"] and told["message"] == f"map {load_map(path).map_id}"
-        (path / "gaussians.ply").write_bytes(b"no ply")
+        (path / "map.json").write_text("{")
         told = reload()
-        assert not told["success"] and "gaussians.ply" in told["message"]
+        assert not told["success"] and "map.json" in told["message"]
     finally:
         seat.close()
         end(node)
