@@ -138,7 +138,7 @@ def test_every_type_is_rosbags_serialisation_of_a_message_made_by_hand() -> None
             head, space, number, kind, action, at, scale, tint, stay, False, [], [], "", image, [], words, "", mesh, False
         )
 
-    nowhere = t["geometry_msgs/msg/Pose"](point(0.0, 0.0, 0.0), turn(0.0, 0.0, 0.0, 0.0))
+    nowhere = t["geometry_msgs/msg/Pose"](point(0.0, 0.0, 0.0), turn(0.0, 0.0, 0.0, 1.0))
     marks = [
         marker(0, 0, 3, nowhere, vector(0.0, 0.0, 0.0), color(0.0, 0.0, 0.0, 0.0), "", ""),
         marker(0, 1, 0, at, vector(0.5, 0.25, 0.125), color(0.0, 1.0, 0.0, 0.4), "", "q"),
