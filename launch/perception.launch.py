@@ -18,7 +18,9 @@ def generate_launch_description():
     return LaunchDescription(
         [
             DeclareLaunchArgument("config", default_value=str(here / "perception.yaml"), description="YAML file"),
-            DeclareLaunchArgument("only", default_value="", description="parts to start, comma-separated; all if empty"),
+            DeclareLaunchArgument(
+                "only", default_value="", description="parts to start, comma-separated; all if empty"
+            ),
             DeclareLaunchArgument("perception", default_value="perception", description="the command, if not on PATH"),
             OpaqueFunction(function=start),
         ]
@@ -27,9 +29,7 @@ def generate_launch_description():
 
 def start(context):
     """The actions for what the YAML file names; a node or viewer whose map is not there yet follows the mapper."""
-    config, only, program = (
-        LaunchConfiguration(name).perform(context) for name in ("config", "only", "perception")
-    )
+    config, only, program = (LaunchConfiguration(name).perform(context) for name in ("config", "only", "perception"))
     command = [program, "launch", config, "--only", only, "--check", "--json"]
     answer = subprocess.run(command, capture_output=True, text=True, check=False)
     if answer.returncode != 0:

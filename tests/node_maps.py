@@ -60,7 +60,10 @@ def write_small_map(path: Path, labels: Sequence[str], points: int = 50, seed: i
             }
         )
     palette = np.zeros((to_palette(), 4), np.float32)
-    described = [InstanceDescription(word(f"see {x}"), word(f"see {x}")[None], palette, ["a.jpg"], [(0, 0, 9, 9)]) for x in labels]
+    described = [
+        InstanceDescription(word(f"see {x}"), word(f"see {x}")[None], palette, ["a.jpg"], [(0, 0, 9, 9)])
+        for x in labels
+    ]
     write_map(
         path,
         GaussianMap(

@@ -136,7 +136,9 @@ def test_mapper_first_then_node_and_what_dies_starts_again(tmp_path: Path) -> No
 
 def test_bad_input_ends_everything(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="viewer: ended with code 2"):
-        run_plan([job("node", "import time; time.sleep(60)"), job("viewer", "exit(2)")], threading.Event(), lambda _: None)
+        run_plan(
+            [job("node", "import time; time.sleep(60)"), job("viewer", "exit(2)")], threading.Event(), lambda _: None
+        )
     with pytest.raises(InputError, match="mapper: ended with code 1"):
         run_plan([job("mapper", "exit(1)", once=True)], threading.Event(), lambda _: None)
     with pytest.raises(InputError, match="is no map, and no mapper"):
@@ -185,7 +187,7 @@ def ros_launch_stub(monkeypatch: pytest.MonkeyPatch, values: dict[str, str]) -> 
 
 def ros_actions(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, config: Path, only: str = "") -> list[Any]:
     program = tmp_path / "perception"
-    program.write_text(f"#!/bin/sh\nexec {sys.executable} -m perception.cli \"$@\"\n")
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m perception.cli "$@"\n')
     program.chmod(0o755)
     monkeypatch.setenv("PYTHONPATH", str(LAUNCH.parent))
     ros_launch_stub(monkeypatch, {"config": str(config), "only": only, "perception": str(program)})

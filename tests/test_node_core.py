@@ -143,7 +143,12 @@ def test_health_tells_the_engine_and_the_transport(served: tuple[Core, Heard, Ga
     core.send_health()
     status = heard.messages[-1][1]["status"][0]
     values = {pair["key"]: pair["value"] for pair in status["values"]}
-    assert (status["level"], values["refused_bad_input"], values["malformed"], values["instances"]) == (0, "1", "3", "2")
+    assert (status["level"], values["refused_bad_input"], values["malformed"], values["instances"]) == (
+        0,
+        "1",
+        "3",
+        "2",
+    )
 
 
 def test_thinned_cloud_of_the_map(tmp_path: Path) -> None:

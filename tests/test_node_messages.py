@@ -135,7 +135,25 @@ def test_every_type_is_rosbags_serialisation_of_a_message_made_by_hand() -> None
         mesh = t["visualization_msgs/msg/MeshFile"]("", nothing)
         stay = t["builtin_interfaces/msg/Duration"](0, 0)
         return t["visualization_msgs/msg/Marker"](
-            head, space, number, kind, action, at, scale, tint, stay, False, [], [], "", image, [], words, "", mesh, False
+            head,
+            space,
+            number,
+            kind,
+            action,
+            at,
+            scale,
+            tint,
+            stay,
+            False,
+            [],
+            [],
+            "",
+            image,
+            [],
+            words,
+            "",
+            mesh,
+            False,
         )
 
     nowhere = t["geometry_msgs/msg/Pose"](point(0.0, 0.0, 0.0), turn(0.0, 0.0, 0.0, 1.0))

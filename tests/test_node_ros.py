@@ -23,7 +23,9 @@ DOMAIN = 20 + os.getpid() % 200
 LABELS = ["red mug", "laptop", "banana"]
 ROS_PYTHON = os.environ.get("PERCEPTION_RCLPY_PYTHON", "")
 
-pytestmark = pytest.mark.skipif(not ROS_PYTHON, reason="PERCEPTION_RCLPY_PYTHON names no Python with rclpy; see .ci/run")
+pytestmark = pytest.mark.skipif(
+    not ROS_PYTHON, reason="PERCEPTION_RCLPY_PYTHON names no Python with rclpy; see .ci/run"
+)
 
 
 def environment() -> dict[str, str]:

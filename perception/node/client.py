@@ -119,7 +119,9 @@ class NodeClient:
             if "error" in facts:
                 return TopicAnswer(facts)
             stamp = (facts["stamp"]["sec"], facts["stamp"]["nanosec"]) if facts else None
-            parts = [seen[topic].get(stamp) for topic in (channels.POINTS, channels.BOXES, channels.MARKS)] if stamp else []
+            parts = (
+                [seen[topic].get(stamp) for topic in (channels.POINTS, channels.BOXES, channels.MARKS)] if stamp else []
+            )
             return TopicAnswer(facts, *parts) if parts and all(part is not None for part in parts) else None
 
         with self._lock:

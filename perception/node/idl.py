@@ -82,7 +82,10 @@ def _class(name: str, fields: dict[str, Any]) -> Any:
     base = _idl().IdlStruct
     scoped = name.replace("::", ".")
     made = types.new_class(
-        scoped.rsplit(".", 1)[1], (base,), {"typename": scoped}, lambda space: space.update(__annotations__=dict(fields))
+        scoped.rsplit(".", 1)[1],
+        (base,),
+        {"typename": scoped},
+        lambda space: space.update(__annotations__=dict(fields)),
     )
     return dataclass(made)
 

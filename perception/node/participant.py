@@ -38,14 +38,14 @@ class Participant:
                 f"node: DDS cannot start on domain {domain}, network {network or 'as the system has it'} ({error}); "
                 "check that the interface exists and is up (`ip addr`), or give --network localhost"
             ) from error
-        self._publications = dds.builtin.BuiltinDataReader(
-            self.participant, dds.builtin.BuiltinTopicDcpsPublication
-        )
+        self._publications = dds.builtin.BuiltinDataReader(self.participant, dds.builtin.BuiltinTopicDcpsPublication)
 
     def writer(self, name: str, kind: str, *, latched: bool = False, headed: bool = False) -> Writer:
         """A reliable writer of ROS type `kind` on DDS topic `name`; latched: the last sample waits for late readers."""
         topic = self._dds.topic.Topic(self.participant, name, sample_type(kind, headed))
-        return Writer(self._dds, self._dds.pub.DataWriter(self.participant, topic, qos=self._qos(latched)), kind, headed)
+        return Writer(
+            self._dds, self._dds.pub.DataWriter(self.participant, topic, qos=self._qos(latched)), kind, headed
+        )
 
     def reader(self, name: str, kind: str, *, latched: bool = False, headed: bool = False) -> Reader:
         """A reliable reader; holds at most DEPTH samples, the newest."""

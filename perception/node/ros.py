@@ -34,9 +34,7 @@ class RosTransport:
 
         self._config = config
         self._context = rclpy.Context()
-        rclpy.init(
-            context=self._context, domain_id=config.domain_id, signal_handler_options=SignalHandlerOptions.NO
-        )
+        rclpy.init(context=self._context, domain_id=config.domain_id, signal_handler_options=SignalHandlerOptions.NO)
         self._node = rclpy.create_node("node", namespace=f"/{config.namespace}", context=self._context)
         self._answer_name = f"/{channels.ANSWER.path(config.namespace)}"
         self._publishers: dict[Topic, Any] = {}
