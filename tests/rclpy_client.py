@@ -39,7 +39,7 @@ def spin_until(done):
     limit = time.monotonic() + WAIT
     while not done():
         if time.monotonic() > limit:
-            sys.exit(f"waited {WAIT} s in vain; heard {dict((k, len(v)) for k, v in heard.items())}")
+            sys.exit(f"waited {WAIT} s in vain; heard { {k: len(v) for k, v in heard.items()} }")
         rclpy.spin_once(node, timeout_sec=0.05)
 
 

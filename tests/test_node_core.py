@@ -89,7 +89,7 @@ def test_full_queue_refuses_at_once_and_forgets_nobody(served: tuple[Core, Heard
 
 
 def test_what_waited_too_long_is_told_so(served: tuple[Core, Heard, GatedEncoder, QueryEngine]) -> None:
-    core, heard, encoder, engine = served
+    core, heard, _, engine = served
     engine.timeout = 0.0
     core.prompt('{"text": "red mug", "id": "a"}')
     told = heard.answers(1)[0]
@@ -125,7 +125,7 @@ def test_parts_of_an_answer_share_a_stamp_no_other_has(served: tuple[Core, Heard
 
 
 def test_one_request_takes_so_many_names_and_no_more(served: tuple[Core, Heard, GatedEncoder, QueryEngine]) -> None:
-    core, _, encoder, engine = served
+    core, _, encoder, _ = served
     encoder.gate.set()
     replies: list[dict[str, Any]] = []
     ended = threading.Event()

@@ -18,9 +18,22 @@ LAYERS = [
     {"masks", "demo"},
     {"gaussians"},
     {"language", "instances"},
-    {"query", "export", "evaluate", "report", "models"},
-    {"node"},
-    {"pipeline", "bench", "launch"},
+    {
+        "query",
+        "export",
+        "evaluate",
+        "report",
+        "models",
+        "editing",
+    },
+    {
+        "serve",
+        "node",
+        "pipeline",
+        "viewer",
+        "bench",
+        "launch",
+    },
     {"cli"},
 ]
 HEIGHT = {name: height for height, layer in enumerate(LAYERS) for name in layer}

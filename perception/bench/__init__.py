@@ -5,5 +5,18 @@ BENCHES = (
     "training",
     "masks",
     "language",
+    "query",
+    "view",
+    "lerf-mask",
+    "lerf-ovs",
+    "scannetpp",
+    "clouds",
+    "smoothing",
+    "queries",
+    "map",
+    "switches",
+    "scaling",
+    "ablation",
+    "export",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from perception.boxes import instance_boxes
 from perception.errors import InputError, missing_extra
-from perception.export.boxes import instance_boxes
 from perception.export.cdr import serialize, typestore
 from perception.export.ros_messages import DETECTIONS, POINT_CLOUD, Stamp, detection, header, packed_rgb, point_cloud2
-from perception.io.cloud_atomic import replacing
+from perception.io.atomic import replacing
 from perception.types import OrientedBox, PointCloud
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import struct
 import threading
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -24,6 +26,22 @@ MOST_ARCHIVE = 4 << 30
 """Bytes an .npz of a map may unpack to; a damaged or hostile one must not fill the memory."""
 _ARRAYS = {"features": 2, "instance_ids": 1, "membership": 1}
 _TRIES = 5
+_DAMAGE = (
+    ValueError,
+    KeyError,
+    TypeError,
+    OSError,
+    EOFError,
+    OverflowError,
+    MemoryError,
+    RuntimeError,  # NotImplementedError, RecursionError and "is encrypted" among them
+    SyntaxError,  # numpy reads the header of an array as Python
+    tokenize.TokenError,
+    struct.error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What numpy and zipfile raise on bytes that are no array or archive."""
 
 Signature = tuple[tuple[int, int, int], ...]
 
@@ -76,8 +94,10 @@ class MapFiles:
         file = self.path / f"{name}.npy"
         try:
             array = np.load(file, mmap_mode="r", allow_pickle=False)
-        except (ValueError, EOFError) as error:
-            raise InputError(f"{file}: cannot be read ({error}); the map is damaged, build it again") from error
+        except FileNotFoundError as error:
+            raise InputError(f"{file}: is missing; the map is damaged, build it again or copy it anew") from error
+        except _DAMAGE as error:
+            raise InputError(f"{file}: cannot be read ({_short(error)}); the map is damaged, build it again") from error
         kind = "i" if name == "instance_ids" else "f"
         if array.ndim != sides or array.dtype.kind != kind:
             raise InputError(f"{file}: holds {array.dtype} of shape {list(array.shape)}; the map is damaged")
@@ -146,7 +166,7 @@ class MapFiles:
     def _unpack(self, name: str) -> dict[str, np.ndarray]:
         """The arrays of an .npz; its CRC-32s tell damage."""
         raw, file = self._archives[name], self.path / f"{name}.npz"
-        if not raw:
+        if raw is None:
             return {}
         try:
             with zipfile.ZipFile(io.BytesIO(raw)) as archive:
@@ -157,8 +177,8 @@ class MapFiles:
                 return {key: arrays[key] for key in arrays.files}
         except InputError:
             raise
-        except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-            raise InputError(f"{file}: cannot be read ({error}); the map is damaged, build it again") from error
+        except _DAMAGE as error:
+            raise InputError(f"{file}: cannot be read ({_short(error)}); the map is damaged, build it again") from error
 
 
 def read_info(path: Path) -> dict[str, Any]:
@@ -241,5 +261,10 @@ def _check_instance(entry: dict[str, Any]) -> None:
         raise ValueError(f"instance {entry['id']}: label is {type(label).__name__}, expected a text or null")
 
 
-def _bytes(file: Path) -> bytes:
-    return file.read_bytes() if file.is_file() else b""
+def _short(error: Exception) -> str:
+    """numpy explains at length, over several lines."""
+    return " ".join(str(error).split())[:120] or type(error).__name__
+
+
+def _bytes(file: Path) -> bytes | None:
+    return file.read_bytes() if file.is_file() else None

@@ -15,7 +15,7 @@ from typing import BinaryIO
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.cloud_atomic import replacing
+from perception.io.atomic import replacing
 
 Element = dict[str, np.ndarray]
 
@@ -107,6 +107,11 @@ def write_ply(path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]]
                 _write_ascii(file, properties)
             else:
                 _packed(properties).tofile(file)
+
+
+def ply_bytes(elements: Mapping[str, Mapping[str, np.ndarray]]) -> bytes:
+    """What `write_ply` would write, binary, for those who send it elsewhere."""
+    return _header(elements, False).encode("ascii") + b"".join(_packed(p).tobytes() for p in elements.values())
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_Table]]:

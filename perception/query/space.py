@@ -59,13 +59,13 @@ class Space:
 
     def reaches(self, instance_id: int, point: np.ndarray) -> bool:
         """Whether `point` [3] lies on the instance by the spacing of its own points there: no farther from its
-        nearest point than twice the radius in which that point has eight neighbours."""
+        nearest point than that point from its eighth neighbour."""
         points = self.index.of(instance_id)
         squared = _squared(points, point)
         nearest = int(squared.argmin())
         around = _squared(points, points[nearest].astype(np.float64))
         radius = np.partition(around, min(_NEIGHBORS, len(around) - 1))[min(_NEIGHBORS, len(around) - 1)]
-        return bool(squared[nearest] <= 4 * radius)
+        return bool(squared[nearest] <= radius)
 
     def gap(self, a: int, b: int) -> float:
         """The least distance between the points of two instances; infinite when one has none."""
