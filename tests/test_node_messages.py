@@ -237,9 +237,10 @@ def test_bytes_are_those_of_rclpy(messages: dict[str, list[dict[str, Any]]], tmp
     )
     theirs = pickle.loads((tmp_path / "out.pickle").read_bytes())
     assert theirs.keys() == own.keys() - {"vision_msgs/msg/Detection3DArray"}
-    for kind, some in theirs.items():  # Fast CDR leaves what lay in memory between the fields: zeros there
-        assert [len(data) for data in some] == [len(data) for data in own[kind]], kind
-        assert [_without_gaps(kind, data) for data in some] == own[kind], kind
+    for kind, some in theirs.items():
+        for data, mine in zip(some, own[kind], strict=True):
+            # Fast CDR leaves what lay in memory between the fields, and room it did not need behind them.
+            assert _without_gaps(kind, data[: len(mine)]) == mine, kind
 
 
 def _without_gaps(kind: str, data: bytes) -> bytes:
