@@ -24,7 +24,7 @@ from perception.errors import InputError
 pytest.importorskip("cyclonedds")
 pytest.importorskip("rosbags")
 
-from perception.export.cdr import deserialize, serialize
+from perception.io.cdr import deserialize, serialize
 from perception.node import channels
 from perception.node.client import NodeClient, cloud_rows
 from perception.node.config import NodeConfig

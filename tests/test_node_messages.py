@@ -20,9 +20,9 @@ from perception.types import OrientedBox
 pytest.importorskip("cyclonedds")
 pytest.importorskip("rosbags")
 
-from perception.export.cdr import deserialize, plain, serialize, typestore
-from perception.export.ros_messages import box_markers, detection, header, point_cloud2, pose
 from perception.geometry import rotation_from_quaternion
+from perception.io.cdr import deserialize, plain, serialize, typestore
+from perception.io.ros_messages import box_markers, detection, header, point_cloud2, pose
 from perception.node import idl
 
 STAMP = (7, 999_999_999)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.export.cdr import deserialize, serialize
+from perception.io.cdr import deserialize, serialize
 from perception.node import channels
 from perception.node.config import NodeConfig
 from perception.node.participant import Participant
