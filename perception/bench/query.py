@@ -2,8 +2,8 @@
 
 Synthetic maps whose answers are known by construction. Cold: a fresh process until its first answer. Load: load_map
 alone. Warm: prompts never asked before, and prompts asked again (their ranking is remembered). Clients: many at once
-through the engine and through HTTP; each answer is compared with the one a single thread got, a difference is a crossed
-answer and an exception a lost one. Memory: resident before and after the queries.
+through the engine, HTTP, and DDS by service and by topics; each answer is compared with the one a single thread got, a
+difference is a crossed answer and an exception a lost one. Memory: resident before and after the queries.
 """
 
 from __future__ import annotations
@@ -23,8 +23,11 @@ from typing import Any
 import numpy as np
 
 from perception.bench.askers import CONTENDERS, Best, Contender
+from perception.bench.dds import DDS_CONTENDERS
 from perception.bench.synthetic_map import write_synthetic_map
 from perception.errors import InputError, missing_extra
+
+_WAYS = {**CONTENDERS, **DDS_CONTENDERS}
 
 _COLD = """
 import sys, resource
@@ -237,12 +240,12 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         repeated = shares_of(names, options.queries, options.clients)
         rows = {
             "new prompts": clients_at_once(
-                CONTENDERS[name],
+                _WAYS[name],
                 path,
                 answers_alone(path, new),
                 [new[c :: options.clients] for c in range(options.clients)],
             ),
-            "repeated prompts": clients_at_once(CONTENDERS[name], path, answers, repeated),
+            "repeated prompts": clients_at_once(_WAYS[name], path, answers, repeated),
         }
         report["clients"][name] = rows
         for kind, row in rows.items():
@@ -305,7 +308,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--clients", type=int, default=8)
     parser.add_argument("--rounds", type=int, default=3, help="processes started for the cold figures")
     parser.add_argument("--turns", type=int, default=7, help="times each map is opened")
-    parser.add_argument("--via", nargs="+", default=list(CONTENDERS), choices=list(CONTENDERS))
+    parser.add_argument("--via", nargs="+", default=list(_WAYS), choices=list(_WAYS))
     parser.add_argument("--json", type=Path, metavar="OUT.json")
     parser.add_argument("--plot", type=Path, metavar="OUT.png")
     options = parser.parse_args(arguments)
