@@ -32,8 +32,7 @@ DIM = 24
 class Table:
     """A hand-made encoder: known words have known vectors, every other text a fixed random direction."""
 
-    identity, dim, templates, references = "table", DIM, ("{}",), None
-    margin, canonical = 0.0, ()
+    identity, dim, templates = "table", DIM, ("{}",)
 
     def __init__(self, known: dict[str, np.ndarray]) -> None:
         self.known = known
