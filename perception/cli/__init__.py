@@ -21,6 +21,7 @@ _MODULES = (
     "clouds",
     "scoring",
     "serving",
+    "node",
     "viewing",
     "models",
 )

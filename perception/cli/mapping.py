@@ -91,8 +91,7 @@ def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         return info, info_text(args.map, info)
     states = verify_map(args.map)
     lines = [f"{name}: {state}" for name, state in states.items()]
-    return {**info, "verified": states}, "
-".join([info_text(args.map, info), *lines])
+    return {**info, "verified": states}, "\n".join([info_text(args.map, info), *lines])
 
 
 def _add_report(commands: Any) -> None:
