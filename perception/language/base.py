@@ -31,11 +31,12 @@ class Reading:
 
     parts: of its embeddings; none: the whole is one. margin: spreads above the map's probes from which an answer is
     believed. canonical: phrases that fit anything, which a prompt must beat; none where sentences do not describe
-    pictures in general.
+    pictures in general. zooms: crops a view that it does best with (the paper's 3 for what reads context well).
     """
 
     parts: tuple[Part, ...] = ()
     margin: float = 0.0
+    zooms: int = 3
     canonical: tuple[str, ...] = ()
 
 

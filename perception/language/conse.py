@@ -95,7 +95,7 @@ class ConseEncoder:
     def reading(self) -> Reading:
         """The two spaces and their shares; texts that fit many classes are told in the first."""
         parts = (Part(MiniLM.dim, 1 - SHARE, self._centred), Part(self.dim, SHARE))
-        return Reading(parts, MARGIN)
+        return Reading(parts, MARGIN, zooms=2)  # a classifier names what fills the picture: wide crops mislead it
 
     @cached_property
     def _centred(self) -> np.ndarray:
