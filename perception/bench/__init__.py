@@ -12,6 +12,7 @@ BENCHES = (
     "clouds",
     "smoothing",
     "queries",
+    "sam",
     "map",
     "switches",
     "scaling",
