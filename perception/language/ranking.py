@@ -35,7 +35,7 @@ PRESENT = 0.8  # default least score of a hit; the probes are harder than the us
 QUANTILE, NORMAL_QUANTILE = 0.8, 0.8416  # Φ(.8416) = .8
 BETA = 0.5  # share of the map's mean embedding that is taken away
 SHAPE_WEIGHT = 6.0  # spreads between no and a full match of shape, for kinds that geometry alone decides
-SHAPE_HINT = 3.0  # the same for kinds that are only likelier with a shape: not every box is closed
+SHAPE_HINT = 2.0  # what a full match adds for kinds that shape only makes likelier: not every box is closed
 TEMPERATURE = 10.0  # LERF's
 COLOR_WEIGHT = 0.1  # relevancy between no and a full colour match
 LABEL_MARGIN = 2.0  # a label means the prompt from 2 + Φ⁻¹(score) spreads above what probes mean to it
@@ -137,8 +137,8 @@ class Ranker:
         kind = shape_kind(text)
         if kind is None or self.shapes is None:
             return 0.0
-        weight = SHAPE_HINT if kind in HINTS else SHAPE_WEIGHT
-        return weight * (self.shapes[:, KINDS.index(kind)] - 0.5)
+        match = self.shapes[:, KINDS.index(kind)]
+        return SHAPE_HINT * match if kind in HINTS else SHAPE_WEIGHT * (match - 0.5)
 
     def _against_canonical(self, row: np.ndarray) -> np.ndarray:
         """LERF's relevancy [I]: how likely the prompt [1, D] is beside the canonical phrase that fits best."""
