@@ -35,7 +35,8 @@ def path(tmp_path: Path) -> Path:
     counts = [60, 60, 60]
     entries = [
         {"id": i, "label": None, "score": 0.5 + 0.1 * i, "num_gaussians": counts[i], "views": 3 + i}
-        | {"centroid": [0, 0, 0], "obb": {}, "aabb": {}}
+        | {"centroid": [0, 0, 0], "aabb": {"min": [0, 0, 0], "max": [1, 1, 1]}}
+        | {"obb": {"center": [0, 0, 0], "rotation": np.eye(3).tolist(), "extent": [1, 1, 1]}}
         for i in range(3)
     ]
     gmap = GaussianMap(
