@@ -13,6 +13,7 @@ BENCHES = (
     "clouds",
     "smoothing",
     "queries",
+    "sam",
     "map",
     "switches",
     "scaling",

@@ -102,6 +102,7 @@ def _embed(
     from perception.instances.crops import choose_views, view_scores
     from perception.instances.describe import describe_instances
     from perception.language import make_encoder
+    from perception.language.base import reading_of
     from perception.language.description import to_arrays
 
     spec = config.language.encoder
@@ -124,8 +125,9 @@ def _embed(
         chosen,
         lambda index: (views[index].photo.numpy(), seen[index].ids),
         [view.name for view in views],
-        levels=config.language.zooms,
+        levels=config.language.zooms or reading_of(encoder).zooms,
         expansion=config.language.expansion,
+        background=config.language.background,  # type: ignore[arg-type]  # config.check knows them all
         progress=lambda done, of: progress.update("language", done, of),
     )
     return to_arrays(descriptions, encoder.identity)
