@@ -9,11 +9,11 @@ import sys
 from collections.abc import Sequence
 
 from perception import __version__
-from perception.cli import asking, clouds, mapping, scoring
+from perception.cli import asking, clouds, mapping, robot_inputs, scoring
 from perception.cli.parser import Parser
 from perception.errors import InputError
 
-_MODULES = (mapping, asking, clouds, scoring)
+_MODULES = (mapping, asking, clouds, scoring, robot_inputs)
 
 
 def build_parser() -> argparse.ArgumentParser:

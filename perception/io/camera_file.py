@@ -41,6 +41,32 @@ def read_camera(path: Path) -> Lens:
     return Lens(model, (float(fx), float(fy), float(cx), float(cy), *distortion), width, height)
 
 
+def write_camera(path: Path, name: str, model: str, size: tuple[int, int], values: np.ndarray) -> None:
+    """A ROS camera_info YAML of a camera of (width, height) pixels.
+
+    model "pinhole": values fx fy cx cy k1 k2 p1 p2 k3 (plumb_bob); "fisheye": fx fy cx cy k1 k2 k3 k4 (equidistant);
+    the principal point in OpenCV's and ROS' convention, the centre of the first pixel being (0, 0). The rectified
+    camera is the camera itself.
+    """
+    import yaml
+
+    from perception.io.atomic import replacing
+
+    fx, fy, cx, cy = (float(v) for v in values[:4])
+    distortion = [float(v) for v in values[4:]]
+    blocks = {
+        "camera_matrix": (3, 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        "distortion_coefficients": (1, len(distortion), distortion),
+        "rectification_matrix": (3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
+        "projection_matrix": (3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
+    }
+    data: dict[str, Any] = {"image_width": int(size[0]), "image_height": int(size[1]), "camera_name": name}
+    data["distortion_model"] = "equidistant" if model == "fisheye" else "plumb_bob"
+    data |= {key: {"rows": r, "cols": c, "data": numbers} for key, (r, c, numbers) in blocks.items()}
+    with replacing(path) as file:
+        file.write(yaml.safe_dump(data, sort_keys=False, default_flow_style=None).encode())
+
+
 def _colmap_distortion(name: str, k: list[float]) -> tuple[str, list[float]]:
     if name == "equidistant":
         return "OPENCV_FISHEYE", k
