@@ -10,5 +10,6 @@ BENCHES = (
     "scannetpp",
     "clouds",
     "smoothing",
+    "calibrate",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""
