@@ -34,7 +34,7 @@ def run_calibration(
     """Calibrates a camera from a folder of photos or a video of a board: (JSON-able result, table).
 
     Writes `output` (ROS camera_info YAML), beside it a .json with every figure, and into `pictures` the detections
-    and the coverage. Pictures are taken as they are stored, whatever their EXIF rotation says. InputError when the
+    and the coverage. Photos are turned upright as their EXIF data says, as the mapper does. InputError when the
     board is not seen, in too few or too similar views.
     """
     if model not in MODELS:

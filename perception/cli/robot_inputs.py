@@ -13,6 +13,7 @@ from perception.errors import InputError
 def register(commands: Any) -> None:
     """Adds this module's subcommands."""
     _add_calibrate(commands)
+    _add_frames(commands)
 
 
 def _add_calibrate(commands: Any) -> None:
@@ -38,3 +39,24 @@ def _calibrate(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     board = Board(args.board, (int(words[0]), int(words[1])), args.square, marker, args.dictionary)
     pictures = args.pictures or args.output.with_name(f"{args.output.stem}_detections")
     return run_calibration(args.input, args.output, board, args.model, pictures)
+
+
+def _add_frames(commands: Any) -> None:
+    p = command(commands, "frames", _frames, "sharp, well-spaced photos out of a ROS bag, with intrinsics and poses")
+    p.add_argument("bag", type=Path, metavar="BAG", help="ROS 1 .bag, ROS 2 bag folder, or .mcap")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    p.add_argument("--topic", help="of the images (default: the bag's only one)")
+    p.add_argument("--camera-info", metavar="TOPIC", help="default: beside the images")
+    p.add_argument("--camera", type=Path, metavar="FILE.yaml", help="a camera file instead of camera_info")
+    p.add_argument("--poses", action=argparse.BooleanOptionalAction, default=True, help="from tf and odometry")
+    p.add_argument("--fixed-frame", metavar="FRAME", help="the world (default: map, odom, world, or the tree's root)")
+    p.add_argument("--odometry", metavar="TOPIC")
+    p.add_argument("--max-frames", type=int, default=200, metavar="N")
+    p.add_argument("--spacing", type=float, default=0.08, metavar="S", help="least motion, as share of the width")
+
+
+def _frames(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.bags import FrameOptions, run_frames
+
+    names = ("topic", "camera_info", "camera", "poses", "fixed_frame", "odometry", "max_frames", "spacing")
+    return run_frames(args.bag, args.output, FrameOptions(**{name: getattr(args, name) for name in names}))
