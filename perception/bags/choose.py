@@ -56,10 +56,8 @@ def _motion(before: np.ndarray, after: np.ndarray) -> float:
     """Median way of tracked corners as share of the width; 1 where the tracks are lost."""
     corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 6)
     if corners is None or len(corners) < _MIN_TRACKS or before.shape != after.shape:
-        difference = (
-            float(np.abs(before.astype(np.float32).mean() - after.mean())) if before.shape == after.shape else 255
-        )
-        return 1.0 if difference > 8 else 0.0  # a bare wall: nothing to track, nothing to see
+        same = before.shape == after.shape and abs(float(before.mean()) - float(after.mean())) < 8
+        return 0.0 if same else 1.0  # a bare wall: nothing to track, nothing to see
     there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None)  # type: ignore[call-overload]
     good = found.ravel() == 1
     if good.sum() < _MIN_TRACKS:

@@ -193,14 +193,9 @@ def _write_transforms(path: Path, names: list[str], placed: Placed, lens: Lens) 
 
 
 def _text(facts: dict[str, Any]) -> str:
-    line = (
-        f"{facts['output']}: {facts['chosen']} of {facts['images']} images of {facts['topic']}, {facts['camera_model']}"
-    )
+    folder = facts["output"]
+    line = f"{folder}: {facts['chosen']} of {facts['images']} images of {facts['topic']}, {facts['camera_model']}"
     if facts["with_pose"]:
-        return (
-            f"{line}; {facts['with_pose']} with a pose in '{facts['fixed_frame']}'\n"
-            f"next: perception map {facts['output']} -o MAP"
-        )
-    return (
-        f"{line}; no poses\nnext: perception map {facts['output']}/images --camera {facts['output']}/camera.yaml -o MAP"
-    )
+        line += f"; {facts['with_pose']} with a pose in '{facts['fixed_frame']}'"
+        return f"{line}\nnext: perception map {folder} -o MAP"
+    return f"{line}; no poses\nnext: perception map {folder}/images --camera {folder}/camera.yaml -o MAP"

@@ -34,11 +34,28 @@ LENSES = {
 """Focal lengths as shares of the width, principal point of width and height, then the distortion."""
 
 
-def known_camera(model: str, size: tuple[int, int]) -> KnownCamera:
-    """One of LENSES for pictures of (width, height) pixels."""
-    values = np.array(LENSES[model])
-    values[:4] *= [size[0], size[0], size[0], size[1]]
-    return KnownCamera(model, values, size)
+def known_camera(model: str, size: tuple[int, int], within: np.ndarray | None = None) -> KnownCamera:
+    """One of LENSES for pictures of (width, height) pixels.
+
+    within [2]: the lens is made longer until it sees no x / z, y / z beyond these.
+    """
+    scale = 1.0
+    while True:
+        values = np.array(LENSES[model])
+        values[:4] *= [scale * size[0], scale * size[0], size[0], size[1]]
+        camera = KnownCamera(model, values, size)
+        if within is None or (np.abs(camera.rays).reshape(-1, 2).max(axis=0) <= within).all():
+            return camera
+        scale *= 1.03
+
+
+def seen_by(scene: Path) -> np.ndarray:
+    """The largest |x / z|, |y / z| that all sides of a pinhole scene's photos show."""
+    from perception.io.transforms import read_frames
+
+    lens = read_frames(scene / "transforms.json")[0][2]
+    fx, fy, cx, cy = lens.params[:4]
+    return np.array([min(cx, lens.width - cx) / fx, min(cy, lens.height - cy) / fy])
 
 
 def make_boards(folder: Path, board: Board, camera: KnownCamera, count: int, noise: float) -> None:
@@ -141,7 +158,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         for kind in args.boards.split(","):
             for model in args.models.split(","):
                 work = Path(folder) / f"{kind}_{model}"
-                camera = known_camera(model, (width, height))
+                camera = known_camera(model, (width, height), seen_by(args.sfm) if args.sfm else None)
                 result = calibrate_known(work, Board(kind, (8, 11), 0.02, 0.015), camera, args)
                 if args.sfm is not None:
                     truth = warp_photos(args.sfm, work / "photos", camera, args.every)

@@ -54,7 +54,7 @@ def write_camera(path: Path, name: str, model: str, size: tuple[int, int], value
 
 
 def write_camera_info(path: Path, message: Any, rectified: bool = False) -> None:
-    """A ROS CameraInfo message (ROS 1 or 2) as a camera file; of rectified images the projection matrix is the camera."""
+    """A ROS CameraInfo message (ROS 1 or 2) as a camera file; rectified images are seen by its projection matrix."""
 
     def field(name: str) -> list[float]:
         values = getattr(message, name.lower(), None)
