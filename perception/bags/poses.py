@@ -86,7 +86,7 @@ class Poses:
 def read_poses(bag: Bag, odometry: str | None = None) -> Poses:
     """All transforms of a bag; odometry [topic] (default: all odometry) joins the tree where tf does not say."""
     poses = Poses()
-    for topic, _, message in bag.messages(bag.of_type(TRANSFORMS)):
+    for topic, _, message in bag.messages(bag.of_type(*TRANSFORMS)):
         for entry in message.transforms:
             t, q = entry.transform.translation, entry.transform.rotation
             static = topic.rstrip("/").endswith("static")

@@ -67,14 +67,15 @@ def run_frames(
         poses = read_poses(bag, options.odometry) if options.poses else Poses()
         with atomic_directory(output) as aside:
             lens = _write_camera(aside / "camera.yaml", options.camera, info, topic, size, source)
-            names, placed = _write_images(bag, topic, chosen, aside / "images", poses, options)
+            stamps, frame = _write_images(bag, topic, chosen, aside / "images")
+            placed = _place(poses, stamps, frame, options.fixed_frame)
             if placed.known:
-                _write_transforms(aside / "transforms.json", names, placed, lens)
+                _write_transforms(aside / "transforms.json", placed, lens)
     facts = {
         "output": str(output),
         "topic": topic,
         "images": len(chooser.motion),
-        "chosen": len(names),
+        "chosen": len(stamps),
         "with_pose": len(placed.known),
         "fixed_frame": placed.fixed if placed.known else None,
         "camera_frame": placed.frame,
@@ -86,7 +87,7 @@ def run_frames(
 
 @dataclass
 class Placed:
-    """Poses of written images: known[name] = camera_from_world; fixed, frame: names of the world and the camera."""
+    """Poses of written images: known[name] = camera_from_world, in order; fixed, frame: the world's and camera's."""
 
     known: dict[str, np.ndarray]
     stamps: dict[str, int]
@@ -138,38 +139,35 @@ def _write_camera(path: Path, camera: Path | None, info: Any, topic: str, size: 
     return lens
 
 
-def _write_images(
-    bag: Bag, topic: str, chosen: list[int], folder: Path, poses: Poses, options: FrameOptions
-) -> tuple[list[str], Placed]:
+def _write_images(bag: Bag, topic: str, chosen: list[int], folder: Path) -> tuple[dict[str, int], str]:
+    """Writes the chosen images; returns their times in ns by name, in order, and the camera's frame."""
     folder.mkdir()
-    wanted, names = set(chosen), []
-    placed = Placed({}, {}, options.fixed_frame, "")
+    wanted, stamps, frame = set(chosen), {}, ""
     for number, (_, recorded, message) in enumerate(bag.messages([topic])):
         if number not in wanted:
             continue
-        picture = decode_image(message, f"{bag.path}: {topic}")
-        suffix, data = encoded(message, picture)
+        suffix, data = encoded(message, decode_image(message, f"{bag.path}: {topic}"))
         name = f"{number:06d}{suffix}"
         (folder / name).write_bytes(data)
-        names.append(name)
-        placed.frame = str(message.header.frame_id)
-        stamp = stamp_of(message) or recorded
-        placed.stamps[name] = stamp
-        placed.fixed = placed.fixed or _fixed_frame(poses, placed.frame)
-        pose = poses.camera_from_world(placed.fixed, placed.frame, stamp)
-        if pose is not None:
-            placed.known[name] = pose
-    return names, placed
+        stamps[name] = stamp_of(message) or recorded
+        frame = str(message.header.frame_id)
+    return stamps, frame
 
 
-def _fixed_frame(poses: Poses, frame: str) -> str:
-    for name in FIXED_FRAMES:
-        if poses.chain(name, frame):
-            return name
-    return poses.root(frame)
+def _place(poses: Poses, stamps: dict[str, int], frame: str, fixed: str | None) -> Placed:
+    """Poses in the first world of FIXED_FRAMES (or the tree's root) that knows four images in five, else the most."""
+    best = Placed({}, stamps, fixed, frame)
+    for name in [fixed] if fixed else [*FIXED_FRAMES, poses.root(frame)]:
+        found = {image: poses.camera_from_world(name, frame, time) for image, time in stamps.items()}
+        known = {image: pose for image, pose in found.items() if pose is not None}
+        if len(known) > len(best.known):
+            best = Placed(known, stamps, name, frame)
+        if len(known) >= 0.8 * len(stamps):
+            break
+    return best
 
 
-def _write_transforms(path: Path, names: list[str], placed: Placed, lens: Lens) -> None:
+def _write_transforms(path: Path, placed: Placed, lens: Lens) -> None:
     """nerfstudio's form: frames with a pose only, OpenGL camera axes, pixel centres at +0.5."""
     frames = [
         {
@@ -177,8 +175,7 @@ def _write_transforms(path: Path, names: list[str], placed: Placed, lens: Lens) 
             "transform_matrix": (inverse_se3(placed.known[name]) @ OPENCV_FROM_OPENGL).tolist(),
             "stamp_ns": placed.stamps[name],
         }
-        for name in names
-        if name in placed.known
+        for name in placed.known
     ]
     fx, fy, cx, cy, *extra = lens.params
     data: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if lens.model == "OPENCV_FISHEYE" else "OPENCV"}
