@@ -83,6 +83,7 @@ def _camera(means, quats, scales, opacities, colors, viewmat, k, width, height, 
     visible = torch.zeros(means.shape[0], dtype=torch.bool)
     visible[index] = (w > 0).any(1)
     out = {"colors": w.T @ colors[index], "alphas": 1 - t, "depths": w.T @ z, "transmittance": t}
+    out["pairs"] = (w > 0).sum(0)  # Gaussians that contribute to the pixel
     if features is not None:
         f = features[index]
         out["features"] = w.T @ f

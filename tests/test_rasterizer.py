@@ -205,3 +205,21 @@ def test_statistics_are_the_2d_mean_gradient_in_pixels():
     gx, gy = (inputs["means"].grad[0, :2] * 2.0 / torch.tensor([30.0, 34.0])).tolist()
     assert float(out.stats.mean2d_grad) == pytest.approx((gx**2 + gy**2) ** 0.5, rel=1e-5)
     assert float(out.stats.radii) == pytest.approx(3 * 0.3**0.5, rel=1e-2)
+
+
+def test_pairs_are_those_the_naive_rasterizer_blends():
+    from perception.gaussians.rasterize import simd_levels
+
+    inputs = scene(n=300, width=70, height=45, dims=21)
+    expected = reference.rasterize(**inputs)["pairs"]
+    for simd in simd_levels():
+        out = perception.rasterize(**inputs, simd=simd)
+        assert out.stats.contributing_pairs == int(expected.sum())
+        assert out.stats.contributing_pairs <= out.stats.evaluated_pairs <= 2 * 300 * 80 * 48
+        assert set(out.stats.seconds) == {"project", "sort", "bin", "blend", "blend_backward", "reduce"}
+
+
+def test_pairs_do_not_depend_on_threads():
+    inputs = scene(n=3000, width=300, height=203, dtype=torch.float32)
+    pairs = [perception.rasterize(**inputs, threads=n).stats for n in (1, 2, 5)]
+    assert len({(p.evaluated_pairs, p.contributing_pairs) for p in pairs}) == 1

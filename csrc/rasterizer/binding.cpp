@@ -67,6 +67,13 @@ std::vector<std::string> simd_levels() {
   return names;
 }
 
+nb::dict stage_seconds(const perception::Stats &stats) {
+  const char *names[perception::kStages] = {"project", "sort", "bin", "blend", "blend_backward", "reduce"};
+  nb::dict seconds;
+  for (int i = 0; i < perception::kStages; ++i) seconds[names[i]] = stats.seconds[i];
+  return seconds;
+}
+
 template <class T>
 struct Handle {
   perception::FramesPtr<T> frames;
@@ -159,7 +166,7 @@ std::unique_ptr<Handle<T>> forward(Arguments<T> &a, Images<T> images, Array<uint
 }
 
 template <class T>
-void backward(Arguments<T> &a, const Handle<T> &handle, Images<T> images, Optional<const T> g_colors,
+void backward(Arguments<T> &a, Handle<T> &handle, Images<T> images, Optional<const T> g_colors,
               Optional<const T> g_alphas, Optional<const T> g_depths, Optional<const T> g_features,
               Optional<const T> g_variance, Optional<T> means, Optional<T> quats, Optional<T> scales,
               Optional<T> opacities, Optional<T> colors, Optional<T> features, Optional<T> viewmats,
@@ -193,7 +200,10 @@ void backward(Arguments<T> &a, const Handle<T> &handle, Images<T> images, Option
 template <class T>
 void bind(nb::module_ &m, const char *suffix) {
   auto name = [suffix](const char *base) { return std::string(base) + suffix; };
-  nb::class_<Handle<T>>(m, name("RasterizerFrames").c_str(), "What a backward call needs of its forward call.");
+  nb::class_<Handle<T>>(m, name("RasterizerFrames").c_str(), "What a backward call needs of its forward call.")
+      .def_prop_ro("evaluated", [](const Handle<T> &h) { return h.frames->stats.evaluated; })
+      .def_prop_ro("contributing", [](const Handle<T> &h) { return h.frames->stats.contributing; })
+      .def_prop_ro("seconds", [](const Handle<T> &h) { return stage_seconds(h.frames->stats); });
   nb::class_<Arguments<T>>(m, name("RasterizerInputs").c_str())
       .def(
           "__init__",
@@ -216,11 +226,8 @@ void bind(nb::module_ &m, const char *suffix) {
         "inputs"_a, "colors"_a.noconvert(), "alphas"_a.noconvert(), "depths"_a.noconvert().none(),
         "features"_a.noconvert().none(), "variance"_a.noconvert().none(), "visible"_a.noconvert(),
         "radii"_a.noconvert().none(), "simd"_a);
-  m.def(name("rasterizer_count_pairs").c_str(),
-        [](Arguments<T> &a, const Handle<T> &handle) { return perception::count_pairs(a.inputs(), *handle.frames); },
-        "inputs"_a, "frames"_a, "Contributing (Gaussian, pixel) pairs of a forward call.");
   m.def(name("rasterize_backward").c_str(),
-        [](Arguments<T> &inputs, const Handle<T> &frames, Array<T> colors, Array<T> alphas, Optional<T> depths,
+        [](Arguments<T> &inputs, Handle<T> &frames, Array<T> colors, Array<T> alphas, Optional<T> depths,
            Optional<T> features, Optional<T> variance, Optional<const T> g_colors, Optional<const T> g_alphas,
            Optional<const T> g_depths, Optional<const T> g_features, Optional<const T> g_variance, Optional<T> d_means,
            Optional<T> d_quats, Optional<T> d_scales, Optional<T> d_opacities, Optional<T> d_colors,

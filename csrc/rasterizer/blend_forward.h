@@ -26,10 +26,11 @@ struct ForwardTile {
   uint32_t lists[16][kChunk + 32];
 };
 
-// Runs one granule's register of pixels over a list of splats; returns the lanes still open.
+// Runs one granule's register of pixels over a list of splats; returns the lanes still open, counts the pairs.
 template <class T, int NF, bool VAR, bool DEPTH>
 inline uint32_t blend_list(const Splat<T> *splats, const T *features, uint8_t *touched, const uint32_t *list, int n,
-                           Vec<T> px, Vec<T> py, uint32_t live_bits, T *transmittance, T (*sums)[16]) {
+                           Vec<T> px, Vec<T> py, uint32_t live_bits, T *transmittance, T (*sums)[16],
+                           uint64_t &evaluated, uint64_t &contributing) {
   using V = Vec<T>;
   using C = Channels<NF, VAR, DEPTH>;
   Mask<T> live = mask_from_bits<T>(live_bits);
@@ -37,18 +38,22 @@ inline uint32_t blend_list(const Splat<T> *splats, const T *features, uint8_t *t
   [[maybe_unused]] Mask<T> fresh = t >= V(T(1));
   V acc[C::kCount];
   for (int c = 0; c < C::kCount; ++c) acc[c] = V::load(sums[c]);
-  for (int i = 0; i < n; ++i) {
-    const Splat<T> &s = splats[list[i]];
+  int i = 0, pairs = 0;
+  while (i < n) {
+    const uint32_t at = list[i++];
+    const Splat<T> &s = splats[at];
     const Blend<T> b = blend(s, px, py, t, live);
     t = b.next;
     const V w = b.weight;
-    touched[list[i]] |= any(b.mask);
+    const uint32_t mask = bits(b.mask);
+    touched[at] |= mask != 0;
+    pairs += __builtin_popcount(mask);
     acc[0] = fma(w, V(s.r), acc[0]);
     acc[1] = fma(w, V(s.g), acc[1]);
     acc[2] = fma(w, V(s.b), acc[2]);
     if constexpr (DEPTH) acc[C::kDepth] = fma(w, V(s.z), acc[C::kDepth]);
     if constexpr (NF > 0) {
-      const T *f = features + static_cast<std::size_t>(list[i]) * NF;
+      const T *f = features + static_cast<std::size_t>(at) * NF;
       if constexpr (VAR) {
         const Mask<T> first = b.mask & fresh;
         if (__builtin_expect(any(first), 0)) {
@@ -66,6 +71,7 @@ inline uint32_t blend_list(const Splat<T> *splats, const T *features, uint8_t *t
     }
     if (__builtin_expect(!any(live), 0)) break;
   }
+  evaluated += static_cast<uint64_t>(i) * V::kLanes, contributing += pairs;
   t.store(transmittance);
   for (int c = 0; c < C::kCount; ++c) acc[c].store(sums[c]);
   return bits(live);
@@ -105,7 +111,8 @@ void forward_tile(Worker<T> &w, int x, int y, const uint32_t *list, int n, Forwa
         live |= blend_list<T, NF, VAR, DEPTH>(w.splats.data(), w.features.data(), w.touched.data(), tile.lists[g],
                                               tile.counts[g], V::load(px), V::load(py), before,
                                               tile.transmittance[g] + lane,
-                                              reinterpret_cast<T(*)[16]>(&tile.sums[g][0][lane]))
+                                              reinterpret_cast<T(*)[16]>(&tile.sums[g][0][lane]), w.evaluated,
+                                              w.contributing)
                 << lane;
       }
       tile.live[g] = static_cast<uint16_t>(live);

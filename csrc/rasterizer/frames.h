@@ -9,6 +9,7 @@ template <class T>
 struct Frames {
   std::vector<std::unique_ptr<Frame<T>>> cameras;
   Level level;
+  Stats stats;  // over all cameras and all calls on these frames
 };
 
 }  // namespace perception

@@ -1,7 +1,8 @@
 // All stages for one SIMD level (PERCEPTION_LEVEL); compiled once per level.
+#include <chrono>
+
 #include "bin_stage.h"
 #include "blend_forward.h"
-#include "count_stage.h"
 #include "project_stage.h"
 #include "reduce_stage.h"
 #include "sort_stage.h"
@@ -9,16 +10,27 @@
 namespace perception {
 namespace PERCEPTION_LEVEL {
 
+// Runs one stage and adds its time.
+template <class Body>
+void timed(Stats &stats, Stage stage, Body &&body) {
+  const auto start = std::chrono::steady_clock::now();
+  body();
+  stats.seconds[stage] += std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+}
+
 template <class T>
 NonFinite prepare(const Inputs<T> &in, int camera, const Options &opt, Frame<T> &f, Scratch<T> &scratch,
-                  const Outputs<T> &out) {
+                  const Outputs<T> &out, Stats &stats) {
   f.camera = make_camera(in.viewmats + 16 * camera, in.Ks + 9 * camera, in.width, in.height, in.near_plane);
   f.tiles_x = (in.width + 63) / 64, f.tiles_y = (in.height + 63) / 64;
   f.count = 0;
-  const NonFinite bad = project_all(in, opt, f, scratch, camera == 0, out.radii ? out.radii + in.n * camera : nullptr);
+  NonFinite bad;
+  timed(stats, kProject, [&] {
+    bad = project_all(in, opt, f, scratch, camera == 0, out.radii ? out.radii + in.n * camera : nullptr);
+  });
   if (bad.argument) return bad;
-  sort_by_depth(opt, f.count, scratch);
-  bin_splats(opt, f, scratch);
+  timed(stats, kSort, [&] { sort_by_depth(opt, f.count, scratch); });
+  timed(stats, kBin, [&] { bin_splats(opt, f, scratch); });
   return {};
 }
 
@@ -43,35 +55,42 @@ void for_each_slice(int dims, const Options &opt, Body &&body) {
 
 template <class T>
 void forward(const Inputs<T> &in, int camera, const Options &opt, const Frame<T> &f, Scratch<T> &scratch,
-             const Outputs<T> &out) {
+             const Outputs<T> &out, Stats &stats) {
+  for (Worker<T> &w : scratch.workers) w.evaluated = w.contributing = 0;
   for_each_slice(in.dims, opt, [&](Slice slice, auto shape) {
     using S = decltype(shape);
-    parallel_for(opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
-      forward_supertile<T, S::NF, S::VAR, S::DEPTH>(in, camera, f, f.tile_order[i], slice, scratch.workers[worker], out);
+    timed(stats, kBlend, [&] {
+      parallel_for(opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
+        forward_supertile<T, S::NF, S::VAR, S::DEPTH>(in, camera, f, f.tile_order[i], slice, scratch.workers[worker], out);
+      });
     });
+    if (slice.begin > 0) return;  // the other slices blend the same pairs again
+    for (const Worker<T> &w : scratch.workers) stats.evaluated += w.evaluated, stats.contributing += w.contributing;
   });
 }
 
 template <class T>
 void backward(const Inputs<T> &in, int camera, const Options &opt, const Frame<T> &f, Scratch<T> &scratch,
-              const Outputs<T> &out, const Cotangents<T> &grad, const Gradients<T> &result) {
+              const Outputs<T> &out, const Cotangents<T> &grad, const Gradients<T> &result, Stats &stats) {
   const uint64_t slots = assign_slots(f, scratch);
   for_each_slice(in.dims, opt, [&](Slice slice, auto shape) {
     using S = decltype(shape);
-    std::memset(scratch.touched.reserve(slots), 0, slots);
-    scratch.records.reserve(slots * (kGeometry + S::NF));
-    parallel_for(opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
-      backward_supertile<T, S::NF, S::VAR, S::DEPTH>(in, camera, f, f.tile_order[i], slice, scratch,
-                                                     scratch.workers[worker], out, grad);
+    timed(stats, kBlendBackward, [&] {
+      std::memset(scratch.touched.reserve(slots), 0, slots);
+      scratch.records.reserve(slots * (kGeometry + S::NF));
+      parallel_for(opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
+        backward_supertile<T, S::NF, S::VAR, S::DEPTH>(in, camera, f, f.tile_order[i], slice, scratch,
+                                                       scratch.workers[worker], out, grad);
+      });
     });
-    reduce_gradients(in, opt, f, camera, slice, S::NF, scratch, result);
+    timed(stats, kReduce, [&] { reduce_gradients(in, opt, f, camera, slice, S::NF, scratch, result); });
   });
 }
 
 extern const Kernels<float> float_kernels;
 extern const Kernels<double> double_kernels;
-const Kernels<float> float_kernels = {prepare<float>, forward<float>, backward<float>, count_pairs<float>};
-const Kernels<double> double_kernels = {prepare<double>, forward<double>, backward<double>, count_pairs<double>};
+const Kernels<float> float_kernels = {prepare<float>, forward<float>, backward<float>};
+const Kernels<double> double_kernels = {prepare<double>, forward<double>, backward<double>};
 
 }  // namespace PERCEPTION_LEVEL
 }  // namespace perception

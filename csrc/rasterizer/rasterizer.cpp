@@ -82,31 +82,24 @@ FramesPtr<T> rasterize_forward(const Inputs<T> &in, const Options &opt, Level le
   if (bad.argument) return nullptr;
   const Kernels<T> &k = kernels<T>(level);
   const ScratchPtr<T> scratch = take_scratch<T>(opt.threads);
-  FramesPtr<T> frames(new Frames<T>{{}, level});
+  FramesPtr<T> frames(new Frames<T>{{}, level, {}});
   for (int camera = 0; camera < in.cameras; ++camera) {
     frames->cameras.push_back(ObjectPool<Frame<T>>::get().take());
     Frame<T> &f = *frames->cameras.back();
-    bad = k.prepare(in, camera, opt, f, *scratch, out);
+    bad = k.prepare(in, camera, opt, f, *scratch, out, frames->stats);
     if (bad.argument) return nullptr;
-    k.forward(in, camera, opt, f, *scratch, out);
+    k.forward(in, camera, opt, f, *scratch, out, frames->stats);
   }
   return frames;
 }
 
 template <class T>
-void rasterize_backward(const Inputs<T> &in, const Options &opt, const Frames<T> &frames, const Outputs<T> &out,
+void rasterize_backward(const Inputs<T> &in, const Options &opt, Frames<T> &frames, const Outputs<T> &out,
                         const Cotangents<T> &grad, const Gradients<T> &result) {
   const ScratchPtr<T> scratch = take_scratch<T>(opt.threads);
   for (int camera = 0; camera < in.cameras; ++camera)
-    kernels<T>(frames.level).backward(in, camera, opt, *frames.cameras[camera], *scratch, out, grad, result);
-}
-
-template <class T>
-uint64_t count_pairs(const Inputs<T> &in, const Frames<T> &frames) {
-  const ScratchPtr<T> scratch = take_scratch<T>(1);
-  uint64_t pairs = 0;
-  for (const auto &f : frames.cameras) pairs += kernels<T>(frames.level).count_pairs(in, *f, *scratch);
-  return pairs;
+    kernels<T>(frames.level)
+        .backward(in, camera, opt, *frames.cameras[camera], *scratch, out, grad, result, frames.stats);
 }
 
 void release_memory() {
@@ -116,14 +109,13 @@ void release_memory() {
   ObjectPool<Frame<double>>::get().clear();
 }
 
-#define INSTANTIATE(T)                                                                                             \
-  template struct ScratchDelete<T>;                                                                                \
-  template struct FramesDelete<T>;                                                                                 \
-  template FramesPtr<T> rasterize_forward(const Inputs<T> &, const Options &, Level, const Outputs<T> &,           \
-                                          NonFinite &);                                                            \
-  template void rasterize_backward(const Inputs<T> &, const Options &, const Frames<T> &, const Outputs<T> &,      \
-                                   const Cotangents<T> &, const Gradients<T> &);                                   \
-  template uint64_t count_pairs(const Inputs<T> &, const Frames<T> &);
+#define INSTANTIATE(T)                                                                                      \
+  template struct ScratchDelete<T>;                                                                         \
+  template struct FramesDelete<T>;                                                                          \
+  template FramesPtr<T> rasterize_forward(const Inputs<T> &, const Options &, Level, const Outputs<T> &,    \
+                                          NonFinite &);                                                     \
+  template void rasterize_backward(const Inputs<T> &, const Options &, Frames<T> &, const Outputs<T> &,     \
+                                   const Cotangents<T> &, const Gradients<T> &);
 INSTANTIATE(float)
 INSTANTIATE(double)
 

@@ -77,6 +77,15 @@ struct Frame {
   Buffer<uint32_t> tile_order;   // tiles by falling list length
 };
 
+enum Stage { kProject, kSort, kBin, kBlend, kBlendBackward, kReduce, kStages };
+
+// What a call did. A pair is one splat at one pixel: evaluated where a register of pixels was blended (lanes outside
+// the ellipse or already opaque among them), contributing where it added colour.
+struct Stats {
+  uint64_t evaluated = 0, contributing = 0;
+  double seconds[kStages] = {};  // wall clock by stage
+};
+
 struct Options {
   int threads;
   bool depth;     // blend the depth channel
@@ -102,11 +111,12 @@ using ScratchPtr = std::unique_ptr<Scratch<T>, ScratchDelete<T>>;
 template <class T>
 struct Kernels {
   // Projects, sorts and bins camera `camera` into frame.
-  NonFinite (*prepare)(const Inputs<T> &, int camera, const Options &, Frame<T> &, Scratch<T> &, const Outputs<T> &);
-  void (*forward)(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Scratch<T> &, const Outputs<T> &);
+  NonFinite (*prepare)(const Inputs<T> &, int camera, const Options &, Frame<T> &, Scratch<T> &, const Outputs<T> &,
+                       Stats &);
+  void (*forward)(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Scratch<T> &, const Outputs<T> &,
+                  Stats &);
   void (*backward)(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Scratch<T> &, const Outputs<T> &,
-                   const Cotangents<T> &, const Gradients<T> &);
-  uint64_t (*count_pairs)(const Inputs<T> &, const Frame<T> &, Scratch<T> &);
+                   const Cotangents<T> &, const Gradients<T> &, Stats &);
 };
 
 enum class Level { baseline, avx2, avx512 };
@@ -128,12 +138,8 @@ using FramesPtr = std::unique_ptr<Frames<T>, FramesDelete<T>>;
 template <class T>
 FramesPtr<T> rasterize_forward(const Inputs<T> &, const Options &, Level, const Outputs<T> &, NonFinite &);
 template <class T>
-void rasterize_backward(const Inputs<T> &, const Options &, const Frames<T> &, const Outputs<T> &,
-                        const Cotangents<T> &, const Gradients<T> &);
-
-// Contributing (splat, pixel) pairs over all cameras, the unit in which speed is reported.
-template <class T>
-uint64_t count_pairs(const Inputs<T> &, const Frames<T> &);
+void rasterize_backward(const Inputs<T> &, const Options &, Frames<T> &, const Outputs<T> &, const Cotangents<T> &,
+                        const Gradients<T> &);
 
 // Frees what the pools keep between calls.
 void release_memory();

@@ -24,6 +24,7 @@ struct Worker {
   Buffer<uint8_t> touched;       // [n]
   Buffer<T> records;             // [n, record]
   Buffer<T> tile;                // per-pixel state
+  uint64_t evaluated = 0, contributing = 0;  // pairs of the forward pass
 };
 
 template <class T>

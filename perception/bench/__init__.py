@@ -5,11 +5,18 @@ BENCHES = (
     "training",
     "masks",
     "language",
+    "view",
     "lerf-mask",
     "lerf-ovs",
     "scannetpp",
     "clouds",
     "smoothing",
     "calibrate",
+    "queries",
+    "map",
+    "switches",
+    "scaling",
+    "ablation",
+    "export",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""

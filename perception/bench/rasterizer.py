@@ -136,7 +136,7 @@ def measure(scene: dict[str, Any], rounds: int = 9, threads: tuple[int, ...] = (
     """All levels × threads × {RGB, RGB + features + variance}, interleaved; a JSON-able report."""
     import torch
 
-    from perception.gaussians.rasterize import Settings, count_pairs, simd_levels
+    from perception.gaussians.rasterize import simd_levels
 
     keys = [(s, t, rich) for s in simd_levels() for t in threads for rich in (False, True)]
     times: dict[Any, list[tuple[float, float, float]]] = {k: [] for k in keys}
@@ -145,9 +145,7 @@ def measure(scene: dict[str, Any], rounds: int = 9, threads: tuple[int, ...] = (
             seconds = _once(scene, key[2], simd=key[0], threads=key[1])
             if i:
                 times[key].append(seconds)
-    names = ("means", "quats", "scales", "opacities", "colors", None, "viewmats", "Ks")
-    inputs = tuple(None if k is None else scene[k] for k in names)
-    pairs = max(1, count_pairs(inputs, Settings(scene["width"], scene["height"])))
+    pairs = max(1, _render(scene, False)[0].stats.contributing_pairs)
     cases = []
     for simd, n, rich in keys:
         total = [t[1] * 1e3 for t in times[simd, n, rich]]

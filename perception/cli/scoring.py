@@ -38,6 +38,10 @@ def _add_eval(commands: Any) -> None:
     p = command(kinds, "images", _eval_images, "PSNR and SSIM per view and mean")
     p.add_argument("prediction", type=Path, metavar="PRED_DIR")
     p.add_argument("truth", type=Path, metavar="GT_DIR")
+    p = command(kinds, "masks", _eval_masks, "mIoU of a map's rendered instance masks in its held-out views")
+    p.add_argument("map", type=Path, metavar="MAP")
+    p.add_argument("truth", type=Path, metavar="MASKS_DIR", help="one PNG a view: instance ids alike in all, 0 = void")
+    p.add_argument("--all-views", action="store_true", help="score the training views too")
 
 
 def _add_rules(p: argparse.ArgumentParser) -> None:
@@ -90,6 +94,12 @@ def _eval_images(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.evaluate import run_images
 
     return run_images(args.prediction, args.truth)
+
+
+def _eval_masks(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.pipeline.scoring import score_masks
+
+    return score_masks(args.map, args.truth, args.all_views)
 
 
 def _add_bench(commands: Any) -> None:

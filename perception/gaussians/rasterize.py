@@ -7,7 +7,7 @@ transmittance falls under 1e-4.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from perception.errors import InputError
@@ -18,14 +18,24 @@ if TYPE_CHECKING:
 
 @dataclass
 class RasterizationStats:
-    """Per-Gaussian figures for densification, in pixels.
+    """Per-Gaussian figures for densification, in pixels, and what the call cost.
 
     radii: [C, N] three standard deviations along the long axis of the 2D Gaussian, 0 where it is not in view.
     mean2d_grad: [C, N] norm of the loss's gradient with respect to the 2D mean; None until backward has run.
+    evaluated_pairs, contributing_pairs: (Gaussian, pixel) pairs over all cameras: those a register was spent on
+    (some more on wider registers), and those that added colour, the unit in which speed is reported.
+    seconds: wall clock by stage: project, sort, bin, blend, and from the backward pass blend_backward, reduce.
     """
 
     radii: Tensor
     mean2d_grad: Tensor | None = None
+    evaluated_pairs: int = 0
+    contributing_pairs: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def _count(self, frames: Any) -> None:
+        self.evaluated_pairs, self.contributing_pairs = frames.evaluated, frames.contributing
+        self.seconds = frames.seconds
 
 
 @dataclass
@@ -157,13 +167,6 @@ def rasterize_forward(inputs: tuple[Tensor | None, ...], background: Tensor | No
     return out
 
 
-def count_pairs(inputs: tuple[Tensor | None, ...], settings: Settings) -> int:
-    """Contributing (Gaussian, pixel) pairs of a scene; inputs as for `rasterize_forward`."""
-    assert inputs[0] is not None  # for the type checker
-    frames = rasterize_forward(inputs, None, settings).frames
-    return int(_core_function("rasterizer_count_pairs", inputs[0])(_core_inputs(inputs, None, settings), frames))
-
-
 def rasterize_backward(
     inputs: tuple[Tensor | None, ...],
     background: Tensor | None,
@@ -208,6 +211,7 @@ def _autograd_function() -> Any:
             shade = None if background is None else background.detach().contiguous()
             out = rasterize_forward(contiguous, shade, settings)
             stats.radii = out.radii
+            stats._count(out.frames)
             images = (out.colors, out.alphas, out.depths, out.features, out.feature_variance)
             ctx.settings, ctx.stats = settings, stats
             if any(ctx.needs_input_grad):
@@ -227,6 +231,7 @@ def _autograd_function() -> Any:
             state = Forward(*images, visible=none, radii=none, frames=ctx.frames)  # type: ignore[misc]
             grads, mean2d = rasterize_backward(inputs, background, ctx.settings, state, cotangents[:5], wanted)
             ctx.stats.mean2d_grad = mean2d.norm(dim=-1)
+            ctx.stats._count(ctx.frames)
             shade = None
             if ctx.needs_input_grad[0] and cotangents[0] is not None:
                 shade = (cotangents[0] * (1 - state.alphas)[..., None]).sum(dim=(1, 2))

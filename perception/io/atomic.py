@@ -16,6 +16,7 @@ from perception.errors import InputError
 
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # Linux' fcntl.h and fs.h
+_REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 
 @contextmanager
@@ -159,4 +160,8 @@ def _disk_errors(path: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno in _FULL:
             raise InputError(f"{path}: the disk is full, nothing was written; free some space") from error
+        if error.errno in _REFUSED:
+            raise InputError(
+                f"{path}: cannot be written ({error.strerror}); choose a place you may write to"
+            ) from error
         raise
