@@ -12,6 +12,7 @@ BENCHES = (
     "scannetpp",
     "clouds",
     "smoothing",
+    "calibrate",
     "queries",
     "sam",
     "map",
