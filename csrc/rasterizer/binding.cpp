@@ -125,7 +125,7 @@ struct Arguments {
   }
   perception::Options options(const perception::Inputs<T> &in) const {
     if (threads < 1 || threads > 1024) throw std::invalid_argument("threads: expected 1 to 1024");
-    return {threads, depth || in.dims > 0, variance && in.dims > 0};
+    return {threads, depth, variance && in.dims > 0};
   }
 };
 

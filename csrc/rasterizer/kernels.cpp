@@ -43,13 +43,22 @@ struct Shape {
 
 template <class Body>
 void for_each_slice(int dims, const Options &opt, Body &&body) {
-  if (dims == 0) return opt.depth ? body(Slice{0, 0}, Shape<0, false, true>()) : body(Slice{0, 0}, Shape<0, false, false>());
+  auto with_depth = [&](Slice slice, auto width, auto variance) {
+    if (opt.depth)
+      body(slice, Shape<width(), variance(), true>());
+    else
+      body(slice, Shape<width(), variance(), false>());
+  };
+  auto with_variance = [&](Slice slice, auto width) {
+    opt.variance ? with_depth(slice, width, std::true_type()) : with_depth(slice, width, std::false_type());
+  };
+  if (dims == 0) return with_depth(Slice{0, 0}, std::integral_constant<int, 0>(), std::false_type());
   for (int begin = 0; begin < dims; begin += 16) {
     const Slice slice{begin, dims - begin < 16 ? dims - begin : 16};
     if (slice.count <= 8)
-      opt.variance ? body(slice, Shape<8, true, true>()) : body(slice, Shape<8, false, true>());
+      with_variance(slice, std::integral_constant<int, 8>());
     else
-      opt.variance ? body(slice, Shape<16, true, true>()) : body(slice, Shape<16, false, true>());
+      with_variance(slice, std::integral_constant<int, 16>());
   }
 }
 

@@ -55,7 +55,7 @@ struct Gradients {
 
 // A Gaussian as one camera sees it. exponent in base 2: log2(alpha) = log_opacity + a (dx + k dy)² + d dy².
 template <class T>
-struct Splat {
+struct alignas(64) Splat {
   T x, y;         // px
   T a, k, d, log_opacity;
   T r, g, b, z;

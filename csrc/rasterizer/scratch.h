@@ -21,7 +21,7 @@ struct Worker {
   int stride = 0;
   uint32_t counts[16];
   int n = 0;
-  Buffer<uint8_t> touched;       // [n]
+  Buffer<uint16_t> touched;      // [n] pixels of some granule, 0 for none
   Buffer<T> records;             // [n, record]
   Buffer<T> tile;                // per-pixel state
   uint64_t evaluated = 0, contributing = 0;  // pairs of the forward pass

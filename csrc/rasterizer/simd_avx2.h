@@ -43,6 +43,7 @@ inline VF reciprocal(VF a) {  // one Newton step: relative error below 2e-7
 inline MF operator>=(VF a, VF b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GE_OQ)}; }
 inline MF operator<(VF a, VF b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_LT_OQ)}; }
 inline MF operator&(MF a, MF b) { return {_mm256_and_ps(a.m, b.m)}; }
+inline MF operator|(MF a, MF b) { return {_mm256_or_ps(a.m, b.m)}; }
 inline MF and_not(MF a, MF b) { return {_mm256_andnot_ps(b.m, a.m)}; }  // a and not b
 inline uint32_t bits(MF a) { return _mm256_movemask_ps(a.m); }
 inline bool any(MF a) { return !_mm256_testz_ps(a.m, a.m); }
@@ -93,6 +94,7 @@ inline VD reciprocal(VD a) { return _mm256_div_pd(_mm256_set1_pd(1.0), a.v); }
 inline MD operator>=(VD a, VD b) { return {_mm256_cmp_pd(a.v, b.v, _CMP_GE_OQ)}; }
 inline MD operator<(VD a, VD b) { return {_mm256_cmp_pd(a.v, b.v, _CMP_LT_OQ)}; }
 inline MD operator&(MD a, MD b) { return {_mm256_and_pd(a.m, b.m)}; }
+inline MD operator|(MD a, MD b) { return {_mm256_or_pd(a.m, b.m)}; }
 inline MD and_not(MD a, MD b) { return {_mm256_andnot_pd(b.m, a.m)}; }
 inline uint32_t bits(MD a) { return _mm256_movemask_pd(a.m); }
 inline bool any(MD a) { return !_mm256_testz_pd(a.m, a.m); }

@@ -40,6 +40,7 @@ inline VF reciprocal(VF a) {  // one Newton step: relative error below 2e-7
 inline MF operator>=(VF a, VF b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
 inline MF operator<(VF a, VF b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LT_OQ)}; }
 inline MF operator&(MF a, MF b) { return {static_cast<__mmask16>(a.m & b.m)}; }
+inline MF operator|(MF a, MF b) { return {static_cast<__mmask16>(a.m | b.m)}; }
 inline MF and_not(MF a, MF b) { return {static_cast<__mmask16>(a.m & ~b.m)}; }  // a and not b
 inline uint32_t bits(MF a) { return a.m; }
 inline bool any(MF a) { return a.m != 0; }
@@ -91,6 +92,7 @@ inline VD reciprocal(VD a) { return _mm512_div_pd(_mm512_set1_pd(1.0), a.v); }
 inline MD operator>=(VD a, VD b) { return {_mm512_cmp_pd_mask(a.v, b.v, _CMP_GE_OQ)}; }
 inline MD operator<(VD a, VD b) { return {_mm512_cmp_pd_mask(a.v, b.v, _CMP_LT_OQ)}; }
 inline MD operator&(MD a, MD b) { return {static_cast<__mmask8>(a.m & b.m)}; }
+inline MD operator|(MD a, MD b) { return {static_cast<__mmask8>(a.m | b.m)}; }
 inline MD and_not(MD a, MD b) { return {static_cast<__mmask8>(a.m & ~b.m)}; }
 inline uint32_t bits(MD a) { return a.m; }
 inline bool any(MD a) { return a.m != 0; }

@@ -57,6 +57,10 @@ Mask<T> operator&(Mask<T> a, Mask<T> b) {
   return {a.m & b.m};
 }
 template <class T>
+Mask<T> operator|(Mask<T> a, Mask<T> b) {
+  return {a.m | b.m};
+}
+template <class T>
 Mask<T> and_not(Mask<T> a, Mask<T> b) {
   return {a.m & ~b.m};
 }

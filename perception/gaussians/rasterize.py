@@ -149,7 +149,7 @@ def rasterize_forward(inputs: tuple[Tensor | None, ...], background: Tensor | No
     out = Forward(
         colors=new((*image, 3)),
         alphas=new(image),
-        depths=new(image) if settings.depth or dims else None,
+        depths=new(image) if settings.depth else None,
         features=None if features is None else new((*image, dims)),
         feature_variance=new((*image, dims)) if features is not None and settings.variance else None,
         visible=torch.zeros((count, n), dtype=torch.uint8),
