@@ -1,6 +1,7 @@
 // Stage 5: the backward pass, splat by splat over each 16x16 tile, replaying the blending front to back. With
 //   cg = Σ_channels (cotangent · value of this splat),  R = Σ over the splats behind of w cg,
-// dL/dalpha = T cg - R / (1 - alpha): two numbers a pixel, T and R, whatever the number of channels.
+// dL/dalpha = T cg - R / (1 - alpha), so dL/d ln alpha = w (cg - R / T'), T' the transmittance behind this splat: two
+// numbers a pixel, T and R, whatever the number of channels.
 //
 // The variance enters linearly: with V = Σ w f² - S², S = Σ w f, and any constant c (here the features of the tile's
 // first splat, so that large common offsets do not cancel), e = f - c:
@@ -47,15 +48,14 @@ template <class T, int NF, bool VAR, class Count>
 inline T load_pixel_features(int64_t at, Count count, const T *shift, T a, const Outputs<T> &out,
                              const Cotangents<T> &grad, T *row, T &constant) {
   T g[NF] = {}, sum[NF] = {}, behind[NF], steady[NF];
-  std::memcpy(sum, out.features + at, count * sizeof(T));
-  if (grad.features) std::memcpy(g, grad.features + at, count * sizeof(T));
+  for (int c = 0; c < count; ++c) sum[c] = out.features[at + c];
+  if (grad.features)
+    for (int c = 0; c < count; ++c) g[c] = grad.features[at + c];
   for (int c = 0; c < NF; ++c) behind[c] = g[c] * (sum[c] - shift[c] * a), steady[c] = g[c] * shift[c];
   if constexpr (VAR) {
     T v[NF] = {}, variance[NF] = {};
-    if (grad.variance) {
-      std::memcpy(v, grad.variance + at, count * sizeof(T));
-      std::memcpy(variance, out.variance + at, count * sizeof(T));
-    }
+    if (grad.variance)
+      for (int c = 0; c < count; ++c) v[c] = grad.variance[at + c], variance[c] = out.variance[at + c];
     for (int c = 0; c < NF; ++c) {
       const T e = sum[c] - shift[c] * a, twice = 2 * v[c] * (sum[c] - shift[c]);
       const T square = variance[c] + e * e - (1 - a) * shift[c] * (shift[c] * a + 2 * e);  // Σ w e²
@@ -63,9 +63,9 @@ inline T load_pixel_features(int64_t at, Count count, const T *shift, T a, const
       behind[c] += v[c] * square - twice * e;
       steady[c] += v[c] * shift[c] * (shift[c] - 2 * sum[c]);
     }
-    std::memcpy(row + NF, v, sizeof v);
+    for (int c = 0; c < NF; ++c) row[NF + c] = v[c];
   }
-  std::memcpy(row, g, sizeof g);
+  for (int c = 0; c < NF; ++c) row[c] = g[c];
   constant += pairwise_sum<NF>(steady);
   return pairwise_sum<NF>(behind);
 }
@@ -133,9 +133,7 @@ void load_tile(const Inputs<T> &in, int camera, int x0, int y0, int x, int y, Sl
       load_row(in, background, pixel, row, std::min(16, in.width - x0 - x), slice, slice.count, shift, out, grad, tile);
   }
   if constexpr (NF > 0)
-    for (int g = 0; g < 16; ++g)
-      for (int c = 0; c < BackwardTile<T, NF, VAR, DEPTH>::kRow; ++c)
-        for (int i = 0; i < 16; ++i) tile.by_channel[g][c][i] = tile.by_pixel[g][i][c];
+    for (int g = 0; g < 16; ++g) transpose<16, BackwardTile<T, NF, VAR, DEPTH>::kRow>(tile.by_pixel[g][0], tile.by_channel[g][0]);
 }
 
 // The sums over pixels that one splat gathers, a lane a pixel.
@@ -189,9 +187,9 @@ inline void backward_step(const Splat<T> &s, bool clamps, int g, int lane, T *pr
     depth = P::load(tile.cotangent[g][3] + lane);
     cg = fma(P(s.z), depth, cg);
   }
-  const P wcg = w * cg, behind = P::load(tile.behind[g] + lane) - wcg;
+  const P behind = fnma(w, cg, P::load(tile.behind[g] + lane));
   behind.store(tile.behind[g] + lane);
-  P h = fnma(behind, b.alpha * reciprocal(P(T(1)) - b.alpha), wcg);
+  P h = w * fnma(behind, reciprocal(b.next), cg);
   if (clamps) h = keep(P(kMaxAlpha<T>) >= b.raw, h);  // a clamped alpha does not move
   const P hu = h * b.u, hy = h * b.dy;
   m.h = add(h, m.h), m.hu = add(hu, m.hu), m.hy = add(hy, m.hy);

@@ -49,8 +49,8 @@ constexpr T kFar = T(1e18);
 template <class T>
 struct Blend {
   Pack<T> u, dy;       // px
-  Pack<T> raw, alpha;  // before and after the clamp; alpha is 0 where the splat does not contribute
-  Pack<T> weight;      // alpha T
+  Pack<T> raw;         // alpha before the clamp
+  Pack<T> weight;      // alpha T, 0 where the splat does not contribute
   Pack<T> next;        // transmittance behind
 };
 
@@ -64,14 +64,12 @@ inline Blend<T> blend(const Splat<T> &s, Pack<T> &px, Pack<T> py, Pack<T> transm
   b.u = fma(P(s.k), b.dy, dx);
   const P e = fma(P(s.a) * b.u, b.u, fma(P(s.d) * b.dy, b.dy, P(s.log_opacity)));
   b.raw = exp2_nonpositive(e);
-  b.alpha = keep(e >= P(kLogThreshold<T>), min(b.raw, P(kMaxAlpha<T>)));
-  b.weight = b.alpha * transmittance;
+  b.weight = keep(e >= P(kLogThreshold<T>), min(b.raw, P(kMaxAlpha<T>)) * transmittance);
   b.next = transmittance - b.weight;
   const PackMask<T> stop = b.next < P(kMinTransmittance<T>);
   if (__builtin_expect(any(stop), 0)) {
     stopped = true;
     px = select(stop, P(kFar<T>), px);
-    b.alpha = select(stop, P(T(0)), b.alpha);
     b.weight = select(stop, P(T(0)), b.weight);
     b.next = select(stop, transmittance, b.next);
   }

@@ -10,6 +10,22 @@ constexpr int padded(int n) {
   return (n + Vec<T>::kLanes - 1) / Vec<T>::kLanes * Vec<T>::kLanes;
 }
 
+// [ROWS, COLUMNS] to [COLUMNS, ROWS], both multiples of 4.
+template <int ROWS, int COLUMNS, class T>
+void transpose(const T *from, T *to) {
+  typedef T Four __attribute__((vector_size(4 * sizeof(T)), aligned(sizeof(T)), may_alias));
+  auto in = [from](int row, int column) { return reinterpret_cast<const Four *>(from + row * COLUMNS + column); };
+  auto out = [to](int row, int column) { return reinterpret_cast<Four *>(to + row * ROWS + column); };
+  for (int r = 0; r < ROWS; r += 4)
+    for (int c = 0; c < COLUMNS; c += 4) {
+      const Four a0 = *in(r, c), a1 = *in(r + 1, c), a2 = *in(r + 2, c), a3 = *in(r + 3, c);
+      const Four b0 = __builtin_shufflevector(a0, a1, 0, 4, 1, 5), b1 = __builtin_shufflevector(a0, a1, 2, 6, 3, 7);
+      const Four b2 = __builtin_shufflevector(a2, a3, 0, 4, 1, 5), b3 = __builtin_shufflevector(a2, a3, 2, 6, 3, 7);
+      *out(c, r) = __builtin_shufflevector(b0, b2, 0, 1, 4, 5), *out(c + 1, r) = __builtin_shufflevector(b0, b2, 2, 3, 6, 7);
+      *out(c + 2, r) = __builtin_shufflevector(b1, b3, 0, 1, 4, 5), *out(c + 3, r) = __builtin_shufflevector(b1, b3, 2, 3, 6, 7);
+    }
+}
+
 // Rows worked on together: their accumulators fill half of the register file.
 template <class T, int WIDTH>
 constexpr int kRows = [] {

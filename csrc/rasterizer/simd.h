@@ -21,7 +21,7 @@ constexpr int kParts = 16 / Vec<T>::kLanes;  // registers per granule of 16 pixe
 // 2^x for x in (-100, 0]; results for other x are arbitrary and must be masked out.
 // float: minimax polynomial of degree 5 on [0, 1), relative error 1.5e-7. double: Taylor of degree 17, 1 ulp or so.
 inline Vec<float> exp2_nonpositive(Vec<float> x) {
-  Vec<float> whole = floor(x), r = x - whole;
+  Vec<float> whole, r = fraction(x, whole);
   Vec<float> p = Vec<float>(1.8775767e-3f);
   p = fma(p, r, Vec<float>(8.9893397e-3f));
   p = fma(p, r, Vec<float>(5.5826318e-2f));
@@ -39,7 +39,7 @@ inline Vec<double> exp2_nonpositive(Vec<double> x) {
                                 1.3215486790144305e-06, 1.5252733804059838e-05, 0.00015403530393381606,
                                 0.0013333558146428441, 0.009618129107628477, 0.055504108664821576,
                                 0.2402265069591007, 0.6931471805599453};
-  Vec<double> whole = floor(x), r = x - whole;
+  Vec<double> whole, r = fraction(x, whole);
   Vec<double> p = Vec<double>(kTaylor[0]);
   for (int k = 1; k < 17; ++k) p = fma(p, r, Vec<double>(kTaylor[k]));
   p = fma(p, r, Vec<double>(1.0));
