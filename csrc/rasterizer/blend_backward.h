@@ -272,6 +272,15 @@ void backward_tile(Worker<T> &w, int x, int y, const uint32_t *list, int n, Back
   }
 }
 
+// How many tiles of a splat's box come before tile `tile` in row-major order.
+template <class T>
+inline uint64_t box_tiles_before(const Splat<T> &s, int tiles_x, int tile) {
+  auto within = [](int value, int limit) { return value < 0 ? 0 : value > limit ? limit : value; };
+  const int width = s.x1 - s.x0 + 1, height = s.y1 - s.y0 + 1, row = tile / tiles_x - s.y0;
+  const int in_row = row >= 0 && row < height ? within(tile % tiles_x - s.x0, width) : 0;
+  return static_cast<uint64_t>(within(row, height)) * width + in_row;
+}
+
 // Writes the records of one 64x64 tile to their slots (one a splat and tile it touches): the geometry's moments, then
 // the feature gradient Σ w (g' + 2 v e).
 template <class T, int NF, bool VAR, bool DEPTH>
@@ -281,7 +290,8 @@ void store_records(const Frame<T> &f, int index, const Worker<T> &w, Scratch<T> 
   for (int j = 0; j < w.n; ++j) {
     if (!w.touched[j]) continue;
     const Splat<T> &s = w.splats[j];
-    const uint64_t slot = scratch.slots[w.source[j]] + (ty - s.y0) * (s.x1 - s.x0 + 1) + (tx - s.x0);
+    const uint64_t place = static_cast<uint64_t>(ty - s.y0) * (s.x1 - s.x0 + 1) + (tx - s.x0);
+    const uint64_t slot = scratch.slots[w.source[j]] + place - box_tiles_before(s, f.tiles_x, scratch.first_tile);
     const T *from = w.records.data() + static_cast<std::size_t>(j) * Tile::kRecord;
     const T *e = w.features.data() + static_cast<std::size_t>(j) * Tile::kRow;
     T *to = scratch.records.data() + slot * (kGeometry + NF);

@@ -33,8 +33,11 @@ struct Scratch {
   Buffer<uint32_t> order[2];
   Buffer<uint32_t> histograms;
   Buffer<uint64_t> slots;        // first gradient record of every splat
+  int first_tile = 0;            // the tiles at hand begin here
   Buffer<uint8_t> touched;       // per record
   Buffer<T> records;
+  Buffer<uint8_t> sum_touched;   // the same summed over several parts of the picture, one a splat
+  Buffer<T> sums;
   Buffer<double> camera_sums;
   std::vector<Worker<T>> workers;
 };
