@@ -5,5 +5,17 @@ BENCHES = (
     "training",
     "masks",
     "language",
+    "view",
+    "lerf-mask",
+    "lerf-ovs",
+    "scannetpp",
+    "clouds",
+    "smoothing",
+    "queries",
+    "map",
+    "switches",
+    "scaling",
+    "ablation",
+    "export",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""
