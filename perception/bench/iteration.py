@@ -19,7 +19,7 @@ PARTS = ("rasterizer", "SSIM + L1", "instance", "variance", "Adam", "torch")
 def make_trainer(scene: dict[str, Any], labels: int, sh_degree: int, losses: bool) -> Any:
     """A trainer of the scene's Gaussians on one photo of them with noise; every iteration has all losses if `losses`.
 
-    scene: as `perception.bench.rasterizer.load_scene` reads it.
+    scene: as `perception.bench.splats.load_scene` reads it.
     """
     import torch
 
@@ -127,8 +127,26 @@ def iteration_table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def draw_iterations(rows: list[dict[str, Any]]) -> Callable[[Any], None]:
+    """What draws the rows as stacked bars on a figure."""
+
+    def draw(figure: Any) -> None:
+        axis = figure.subplots()
+        labels = [f"{row['losses']}, SH {row['sh_degree']}, {row['threads']} thr" for row in rows]
+        left = [0.0] * len(rows)
+        for part in PARTS:
+            widths = [row["ms"][part] for row in rows]
+            axis.barh(labels, widths, left=left, label=part)
+            left = [a + b for a, b in zip(left, widths, strict=True)]
+        axis.invert_yaxis()
+        axis.set_xlabel("milliseconds an iteration")
+        axis.legend()
+
+    return draw
+
+
 def default_scene(path: Path | None) -> dict[str, Any]:
     """The splats at `path`, or 54,000 synthetic Gaussians before a camera of 270 × 480."""
-    from perception.bench.rasterizer import load_scene, synthetic_scene
+    from perception.bench.splats import load_scene, synthetic_scene
 
     return load_scene(path) if path else synthetic_scene(54_000, 270, 480)
