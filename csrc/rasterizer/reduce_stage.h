@@ -131,11 +131,11 @@ void color_gradient(const Inputs<T> &in, const Camera<T> &cam, const Splat<T> &s
       for (int c = 0; c < 3; ++c) out.colors[3 * i + c] += g_rgb[c];
     return;
   }
-  T v[3], gv[3], unused[3 * kMaxShCoefficients] = {};
+  T v[3], gv[3];
   const T gated[3] = {s.r > 0 ? g_rgb[0] : 0, s.g > 0 ? g_rgb[1] : 0, s.b > 0 ? g_rgb[2] : 0};
   view_vector(cam, in.means + 3 * i, v);
   sh_color_vjp(in.sh_degree, v, in.colors + 3 * i * in.sh_stride, gated,
-               out.colors ? out.colors + 3 * i * in.sh_stride : unused, gv);
+               out.colors ? out.colors + 3 * i * in.sh_stride : nullptr, gv);
   for (int c = 0; c < 3; ++c) {  // v = mean + Rᵀ t
     g_mean[c] += gv[c];
     for (int k = 0; k < 3; ++k) g_R[3 * k + c] += cam.t[k] * gv[c], g_t[k] += cam.R[3 * k + c] * gv[c];
