@@ -52,7 +52,10 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class DensifyConfig:
-    """Growth by screen-space gradient up to the budget, and pruning of what no photo needs."""
+    """Growth by screen-space gradient up to the budget, and pruning of what no photo needs.
+
+    Every `fill_every`-th time (0: never) places that the photos show and the map leaves empty get Gaussians first.
+    """
 
     start: float = 0.05
     stop: float = 0.6
@@ -61,9 +64,7 @@ class DensifyConfig:
     percent_dense: float = 0.01
     prune_opacity: float = 0.005
     opacity_decay: float = 1e-2
-    by_error: bool = False
-    error_floor: float = 0.01
-    error_power: float = 1.0
+    fill_every: int = 5
 
 
 @dataclass(frozen=True)

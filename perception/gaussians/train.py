@@ -18,12 +18,13 @@ import torch
 from perception.config import MapConfig
 from perception.gaussians.densify import Statistics, decay_opacities, densify, target_count
 from perception.gaussians.economy import TRIAL, Economy
+from perception.gaussians.holes import fill_holes
 from perception.gaussians.losses import instance_loss, photometric_loss, variance_loss
 from perception.gaussians.model import Gaussians
 from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.profile import Profile
 from perception.gaussians.rasterize import Rasterization, rasterize
-from perception.gaussians.views import TrainingView, cooling, depth_image, error_at, psnr, render_view, scene_extent
+from perception.gaussians.views import TrainingView, cooling, depth_image, psnr, render_view, scene_extent
 
 __all__ = ["TrainRecord", "Trainer", "TrainingView", "depth_image", "psnr", "render_view", "scene_extent"]
 
@@ -236,9 +237,8 @@ class Trainer:
 
     def _watch(self, view: TrainingView, out: Rasterization) -> None:
         assert out.stats.mean2d_grad is not None
-        visible, long_side = out.visible[0], max(view.photo.shape[:2])
-        error = error_at(self.gaussians.means, view, out.colors[0].detach()) if self.config.densify.by_error else None
-        self.statistics.add(out.stats.mean2d_grad[0], out.stats.radii[0], visible, long_side, error)
+        long_side = max(view.photo.shape[:2])
+        self.statistics.add(out.stats.mean2d_grad[0], out.stats.radii[0], out.visible[0], long_side)
 
     def _feature_losses(self, view: TrainingView, out: Any, figures: dict[str, float]) -> torch.Tensor:
         losses = self.config.losses
@@ -274,7 +274,19 @@ class Trainer:
             self.optimiser.keep(change.keep)
             self.optimiser.append(vars(change.born))
             self._sync()
+            turn = round((progress - config.densify.start) * config.train.iterations / config.densify.every)
+            if config.densify.fill_every and turn % config.densify.fill_every == 0:
+                self._fill(seed)
             self.statistics = Statistics.zeros(len(self.gaussians))
+
+    def _fill(self, seed: int) -> None:
+        room = self.config.train.budget - len(self.gaussians)
+        if room > 0:
+            born, empty = fill_holes(self.gaussians, self.coarse or self.views, room, seed)
+            self.optimiser.append(vars(born))
+            self._sync()
+            if len(born):
+                self._decide(f"holes: {empty:.2%} of the pictures were empty, {len(born)} Gaussians placed there")
 
     # ---------------------------------------------------------------- economy
 

@@ -86,29 +86,6 @@ def psnr(image: torch.Tensor, photo: torch.Tensor) -> float:
     return float("inf") if error == 0 else -10 * float(np.log10(error))
 
 
-ERROR_BLOCK = 8
-"""Pixels a side over which a photo's error is averaged before Gaussians read it."""
-
-
-@torch.no_grad()
-def error_at(means: torch.Tensor, view: TrainingView, image: torch.Tensor) -> torch.Tensor:
-    """Mean absolute error [N] of render `image` [H, W, 3] in the block of pixels where each of means [N, 3] lies.
-
-    The view's mean colour error is taken out, so that a photo's exposure does not count as detail that is missing.
-    Outside the picture the nearest block's error is read.
-    """
-    height, width = view.photo.shape[:2]
-    difference = image - view.photo / 255
-    difference = (difference - difference.mean(dim=(0, 1))).abs().mean(dim=2)
-    blocks = torch.nn.functional.avg_pool2d(difference[None, None], ERROR_BLOCK, ceil_mode=True)[0, 0]
-    pose = view.camera_from_world
-    p = torch.addmm(pose[:3, 3], means, pose[:3, :3].T)
-    depth = p[:, 2].clamp(min=1e-6)
-    column = (p[:, 0] / depth * view.K[0, 0] + view.K[0, 2]).clamp(0, width - 1).div(ERROR_BLOCK).long()
-    row = (p[:, 1] / depth * view.K[1, 1] + view.K[1, 2]).clamp(0, height - 1).div(ERROR_BLOCK).long()
-    return blocks[row, column]
-
-
 def cooling(progress: float, share: float) -> float:
     """Factor of all learning rates at `progress`: 1, and over the last `share` of the course down to .05 (half a
     cosine)."""
