@@ -2,25 +2,129 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from perception.types import OrientedBox
 
+SAMPLE = 4096
+"""Points that choose a trimmed box's axes."""
 
-def oriented_box(points: np.ndarray) -> OrientedBox:
-    """The box along the principal axes of points [P, 3] float, P >= 1; longest axis first, right-handed.
 
-    Coincident or coplanar points give zero extents along the missing axes. The sign of each axis is fixed by its
-    largest component being positive, so equal sets in any order have equal boxes.
+def oriented_box(points: np.ndarray, trim: float = 0.0) -> OrientedBox:
+    """The smallest box of finite points [P, 3] float, P >= 1, among those with an edge along x, y or z, or along
+    their principal axes.
+
+    About each of the three axes the box turns along the sides of the planar hull, where the least area lies.
+    Longest side first, right-handed, the sign of each axis fixed by its largest component being positive: the same
+    points in any order have the same box. Coplanar points give a zero extent. trim: share of points left out at
+    either end of each axis, against strays; the choice is then made on an even sample.
     """
     points = np.asarray(points, np.float64)
-    mean = points.mean(axis=0)
-    _, axes = np.linalg.eigh((points - mean).T @ (points - mean))
-    rotation = axes[:, ::-1].T.copy()
+    outline = _hull(points) if trim == 0 else points[:: len(points) // SAMPLE + 1]
+    outline = outline[np.lexsort(outline.T)]
+    axes = np.stack(_candidates(outline))
+    low, high = _sides(axes, outline, trim)
+    extent = high - low
+    # A floor of a thousandth of the longest side, so that flat instances compare by their area.
+    volume = np.maximum(extent, np.maximum(extent.max(axis=1, keepdims=True) * 1e-3, 1e-12)).prod(axis=1)
+    best = int(np.argmax(volume <= 1.001 * volume.min()))  # of equals the first: the world's axes if they do
+    rotation = _in_order(axes[best], extent[best])
+    low, high = _sides(rotation[None], points if trim else outline, trim)
+    return OrientedBox(rotation.T @ ((low[0] + high[0]) / 2), rotation, high[0] - low[0])
+
+
+def instance_boxes(points: np.ndarray, labels: np.ndarray, trim: float = 0.0) -> dict[int, dict[str, Any]]:
+    """{id: {"num_points", "centroid", "aabb": {"min", "max"}, "obb"}} of labelled points [P, 3], labels [P]
+    (−1 = none). trim as in `oriented_box`; points that are not finite are left out.
+    """
+    inside = (labels >= 0) & np.isfinite(points).all(axis=1)
+    order = np.flatnonzero(inside)
+    order = order[np.argsort(labels[order], kind="stable")]
+    ids, starts = np.unique(labels[order], return_index=True)
+    boxes: dict[int, dict[str, Any]] = {}
+    for i, rows in zip(ids.tolist(), np.split(order, starts[1:]), strict=True):
+        own = points[rows].astype(np.float64)
+        low, high = np.quantile(own, [trim, 1 - trim], axis=0)
+        boxes[i] = {
+            "num_points": len(own),
+            "centroid": own.mean(axis=0).tolist(),
+            "aabb": {"min": low.tolist(), "max": high.tolist()},
+            "obb": oriented_box(own, trim).to_json(),
+        }
+    return boxes
+
+
+BOX_EDGES = ((0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7))
+"""Pairs of `box_corners` that an edge joins."""
+
+
+def box_corners(box: OrientedBox) -> np.ndarray:
+    """The eight corners [8, 3] of a box; corner 4i + 2j + k lies at the far end of axis 0, 1, 2 where i, j, k is 1."""
+    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    return np.asarray(box.center + (signs * box.extent / 2) @ box.rotation)
+
+
+def _sides(axes: np.ndarray, points: np.ndarray, trim: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest coordinates [C, 3] of points along the rows of axes [C, 3, 3]."""
+    local = np.einsum("cij,pj->cpi", axes, points)
+    if trim:
+        low, high = np.quantile(local, [trim, 1 - trim], axis=1)
+        return low, high
+    return local.min(axis=1), local.max(axis=1)
+
+
+def _in_order(axes: np.ndarray, extent: np.ndarray) -> np.ndarray:
+    """The same axes, longest side first, signs fixed, right-handed."""
+    rotation = axes[np.argsort(-extent, kind="stable")].copy()
     for row in rotation[:2]:
         if row[np.abs(row).argmax()] < 0:
             row *= -1
     rotation[2] = np.cross(rotation[0], rotation[1])
-    local = (points - mean) @ rotation.T
-    low, high = local.min(axis=0), local.max(axis=0)
-    return OrientedBox(mean + (low + high) / 2 @ rotation, rotation, high - low)
+    return rotation
+
+
+def _hull(points: np.ndarray) -> np.ndarray:
+    """The corners of the convex hull [C, 3], or all points when they lie in a plane."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return points[ConvexHull(points).vertices]
+    except (QhullError, ValueError):
+        return points
+
+
+def _candidates(points: np.ndarray) -> list[np.ndarray]:
+    """Rotations [3, 3] (rows are axes) worth trying; the world's axes come first."""
+    found = [np.eye(3)]
+    if len(points) < 4:
+        return [*found, _along(points)]
+    for up in range(3):
+        a, b = (up + 1) % 3, (up + 2) % 3
+        for direction in _hull_directions(points[:, [a, b]]):
+            axes = np.zeros((3, 3))
+            axes[0, [a, b]] = direction
+            axes[1, [a, b]] = [-direction[1], direction[0]]
+            axes[2, up] = 1
+            found.append(axes)
+    return [*found, _along(points)]
+
+
+def _along(points: np.ndarray) -> np.ndarray:
+    """Principal axes of points [P, 3]."""
+    return np.asarray(np.linalg.svd((points - points.mean(axis=0)).T @ (points - points.mean(axis=0)))[2])
+
+
+def _hull_directions(plane: np.ndarray, most: int = 64) -> np.ndarray:
+    """Unit directions [D, 2] of the convex hull's longest sides; none when the points lie on a line."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        corners = plane[ConvexHull(plane).vertices]
+    except QhullError:
+        return np.empty((0, 2))
+    sides = np.roll(corners, -1, axis=0) - corners
+    length = np.linalg.norm(sides, axis=1)
+    longest = np.argsort(-length, kind="stable")[:most]
+    return sides[longest] / length[longest, None]

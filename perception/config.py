@@ -14,10 +14,14 @@ from perception.errors import InputError
 
 @dataclass(frozen=True)
 class PhotoConfig:
-    """What is read: long side in pixels at which the map is trained, and every `holdout`-th view kept for scoring."""
+    """What is read: long side in pixels at which the map is trained, and every `holdout`-th view kept for scoring.
+
+    held_out: a text file of photo names (with or without suffix), one a line, that are kept for scoring instead.
+    """
 
     max_side: int = 800
     holdout: int = 8
+    held_out: str | None = None
     camera: str | None = None
 
 
@@ -191,13 +195,21 @@ def load_config(file: Path | None = None, pairs: list[str] | None = None, preset
     if file is not None:
         for key, value in _read_toml(file).items():
             config = set_value(config, key, value, str(file))
-    for pair in pairs or []:
+    for key, text in read_pairs(pairs or []).items():
+        config = set_value(config, key, text)
+    check(config)
+    return config
+
+
+def read_pairs(pairs: list[str]) -> dict[str, Any]:
+    """KEY=VALUE texts by key; the last of equal keys counts."""
+    values: dict[str, Any] = {}
+    for pair in pairs:
         key, separator, value = pair.partition("=")
         if not separator:
             raise InputError(f"--set: found '{pair}', expected KEY=VALUE")
-        config = set_value(config, key.strip(), value.strip())
-    check(config)
-    return config
+        values[key.strip()] = value.strip()
+    return values
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

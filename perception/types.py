@@ -72,6 +72,11 @@ class OrientedBox:
             "extent": [float(x) for x in self.extent],
         }
 
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> OrientedBox:
+        """The box that `to_json` wrote."""
+        return cls(*(np.array(data[key], np.float64) for key in ("center", "rotation", "extent")))
+
 
 @dataclass
 class PointCloud:

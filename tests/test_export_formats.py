@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
+from perception.boxes import instance_boxes, oriented_box
 from perception.errors import InputError
-from perception.export.boxes import instance_boxes, oriented_box
 from perception.export.formats import instance_colors, write_boxes, write_scannet, write_split
 from perception.export.labels import ExportOptions, check_overlap, export_labels
 from perception.export.run import Outputs, run_export, write_export

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import threading
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from PIL import Image
 
 from perception.errors import InputError
 from perception.geometry import align_similarity, inverse_se3, look_at, rotation_from_quaternion
-from perception.io import features, triangulate
+from perception.io import atomic, features, triangulate
 from perception.io.atomic import atomic_directory, atomic_file, recover
 from perception.io.camera_file import read_camera
 from perception.io.inputs import load_scene
@@ -254,3 +255,31 @@ def test_atomic_writes_leave_old_or_new(tmp_path):
     recover(target)
     assert (target / "a").read_text() == "new"
     assert [path.name for path in tmp_path.iterdir()] == ["map"]
+
+
+@pytest.mark.parametrize("exchange", [True, False])
+def test_a_swapped_folder_is_old_or_new_and_never_gone(tmp_path, monkeypatch, exchange):
+    target, done, seen = tmp_path / "map", threading.Event(), set()
+    if not exchange:
+        monkeypatch.setattr(atomic, "_exchange", lambda a, b: False)
+
+    def write(text):
+        with atomic_directory(target) as new:
+            (new / "a").write_text(text)
+            (new / "b").write_text(text)
+
+    def watch():
+        while not done.is_set():
+            seen.add(target.exists())
+
+    write("0")
+    reader = threading.Thread(target=watch)
+    reader.start()
+    for number in range(1, 200):
+        write(str(number))
+    done.set()
+    reader.join()
+    assert (target / "a").read_text() == (target / "b").read_text() == "199"
+    assert [path.name for path in tmp_path.iterdir()] == ["map"]
+    if exchange:  # the other way has its instant without a folder, as its documentation says
+        assert seen == {True}

@@ -18,8 +18,21 @@ LAYERS = [
     {"masks", "demo"},
     {"gaussians"},
     {"language", "instances"},
-    {"query", "export", "evaluate", "report", "models"},
-    {"pipeline", "bench"},
+    {
+        "query",
+        "export",
+        "evaluate",
+        "report",
+        "models",
+        "editing",
+    },
+    {
+        "serve",
+        "node",
+        "pipeline",
+        "viewer",
+        "bench",
+    },
     {"cli"},
 ]
 HEIGHT = {name: height for height, layer in enumerate(LAYERS) for name in layer}

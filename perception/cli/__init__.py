@@ -8,13 +8,24 @@ import os
 import shlex
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
 from perception import __version__
-from perception.cli import asking, clouds, mapping, scoring
 from perception.cli.parser import Parser
 from perception.errors import InputError
 
-_MODULES = (mapping, asking, clouds, scoring)
+_MODULES = (
+    "mapping",
+    "asking",
+    "labels",
+    "clouds",
+    "scoring",
+    "serving",
+    "node",
+    "viewing",
+    "models",
+)
+"""Files of this package that add subcommands, in the order of --help."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -22,8 +33,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser = Parser(prog="perception", description="From photos to a 3D instance map that answers text prompts.")
     parser.add_argument("--version", action="version", version=f"perception {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
-    for module in _MODULES:
-        module.register(commands)
+    for name in _MODULES:
+        import_module(f"perception.cli.{name}").register(commands)
     return parser
 
 
@@ -38,6 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code: 0, 2 for bad usage or input, 130 on Ctrl-C."""
     # Threads of torch's OpenMP that spin while they wait would take the cores from the kernels' own threads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    args = argparse.Namespace()
     try:
         args = build_parser().parse_args(argv)
         result, text = args.run(args)
@@ -49,6 +61,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
+        told = "interrupted; what was done is kept, repeat the command with --resume"
+        print(getattr(args, "interrupted", told), file=sys.stderr)
         print(f"interrupted; what was done is kept, go on with: {_resume(argv)}", file=sys.stderr)
         return 130
     except BrokenPipeError:

@@ -22,8 +22,15 @@ def _add_export(commands: Any) -> None:
     p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.ply")
     p.add_argument("--smooth", action=argparse.BooleanOptionalAction, default=True)
     p.add_argument("--rule", choices=("nearest", "densest"), default="nearest", help="nearest mean is the paper's")
-    p.add_argument("--max-distance", type=float, metavar="D", help="points farther than D from any Gaussian stay -1")
+    p.add_argument(
+        "--max-distance",
+        type=_length,
+        metavar="D",
+        help="points farther than D from any Gaussian stay -1 (auto: by the map's own spacing)",
+    )
     p.add_argument("--fill", action=argparse.BooleanOptionalAction, default=True, help="noise Gaussians do not vote")
+    p.add_argument("--graph", choices=("auto", "mesh", "knn", "radius"), default="auto", help="what smoothing runs on")
+    p.add_argument("--color-weight", type=float, metavar="W", help="weight of an edge's RGB distance when smoothing")
     p.add_argument("--segments", type=Path, metavar="X.segs.json", help="ScanNet segments instead of our own")
     p.add_argument("--color", choices=("original", "instance"), default="original")
     p.add_argument("--split", type=Path, metavar="DIR", help="one cloud an instance")
@@ -32,8 +39,13 @@ def _add_export(commands: Any) -> None:
     p.add_argument("--mcap", type=Path, metavar="OUT.mcap", help="ROS 2 bag with cloud and detections")
 
 
+def _length(text: str) -> float | str:
+    return text if text == "auto" else float(text)
+
+
 def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.export import ExportOptions, Outputs
+    from perception.export.smooth import SmoothOptions
     from perception.io.store import read_info
     from perception.pipeline.exporting import export_map
 
@@ -43,6 +55,7 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         drop_noise=args.fill,
         max_distance=args.max_distance,
         smooth=args.smooth,
+        smoothing=SmoothOptions(graph=args.graph, color_weight=args.color_weight),
         segments=args.segments,
     )
     outputs = Outputs(
@@ -56,7 +69,9 @@ def _add_render(commands: Any) -> None:
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("--cameras", type=Path, metavar="transforms.json", help="default: the map's held-out views")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
-    p.add_argument("--what", default="rgb", metavar="KINDS", help="comma-separated: rgb, depth, instances, features")
+    p.add_argument(
+        "--what", default="rgb", metavar="KINDS", help="comma-separated: rgb, depth, instances, features, boxes"
+    )
 
 
 def _render(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

@@ -34,6 +34,7 @@ def _add_map(commands: Any) -> None:
     p.add_argument("--holdout", metavar="N", help="every N-th view is kept for scoring, 0 trains on all")
     p.add_argument("--seed", metavar="S")
     p.add_argument("--device", help="auto, cpu or cuda")
+    p.add_argument("--labels-from", type=Path, metavar="OLD.gsmap", help="carry over the names given to its instances")
     p.add_argument("--profile", action="store_true", help="print where the time went")
     p.add_argument("--resume", action="store_true", help="go on with an interrupted run")
 
@@ -60,7 +61,9 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.pipeline.mapping import build_map
     from perception.progress import Progress
 
-    gmap = build_map(args.input, args.output, config, resume=args.resume, progress=Progress())
+    gmap = build_map(
+        args.input, args.output, config, resume=args.resume, progress=Progress(), labels_from=args.labels_from
+    )
     from perception.pipeline.summary import map_facts, profile_text
 
     facts = map_facts(args.output, gmap.info, len(gmap), len(gmap.instances))
@@ -70,14 +73,25 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 def _add_info(commands: Any) -> None:
     p = command(commands, "info", _info, "what a map holds, how it was made, how good it is")
     p.add_argument("map", type=Path, metavar="MAP")
+    p.add_argument("--verify", action="store_true", help="read every byte and compare it with the checksums")
+    p.add_argument("--sheet", type=Path, metavar="OUT.png", help="picture of every instance with its likeliest names")
 
 
 def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.store import read_info
+    from perception.io.store import read_info, verify_map
     from perception.pipeline.summary import info_text
 
     info = read_info(args.map)
-    return info, info_text(args.map, info)
+    if args.sheet is not None:
+        from perception.pipeline.reporting import write_sheet
+        from perception.query import load_map
+
+        write_sheet(load_map(args.map), args.sheet)
+    if not args.verify:
+        return info, info_text(args.map, info)
+    states = verify_map(args.map)
+    lines = [f"{name}: {state}" for name, state in states.items()]
+    return {**info, "verified": states}, "\n".join([info_text(args.map, info), *lines])
 
 
 def _add_report(commands: Any) -> None:

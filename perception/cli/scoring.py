@@ -22,22 +22,84 @@ def _add_eval(commands: Any) -> None:
     p = command(kinds, "instances", _eval_instances, "AP, AP50, AP25 of labelled clouds")
     p.add_argument("prediction", type=Path, metavar="PRED.ply")
     p.add_argument("truth", type=Path, metavar="GT.ply")
-    p.add_argument("--protocol", default="scannet", choices=("scannet", "mask3d", "scannetpp"))
+    p.add_argument("--scores", type=Path, metavar="X.json", help="confidences; default: PRED.json where it lies there")
+    _add_rules(p)
+    p = command(kinds, "scannet", _eval_scannet, "AP over the scenes of a ScanNet or ScanNet++ submission")
+    p.add_argument("prediction", type=Path, metavar="PRED_DIR", help="<scene>.txt with masks, or <scene>.json")
+    p.add_argument("truth", type=Path, metavar="GT_DIR", help="<scene>.txt, 1000 * class + instance a vertex")
+    _add_rules(p)
+    p = command(kinds, "lerf-mask", _eval_lerf_mask, "mIoU and boundary IoU of masks for text prompts")
+    p.add_argument("prediction", type=Path, metavar="PRED_DIR", help="<scene>/<view>/<prompt>.png")
+    p.add_argument("truth", type=Path, metavar="DATASET", help="<scene>/test_mask/<view>/<prompt>.png")
+    p.add_argument("--missing", choices=("zero", "skip"), default="zero", help="skip is the original script's way")
+    p = command(kinds, "lerf-ovs", _eval_lerf_ovs, "mIoU and mAcc@.25 of Gaussians selected by text")
+    p.add_argument("prediction", type=Path, metavar="PRED_DIR", help="<scene>/<view>/<prompt>.png, silhouettes")
+    p.add_argument("truth", type=Path, metavar="DATASET", help="label/<scene>/frame_*.json")
     p = command(kinds, "images", _eval_images, "PSNR and SSIM per view and mean")
     p.add_argument("prediction", type=Path, metavar="PRED_DIR")
     p.add_argument("truth", type=Path, metavar="GT_DIR")
+    p = command(kinds, "masks", _eval_masks, "mIoU of a map's rendered instance masks in its held-out views")
+    p.add_argument("map", type=Path, metavar="MAP")
+    p.add_argument("truth", type=Path, metavar="MASKS_DIR", help="one PNG a view: instance ids alike in all, 0 = void")
+    p.add_argument("--all-views", action="store_true", help="score the training views too")
+
+
+def _add_rules(p: argparse.ArgumentParser) -> None:
+    """The switches of an AP protocol."""
+    p.add_argument("--protocol", default="scannet", choices=("scannet", "mask3d", "segment3d", "scannetpp"))
+    p.add_argument("--by-class", action="store_true", help="match within semantic classes and average over them")
+    p.add_argument("--classes", type=_numbers, metavar="N,N,...", help="classes that count; others are void")
+    p.add_argument("--void", type=_numbers, metavar="N,N,...", help="truth ids that are void (default 0; 'none')")
+    p.add_argument("--min-region", type=int, metavar="N", help="least points of an instance (default 100)")
+    p.add_argument("--constant-score", action="store_true", help="all confidences 1.0, as Segment3D")
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    return () if text == "none" else tuple(int(word) for word in text.split(","))
+
+
+def _rules(args: argparse.Namespace) -> dict[str, Any]:
+    """Switches of the protocol that were given."""
+    given = {"valid_classes": args.classes, "void_ids": args.void, "min_region": args.min_region}
+    if args.constant_score:
+        given["constant_score"] = True
+    return {"by_class": args.by_class} | {name: value for name, value in given.items() if value is not None}
 
 
 def _eval_instances(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.evaluate import run_instances
 
-    return run_instances(args.prediction, args.truth, protocol=args.protocol)
+    return run_instances(args.prediction, args.truth, args.protocol, scores=args.scores, **_rules(args))
+
+
+def _eval_scannet(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.evaluate.layouts import run_scannet
+
+    return run_scannet(args.prediction, args.truth, args.protocol, **_rules(args))
+
+
+def _eval_lerf_mask(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.evaluate.layouts import run_lerf_mask
+
+    return run_lerf_mask(args.prediction, args.truth, missing=args.missing)
+
+
+def _eval_lerf_ovs(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.evaluate.layouts import run_lerf_ovs
+
+    return run_lerf_ovs(args.prediction, args.truth)
 
 
 def _eval_images(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.evaluate import run_images
 
     return run_images(args.prediction, args.truth)
+
+
+def _eval_masks(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.pipeline.scoring import score_masks
+
+    return score_masks(args.map, args.truth, args.all_views)
 
 
 def _add_bench(commands: Any) -> None:

@@ -55,14 +55,18 @@ def read_lerf_polygons(folder: str | Path) -> dict[tuple[str, str], np.ndarray]:
     return masks
 
 
-def run_lerf_mask(prediction: str | Path, dataset: str | Path, *, missing: str = "zero") -> tuple[dict[str, Any], str]:
+def run_lerf_mask(
+    prediction: str | Path, dataset: str | Path, *, missing: str = "zero", **switches: Any
+) -> tuple[dict[str, Any], str]:
     """LERF-mask over the scenes of a dataset folder (or one scene): (result, table).
 
     dataset: <scene>/test_mask/<view>/<prompt>.*; prediction: <scene>/<view>/<prompt>.*, or with test_mask
     between.
     """
     scenes = {
-        name: evaluate_lerf_mask(_predicted(prediction, name, "test_mask"), read_mask_folder(folder), missing=missing)
+        name: evaluate_lerf_mask(
+            _predicted(prediction, name, "test_mask"), read_mask_folder(folder), missing=missing, **switches
+        )
         for name, folder in _scenes(dataset, "test_mask").items()
     }
     return _scene_result(scenes, ("miou", "mbiou"))
@@ -138,7 +142,7 @@ def run_scannet(
     overlaps, missing = [], []
     for path in files:
         ids = _read_ids(path)
-        ids = np.where(ids >= 1000, ids, 0)  # class 0 is none
+        ids = np.where(ids >= 1000, ids, np.minimum(ids, 0))  # class 0 is none; below -1: ignored
         found = _read_prediction(Path(prediction), path.stem, len(ids))
         if found is None:
             missing.append(path.stem)

@@ -38,13 +38,13 @@ def boundary_iou(prediction: np.ndarray, truth: np.ndarray, dilation_ratio: floa
     return mask_iou(mask_boundary(prediction, dilation_ratio), mask_boundary(truth, dilation_ratio))
 
 
-def evaluate_lerf_mask(predictions: Masks, truths: Masks, *, missing: str = "zero") -> dict[str, Any]:
+def evaluate_lerf_mask(predictions: Masks, truths: Masks, *, missing: str = "zero", **switches: Any) -> dict[str, Any]:
     """LERF-mask (Gaussian Grouping): mIoU and mean boundary IoU, mean per prompt over views, then over
     prompts.
 
     truths: {(view, prompt): 8-bit mask, object > 128}; predictions alike, or bool, resized to the truth by
     nearest neighbour. missing: "zero" scores an absent prediction 0; "skip" leaves it out, as the original
-    script does.
+    script does. switches (how instances are selected and rendered) are printed with the figures.
     """
     if missing not in ("zero", "skip"):
         raise InputError(f"missing is '{missing}'; expected zero or skip")
@@ -80,6 +80,7 @@ def evaluate_lerf_mask(predictions: Masks, truths: Masks, *, missing: str = "zer
             "mean": "per prompt over views, then over prompts",
             "missing_prediction": "scores 0" if missing == "zero" else "skipped",
             "empty_union": "scores 1",
+            **switches,
         },
     }
 

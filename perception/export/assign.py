@@ -34,6 +34,22 @@ def nearest_gaussian(
     return result
 
 
+def auto_distance(means: np.ndarray) -> float | None:
+    """A reach that fits the map: twice the 99th percentile of the distance between neighbouring means [N, 3].
+
+    Even where the map is sparsest a point on its surface lies within half that spacing, so four times as much is
+    taken; what lies farther was not mapped. None (no limit) for fewer than two distinct means.
+    """
+    means = _checked(means, "means")
+    means = means[np.isfinite(means).all(axis=1)]
+    if len(means) < 2:
+        return None
+    chosen = means[:: max(len(means) // 50_000, 1)]
+    gaps = Neighbors(means).query(chosen, 2)[1][:, 1]
+    gaps = gaps[gaps > 0]
+    return 2 * float(np.quantile(gaps, 0.99)) if len(gaps) else None
+
+
 def _checked(points: np.ndarray, name: str) -> np.ndarray:
     points = np.asarray(points)
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from perception.boxes import instance_boxes
 from perception.errors import InputError
-from perception.export.boxes import instance_boxes
+from perception.io.atomic import replacing
 from perception.io.cloud import write_cloud
-from perception.io.cloud_atomic import replacing
 from perception.types import PointCloud
 
 Instances = Mapping[int, Mapping[str, Any]]

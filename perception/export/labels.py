@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from perception.errors import InputError
-from perception.export.assign import nearest_gaussian
+from perception.export.assign import auto_distance, nearest_gaussian
 from perception.export.likelihood import densest_instance
 from perception.export.smooth import SmoothOptions, read_segments, segment_cloud, vote
 from perception.types import PointCloud
@@ -21,13 +21,14 @@ class ExportOptions:
     drop_noise: Gaussians without an instance take no part, so every point gets a label (the paper's
     released code).
 
-    max_distance: in map units; None = no limit, as in the paper. smooth: superpoint vote, on or off.
+    max_distance: in map units; None = no limit, as in the paper; "auto" = measured from the map's own spacing
+    (`auto_distance`). smooth: superpoint vote, on or off.
     segments: a ScanNet *.segs.json used instead of an own segmentation.
     """
 
     rule: str = "nearest"
     drop_noise: bool = True
-    max_distance: float | None = None
+    max_distance: float | str | None = None
     smooth: bool = True
     smoothing: SmoothOptions = field(default_factory=SmoothOptions)
     segments: Path | None = None
@@ -61,8 +62,8 @@ def export_labels(
     means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise). The rule "densest" also asks for
     opacities [N] in (0, 1), quats [N, 4] wxyz and scales [N, 3] > 0.
     """
-    options = options or ExportOptions()
     used = np.isfinite(means).all(axis=1)
+    options = resolved(options or ExportOptions(), means, instance_ids)
     if options.drop_noise:
         used &= instance_ids >= 0
     gaussians = _Gaussians(means, instance_ids, opacities, quats, scales).rows(used)
@@ -79,15 +80,28 @@ def export_labels(
     return np.where(np.isfinite(cloud.points).all(axis=1), smoothed, -1).astype(np.int32)
 
 
+def resolved(options: ExportOptions, means: np.ndarray, instance_ids: np.ndarray) -> ExportOptions:
+    """The options with `max_distance` as a number or None."""
+    limit = options.max_distance
+    if limit is None or (isinstance(limit, float | int) and limit >= 0):
+        return options
+    if limit != "auto":
+        raise InputError(f"max_distance is {limit}; expected a length that is not negative, or auto")
+    used = means[instance_ids >= 0] if options.drop_noise else means
+    return replace(options, max_distance=auto_distance(used))
+
+
 def _assigned(g: _Gaussians, points: np.ndarray, options: ExportOptions) -> np.ndarray:
+    limit = options.max_distance
+    assert not isinstance(limit, str)  # resolved
     if options.rule == "nearest":
-        owner = nearest_gaussian(points, g.means, max_distance=options.max_distance)
+        owner = nearest_gaussian(points, g.means, max_distance=limit)
         return np.append(g.ids, -1).astype(np.int32)[owner]
     if options.rule != "densest":
         raise InputError(f"assignment rule '{options.rule}' is unknown; expected nearest or densest")
     if g.opacities is None or g.quats is None or g.scales is None:
         raise InputError("assignment rule 'densest' needs the Gaussians' rotations, scales and opacities")
-    return densest_instance(points, g.means, g.quats, g.scales, g.opacities, g.ids, max_distance=options.max_distance)
+    return densest_instance(points, g.means, g.quats, g.scales, g.opacities, g.ids, max_distance=limit)
 
 
 def check_overlap(means: np.ndarray, points: np.ndarray) -> float:

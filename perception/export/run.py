@@ -13,9 +13,9 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.export.formats import Instances, instance_colors, write_boxes, write_scannet, write_split
-from perception.export.labels import ExportOptions, check_overlap, export_labels
+from perception.export.labels import ExportOptions, check_overlap, export_labels, resolved
+from perception.io.atomic import replacing
 from perception.io.cloud import read_cloud, write_cloud
-from perception.io.cloud_atomic import replacing
 from perception.types import PointCloud
 
 
@@ -57,7 +57,7 @@ def run_export(
     in export_labels; instances: {id: {"score", "label"}}; classes: semantic id by instance id, written as
     `semantic_id` (0 where unknown) and into the submission.
     """
-    options, outputs = options or ExportOptions(), outputs or Outputs()
+    options, outputs = resolved(options or ExportOptions(), means, instance_ids), outputs or Outputs()
     if outputs.color not in ("original", "instance"):
         raise InputError(f"color is '{outputs.color}'; expected original or instance")
     began = time.perf_counter()
@@ -75,6 +75,7 @@ def run_export(
         "inside_map": inside,
         "seconds": time.perf_counter() - began,
         "rule": options.rule,
+        "max_distance": options.max_distance,
         "smoothed": options.smooth,
         **sidecar,
     }
@@ -106,6 +107,8 @@ def _table(result: dict[str, Any]) -> str:
     rows = sorted(result["instances"].items(), key=lambda row: -row[1]["num_points"])
     lines += [f"{i:>6}{r['num_points']:>12}{r['score']:>8.3f}  {r['label'] or ''}" for i, r in rows]
     lines.append(f"{result['labelled']} of {result['points']} points labelled, {result['seconds']:.1f} s")
+    if result["max_distance"] is not None:
+        lines.append(f"points farther than {result['max_distance']:.4g} from every Gaussian are -1")
     if result["inside_map"] < 0.5:
         lines.append(f"only {result['inside_map']:.0%} of the points lie inside the map: same frame and unit?")
     return "\n".join(lines)

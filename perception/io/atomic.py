@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 from uuid import uuid4
 
 from perception.errors import InputError
 
 _FULL = {errno.ENOSPC, errno.EDQUOT}
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # Linux' fcntl.h and fs.h
+_REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 
 @contextmanager
@@ -32,12 +36,30 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
+def replacing(path: str | Path) -> Iterator[BinaryIO]:
+    """A binary file to write into; it takes the place of `path` only when the block ends without an error.
+
+    Its folder must exist; whatever the system refuses is an InputError.
+    """
+    path = Path(path)
+    try:
+        if not path.parent.is_dir():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+        with atomic_file(path) as temporary, temporary.open("wb") as file:
+            yield file
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"{path}: cannot be written ({reason}); give a writable place") from error
+
+
+@contextmanager
 def atomic_directory(path: Path) -> Iterator[Path]:
     """Yield an empty temporary sibling folder to fill; on success it takes the place of `path`, else it is removed.
 
-    An existing `path` is moved aside first and deleted last. POSIX has no portable swap of two folders, so between
-    the two renames (microseconds) `path` does not exist; a process killed right there leaves the old folder
-    beside it, and the next `atomic_directory(path)` or `recover(path)` puts it back. It is never half of one.
+    On Linux the two folders are exchanged in one step, so there is no instant without a `path`. Where the system
+    cannot, the old folder is moved aside first: between the two renames (microseconds) `path` does not exist, and a
+    process killed right there leaves the old folder beside it for the next `atomic_directory(path)` or
+    `recover(path)` to put back. It is never half of one.
     """
     path = Path(path)
     temporary, old = _sibling(path, "new"), _sibling(path, "old")
@@ -74,6 +96,8 @@ def recover(path: Path) -> None:
 def _swap(new: Path, path: Path, old: Path) -> None:
     if not path.exists():
         new.rename(path)
+    elif _exchange(new, path):
+        old = new  # where the old folder lies now
     else:
         path.rename(old)
         try:
@@ -81,8 +105,20 @@ def _swap(new: Path, path: Path, old: Path) -> None:
         except OSError:
             old.rename(path)
             raise
-        shutil.rmtree(old, ignore_errors=True)
-    _sync(path.parent)
+    _sync(path.parent)  # before the old folder goes: a power cut must not leave neither
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _exchange(a: Path, b: Path) -> bool:
+    """Swap two names in one step by Linux' renameat2; False where the system or its file system has no such call."""
+    try:
+        call = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError):
+        return False
+    result: int = call(_AT_FDCWD, os.fsencode(a), _AT_FDCWD, os.fsencode(b), _RENAME_EXCHANGE)
+    if result != 0 and ctypes.get_errno() not in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(b))
+    return result == 0
 
 
 def _sibling(path: Path, kind: str) -> Path:
@@ -124,4 +160,8 @@ def _disk_errors(path: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno in _FULL:
             raise InputError(f"{path}: the disk is full, nothing was written; free some space") from error
+        if error.errno in _REFUSED:
+            raise InputError(
+                f"{path}: cannot be written ({error.strerror}); choose a place you may write to"
+            ) from error
         raise

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.cloud_atomic import replacing
+from perception.io.atomic import replacing
 from perception.io.cloud_las import read_las
 from perception.io.cloud_memory import require_memory
 from perception.io.cloud_pcd import read_pcd, write_pcd

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.cloud_atomic import replacing
+from perception.io.atomic import replacing
 from perception.types import PointCloud
 
 _SIZES = {"F": ("4", "8"), "I": ("1", "2", "4", "8"), "U": ("1", "2", "4", "8")}

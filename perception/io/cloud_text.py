@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.cloud_atomic import replacing
+from perception.io.atomic import replacing
 from perception.types import PointCloud
 
 

@@ -15,7 +15,7 @@ from typing import BinaryIO
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.cloud_atomic import replacing
+from perception.io.atomic import replacing
 
 Element = dict[str, np.ndarray]
 
@@ -70,6 +70,31 @@ def read_ply(path: str | Path) -> dict[str, Element]:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); expected a PLY file") from error
 
 
+def map_ply(path: str | Path, element: str) -> np.ndarray:
+    """The first element of a binary little-endian PLY as a structured array [rows], mapped into memory, read-only.
+
+    For tables too big to read whole. InputError when the file has another first element, lists in it, or is cut short.
+    """
+    path = Path(path)
+    with path.open("rb") as file:
+        order, tables = _read_header(file, path)
+        start, size = file.tell(), path.stat().st_size
+        if order != "<" or not tables or tables[0].name != element or tables[0].has_list:
+            raise InputError(f"{path}: expected a binary little-endian PLY that begins with plain element '{element}'")
+        names = [p.name for p in tables[0].properties]
+        if len(set(names)) != len(names) or tables[0].rows < 0:
+            raise InputError(f"{path}: PLY header names a property twice, or a negative number of rows")
+        dtype = np.dtype([(p.name, order + p.kind) for p in tables[0].properties])
+        found = (size - start) // max(dtype.itemsize, 1)
+        if found < tables[0].rows:
+            raise InputError(
+                f"{path}: is cut short: element '{element}' has {found} whole rows, header says {tables[0].rows}"
+            )
+        if tables[0].rows == 0 or dtype.itemsize == 0:
+            return np.empty(tables[0].rows, dtype)
+        return np.memmap(file, dtype, "r", start, (tables[0].rows,))
+
+
 def write_ply(path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]], *, ascii: bool = False) -> None:
     """Write elements of scalar properties [rows] and list properties [rows, k], in the order given.
 
@@ -82,6 +107,11 @@ def write_ply(path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]]
                 _write_ascii(file, properties)
             else:
                 _packed(properties).tofile(file)
+
+
+def ply_bytes(elements: Mapping[str, Mapping[str, np.ndarray]]) -> bytes:
+    """What `write_ply` would write, binary, for those who send it elsewhere."""
+    return _header(elements, False).encode("ascii") + b"".join(_packed(p).tobytes() for p in elements.values())
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_Table]]:

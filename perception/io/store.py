@@ -6,6 +6,8 @@ instances.json  per instance: id, label, score, num_gaussians, centroid, obb, aa
 features.npy    [N, D] float32      instance_ids.npy  [N] int32 (−1 = none)   membership.npy [N] float32
 language.npz    what the encoder knows of each instance, with its identity (absent without an encoder)
 cameras.npz     the views: names, K, sizes, camera_from_world, which were held out
+index.npz       the points of each instance side by side (see instance_index), for questions
+map.json also lists size and SHA-256 of the other files (`files`) and its own (`sha256`); see checksums.
 """
 
 from __future__ import annotations
@@ -19,10 +21,25 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_directory
-from perception.io.ply import read_ply, write_ply
+from perception.io.atomic import atomic_directory, atomic_file
+from perception.io.checksums import EDITABLE, FACTS, file_facts, seal, verify
+from perception.io.instance_index import InstanceIndex, build_index
+from perception.io.map_files import FORMAT_VERSION, MapFiles, map_signature, read_info
+from perception.io.map_lock import writing
+from perception.io.ply import write_ply
 
-FORMAT_VERSION = 1
+__all__ = [
+    "FORMAT_VERSION",
+    "GaussianMap",
+    "gaussian_map",
+    "map_signature",
+    "read_info",
+    "read_map",
+    "set_labels",
+    "verify_map",
+    "write_gaussian_ply",
+    "write_map",
+]
 
 
 @dataclass
@@ -58,70 +75,93 @@ class GaussianMap:
     def opacities(self) -> np.ndarray:
         return 1 / (1 + np.exp(-self.opacity_logits))
 
+    def instance_index(self) -> InstanceIndex:
+        """The points of each instance side by side."""
+        return build_index(self.means, self.instance_ids)
+
 
 def write_map(path: Path, gmap: GaussianMap) -> None:
-    """Writes the whole map aside and swaps it in: a reader sees the old map or the new one, never half of one."""
+    """Writes the whole map aside and swaps it in: a reader sees the old map or the new one, never half of one.
+
+    InputError when another writer is at this map, or the place cannot be written to.
+    """
     info = {**gmap.info, "format_version": FORMAT_VERSION, "num_gaussians": len(gmap)}
     info["num_instances"] = len(gmap.instances)
     info["sh_degree"] = math.isqrt(gmap.sh.shape[1]) - 1
-    with atomic_directory(path) as folder:
+    with writing(path), atomic_directory(path) as folder:
         write_gaussian_ply(folder / "gaussians.ply", gmap)
         np.save(folder / "features.npy", gmap.features.astype(np.float32))
         np.save(folder / "instance_ids.npy", gmap.instance_ids.astype(np.int32))
         np.save(folder / "membership.npy", gmap.membership.astype(np.float32))
         np.savez(folder / "cameras.npz", **gmap.cameras)  # type: ignore[arg-type]
+        np.savez(folder / "index.npz", **gmap.instance_index().to_arrays())  # type: ignore[arg-type]
         if gmap.language:
             np.savez_compressed(folder / "language.npz", **gmap.language)  # type: ignore[arg-type]
-        _dump(folder / "instances.json", {"instances": gmap.instances})
-        _dump(folder / "map.json", info)
+        _dump(folder / EDITABLE, {"instances": gmap.instances})
+        _dump(folder / FACTS, _with_checksums(info, folder))
 
 
 def read_map(path: Path) -> GaussianMap:
-    """Opens a map. Raises InputError naming the file when it is no map, of another version, or damaged."""
-    info = read_info(path)
+    """Reads all of a map, checksums compared. Raises InputError naming the file when it is no map, of another
+    version, or damaged."""
+    return gaussian_map(MapFiles(path))
+
+
+def gaussian_map(files: MapFiles) -> GaussianMap:
+    """All of an opened map in memory, checksums compared; InputError naming the file when one is damaged."""
+    files.check_contents()
+    rows, file = files.rows, files.path / "gaussians.ply"
     try:
-        rows = read_ply(path / "gaussians.ply")["vertex"]
-        count = len(rows["x"])
-        gmap = GaussianMap(
+        return GaussianMap(
             means=_columns(rows, ["x", "y", "z"]),
             quats=_columns(rows, [f"rot_{i}" for i in range(4)]),
             log_scales=_columns(rows, [f"scale_{i}" for i in range(3)]),
             opacity_logits=np.ascontiguousarray(rows["opacity"], np.float32),
             sh=_read_sh(rows),
-            features=np.load(path / "features.npy"),
-            instance_ids=np.load(path / "instance_ids.npy"),
-            membership=np.load(path / "membership.npy"),
-            instances=json.loads((path / "instances.json").read_text(encoding="utf-8"))["instances"],
-            info=info,
-            cameras=_load_npz(path / "cameras.npz"),
-            language=_load_npz(path / "language.npz"),
+            **{name: np.array(array) for name, array in files.arrays.items()},
+            instances=files.instances,
+            info=files.info,
+            cameras=files.cameras,
+            language=files.language,
         )
-    except (OSError, KeyError, ValueError, EOFError) as error:
+    except (KeyError, ValueError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: the map is damaged ({error}); build it again with `perception map`") from error
-    for name in ("features", "instance_ids", "membership"):
-        found = len(getattr(gmap, name))
-        if found != count:
-            raise InputError(
-                f"{path / name}.npy: holds {found} rows, expected {count} as in gaussians.ply; rebuild the map"
-            )
-    return gmap
+        raise InputError(f"{file}: is no 3DGS cloud ({error}); the map is damaged, build it again") from error
 
 
-def read_info(path: Path) -> dict[str, Any]:
-    """map.json alone; raises InputError when `path` is no map or of a version this program does not read."""
-    file = path / "map.json"
-    if not file.is_file():
-        raise InputError(f"{path}: is no map (no map.json inside); give a directory made by `perception map`")
-    try:
-        info = json.loads(file.read_text(encoding="utf-8"))
-        version = info["format_version"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{file}: cannot be read as a map's facts ({error})") from error
-    if version != FORMAT_VERSION:
-        raise InputError(f"{file}: format_version is {version}, this program reads {FORMAT_VERSION}; rebuild the map")
-    return info
+def verify_map(path: Path) -> dict[str, str]:
+    """Reads every byte: {file: "ok", "edited" or "no checksum"}; InputError naming the first damaged file."""
+    files = MapFiles(path)
+    states = verify(path, files.info)
+    files.instance_index()
+    return states
+
+
+def set_labels(path: Path, labels: dict[int, str | None]) -> None:
+    """Gives instances of the map on disk the user's names (None takes one away), or does nothing at all.
+
+    InputError for an id the map does not have, and while another writer is at this map.
+    """
+    with writing(path):
+        files = MapFiles(path)
+        places = {entry["id"]: n for n, entry in enumerate(files.instances)}
+        for instance_id, label in labels.items():
+            if instance_id not in places:
+                raise InputError(f"{path}: has no instance {instance_id}; it has {len(places)}")
+            if label is not None and not (isinstance(label, str) and label.strip()):
+                raise InputError(f"{path}: the label of instance {instance_id} is empty; give a name or none")
+            files.instances[places[instance_id]]["label"] = label
+        with atomic_file(path / EDITABLE) as aside:
+            _dump(aside, {"instances": files.instances})
+        if "files" in files.info:
+            with atomic_file(path / FACTS) as aside:
+                _dump(aside, _with_checksums(files.info, path))
+
+
+def _with_checksums(info: dict[str, Any], folder: Path) -> dict[str, Any]:
+    facts = json.loads(json.dumps(info, allow_nan=False, default=_plain))
+    return seal({**facts, "files": file_facts(folder)})
 
 
 def write_gaussian_ply(path: Path, gmap: GaussianMap) -> None:
@@ -145,24 +185,17 @@ def write_gaussian_ply(path: Path, gmap: GaussianMap) -> None:
     write_ply(path, {"vertex": {name: np.ascontiguousarray(column, np.float32) for name, column in table.items()}})
 
 
-def _read_sh(rows: dict[str, np.ndarray]) -> np.ndarray:
+def _read_sh(rows: np.ndarray) -> np.ndarray:
     constant = _columns(rows, [f"f_dc_{i}" for i in range(3)])[:, None, :]
-    width = sum(name.startswith("f_rest_") for name in rows)
+    width = sum(name.startswith("f_rest_") for name in rows.dtype.names or ())
     if width == 0:
         return constant
     rest = _columns(rows, [f"f_rest_{i}" for i in range(width)]).reshape(len(constant), 3, width // 3)
     return np.ascontiguousarray(np.concatenate([constant, rest.transpose(0, 2, 1)], axis=1))
 
 
-def _columns(rows: dict[str, np.ndarray], names: list[str]) -> np.ndarray:
+def _columns(rows: np.ndarray, names: list[str]) -> np.ndarray:
     return np.stack([rows[name] for name in names], axis=1).astype(np.float32)
-
-
-def _load_npz(path: Path) -> dict[str, np.ndarray]:
-    if not path.is_file():
-        return {}
-    with np.load(path, allow_pickle=False) as archive:
-        return {name: archive[name] for name in archive.files}
 
 
 def _dump(path: Path, value: Any) -> None:

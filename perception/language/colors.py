@@ -35,6 +35,7 @@ _EXAMPLES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "gold": ((200, 160, 60),),
     "silver": ((180, 182, 185), (140, 142, 145)),
 }
+COLOR_NAMES = tuple(_EXAMPLES)
 _SYNONYMS = {
     "grey": "gray", "crimson": "red", "scarlet": "red", "maroon": "red", "reddish": "red", "violet": "purple",
     "lilac": "purple", "magenta": "pink", "cyan": "turquoise", "teal": "turquoise", "tan": "beige",

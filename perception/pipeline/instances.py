@@ -72,13 +72,17 @@ def find_instances(
     return FoundInstances(clusters.ids, clusters.membership, instances, language, report)
 
 
+BOX_TRIM = 0.01
+"""Share of an instance's Gaussians left out of its oriented box at either end of each axis: strays stretch boxes."""
+
+
 def _describe(
     instance: int, means: np.ndarray, opacities: np.ndarray, ids: np.ndarray, score: float, views: int
 ) -> dict[str, Any]:
     rows = ids == instance
     points = means[rows].astype(np.float64)
     weights = opacities[rows].astype(np.float64)
-    box = oriented_box(points)
+    box = oriented_box(points, BOX_TRIM)
     return {
         "id": instance,
         "label": None,

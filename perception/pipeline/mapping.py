@@ -15,10 +15,12 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
+from perception.instances.survival import carried_text, carry_labels
 from perception.io.inputs import load_scene
+from perception.io.map_lock import writing
 from perception.io.photos import load_photo
 from perception.io.scene_cache import load_saved_scene, save_scene, view_json
-from perception.io.store import GaussianMap, write_map
+from perception.io.store import GaussianMap, read_map, write_map
 from perception.masks import MaskSource, make_source
 from perception.masks.source import GeometryMaskSource
 from perception.masks.store import compute_masks
@@ -41,37 +43,48 @@ def work_folder(output: Path) -> Path:
 
 
 def build_map(
-    source: Path, output: Path, config: MapConfig, *, resume: bool = False, progress: Progress | None = None
+    source: Path,
+    output: Path,
+    config: MapConfig,
+    *,
+    resume: bool = False,
+    progress: Progress | None = None,
+    labels_from: Path | None = None,
 ) -> GaussianMap:
     """Builds a map from photos, a COLMAP workspace or a transforms.json, and writes it to `output`.
 
     Raises InputError for bad input. What was done is kept in `work_folder(output)` until the map is written; with
-    `resume` a run goes on from there. A run refused before it trained leaves nothing behind.
+    `resume` a run goes on from there. Names given to the instances of the map `labels_from` are carried over to those
+    that fill the same place. A run refused before it trained leaves nothing behind.
     """
     if config.device == "cuda":
         raise InputError("--device cuda: this build has no CUDA rasterizer; use --device cpu or auto")
+    labelled = None if labels_from is None else read_map(labels_from)
     fresh = not work_folder(output).exists()
     work = _prepare(source, output, resume)
-    try:
-        return _build(source, output, work, config, progress or Progress(quiet=True))
-    except OSError as error:
-        if error.errno != errno.ENOSPC:
+    with writing(output):
+        try:
+            return _build(source, output, work, config, progress or Progress(quiet=True), labelled)
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise
+            raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
+        except InputError:
+            if fresh and not (work / CHECKPOINT).exists():
+                shutil.rmtree(work, ignore_errors=True)
             raise
-        raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
-    except InputError:
-        if fresh and not (work / CHECKPOINT).exists():
-            shutil.rmtree(work, ignore_errors=True)
-        raise
 
 
-def _build(source: Path, output: Path, work: Path, config: MapConfig, progress: Progress) -> GaussianMap:
+def _build(
+    source: Path, output: Path, work: Path, config: MapConfig, progress: Progress, labelled: GaussianMap | None
+) -> GaussianMap:
     stages = Stages()
     started = time.monotonic()
 
     with stages("poses"):
         scene = _scene(source, work, config, progress)
     _tell_scene(scene, progress)
-    training, held_out = split_views(scene.views, config.photos.holdout)
+    training, held_out = split_views(scene.views, config.photos.holdout, config.photos.held_out)
 
     source_of_masks = make_source(config.masks, cache_dir=work)
     with stages("photos"):
@@ -113,6 +126,8 @@ def _build(source: Path, output: Path, work: Path, config: MapConfig, progress: 
         "peak_memory_mib": peak_memory_mib(),
     }
     gmap = _assemble(gaussians, found, scene, held_out, record)
+    if labelled is not None:
+        _carry_labels(labelled, gmap, progress)
     write_map(output, gmap)
     shutil.rmtree(work, ignore_errors=True)
     _tell_result(gmap, output, progress)
@@ -288,6 +303,14 @@ def _assemble(
         cameras=cameras,
         language=found.language,
     )
+
+
+def _carry_labels(old: GaussianMap, gmap: GaussianMap, progress: Progress) -> None:
+    carried = carry_labels(old, gmap)
+    for entry in gmap.instances:
+        entry["label"] = carried.labels.get(entry["id"], entry["label"])
+    gmap.info["labels"] = {"carried": len(carried.labels), "dropped": [name for _, name in carried.dropped]}
+    progress.log(carried_text(carried))
 
 
 # ----------------------------------------------------------------------- words

@@ -4,23 +4,42 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
 
+from perception.errors import InputError
 from perception.gaussians.train import TrainingView
 from perception.io.photos import load_photo, scaled_K
 from perception.masks.store import load_labels
 from perception.types import View
 
 
-def split_views(views: list[View], holdout: int) -> tuple[list[View], list[View]]:
-    """(training, held out): sorted by name, index % holdout == 0 is held out; holdout 0 or 1 view trains on all."""
+def split_views(views: list[View], holdout: int, listed: str | None = None) -> tuple[list[View], list[View]]:
+    """(training, held out): sorted by name, index % holdout == 0 is held out; holdout 0 or 1 view trains on all.
+
+    listed: a text file that names the held-out photos instead, one a line.
+    """
+    if listed is not None:
+        names = _names(Path(listed))
+        named = [bool(names & {view.name, PurePosixPath(view.name).stem}) for view in views]
+        if all(named):
+            raise InputError(f"{listed}: names all {len(views)} photos; some must be left to train on")
+        return [v for v, is_held in zip(views, named, strict=True) if not is_held], [
+            v for v, is_held in zip(views, named, strict=True) if is_held
+        ]
     if holdout <= 1 or len(views) < 4:
         return list(views), []
     held = [view for i, view in enumerate(views) if i % holdout == 0]
     return [view for i, view in enumerate(views) if i % holdout != 0], held
+
+
+def _names(listed: Path) -> set[str]:
+    try:
+        return {line.strip() for line in listed.read_text(encoding="utf-8").splitlines() if line.strip()}
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{listed}: cannot be read; expected a text file of photo names, one a line") from error
 
 
 def training_view(view: View, max_side: int) -> TrainingView:

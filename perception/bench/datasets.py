@@ -1,0 +1,257 @@
+"""What the dataset benches share: a map of each scene, made or reused, and masks of its instances in given views."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from perception.config import MapConfig, load_config
+from perception.errors import InputError
+from perception.io.atomic import atomic_directory, atomic_file
+from perception.io.store import GaussianMap, read_map
+from perception.pipeline.mapping import build_map
+from perception.pipeline.record import versions
+from perception.pipeline.rendering import as_gaussians, map_views
+from perception.progress import Progress
+from perception.query import LoadedMap
+from perception.types import View
+
+Masks = Mapping[tuple[str, str], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """Folders and settings of one bench run. maps: <scene>.gsmap, reused when there; config: by scene name."""
+
+    work: Path
+    maps: Path
+    config: Callable[[str], MapConfig]
+    progress: Progress
+
+    def map(self, scene: str, source: Path, held_out: list[str] | None = None) -> GaussianMap:
+        """The scene's map: read where it lies in `maps`, else built (an interrupted run goes on).
+
+        held_out: photo names kept out of training. They are not known to a map that was brought along.
+        """
+        path = self.maps / f"{scene}.gsmap"
+        if path.exists():
+            self.progress.log(f"{scene}: using {path}")
+            return read_map(path)
+        config = self.config(scene)
+        if held_out is not None:
+            listed = self.work / "held_out" / f"{scene}.txt"
+            with atomic_file(listed) as aside:
+                aside.write_text("".join(f"{name}\n" for name in held_out), encoding="utf-8")
+            config = load_config_with(config, "photos.held_out", str(listed))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.progress.log(f"{scene}: mapping {source}")
+        return build_map(source, path, config, resume=True, progress=self.progress)
+
+
+def load_config_with(config: MapConfig, key: str, value: str) -> MapConfig:
+    """The same settings with one value changed."""
+    from perception.config import set_value
+
+    return set_value(config, key, value, "--set")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options all dataset benches have."""
+    parser.add_argument("dataset", type=Path, metavar="DIR", help="the dataset as downloaded")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="WORK", help="maps, predictions, result")
+    parser.add_argument("--maps", type=Path, metavar="DIR", help="finished maps <scene>.gsmap (default WORK/maps)")
+    parser.add_argument("--scenes", type=lambda text: text.split(","), metavar="A,B", help="only these")
+    parser.add_argument("--masks", default="auto", metavar="SOURCE", help="of the mapper; {scene} is the scene's name")
+    parser.add_argument("--preset", default="default")
+    parser.add_argument("--config", type=Path, metavar="FILE.toml")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
+    parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
+
+
+def workplace(args: argparse.Namespace) -> Workplace:
+    """Folders and settings as the arguments say."""
+
+    def config(scene: str) -> MapConfig:
+        pairs = [*args.pairs, f"masks={args.masks.replace('{scene}', scene)}"]
+        return load_config(args.config, pairs, args.preset)
+
+    config("scene")  # bad settings are told before the first scene
+    return Workplace(args.output, args.maps or args.output / "maps", config, Progress(quiet=args.json))
+
+
+def chosen_scenes(scenes: Mapping[str, Path], wanted: list[str] | None, dataset: Path) -> dict[str, Path]:
+    """The scenes to run. InputError when there are none or a wanted one is missing."""
+    for name in wanted or []:
+        if name not in scenes:
+            raise InputError(f"{dataset}: holds no scene '{name}'; found {', '.join(scenes) or 'none'}")
+    return {name: path for name, path in scenes.items() if not wanted or name in wanted}
+
+
+def run_scenes(
+    scenes: Mapping[str, Path], place: Workplace, predict: Callable[[str, Path, Path], None]
+) -> dict[str, str]:
+    """Calls predict(name, scene folder, empty folder to fill) for each scene whose predictions are not there yet.
+
+    Returns why scenes failed, by name: a scene that cannot be mapped has no predictions and scores 0.
+    """
+    failed = {}
+    for name, folder in scenes.items():
+        target = place.work / "predictions" / name
+        if target.exists():
+            place.progress.log(f"{name}: predictions are there already")
+            continue
+        try:
+            with atomic_directory(target) as aside:
+                predict(name, folder, aside)
+        except InputError as error:
+            failed[name] = str(error)
+            place.progress.log(f"warning: {name} failed and scores 0: {error}")
+    return failed
+
+
+def write_masks(folder: Path, masks: Masks) -> None:
+    """<folder>/<view>/<prompt>.png, 255 × the mask or silhouette."""
+    import cv2
+
+    for (view, prompt), mask in masks.items():
+        path = folder / view / f"{prompt}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        values = np.clip(np.round(np.asarray(mask, np.float32) * 255), 0, 255).astype(np.uint8)
+        if not cv2.imwrite(str(path), values):
+            raise InputError(f"{path}: cannot be written; choose a writable -o")
+
+
+def report(
+    name: str,
+    args: argparse.Namespace,
+    result: dict[str, Any],
+    table: str,
+    failed: Mapping[str, str],
+    scenes: Mapping[str, Path],
+) -> None:
+    """Writes WORK/<name>.json and prints the table (or the JSON)."""
+    maps = args.maps or args.output / "maps"
+    infos = {scene: _map_facts(maps / f"{scene}.gsmap") for scene in scenes}
+    facts = {
+        "bench": name,
+        "arguments": {key: str(value) for key, value in vars(args).items()},
+        "versions": versions(),
+        "failed": dict(failed),
+        "maps": infos,
+        "result": result,
+    }
+    with atomic_file(args.output / f"{name}.json") as aside:
+        aside.write_text(json.dumps(facts, indent=1, default=str) + "\n", encoding="utf-8")
+    lines = [table] + [f"{scene} failed and scores 0: {why}" for scene, why in failed.items()]
+    print(json.dumps(facts, default=str) if args.json else "\n".join(lines))
+
+
+def _map_facts(path: Path) -> dict[str, Any] | None:
+    if not (path / "map.json").is_file():
+        return None
+    info = json.loads((path / "map.json").read_text(encoding="utf-8"))
+    kept = ("num_gaussians", "num_instances", "seed", "config", "seconds", "masks")
+    facts = {key: info.get(key) for key in kept}
+    facts["quality"] = {k: v for k, v in info.get("quality", {}).items() if k != "views"}
+    return facts
+
+
+class InstanceViews:
+    """A map's instances as masks in its own views."""
+
+    def __init__(self, gmap: GaussianMap) -> None:
+        self.gmap = gmap
+        self.gaussians = as_gaussians(gmap)
+        self.views = {view.name: view for view in map_views(gmap, held_out=False)}
+
+    def find(self, name: str) -> View | None:
+        """The view of a photo given with or without its folder and suffix; None when it is not registered."""
+        wanted = PurePosixPath(name)
+        for view in self.views.values():
+            have = PurePosixPath(view.name)
+            if name in (view.name, have.name, have.stem) or wanted.stem == have.stem:
+                return view
+        return None
+
+    def ids(self, view: View) -> np.ndarray:
+        """Instance image [H, W] int32 with occlusion, −1 = none."""
+        import torch
+
+        from perception.instances.silhouettes import render_silhouettes
+
+        pose = torch.from_numpy(view.camera_from_world.astype(np.float32))
+        K = torch.from_numpy(view.K.astype(np.float32))
+        return render_silhouettes(self.gaussians, self.gmap.instance_ids, pose, K, view.width, view.height).ids
+
+    def silhouette(self, instances: list[int], view: View, occlusion: bool) -> np.ndarray:
+        """Accumulated weight [H, W] float32 in [0, 1] of the instances' Gaussians, white on black.
+
+        occlusion: the other Gaussians are in front where they are; else the instances are rendered alone.
+        """
+        import torch
+
+        from perception.gaussians.rasterize import rasterize
+
+        own = torch.from_numpy(np.isin(self.gmap.instance_ids, instances))
+        g = self.gaussians
+        used = torch.ones_like(own) if occlusion else own
+        if not own.any():
+            return np.zeros((view.height, view.width), np.float32)
+        with torch.no_grad():
+            out = rasterize(
+                g.means[used],
+                g.quats[used],
+                g.scales[used],
+                g.opacities[used],
+                own[used].float()[:, None].repeat(1, 3),
+                torch.from_numpy(view.camera_from_world.astype(np.float32))[None],
+                torch.from_numpy(view.K.astype(np.float32))[None],
+                view.width,
+                view.height,
+            )
+        return out.colors[0, ..., 0].numpy()
+
+
+def by_words(gmap: GaussianMap, prompt: str, rule: str) -> list[int]:
+    """Ids of the instances that a prompt selects, by the map's own words, whether or not it says "present".
+
+    rule: "top-1", or "relative": all whose score, less the least, reaches .85 of the best's.
+    """
+    hits = LoadedMap(gmap).query(prompt, top_k=max(len(gmap.instances), 1), min_score=0.0)
+    if not hits:
+        return []
+    if rule == "top-1":
+        return [hits[0].instance_id]
+    least, best = min(hit.score for hit in hits), hits[0].score
+    return [hit.instance_id for hit in hits if hit.score - least >= 0.85 * (best - least)]
+
+
+def by_reference(ids: np.ndarray, reference: np.ndarray, share: float = 0.7) -> list[int]:
+    """Instances of an id image [H, W] that lie to more than `share` within a reference mask (Gaussian Grouping)."""
+    import cv2
+
+    if reference.shape != ids.shape:
+        size = (ids.shape[1], ids.shape[0])
+        reference = cv2.resize(reference.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
+    count = int(ids.max(initial=-1)) + 1
+    area = np.bincount(ids[ids >= 0], minlength=count)
+    inside = np.bincount(ids[(ids >= 0) & reference], minlength=count)
+    return np.flatnonzero((area > 0) & (inside > share * area)).tolist()
+
+
+def link(source: Path, target: Path) -> None:
+    """`target` as a link to `source`, or a copy where links cannot be made."""
+    if target.exists():
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        target.symlink_to(source.resolve(), target_is_directory=source.is_dir())
+    except OSError:
+        (shutil.copytree if source.is_dir() else shutil.copy2)(source, target)  # type: ignore[operator]

@@ -1,0 +1,334 @@
+"""Corrections by hand: rename, hide, merge, split, remove, delete floaters; each can be undone, all saved at once.
+
+An `Editor` owns one opened map. Operations change memory only; `save` writes the whole map aside and swaps it in. It is
+safe to call from several threads: every operation is one step under a lock, so a caller that vanishes leaves either all
+of an edit or none of it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from perception.boxes import oriented_box
+from perception.config import InstanceConfig
+from perception.errors import InputError
+from perception.io.store import GaussianMap, read_map, write_map
+from perception.language.description import InstanceDescription, from_arrays, to_arrays
+
+FLOATER_SPREAD = 5.0
+"""A Gaussian is a floater when its mean distance to its neighbours lies this many robust deviations (in logarithm)
+above the map's median: what statistical outlier removal (Rusu et al. 2008) cuts, without its Gaussian model."""
+NEIGHBORS = 8
+UNDO_DEPTH = 100
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class _State:
+    """One moment of the map; arrays are never changed in place, so states share what they have in common."""
+
+    what: str
+    ids: np.ndarray
+    kept: np.ndarray
+    instances: tuple[dict[str, Any], ...]
+    descriptions: tuple[InstanceDescription, ...]
+
+
+def _step(method: F) -> F:
+    @wraps(method)
+    def locked(self: Editor, *args: Any, **kwargs: Any) -> Any:
+        with self._lock:
+            return method(self, *args, **kwargs)
+
+    return locked  # type: ignore[return-value]
+
+
+class Editor:
+    """A map and its history. Instances are named by their `id`, which never changes; merged ones get a new id."""
+
+    def __init__(self, path: Path):
+        self.path = Path(path)
+        self._lock = threading.RLock()
+        self._signature = _signature(self.path)
+        self.original = read_map(self.path)
+        gmap = self.original
+        descriptions, self._encoder = from_arrays(gmap.language) if gmap.language else ([], "")
+        kept = np.ones(len(gmap), bool)
+        self._past = [_State("opened", gmap.instance_ids, kept, tuple(gmap.instances), tuple(descriptions))]
+        self._future: list[_State] = []
+        self._saved = self._past[0]
+
+    # ------------------------------------------------------------------ reading
+
+    @property
+    def _now(self) -> _State:
+        return self._past[-1]
+
+    @property
+    def instances(self) -> tuple[dict[str, Any], ...]:
+        """The entries of instances.json as they now are."""
+        return self._now.instances
+
+    @property
+    def ids(self) -> np.ndarray:
+        """[N] int32 instance of every Gaussian of the opened map, −1 = none."""
+        return self._now.ids
+
+    @property
+    def kept(self) -> np.ndarray:
+        """[N] bool: Gaussians that are not deleted."""
+        return self._now.kept
+
+    @property
+    def dirty(self) -> bool:
+        """Whether there is something to save."""
+        return self._now is not self._saved
+
+    @property
+    def history(self) -> list[str]:
+        """What was done, oldest first."""
+        return [state.what for state in self._past[1:]]
+
+    def entry(self, instance: int) -> dict[str, Any]:
+        """The entry of instance id `instance`; raises InputError when there is none."""
+        return self.instances[self._place(instance)]
+
+    def _place(self, instance: int) -> int:
+        for place, entry in enumerate(self.instances):
+            if entry["id"] == instance:
+                return place
+        raise InputError(f"instance {instance}: not in {self.path}; expected one of its {len(self.instances)} ids")
+
+    @_step
+    def current(self) -> GaussianMap:
+        """The map as edited, deleted Gaussians left out."""
+        now, kept = self._now, self._now.kept
+        count = len(self.original)
+        arrays: dict[str, Any] = {
+            field.name: value[kept]
+            for field in dataclasses.fields(GaussianMap)
+            if isinstance(value := getattr(self.original, field.name), np.ndarray) and len(value) == count
+        }
+        arrays["instance_ids"] = now.ids[kept]
+        arrays["membership"] = np.where(now.ids[kept] >= 0, self.original.membership[kept], 0).astype(np.float32)
+        language = to_arrays(now.descriptions, self._encoder) if self._encoder else {}
+        return dataclasses.replace(self.original, **arrays, instances=list(now.instances), language=language)
+
+    # ------------------------------------------------------------------ editing
+
+    def _push(self, what: str, **changes: Any) -> None:
+        self._past.append(dataclasses.replace(self._now, what=what, **changes))
+        self._future.clear()
+        del self._past[: max(0, len(self._past) - UNDO_DEPTH)]
+
+    def _change(self, what: str, instance: int, **values: Any) -> None:
+        place = self._place(instance)
+        instances = list(self.instances)
+        instances[place] = {**instances[place], **values}
+        self._push(what, instances=tuple(instances))
+
+    @_step
+    def rename(self, instance: int, label: str | None) -> None:
+        """Gives an instance a name of the user's; an empty one takes the name away."""
+        label = " ".join(label.split()) if label else None
+        self._change(f"named {instance} '{label}'" if label else f"took the name of {instance}", instance, label=label)
+
+    @_step
+    def hide(self, instance: int, hidden: bool = True) -> None:
+        """Marks an instance as not to be shown (it stays in the map)."""
+        self._change(f"{'hid' if hidden else 'showed'} {instance}", instance, hidden=hidden)
+
+    @_step
+    def merge(self, chosen: list[int]) -> int:
+        """Makes one instance of several, with a new id; it keeps the first name among them. Returns the id."""
+        chosen = sorted(set(chosen))
+        if len(chosen) < 2:
+            raise InputError(f"merge: found {len(chosen)} instance, expected at least 2; choose another one to join")
+        places = [self._place(instance) for instance in chosen]
+        new = self._next_id()
+        ids = np.where(np.isin(self.ids, chosen), new, self.ids).astype(np.int32)
+        entries = [self.instances[place] for place in places]
+        weights = np.array([entry["num_gaussians"] for entry in entries], np.float64)
+        label = next((entry["label"] for entry in entries if entry.get("label")), None)
+        merged = self._entry(new, ids, label, float(weights @ [e["score"] for e in entries] / weights.sum()))
+        merged["views"] = max(int(entry.get("views", 0)) for entry in entries)
+        self._replace(f"merged {', '.join(map(str, chosen))} into {new}", places, ids, [merged], _joined)
+        return new
+
+    @_step
+    def split(self, instance: int) -> list[int]:
+        """Cuts an instance into its parts; returns their ids. Raises InputError when it has none.
+
+        Its features are clustered again, alone and finer: what the whole map's cut had put into one.
+        """
+        from perception.instances.cluster import cluster_gaussians
+
+        place = self._place(instance)
+        rows = np.flatnonzero((self.ids == instance) & self.kept)
+        gmap = self.original
+        finer = dataclasses.replace(InstanceConfig(), min_cluster_size=max(8, len(rows) // 20), min_samples=8)
+        found = cluster_gaussians(gmap.means[rows], gmap.scales[rows], gmap.opacities[rows], gmap.features[rows], finer)
+        if found.count < 2:
+            raise InputError(f"instance {instance}: its Gaussians are all alike, there is nothing to split")
+        first = self._next_id()
+        ids = self.ids.copy()
+        ids[rows] = _nearest_filled(gmap.means[rows], found.ids) + first
+        news = list(range(first, first + found.count))
+        entry = self.instances[place]
+        parts = [{**self._entry(new, ids, None, entry["score"]), "views": entry.get("views", 0)} for new in news]
+        self._replace(f"split {instance} into {len(parts)}", [place], ids, parts, lambda descriptions: descriptions[0])
+        return news
+
+    @_step
+    def remove(self, instance: int) -> None:
+        """Takes an instance from the list; its Gaussians stay, as no instance."""
+        place = self._place(instance)
+        ids = np.where(self.ids == instance, -1, self.ids).astype(np.int32)
+        self._replace(f"removed {instance}", [place], ids, [], _joined)
+
+    @_step
+    def delete_floaters(self) -> int:
+        """Deletes Gaussians that hang alone in space; returns how many. Instances left empty leave the list."""
+        rows = np.flatnonzero(self.kept)
+        if len(rows) <= NEIGHBORS:
+            return 0
+        alone = rows[isolated(self.original.means[rows])]
+        if len(alone) == 0:
+            return 0
+        kept = self.kept.copy()
+        kept[alone] = False
+        touched = set(np.unique(self.ids[alone]).tolist()) - {-1}
+        places = [i for i, entry in enumerate(self.instances) if entry["id"] in touched]
+        entries, descriptions = list(self.instances), list(self._now.descriptions)
+        for place in reversed(places):
+            entry = entries[place]
+            if not ((self.ids == entry["id"]) & kept).any():
+                del entries[place]
+                if descriptions:
+                    del descriptions[place]
+                continue
+            shape = self._entry(entry["id"], np.where(kept, self.ids, -1), entry.get("label"), entry["score"])
+            entries[place] = {**entry, **shape}
+        self._push(
+            f"deleted {len(alone)} floaters", kept=kept, instances=tuple(entries), descriptions=tuple(descriptions)
+        )
+        return len(alone)
+
+    @_step
+    def undo(self) -> str | None:
+        """Takes the last edit back; returns what it was, None when there is none."""
+        if len(self._past) < 2:
+            return None
+        state = self._past.pop()
+        self._future.append(state)
+        return state.what
+
+    @_step
+    def redo(self) -> str | None:
+        """Does again what was undone last; returns what it was, None when there is nothing."""
+        if not self._future:
+            return None
+        self._past.append(self._future.pop())
+        return self._now.what
+
+    @_step
+    def save(self) -> None:
+        """Writes the edited map in place of the old one; refuses when somebody else replaced it since it was opened."""
+        if _signature(self.path) != self._signature:
+            raise InputError(
+                f"{self.path}: was changed by another program since it was opened; open it again and repeat"
+            )
+        write_map(self.path, self.current())
+        self._signature = _signature(self.path)
+        self._saved = self._now
+
+    # ------------------------------------------------------------------ helpers
+
+    def _next_id(self) -> int:
+        return 1 + max((entry["id"] for state in (*self._past, *self._future) for entry in state.instances), default=-1)
+
+    def _entry(self, instance: int, ids: np.ndarray, label: str | None, score: float) -> dict[str, Any]:
+        rows = (ids == instance) & self.kept
+        points = self.original.means[rows].astype(np.float64)
+        weights = self.original.opacities[rows].astype(np.float64)
+        return {
+            "id": instance,
+            "label": label,
+            "score": score,
+            "num_gaussians": int(rows.sum()),
+            "centroid": (weights @ points / max(weights.sum(), 1e-12)).tolist(),
+            "obb": oriented_box(points).to_json(),
+            "aabb": {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()},
+        }
+
+    def _replace(
+        self,
+        what: str,
+        places: list[int],
+        ids: np.ndarray,
+        news: list[dict[str, Any]],
+        describe: Callable[[list[InstanceDescription]], InstanceDescription],
+    ) -> None:
+        """Entries at `places` make room for `news`, which stand where the first of them stood."""
+        entries, descriptions = list(self.instances), list(self._now.descriptions)
+        said = [descriptions[place] for place in places] if descriptions else []
+        for place in reversed(places):
+            del entries[place]
+            if descriptions:
+                del descriptions[place]
+        entries[places[0] : places[0]] = news
+        if said:
+            descriptions[places[0] : places[0]] = [describe(said) for _ in news]
+        self._push(what, ids=ids, instances=tuple(entries), descriptions=tuple(descriptions))
+
+
+def isolated(means: np.ndarray) -> np.ndarray:
+    """[N] bool: points [N, 3] whose mean distance to their NEIGHBORS nearest is far above the common one."""
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(means).query(means, k=NEIGHBORS + 1, workers=-1)
+    level = np.log(np.maximum(distance[:, 1:].mean(axis=1), 1e-12))
+    middle = np.median(level)
+    spread = 1.4826 * np.median(np.abs(level - middle))  # the deviation a normal distribution would have
+    return np.asarray(level > middle + FLOATER_SPREAD * max(spread, 1e-3))
+
+
+def _nearest_filled(means: np.ndarray, ids: np.ndarray) -> np.ndarray:
+    """ids [N] with −1 replaced by the id of the nearest point that has one."""
+    from scipy.spatial import cKDTree
+
+    known = ids >= 0
+    _, nearest = cKDTree(means[known]).query(means)
+    return np.asarray(np.where(known, ids, ids[known][nearest]))
+
+
+def _joined(descriptions: list[InstanceDescription]) -> InstanceDescription:
+    """What is known of several instances as one: all views, the mean embedding, the colours of the best seen."""
+    best = max(descriptions, key=lambda d: len(d.views))
+    total = np.sum([d.embedding * len(d.views) for d in descriptions], axis=0)
+    norm = float(np.linalg.norm(total))
+    return InstanceDescription(
+        (total / norm if norm > 0 else best.embedding).astype(np.float32),
+        np.concatenate([d.per_view for d in descriptions]),
+        best.palette,
+        [name for d in descriptions for name in d.views],
+        [box for d in descriptions for box in d.boxes],
+    )
+
+
+def _signature(path: Path) -> tuple[int, int, int]:
+    """Changes whenever the map is replaced."""
+    try:
+        facts = (path / "map.json").stat()
+    except OSError:
+        return (0, 0, 0)
+    return (facts.st_ino, facts.st_mtime_ns, facts.st_size)

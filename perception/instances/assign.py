@@ -1,0 +1,77 @@
+"""Gaussians one by one: how well each agrees with its instance, and which instance the undecided belong to."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perception.instances.votes import MaskVotes
+
+CHUNK = 20_000
+NEIGHBOURS = 8
+LEAST_AGREEMENT = 0.5
+MARGIN = 0.15
+
+
+def mask_shares(table: np.ndarray, votes: MaskVotes) -> np.ndarray:
+    """[K, M]: of what a view shows of instance k, the share that lies in each of its masks. table: as of `votes.table`."""
+    if table.shape[1] == 0:
+        return table
+    number = np.cumsum(np.diff(votes.view, prepend=-1) > 0) - 1
+    each = np.add.reduceat(table, votes.starts, axis=1)
+    return table / np.maximum(each[:, number], 1e-12)
+
+
+def affinities(votes: MaskVotes, shares: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """([R, K], [R]): mean over a Gaussian's pixels of the share of instance k in the pixel's mask; and its pixels."""
+    weights = votes.weights[rows]
+    pixels = np.asarray(weights.sum(axis=1)).reshape(-1)
+    return np.asarray(weights @ shares.T) / np.maximum(pixels, 1e-12)[:, None], pixels
+
+
+def settle(
+    ids: np.ndarray, means: np.ndarray, opacities: np.ndarray, votes: MaskVotes, min_opacity: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Takes up undecided Gaussians and moves misplaced ones, where masks and neighbours in space agree on it.
+
+    ids [N] int32 (−1 = none), means [N, 3], opacities [N]. An undecided Gaussian (too faint to vote, say) joins the instance of at
+    least half of its 8 nearest voters if its own masks agree with that one best, by at least half. A voter moves
+    to the instance of at least half of its neighbours if the masks prefer that one clearly. Others stay as they
+    are. Returns (ids [N] int32, agreement [N] float32 in [0, 1] of each Gaussian with its instance, 0 for noise).
+    """
+    count = int(ids.max(initial=-1)) + 1
+    settled, agreement = ids.copy(), np.zeros(len(ids), np.float32)
+    voters = np.flatnonzero((ids >= 0) & (opacities >= min_opacity))
+    if count == 0 or len(voters) < 2:
+        return settled, agreement
+    from scipy.spatial import cKDTree
+
+    shares = mask_shares(votes.table(ids, count), votes)
+    tree = cKDTree(means[voters])
+    near = min(NEIGHBOURS + 1, len(voters))
+    for begin in range(0, len(ids), CHUNK):
+        rows = np.arange(begin, min(begin + CHUNK, len(ids)))
+        affinity, pixels = affinities(votes, shares, rows)
+        _, found = tree.query(means[rows], k=near, workers=-1)
+        around = ids[voters[found]]
+        around[voters[found] == rows[:, None]] = -1  # not its own neighbour
+        popular, support = _mode(around)
+        at = np.arange(len(rows))
+        own = np.where(ids[rows] >= 0, affinity[at, ids[rows]], 0)
+        theirs = np.where(popular >= 0, affinity[at, popular], 0)
+        backed = (popular >= 0) & (2 * support >= near - 1) & (pixels > 0)
+        joins = backed & (ids[rows] < 0) & (theirs >= LEAST_AGREEMENT) & (theirs >= affinity.max(axis=1) - MARGIN)
+        moves = backed & (ids[rows] >= 0) & (theirs >= own + MARGIN) & (theirs >= LEAST_AGREEMENT)
+        change = joins | moves
+        settled[rows[change]] = popular[change]
+        agreement[rows] = np.where(change, theirs, own)
+    agreement[settled < 0] = 0
+    return settled, agreement
+
+
+def _mode(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Most frequent non-negative value of each row [R, k] (ties: the nearer first), and how often it occurs; −1, 0 if none."""
+    equal = (values[:, :, None] == values[:, None, :]) & (values[:, :, None] >= 0)
+    counts = equal.sum(axis=2)
+    first = counts.argmax(axis=1)
+    at = np.arange(len(values))
+    return np.where(counts[at, first] > 0, values[at, first], -1), counts[at, first]

@@ -1,0 +1,208 @@
+"""Segments into instances by what the masks of all photos agree on: a merge tree, its best cut, and parts below it.
+
+Two segments belong together as far as photos that show both put them into one mask. Merging the pair that agrees most,
+again and again, gives a tree (average linkage, with the evidence pooled anew at each merge). The tree is cut where
+its nodes' silhouettes match the masks best: a whole that photos show as one mask beats its parts, parts that photos
+mostly keep apart beat a whole that few masks hold. What is below the cut and singled out by masks of its own is kept
+as parts. So an error of the segmenter in some photos is outvoted by the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+GLIMPSE = 0.1  # of its best view: what shows less of a segment is no evidence about it
+PRIOR = 0.5  # views that the features' own evidence weighs as much as
+SUPPORT = 0.6  # IoU with a mask from which on a photo singles a node out
+
+
+@dataclass(frozen=True)
+class MergeTree:
+    """Leaves 0 … S − 1, then one node a merge, in order: children [R, 2] int64, affinity [R] float64 in [0, 1]."""
+
+    leaves: int
+    children: np.ndarray
+    affinity: np.ndarray
+
+    @property
+    def roots(self) -> list[int]:
+        below = set(self.children.ravel().tolist())
+        return [node for node in range(self.leaves + len(self.children)) if node not in below]
+
+    def kids(self, node: int) -> list[int]:
+        return [] if node < self.leaves else self.children[node - self.leaves].tolist()
+
+    def under(self, node: int) -> list[int]:
+        """The leaves of a node."""
+        stack, found = [node], []
+        while stack:
+            at = stack.pop()
+            stack += self.kids(at)
+            found += [at] if at < self.leaves else []
+        return sorted(found)
+
+
+class _Merger:
+    """The state of the agglomeration. Tables lie mask-major, so that the few masks a segment is in are whole rows."""
+
+    def __init__(
+        self, table: np.ndarray, view: np.ndarray, prototypes: np.ndarray, sizes: np.ndarray, near: np.ndarray
+    ):
+        count = len(table)
+        self.view = np.unique(view, return_inverse=True)[1].reshape(-1)
+        self.views = int(self.view.max(initial=-1)) + 1
+        self.table = np.ascontiguousarray(table.T, np.float32)
+        self.share = np.zeros_like(self.table)
+        self.seen = np.zeros((self.views, count), np.float32)
+        self.prototypes, self.sizes = prototypes.astype(np.float64), sizes.astype(np.float64)
+        self.near = near.copy()
+        self.alive = np.ones(count, bool)
+        for segment in range(count):
+            self._normalise(segment)
+        self.affinity = np.stack([self._row(segment) for segment in range(count)]) if count else np.zeros((0, 0))
+
+    def _normalise(self, i: int) -> None:
+        """The segment's unit direction over the masks of each view, and how much of it each view shows."""
+        column = self.table[:, i]
+        total = np.bincount(self.view, column, self.views)
+        length = np.sqrt(np.bincount(self.view, column**2, self.views))
+        self.share[:, i] = column / np.maximum(length[self.view], 1e-12)
+        self.seen[:, i] = total / max(float(total.max(initial=0)), 1e-12)
+
+    def _row(self, i: int) -> np.ndarray:
+        """Affinity [S] of segment i to all: mean cosine over common views, weighted by how much they show."""
+        masks = np.flatnonzero(self.share[:, i] > 0)
+        products = self.share[masks] * self.share[masks, i][:, None]
+        views, first = np.unique(self.view[masks], return_index=True)
+        same = np.add.reduceat(products, first, axis=0) if len(masks) else products
+        weight = np.minimum(self.seen[views], self.seen[views, i][:, None])
+        weight = np.where(weight > GLIMPSE, weight, 0)
+        distance = ((self.prototypes - self.prototypes[i]) ** 2).sum(axis=1)
+        prior = np.clip(1 - distance, 0, 1) * self.near[i]
+        row = ((weight * same).sum(axis=0) + PRIOR * prior) / (weight.sum(axis=0) + PRIOR)
+        row[~self.alive] = -1
+        row[i] = -1
+        return row
+
+    def join(self, i: int, j: int) -> None:
+        """Segment j goes into i."""
+        whole = self.sizes[i] + self.sizes[j]
+        self.prototypes[i] = (self.prototypes[i] * self.sizes[i] + self.prototypes[j] * self.sizes[j]) / whole
+        self.sizes[i] = whole
+        self.table[:, i] += self.table[:, j]
+        self.near[i] |= self.near[j]
+        self.near[:, i] |= self.near[:, j]
+        self.share[:, j] = 0
+        self.alive[j] = False
+        self._normalise(i)
+        self.affinity[j] = self.affinity[:, j] = -1
+        self.affinity[i] = self.affinity[:, i] = self._row(i)
+
+
+def merge_tree(
+    table: np.ndarray,
+    view: np.ndarray,
+    prototypes: np.ndarray,
+    sizes: np.ndarray,
+    near: np.ndarray,
+    lowest: float = 0.05,
+) -> MergeTree:
+    """Merges the most agreeing pair until none agrees by `lowest`.
+
+    table [S, M] pixels of each mask that each segment fills, view [M] the photo of each mask, prototypes [S, D] mean
+    features (in units of the loss's margin), sizes [S] Gaussians, near [S, S] bool. Features decide only where
+    photos do not: for neighbours, with the weight of half a view.
+    """
+    state = _Merger(table, view, prototypes, sizes, near)
+    node = np.arange(len(table))
+    best = state.affinity.max(axis=1, initial=-1)
+    children, affinity = [], []
+    while len(best) and (top := int(best.argmax())) >= 0 and best[top] >= lowest:
+        other = int(state.affinity[top].argmax())
+        i, j = min(top, other), max(top, other)
+        affinity.append(float(best[top]))
+        children.append((node[i], node[j]))
+        state.join(i, j)
+        node[i] = len(table) + len(children) - 1
+        best = state.affinity.max(axis=1)
+    return MergeTree(len(table), np.array(children, np.int64).reshape(-1, 2), np.array(affinity))
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Of each node: pixels it fills under masks, pixels · IoU with the best mask of each view summed over views
+    (agreement = matched / pixels), views that show it, and views in which a mask singles it out."""
+
+    pixels: np.ndarray
+    matched: np.ndarray
+    views: np.ndarray
+    support: np.ndarray
+
+    @property
+    def agreement(self) -> np.ndarray:
+        """[·] in [0, 1]: mean IoU with the best mask, weighted by pixels; 0 where no mask covers it."""
+        return self.matched / np.maximum(self.pixels, 1e-12)
+
+
+def evidence(rows: np.ndarray, view: np.ndarray, area: np.ndarray, smallest: float = 8.0) -> Evidence:
+    """Of each row of a table [R, M]; a view shows what fills at least `smallest` pixels of its masks."""
+    if rows.shape[1] == 0:
+        none = np.zeros(len(rows))
+        return Evidence(none, none, none.astype(np.int64), none.astype(np.int64))
+    starts = np.flatnonzero(np.diff(view, prepend=-1) > 0)
+    rows = rows.astype(np.float64)
+    each = np.add.reduceat(rows, starts, axis=1)
+    number = np.cumsum(np.diff(view, prepend=-1) > 0) - 1
+    iou = np.maximum.reduceat(rows / np.maximum(each[:, number] + area - rows, 1e-12), starts, axis=1)
+    shown = each >= smallest
+    return Evidence(
+        each.sum(axis=1),
+        (each * iou).sum(axis=1),
+        shown.sum(axis=1),
+        (shown & (iou >= SUPPORT)).sum(axis=1),
+    )
+
+
+def node_evidence(tree: MergeTree, table: np.ndarray, view: np.ndarray, area: np.ndarray) -> Evidence:
+    """Evidence of all nodes of a tree over the leaves' table [S, M]."""
+    whole = [evidence(table, view, area)]
+    rows = dict(enumerate(table))
+    for number, (a, b) in enumerate(tree.children.tolist()):
+        rows[tree.leaves + number] = rows.pop(a) + rows.pop(b)
+        whole.append(evidence(rows[tree.leaves + number][None], view, area))
+    names = ("pixels", "matched", "views", "support")
+    return Evidence(*(np.concatenate([getattr(part, name) for part in whole]) for name in names))
+
+
+def best_cut(tree: MergeTree, matched: np.ndarray) -> list[int]:
+    """The nodes, none below another and all leaves covered, with the largest sum of `matched` (ties: the whole)."""
+    best = matched.copy()
+    for number, (a, b) in enumerate(tree.children.tolist()):
+        node = tree.leaves + number
+        best[node] = max(matched[node], best[a] + best[b])
+    chosen, stack = [], tree.roots
+    while stack:
+        node = stack.pop()
+        kids = tree.kids(node)
+        if not kids or matched[node] >= best[kids].sum() * (1 - 1e-9):
+            chosen.append(node)
+        else:
+            stack += kids
+    return sorted(chosen)
+
+
+def parts_of(tree: MergeTree, node: int, found: Evidence, largest: float = 0.8, least_views: int = 2) -> list[int]:
+    """Parts of an instance: the highest nodes below it that masks single out in `least_views` photos or more.
+
+    A part fills at most `largest` of the whole's pixels: it is not the whole once more.
+    """
+    parts, stack = [], tree.kids(node)
+    while stack:
+        at = stack.pop()
+        if found.support[at] >= least_views and found.pixels[at] <= largest * found.pixels[node]:
+            parts.append(at)
+        else:
+            stack += tree.kids(at)
+    return sorted(parts)

@@ -1,0 +1,55 @@
+"""Over-segmentation: Gaussians that lie together in feature and in space, far more groups than there are objects."""
+
+from __future__ import annotations
+
+import numpy as np
+
+ROUNDS = 12  # of Lloyd's algorithm; the groups are raw material, not the answer
+SAMPLE = 50_000  # rows the centres are found on; all rows then take the nearest
+CHUNK = 1 << 15
+
+
+def over_segment(means: np.ndarray, features: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
+    """Group [N] int64, 0 … S − 1 with S ≤ count, by k-means (Lloyd) on features beside positions.
+
+    means [N, 3], features [N, D]. Positions are scaled so that nine tenths of the Gaussians lie within 1 of the median,
+    the margin that the loss keeps between features: far things part though their features agree.
+    """
+    centred = means - np.median(means, axis=0)
+    radius = float(np.quantile(np.linalg.norm(centred, axis=1), 0.9)) if len(means) else 1.0
+    rows = np.concatenate([features, centred / max(radius, 1e-12)], axis=1).astype(np.float32)
+    rng = np.random.default_rng(seed)
+    sample = rows if len(rows) <= SAMPLE else rows[np.sort(rng.choice(len(rows), SAMPLE, replace=False))]
+    centres = sample[np.sort(rng.choice(len(sample), min(count, len(sample)), replace=False))]
+    for _ in range(ROUNDS):
+        owner = _nearest(sample, centres)
+        sizes = np.bincount(owner, minlength=len(centres))
+        sums = np.stack([np.bincount(owner, column, minlength=len(centres)) for column in sample.T], axis=1)
+        centres = (sums[sizes > 0] / sizes[sizes > 0, None]).astype(np.float32)
+    return np.unique(_nearest(rows, centres), return_inverse=True)[1].reshape(-1)
+
+
+def _nearest(rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    half = 0.5 * (centres**2).sum(axis=1)
+    parts = [(half - rows[begin : begin + CHUNK] @ centres.T).argmin(axis=1) for begin in range(0, len(rows), CHUNK)]
+    return np.concatenate(parts) if parts else np.zeros(0, np.int64)
+
+
+def touching(means: np.ndarray, groups: np.ndarray, count: int, neighbours: int = 7, least: int = 3) -> np.ndarray:
+    """[S, S] bool: at least `least` pairs of near Gaussians lie across the two groups.
+
+    Near: among the `neighbours` nearest, and within 3 times the larger of the Gaussian's own nearest distance and
+    the median one.
+    """
+    from scipy.spatial import cKDTree
+
+    k = min(neighbours + 1, len(means))
+    across = np.zeros((count, count), np.int64)
+    if k < 2:
+        return across > 0
+    distance, neighbour = cKDTree(means).query(means, k=k, workers=-1)
+    reach = 3 * np.maximum(distance[:, 1:2], np.median(distance[:, 1]))
+    row, column = np.nonzero(distance[:, 1:] <= reach)
+    a, b = groups[row], groups[neighbour[row, column + 1]]
+    np.add.at(across, (a[a != b], b[a != b]), 1)
+    return (across + across.T) >= least

@@ -1,0 +1,103 @@
+"""Is a map's directory what was written? Sizes at every opening, SHA-256 when all of a file is read or on demand."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from perception.errors import InputError
+
+FACTS = "map.json"
+EDITABLE = "instances.json"
+"""People write labels into this file by hand, so a change there is told, not refused."""
+
+
+def file_facts(folder: Path) -> dict[str, dict[str, Any]]:
+    """{name: {"bytes", "sha256"}} of every file in `folder` but map.json, which cannot hold its own."""
+    files = sorted(file for file in folder.iterdir() if file.is_file() and file.name != FACTS)
+    return {file.name: {"bytes": file.stat().st_size, "sha256": sha256(file)} for file in files}
+
+
+def sha256(file: Path) -> str:
+    """Hexadecimal SHA-256 of a file."""
+    digest = hashlib.sha256()
+    with file.open("rb") as stream:
+        while block := stream.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def seal(info: dict[str, Any]) -> dict[str, Any]:
+    """`info` with its own checksum under "sha256", over its canonical JSON without that key."""
+    plain = {key: value for key, value in info.items() if key != "sha256"}
+    return {**plain, "sha256": _digest(plain)}
+
+
+def check_sizes(folder: Path, info: dict[str, Any]) -> None:
+    """InputError naming the first file of map.json's list that is missing or of another size."""
+    for name, facts in listed(folder, info).items():
+        if name == EDITABLE:
+            continue
+        file = folder / name
+        if not file.is_file():
+            raise InputError(f"{file}: is missing; the map is damaged, build it again or copy it anew")
+        found = file.stat().st_size
+        if found != facts["bytes"]:
+            raise InputError(
+                f"{file}: has {found} bytes, {facts['bytes']} were written; the map is damaged, "
+                "build it again or copy it anew"
+            )
+
+
+def check_file(folder: Path, info: dict[str, Any], name: str) -> None:
+    """InputError when the file's SHA-256 is not the one recorded; a file without a record passes."""
+    facts = listed(folder, info).get(name)
+    if facts is not None and sha256(folder / name) != facts["sha256"]:
+        raise InputError(
+            f"{folder / name}: its bytes are not those that were written (SHA-256 differs); the map is damaged, "
+            "build it again or copy it anew"
+        )
+
+
+def verify(folder: Path, info: dict[str, Any]) -> dict[str, str]:
+    """Checks every byte: {file: "ok", "edited" or "no checksum"}; InputError naming the first damaged file.
+
+    "edited": instances.json differs from what was written, which labels set by hand do. Maps made before checksums
+    were recorded have none.
+    """
+    check_sizes(folder, info)
+    known = listed(folder, info)
+    if "sha256" in info and seal(info)["sha256"] != info["sha256"]:
+        raise InputError(f"{folder / FACTS}: its own checksum differs; it was edited or is damaged")
+    states = {FACTS: "ok" if "sha256" in info else "no checksum"}
+    for file in sorted(file for file in folder.iterdir() if file.is_file() and file.name != FACTS):
+        if file.name not in known:
+            states[file.name] = "no checksum"
+        elif file.name == EDITABLE:
+            states[file.name] = "ok" if sha256(file) == known[file.name]["sha256"] else "edited"
+        else:
+            check_file(folder, info, file.name)
+            states[file.name] = "ok"
+    return states
+
+
+def listed(folder: Path, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The files map.json lists; {} for a map made before they were. InputError when the list makes no sense."""
+    files = info.get("files", {})
+    good = isinstance(files, dict) and all(
+        isinstance(facts, dict)
+        and isinstance(facts.get("bytes"), int)
+        and isinstance(facts.get("sha256"), str)
+        and Path(name).name == name
+        for name, facts in files.items()
+    )
+    if not good:
+        raise InputError(f"{folder / FACTS}: its list of files cannot be understood; the map is damaged")
+    return files
+
+
+def _digest(value: Any) -> str:
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,63 @@
+"""Ask a finished map: text in, ranked 3D instances out; filters, frames, neighbourhoods; an engine for servers.
+
+gmap = load_map("kitchen.gsmap")             one process, as many threads as you like
+with QueryEngine("kitchen.gsmap") as engine  a server's: queue, time-outs, reload while it answers
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from perception.query.engine import AnswerTimeout, EngineBusy, EngineClosed, QueryEngine
+    from perception.query.frames import Frame
+    from perception.query.hit import Description, Hit, Neighbor
+    from perception.query.opened import LoadedMap, load_map
+    from perception.query.regions import Prism, Region, axis_box
+    from perception.query.requests import Reply, Request
+    from perception.query.where import Where
+
+_HOMES = {
+    "AnswerTimeout": "engine",
+    "Description": "hit",
+    "EngineBusy": "engine",
+    "EngineClosed": "engine",
+    "Frame": "frames",
+    "Hit": "hit",
+    "LoadedMap": "opened",
+    "Neighbor": "hit",
+    "Prism": "regions",
+    "QueryEngine": "engine",
+    "Region": "regions",
+    "Reply": "requests",
+    "Request": "requests",
+    "Where": "where",
+    "axis_box": "regions",
+    "load_map": "opened",
+}
+__all__ = [
+    "AnswerTimeout",
+    "Description",
+    "EngineBusy",
+    "EngineClosed",
+    "Frame",
+    "Hit",
+    "LoadedMap",
+    "Neighbor",
+    "Prism",
+    "QueryEngine",
+    "Region",
+    "Reply",
+    "Request",
+    "Where",
+    "axis_box",
+    "load_map",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        import importlib
+
+        return getattr(importlib.import_module(f"perception.query.{_HOMES[name]}"), name)
+    raise AttributeError(f"module 'perception.query' has no attribute '{name}'")

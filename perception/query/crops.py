@@ -1,0 +1,46 @@
+"""The photo that shows an instance best, cut out around it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.query.opened import LoadedMap
+
+MARGIN = 0.15
+"""Share of the box's longer side that is left around it."""
+
+
+def best_crop(gmap: LoadedMap, instance_id: int, side: int = 320) -> np.ndarray | None:
+    """The instance in its best photo, [h, w, 3] uint8 RGB, longer side at most `side` pixels.
+
+    None when no photo shows it, or the photo has moved or cannot be read any more. InputError for an unknown id.
+    """
+    from perception.io.photos import load_photo
+    from perception.io.scene_cache import view_from_json
+
+    position = gmap.position(instance_id)
+    box = gmap.best_view(position)
+    if box is None:
+        return None
+    name, (x0, y0, x1, y1) = box
+    entry = next((entry for entry in gmap.info.get("views", []) if entry["name"] == name), None)
+    if entry is None:
+        return None
+    try:
+        photo = load_photo(view_from_json(entry), int(gmap.info["config"]["photos"]["max_side"]))
+    except (InputError, OSError, KeyError):
+        return None
+    margin = 2 + round(MARGIN * max(x1 - x0, y1 - y0))
+    top, left = max(0, y0 - margin), max(0, x0 - margin)
+    cut = photo[top : y1 + margin, left : x1 + margin]
+    return _shrunk(cut, side) if cut.size else None
+
+
+def _shrunk(picture: np.ndarray, side: int) -> np.ndarray:
+    import cv2
+
+    height, width = picture.shape[:2]
+    scale = min(1.0, side / max(height, width))
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return picture if scale == 1 else np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))

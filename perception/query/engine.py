@@ -1,0 +1,330 @@
+"""The engine of every server: one map, many askers, a bounded queue, and a new map while it answers.
+
+Servers (HTTP, DDS, ROS) only convert messages; waiting, refusing, timing out and reloading happen here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeout
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.store import map_signature
+from perception.language.base import Encoder, make_encoder
+from perception.query.opened import LoadedMap, load_map
+from perception.query.requests import Reply, Request
+
+T = TypeVar("T")
+_SELDOM = 32
+"""A new map that cannot be opened is tried again at most this many looks later."""
+_REMEMBERED = 1000
+"""Latencies kept for the health figures."""
+
+
+class EngineBusy(RuntimeError):
+    """The queue is full: ask again later, or ask another."""
+
+
+class AnswerTimeout(TimeoutError):
+    """No answer within the time given; work that had not begun is dropped."""
+
+
+class EngineClosed(RuntimeError):
+    """The engine has been closed."""
+
+
+@dataclass
+class _Job:
+    work: Callable[[LoadedMap], Any]
+    future: Future[Any]
+    asked: float
+    deadline: float
+
+
+class QueryEngine:
+    """Owns the map at `path`, answers from `workers` threads, and takes over a new map without dropping a question.
+
+    At most `queue_size` questions wait; more are refused with EngineBusy. A question not answered within `timeout`
+    seconds raises AnswerTimeout. Every `watch` seconds (None: never) the directory is looked at; when another map or
+    new labels lie there it is opened beside the old one, made ready, and put in its place in one step: every answer
+    comes from one map or the other. A new map that cannot be read is told in `health`, the old one goes on. The map
+    may be deleted meanwhile; what answers need is in memory. Thread-safe; a context manager.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        workers: int = 2,
+        queue_size: int = 64,
+        timeout: float = 10.0,
+        watch: float | None = 1.0,
+        encoders: Callable[[str], Encoder | None] = make_encoder,
+    ) -> None:
+        for name, value, least in (("workers", workers, 1), ("queue_size", queue_size, 1), ("timeout", timeout, 1e-3)):
+            if not value >= least:
+                raise InputError(f"engine: {name} is {value}, expected at least {least}")
+        self.path, self.timeout = Path(path), timeout
+        self._encoders = _Shared(encoders)
+        self._signature = map_signature(self.path)
+        self._map = self._open()
+        self._jobs: queue.Queue[_Job | None] = queue.Queue(queue_size)
+        self._figures = _Figures()
+        self._reloading = threading.Lock()
+        self._listeners: list[Callable[[LoadedMap], None]] = []
+        self._problem: str | None = None
+        self._closed = threading.Event()
+        self._threads = [threading.Thread(target=self._work, name=f"query-{n}", daemon=True) for n in range(workers)]
+        if watch is not None:
+            self._threads.append(threading.Thread(target=self._watch, args=(watch,), name="query-watch", daemon=True))
+        for thread in self._threads:
+            thread.start()
+
+    # ------------------------------------------------------------------ asking
+
+    @property
+    def current(self) -> LoadedMap:
+        """The map that answers now. Keep the reference for as long as one answer needs one map."""
+        return self._map
+
+    def ask(self, request: Request | str, timeout: float | None = None) -> Reply:
+        """The answer to a prompt; blocks. InputError, EngineBusy, AnswerTimeout, EngineClosed."""
+        return self.wait(self.submit(request, timeout), timeout)
+
+    def submit(self, request: Request | str, timeout: float | None = None) -> Future[Reply]:
+        """Queues a prompt and returns at once; EngineBusy when the queue is full. The future raises as `ask` does."""
+        asked = time.monotonic()
+        item = Request(request) if isinstance(request, str) else request
+
+        def work(gmap: LoadedMap) -> Reply:
+            hits = gmap.query(item.text, item.top_k, item.min_score, where=item.where, frame=item.frame)
+            frame = item.frame.name if item.frame else gmap.frame
+            return Reply(item, tuple(hits), gmap.map_id, frame, gmap.metric, time.monotonic() - asked)
+
+        return self.run(work, timeout)
+
+    def run(self, work: Callable[[LoadedMap], T], timeout: float | None = None) -> Future[T]:
+        """Queues any question to the map: `work` is called with it by a worker. EngineBusy when the queue is full."""
+        if self._closed.is_set():
+            raise EngineClosed(f"{self.path}: the engine has been closed")
+        now = time.monotonic()
+        job = _Job(work, Future(), now, now + (self.timeout if timeout is None else timeout))
+        try:
+            self._jobs.put_nowait(job)
+        except queue.Full:
+            self._figures.count("refused")
+            raise EngineBusy(f"{self._jobs.maxsize} questions are waiting already; ask again later") from None
+        return job.future
+
+    def wait(self, future: Future[T], timeout: float | None = None) -> T:
+        """The future's result, AnswerTimeout after `timeout` seconds (the engine's own when None)."""
+        seconds = self.timeout if timeout is None else timeout
+        try:
+            return future.result(seconds)
+        except FutureTimeout as error:
+            if isinstance(error, AnswerTimeout):
+                raise
+            future.cancel()  # drops it if it has not begun
+            self._figures.count("timed_out")
+            raise AnswerTimeout(f"no answer within {seconds:g} s") from None
+
+    async def awaited(self, future: Future[T], timeout: float | None = None) -> T:
+        """`wait` for servers that run an event loop."""
+        seconds = self.timeout if timeout is None else timeout
+        try:
+            return await asyncio.wait_for(asyncio.wrap_future(future), seconds)  # cancels what has not begun
+        except (TimeoutError, asyncio.TimeoutError) as error:
+            if isinstance(error, AnswerTimeout):
+                raise
+            self._figures.count("timed_out")
+            raise AnswerTimeout(f"no answer within {seconds:g} s") from None
+
+    # --------------------------------------------------------------- reloading
+
+    def reload(self) -> bool:
+        """Opens what lies at the path now and swaps it in; False when it is the map that answers already.
+
+        InputError when it cannot be opened; the old map goes on answering.
+        """
+        with self._reloading:
+            try:
+                signature = map_signature(self.path)
+                if signature == self._signature and self._problem is None:
+                    return False
+                fresh = self._open()
+            except InputError as error:
+                self._problem = str(error)
+                raise
+            self._signature, self._problem, old = signature, None, self._map
+            self._map = fresh
+            self._figures.count("reloads")
+            if fresh.map_id == old.map_id:
+                return False
+            for listener in list(self._listeners):
+                listener(fresh)
+            return True
+
+    def on_reload(self, listener: Callable[[LoadedMap], None]) -> None:
+        """Calls `listener(new map)` after each swap, from the thread that reloaded; it must not raise."""
+        self._listeners.append(listener)
+
+    def _open(self) -> LoadedMap:
+        gmap = load_map(self.path, encoders=self._encoders)
+        gmap.warm()
+        return gmap
+
+    def _watch(self, every: float) -> None:
+        """Looks, and takes over. A map that cannot be opened may still be on its way (someone copies it file by file),
+        so it is tried again, less and less often."""
+        tried: Any = None
+        wait, left = every, 0.0
+        while not self._closed.wait(every):
+            left -= every
+            try:
+                signature = map_signature(self.path)
+            except InputError as error:
+                self._problem, tried = str(error), None
+                continue
+            if signature == self._signature:
+                self._problem = None
+            elif signature != tried or left <= 0:
+                wait = every if signature != tried else min(2 * wait, _SELDOM * every)
+                tried, left = signature, wait
+                with suppress(InputError):  # told in health
+                    self.reload()
+
+    # ------------------------------------------------------------------ health
+
+    def health(self) -> dict[str, Any]:
+        """status: ok, degraded (the map on disk is gone or unreadable; the one in memory answers) or closed; the map's
+        identity and counts, the queue, totals since the start, and latency of the last thousand answers in ms."""
+        gmap = self._map
+        status = "closed" if self._closed.is_set() else "degraded" if self._problem or gmap.problem else "ok"
+        return {
+            "status": status,
+            "problem": self._problem or gmap.problem,
+            "map": str(self.path),
+            "map_id": gmap.map_id,
+            "frame": gmap.frame,
+            "metric": gmap.metric,
+            "instances": len(gmap.instances),
+            "gaussians": int(gmap.info.get("num_gaussians", 0)),
+            "waiting": self._jobs.qsize(),
+            "queue_size": self._jobs.maxsize,
+            **self._figures.to_json(),
+        }
+
+    def close(self) -> None:
+        """Answers what runs, refuses what waits, and ends the threads."""
+        if self._closed.is_set():
+            return
+        self._closed.set()
+        self._drain()
+        for _ in self._threads:
+            try:
+                self._jobs.put_nowait(None)
+            except queue.Full:
+                break
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(timeout=self.timeout)
+        self._drain()
+
+    def __enter__(self) -> QueryEngine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # ----------------------------------------------------------------- workers
+
+    def _drain(self) -> None:
+        while True:
+            try:
+                job = self._jobs.get_nowait()
+            except queue.Empty:
+                return
+            if job is not None and job.future.set_running_or_notify_cancel():
+                job.future.set_exception(EngineClosed(f"{self.path}: the engine has been closed"))
+
+    def _work(self) -> None:
+        while not self._closed.is_set():
+            job = self._jobs.get()
+            if job is None:
+                return
+            if not job.future.set_running_or_notify_cancel():
+                continue
+            if time.monotonic() > job.deadline:
+                self._figures.count("timed_out")
+                job.future.set_exception(AnswerTimeout("the question waited too long and was dropped"))
+                continue
+            self._answer(job)
+
+    def _answer(self, job: _Job) -> None:
+        try:
+            result = job.work(self._map)
+        except InputError as error:
+            self._figures.count("bad_input")
+            job.future.set_exception(error)
+        except Exception as error:  # a defect in one answer must not end the worker
+            self._figures.count("failed")
+            job.future.set_exception(error)
+        else:
+            self._figures.answered(time.monotonic() - job.asked)
+            job.future.set_result(result)
+
+
+class _Shared:
+    """Encoders by name, made once and shared by the old map and the new."""
+
+    def __init__(self, make: Callable[[str], Encoder | None]) -> None:
+        self._make, self._made, self._lock = make, {}, threading.Lock()  # type: ignore[var-annotated]
+
+    def __call__(self, spec: str) -> Encoder | None:
+        with self._lock:
+            if spec not in self._made:
+                self._made[spec] = self._make(spec)
+            return self._made[spec]
+
+
+class _Figures:
+    """Totals and recent latencies."""
+
+    _NAMES = ("answered", "bad_input", "failed", "refused", "timed_out", "reloads")
+
+    def __init__(self) -> None:
+        self._totals: Counter[str] = Counter()
+        self._recent: deque[float] = deque(maxlen=_REMEMBERED)
+        self._lock = threading.Lock()
+        self._started = time.monotonic()
+
+    def count(self, name: str) -> None:
+        with self._lock:
+            self._totals[name] += 1
+
+    def answered(self, seconds: float) -> None:
+        with self._lock:
+            self._totals["answered"] += 1
+            self._recent.append(seconds)
+
+    def to_json(self) -> dict[str, Any]:
+        with self._lock:
+            recent = np.array(self._recent) * 1e3
+            totals = {name: self._totals[name] for name in self._NAMES}
+        latency = {}
+        if len(recent):
+            median, high = np.percentile(recent, [50, 99])
+            latency = {"median_ms": round(float(median), 2), "p99_ms": round(float(high), 2)}
+        return {"uptime_s": round(time.monotonic() - self._started, 1), **totals, **latency}

@@ -1,0 +1,100 @@
+"""What an answer is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from perception.query.frames import check_similarity, move_box, move_points
+from perception.types import OrientedBox
+
+_NO_SPREAD = np.zeros((3, 3))
+
+
+@dataclass(frozen=True)
+class Hit:
+    """One instance that answers a question.
+
+    points: [P, 3] float32, read-only, the means of its Gaussians. centroid: [3] float64, weighted by opacity.
+    obb: the box around the points. covariance: [3, 3] float64 of the points about their mean, divided by P.
+    score: in [0, 1]; of a prompt's answer how well it fits, else the instance's own confidence. views: the photos
+    that show it best, best first. All of it in `frame`, whose unit is the metre when the map says so.
+    distance: from the place asked about to the nearest of the points; None when no place was given.
+    """
+
+    instance_id: int
+    score: float
+    points: np.ndarray
+    centroid: np.ndarray
+    obb: OrientedBox
+    label: str | None = None
+    views: tuple[str, ...] = ()
+    covariance: np.ndarray = field(default_factory=lambda: _NO_SPREAD)
+    frame: str = "map"
+    distance: float | None = None
+
+    def transformed(self, a_from_b: np.ndarray, frame: str | None = None) -> Hit:
+        """The same hit in frame a, given a_from_b [4, 4] (rigid or similarity) from the frame it is in now.
+
+        `frame` names a. Raises InputError when a_from_b shears or mirrors.
+        """
+        moved = check_similarity(a_from_b)
+        linear = moved[:3, :3]
+        points = move_points(moved, self.points)
+        points.setflags(write=False)
+        return replace(
+            self,
+            points=points,
+            centroid=move_points(moved, np.asarray(self.centroid, np.float64)),
+            obb=move_box(moved, self.obb),
+            covariance=linear @ self.covariance @ linear.T,
+            frame=self.frame if frame is None else frame,
+            distance=None if self.distance is None else self.distance * float(np.cbrt(np.linalg.det(linear))),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """A hit of `perception query --json`."""
+        answer = {
+            "instance_id": self.instance_id,
+            "score": round(float(self.score), 4),
+            "num_points": len(self.points),
+            "centroid": [float(x) for x in self.centroid],
+            "obb": self.obb.to_json(),
+            "label": self.label,
+            "views": list(self.views),
+            "covariance": [[float(x) for x in row] for row in self.covariance],
+        }
+        return answer if self.distance is None else {**answer, "distance": float(self.distance)}
+
+
+@dataclass(frozen=True)
+class Neighbor:
+    """Another instance beside one: the gap is the least distance between their points."""
+
+    instance_id: int
+    label: str | None
+    gap: float
+
+
+@dataclass(frozen=True)
+class Description:
+    """All a map knows of one instance. confidence: the mapper's own score in [0, 1]; aabb: [2, 3] lowest and
+    highest corner in the frame of `hit`; colors: names of its main colours with their shares, largest first."""
+
+    hit: Hit
+    confidence: float
+    aabb: np.ndarray
+    colors: tuple[tuple[str, float], ...] = ()
+    neighbors: tuple[Neighbor, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON; the keys of `Hit.to_json` and more."""
+        return {
+            **self.hit.to_json(),
+            "confidence": round(float(self.confidence), 4),
+            "aabb": {"min": self.aabb[0].tolist(), "max": self.aabb[1].tolist()},
+            "colors": [{"name": name, "share": round(share, 3)} for name, share in self.colors],
+            "neighbors": [vars(neighbor) for neighbor in self.neighbors],
+        }

@@ -1,0 +1,391 @@
+"""A map opened for questions: `perception.load_map`."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.instance_index import InstanceIndex
+from perception.io.map_files import MapFiles
+from perception.io.store import GaussianMap, gaussian_map
+from perception.query.frames import Frame, move_points
+from perception.query.hit import Description, Hit, Neighbor
+from perception.query.requests import Request
+from perception.query.space import Space
+from perception.query.where import Where, place, tidy
+from perception.types import OrientedBox
+
+if TYPE_CHECKING:
+    from perception.language.base import Encoder
+    from perception.language.ranking import Answer, Ranker
+
+    Encoders = Callable[[str], Encoder | None]
+
+_REMEMBERED = 256
+"""Prompts whose ranking is kept: planners ask the same thing again and again."""
+_NEIGHBORS = 3
+_LEAST_COLOR = 0.05
+
+
+class UnknownInstance(InputError):
+    """The map has no instance with this id."""
+
+
+class LoadedMap:
+    """A map opened for questions, by any number of threads at once.
+
+    What only some questions need waits for them: Gaussians for `gmap`, embeddings and encoder for the first prompt.
+    The directory may be replaced meanwhile: this object goes on answering from the map it opened.
+
+    Every method that takes `frame` speaks that frame: points, poses, boxes and lengths given to it are in that frame,
+    and so is all it returns. Without, everything is in the map's own frame (`frame`), in metres when `metric`.
+    """
+
+    def __init__(self, held: GaussianMap | MapFiles, path: Path | None = None, encoders: Encoders | None = None):
+        self._held, self.path, self._encoders = held, path, encoders
+        self._lock = threading.RLock()
+        self._ranked: OrderedDict[tuple[str, float | None], Answer] = OrderedDict()
+        self._covariances: dict[int, np.ndarray] = {}
+        self._made_gmap: GaussianMap | None = None
+        self._made_space: Space | None = None
+        self._made_ranker: Ranker | InputError | None = None
+
+    # ------------------------------------------------------------------- facts
+
+    @property
+    def frame(self) -> str:
+        """The name of the map's frame."""
+        return str(self.info.get("frame", "map"))
+
+    @property
+    def metric(self) -> bool:
+        """Whether the unit of length is known to be the metre."""
+        return bool(self.info.get("metric", False))
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """map.json."""
+        return self._held.info
+
+    @property
+    def instances(self) -> list[dict[str, Any]]:
+        """The list of instances.json."""
+        return self._held.instances
+
+    @property
+    def map_id(self) -> str:
+        """Short name of this very map with these very labels; another one has another."""
+        return self._held.map_id if isinstance(self._held, MapFiles) else "unsaved"
+
+    @property
+    def gmap(self) -> GaussianMap:
+        """All arrays in memory, read at first use."""
+        if isinstance(self._held, GaussianMap):
+            return self._held
+        with self._lock:
+            if self._made_gmap is None:
+                self._made_gmap = gaussian_map(self._held)
+            return self._made_gmap
+
+    @property
+    def problem(self) -> str | None:
+        """Why prompts cannot be answered (no embeddings, no encoder), one line; None when they can."""
+        try:
+            _ = self._ranker
+        except InputError as error:
+            return str(error)
+        return None
+
+    def warm(self) -> None:
+        """Does now what the first questions would wait for."""
+        _ = self._space
+        if self.problem is None and self.instances:
+            self.query("thing")
+
+    # --------------------------------------------------------------- questions
+
+    def query(
+        self,
+        text: str,
+        top_k: int = 3,
+        min_score: float | None = None,
+        *,
+        where: Where | None = None,
+        frame: Frame | None = None,
+    ) -> list[Hit]:
+        """The instances that answer `text`, best first, at most top_k; empty when it is not present.
+
+        With `min_score` the encoder's own judgement of presence is replaced by that bound on the score. `where` leaves
+        only instances that fulfil it; what is present then is judged among those. Raises InputError for an empty or
+        overlong text, and for a map without embeddings or whose encoder is not installed.
+        """
+        Request(text, top_k, min_score)
+        if not self.instances:
+            return []
+        answer = self._rank(text, min_score)
+        if where is None:
+            if not answer.present:
+                return []
+            chosen = answer.hits if min_score is None else [(n, s) for n, s in answer.hits if s >= min_score]
+            return [self._in(frame, self.hit(n, s)) for n, s in chosen[:top_k]]
+        return self._query_where(answer, top_k, min_score, where.in_map(frame), frame)
+
+    def find(self, where: Where | None = None, *, frame: Frame | None = None) -> list[Hit]:
+        """All instances that fulfil `where`, in the order of instances.json, scored by the mapper's confidence."""
+        wanted = (where or Where()).in_map(frame)
+        return [self._in(frame, self._measured(n, wanted)) for n in self._fulfilling(wanted)]
+
+    def in_box(self, box: OrientedBox, *, share: float = 0.5, frame: Frame | None = None) -> list[Hit]:
+        """The instances with at least `share` of their points in `box` (see `axis_box` for a box along the axes)."""
+        return self.find(Where(region=box, share=share), frame=frame)
+
+    def nearest(
+        self,
+        near: np.ndarray,
+        top_k: int = 1,
+        *,
+        where: Where | None = None,
+        frame: Frame | None = None,
+    ) -> list[Hit]:
+        """The top_k instances nearest to a point [3] or a pose [4, 4] by their nearest point, nearest first; each hit
+        says its `distance`. `where` leaves only those that fulfil it."""
+        if top_k < 1:
+            raise InputError(f"nearest: top_k is {top_k}, expected at least 1")
+        wanted = (where or Where()).in_map(frame)
+        point = place(near) if frame is None else move_points(frame.to_map, place(near))
+        ids = {self._id(n): n for n in self._fulfilling(wanted)}
+        found = self._space.nearest(point, top_k, ids)
+        return [self._in(frame, self._measured(ids[i], Where(near=point))) for _, i in found]
+
+    def instance_at(
+        self, point: np.ndarray, *, max_distance: float | None = None, frame: Frame | None = None
+    ) -> Hit | None:
+        """The instance that `point` [3] lies on: the one with the nearest point, if that is at most `max_distance`
+        away; when None, no farther than the spacing of the instance's points there (see `Space.reaches`)."""
+        hits = self.nearest(place(point), 1, frame=frame)
+        if not hits or hits[0].distance is None:
+            return None
+        if max_distance is not None:
+            return hits[0] if hits[0].distance <= max_distance else None
+        spot = place(point) if frame is None else move_points(frame.to_map, place(point))
+        return hits[0] if self._space.reaches(hits[0].instance_id, spot) else None
+
+    def get(self, instance_id: int, *, frame: Frame | None = None) -> Hit:
+        """The instance with this id; InputError when there is none."""
+        return self._in(frame, self.hit(self.position(instance_id)))
+
+    def describe(self, instance_id: int, *, frame: Frame | None = None) -> Description:
+        """What the map knows of an instance: its hit, colours, bounds and the three instances nearest to it."""
+        position = self.position(instance_id)
+        hit = self._in(frame, self.hit(position))
+        scale = 1.0 if frame is None else float(np.cbrt(np.linalg.det(frame.from_map[:3, :3])))
+        beside = self._space.neighbors(instance_id, _NEIGHBORS)
+        labels = {entry["id"]: entry.get("label") for entry in self.instances}
+        bounds = np.array([hit.points.min(axis=0), hit.points.max(axis=0)] if len(hit.points) else np.full((2, 3), 0.0))
+        return Description(
+            hit,
+            float(self.instances[position]["score"]),
+            bounds.astype(np.float64),
+            self._colors(position),
+            tuple(Neighbor(i, labels.get(i), gap * scale) for gap, i in beside),
+        )
+
+    def hit(self, position: int, score: float | None = None) -> Hit:
+        """The instance at place `position` of instances.json; score: its own confidence when None."""
+        entry = self.instances[position]
+        box = entry["obb"]
+        points = self._index.of(entry["id"])
+        return Hit(
+            int(entry["id"]),
+            float(entry["score"]) if score is None else score,
+            points,
+            np.array(entry["centroid"], np.float64),
+            OrientedBox(np.array(box["center"]), np.array(box["rotation"]), np.array(box["extent"])),
+            entry.get("label"),
+            self._views(position),
+            self._covariance(position),
+            self.frame,
+        )
+
+    def position(self, instance_id: int) -> int:
+        """The place of this id in instances.json; InputError when there is none."""
+        place = self._places.get(instance_id)
+        if place is None:
+            raise UnknownInstance(f"instance {instance_id}: the map has none such; it has {len(self.instances)}")
+        return place
+
+    def best_view(self, position: int) -> tuple[str, tuple[int, int, int, int]] | None:
+        """The photo that shows the instance best and its tight box (x0, y0, x1, y1) there, in pixels of the size the
+        map was trained at; None when no photo does."""
+        names = self._views(position)
+        if not names:
+            return None
+        start = int(self._view_stops[position]) - len(names)
+        x0, y0, x1, y1 = (int(value) for value in self._held.language["view_boxes"][start])
+        return names[0], (x0, y0, x1, y1)
+
+    # --------------------------------------------------------------- internals
+
+    def _rank(self, text: str, min_score: float | None) -> Answer:
+        key = (" ".join(text.split()), min_score)
+        with self._lock:
+            if key in self._ranked:
+                self._ranked.move_to_end(key)
+                return self._ranked[key]
+        answer = self._ranker.rank(text, min_score)
+        with self._lock:
+            self._ranked[key] = answer
+            if len(self._ranked) > _REMEMBERED:
+                self._ranked.popitem(last=False)
+        return answer
+
+    def _query_where(
+        self, answer: Answer, top_k: int, min_score: float | None, where: Where, frame: Frame | None
+    ) -> list[Hit]:
+        from perception.language.ranking import PRESENT
+
+        allowed = set(self._fulfilling(where))
+        left = [(n, s) for n, s in answer.hits if n in allowed]
+        if not left or left[0][1] < (PRESENT if min_score is None else min_score):
+            return []
+        chosen = left if min_score is None else [(n, s) for n, s in left if s >= min_score]
+        return [self._in(frame, self._measured(n, where, s)) for n, s in chosen[:top_k]]
+
+    def _fulfilling(self, where: Where) -> list[int]:
+        """Places in instances.json of the instances that fulfil `where`, which speaks the map's frame."""
+        return [n for n in range(len(self.instances)) if self._fulfils(n, where)]
+
+    def _fulfils(self, position: int, where: Where) -> bool:
+        entry = self.instances[position]
+        if where.labels is not None and tidy(entry.get("label") or "") not in where.labels:
+            return False
+        longest = max(entry["obb"]["extent"])
+        if where.min_size is not None and longest < where.min_size:
+            return False
+        if where.max_size is not None and longest > where.max_size:
+            return False
+        if where.region is not None and self._space.share_inside(entry["id"], where.region) < where.share:
+            return False
+        return where.within is None or self._space.distance(entry["id"], np.asarray(where.near)) <= where.within
+
+    def _measured(self, position: int, where: Where, score: float | None = None) -> Hit:
+        """A hit that says its distance where `where` names a place."""
+        hit = self.hit(position, score)
+        if where.near is None:
+            return hit
+        return replace(hit, distance=self._space.distance(hit.instance_id, np.asarray(where.near)))
+
+    def _in(self, frame: Frame | None, hit: Hit) -> Hit:
+        return hit if frame is None else hit.transformed(frame.from_map, frame.name)
+
+    def _id(self, position: int) -> int:
+        return int(self.instances[position]["id"])
+
+    @cached_property
+    def _places(self) -> dict[int, int]:
+        return {int(entry["id"]): n for n, entry in enumerate(self.instances)}
+
+    def _views(self, position: int) -> tuple[str, ...]:
+        language = self._held.language
+        if not language:
+            return ()
+        stop = int(self._view_stops[position])
+        names = language["view_names"][stop - int(language["view_counts"][position]) : stop]
+        return tuple(str(name) for name in names)
+
+    @cached_property
+    def _view_stops(self) -> np.ndarray:
+        return np.cumsum(self._held.language["view_counts"])
+
+    def _covariance(self, position: int) -> np.ndarray:
+        """[3, 3] of the instance's points, computed once."""
+        if position not in self._covariances:
+            points = self._index.of(self._id(position)).astype(np.float64)
+            centred = points - points.mean(axis=0) if len(points) else points
+            covariance = centred.T @ centred / max(len(points), 1)
+            covariance.setflags(write=False)
+            self._covariances[position] = covariance
+        return self._covariances[position]
+
+    def _colors(self, position: int) -> tuple[tuple[str, float], ...]:
+        """Names of the instance's colours and their shares, from 5 % up, largest first."""
+        palettes = self._held.language.get("palettes")
+        if palettes is None:
+            return ()
+        from perception.language.colors import COLOR_NAMES, color_share
+
+        shares = [(name, float(color_share(palettes[position : position + 1], name)[0])) for name in COLOR_NAMES]
+        return tuple(sorted((entry for entry in shares if entry[1] >= _LEAST_COLOR), key=lambda entry: -entry[1]))
+
+    @property
+    def _index(self) -> InstanceIndex:
+        return self._space.index
+
+    @property
+    def _space(self) -> Space:
+        with self._lock:
+            if self._made_space is None:
+                self._made_space = Space(self._held.instance_index())
+            return self._made_space
+
+    @property
+    def _ranker(self) -> Ranker:
+        with self._lock:
+            if isinstance(self._made_ranker, InputError):
+                raise InputError(str(self._made_ranker))
+            if self._made_ranker is None:
+                try:
+                    self._made_ranker = self._make_ranker()
+                except InputError as error:
+                    self._made_ranker = error
+                    raise
+            return self._made_ranker
+
+    def _make_ranker(self) -> Ranker:
+        from perception.language import make_encoder
+        from perception.language.description import check_encoder, from_arrays
+        from perception.language.ranking import Ranker
+
+        if not self._held.language:
+            raise InputError(
+                f"{self.path}: holds no language embeddings; map again with an encoder (language.encoder=…)"
+            )
+        descriptions, identity = from_arrays(self._held.language)
+        spec = self.info.get("config", {}).get("language", {}).get("encoder", "auto")
+        encoder = (self._encoders or make_encoder)("conse" if spec == "auto" else spec)
+        if encoder is None:
+            raise InputError(f"{self.path}: was mapped without an encoder; map again with language.encoder=conse")
+        check_encoder(identity, encoder.identity)
+        labels = [entry.get("label") for entry in self.instances]
+        return Ranker(descriptions, encoder, labels, self._shapes)
+
+    def _shapes(self) -> np.ndarray:
+        from perception.instances.shapes import shape_scores
+
+        ids = [entry["id"] for entry in self.instances]
+        poses = self._held.cameras.get("camera_from_world", np.zeros((0, 4, 4)))
+        return shape_scores(self._held.means, self._held.instance_ids, ids, poses)
+
+    def likely_names(self, count: int = 3) -> list[list[str]]:
+        """The likeliest names of every instance, best first, in the order of `instances`."""
+        from perception.language.naming import likely_names
+
+        return likely_names(self._ranker, count) if self.instances else []
+
+
+def load_map(path: str | Path, encoders: Encoders | None = None) -> LoadedMap:
+    """Opens a map directory, a million Gaussians in well under a second.
+
+    encoders: makes an encoder from its name in the map's config; perception.language.make_encoder when None.
+    Raises InputError when `path` is no map, damaged, or of another format version.
+    """
+    path = Path(path)
+    return LoadedMap(MapFiles(path), path, encoders)

@@ -1,0 +1,99 @@
+"""What servers ask and answer, as JSON. One place for HTTP and ROS, so that both speak the same words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.query.frames import Frame
+from perception.query.where import Where, where_from_json
+
+if TYPE_CHECKING:
+    from perception.query.hit import Hit
+
+MAX_TEXT = 1000
+"""Characters of a prompt; no encoder reads more, and a server should not be made to."""
+MAX_TOP = 1000
+MAX_TEXTS = 32
+_KEYS = ("text", "top_k", "min_score", "where", "frame")
+
+
+@dataclass(frozen=True)
+class Request:
+    """One prompt with its filters; everything in it and in its answer is in `frame`, None = the map's."""
+
+    text: str
+    top_k: int = 3
+    min_score: float | None = None
+    where: Where | None = None
+    frame: Frame | None = None
+
+    def __post_init__(self) -> None:
+        check_text(self.text)
+        if isinstance(self.top_k, bool) or not isinstance(self.top_k, (int, np.integer)):
+            raise InputError(f"query: top_k is {self.top_k!r}, expected a whole number")
+        if not 1 <= self.top_k <= MAX_TOP:
+            raise InputError(f"query: top_k is {self.top_k}, expected at least 1 and at most {MAX_TOP}")
+        score = self.min_score
+        if score is not None and (isinstance(score, bool) or not isinstance(score, (int, float, np.number))):
+            raise InputError(f"query: min_score is {score!r}, expected a number or none")
+        if score is not None and not np.isfinite(score):
+            raise InputError(f"query: min_score is {score}, expected a finite number")
+
+
+@dataclass(frozen=True)
+class Reply:
+    """The answer to a request, all of it from the one map named map_id. seconds: from asking to answer."""
+
+    request: Request
+    hits: tuple[Hit, ...]
+    map_id: str
+    frame: str
+    metric: bool
+    seconds: float
+
+    def to_json(self) -> dict[str, Any]:
+        """An entry of the contract's `results`."""
+        return {"text": self.request.text, "present": bool(self.hits), "hits": [hit.to_json() for hit in self.hits]}
+
+
+def check_text(text: Any) -> str:
+    """The prompt itself; InputError when it is no text, empty or longer than MAX_TEXT."""
+    if not isinstance(text, str):
+        raise InputError(f"query: the text is {type(text).__name__}, expected a text")
+    if not text.strip():
+        raise InputError('query: the text is empty; ask for a thing, such as "red mug"')
+    if len(text) > MAX_TEXT:
+        raise InputError(f"query: the text has {len(text)} characters, expected at most {MAX_TEXT}")
+    return text
+
+
+def requests_from_json(value: Any) -> list[Request]:
+    """{"text": text or list of texts, "top_k"?, "min_score"?, "where"?, "frame"?} → a request a text.
+
+    "frame" is {"name", "from_map"} with a 4 × 4 list of rows.
+    """
+    if not isinstance(value, dict):
+        raise InputError(f"query: found {type(value).__name__}, expected an object with {', '.join(_KEYS)}")
+    for key in value:
+        if key not in _KEYS:
+            raise InputError(f"query: found '{str(key)[:40]}', expected one of {', '.join(_KEYS)}")
+    if "text" not in value:
+        raise InputError('query: "text" is missing; ask for a thing, such as "red mug"')
+    texts = value["text"] if isinstance(value["text"], list) else [value["text"]]
+    if not 1 <= len(texts) <= MAX_TEXTS:
+        raise InputError(f"query: {len(texts)} texts, expected 1 to {MAX_TEXTS}")
+    where = None if value.get("where") is None else where_from_json(value["where"])
+    frame = None if value.get("frame") is None else frame_from_json(value["frame"])
+    top_k = 3 if value.get("top_k") is None else value["top_k"]
+    return [Request(text, top_k, value.get("min_score"), where, frame) for text in texts]
+
+
+def frame_from_json(value: Any) -> Frame:
+    """{"name": text, "from_map": 4 × 4 rows} as a frame."""
+    if not isinstance(value, dict) or set(value) != {"name", "from_map"} or not isinstance(value["name"], str):
+        raise InputError('frame: expected {"name": text, "from_map": 4 rows of 4 numbers}')
+    return Frame(value["name"], value["from_map"])

@@ -1,0 +1,114 @@
+"""Distances and shares over the points of instances: exact, with boxes to spare most of the work."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable
+
+import numpy as np
+
+from perception.io.instance_index import InstanceIndex
+from perception.query.regions import Region, inside
+from perception.types import OrientedBox
+
+_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_NEIGHBORS = 8
+
+
+class Space:
+    """The points of all instances; bounds [K, 2, 3] are their lowest and highest corners, in the order of ids."""
+
+    def __init__(self, index: InstanceIndex) -> None:
+        self.index = index
+        bounds = [(points.min(axis=0), points.max(axis=0)) for points in map(index.of, index.ids)]
+        self.bounds = np.array(bounds, np.float64).reshape(-1, 2, 3)
+        self._place = {int(i): n for n, i in enumerate(index.ids)}
+
+    def aabb(self, instance_id: int) -> np.ndarray:
+        """[2, 3] lowest and highest corner of the instance's points; NaN without points."""
+        return self.bounds[self._place[instance_id]] if instance_id in self._place else np.full((2, 3), np.nan)
+
+    def distance(self, instance_id: int, point: np.ndarray) -> float:
+        """From a point [3] to the nearest of the instance's points; infinite without points."""
+        points = self.index.of(instance_id)
+        return float(np.sqrt(_squared(points, point).min())) if len(points) else float("inf")
+
+    def nearest(self, point: np.ndarray, count: int, ids: Iterable[int]) -> list[tuple[float, int]]:
+        """The `count` instances of `ids` with the nearest points: (distance, id), nearest first, ties by id.
+
+        Instances come in the order of the distance to their bounds, which is never more than that to their points,
+        so the search may stop once the bound exceeds the worst that is kept.
+        """
+        known = [i for i in ids if i in self._place]
+        bounds = self.bounds[[self._place[i] for i in known]].reshape(-1, 2, 3)
+        outside = np.maximum(bounds[:, 0] - point, point - bounds[:, 1]).clip(min=0)
+        least = np.sqrt((outside**2).sum(axis=1)) * (1 - 1e-9)  # rounding must not hide a tie
+        kept: list[tuple[float, int]] = []
+        for n in np.argsort(least, kind="stable"):
+            if len(kept) >= count and least[n] > kept[-1][0]:
+                break
+            kept = heapq.nsmallest(count, [*kept, (self.distance(known[n], point), known[n])])
+        return kept
+
+    def share_inside(self, instance_id: int, region: Region) -> float:
+        """Which share of the instance's points lies in `region`; 0 without points."""
+        points = self.index.of(instance_id)
+        if not len(points) or self._apart(instance_id, region):
+            return 0.0
+        return float(inside(region, points).mean())
+
+    def reaches(self, instance_id: int, point: np.ndarray) -> bool:
+        """Whether `point` [3] lies on the instance by the spacing of its own points there: no farther from its
+        nearest point than that point from its eighth neighbour."""
+        points = self.index.of(instance_id)
+        squared = _squared(points, point)
+        nearest = int(squared.argmin())
+        around = _squared(points, points[nearest].astype(np.float64))
+        radius = np.partition(around, min(_NEIGHBORS, len(around) - 1))[min(_NEIGHBORS, len(around) - 1)]
+        return bool(squared[nearest] <= radius)
+
+    def gap(self, a: int, b: int) -> float:
+        """The least distance between the points of two instances; infinite when one has none."""
+        from scipy.spatial import cKDTree
+
+        first, second = self.index.of(a), self.index.of(b)
+        if not len(first) or not len(second):
+            return float("inf")
+        distances, _ = cKDTree(first).query(second)
+        return float(distances.min())
+
+    def neighbors(self, instance_id: int, count: int) -> list[tuple[float, int]]:
+        """The `count` other instances whose points come nearest: (gap, id), nearest first."""
+        from scipy.spatial import cKDTree
+
+        points = self.index.of(instance_id)
+        others = [int(i) for i in self.index.ids if i != instance_id]
+        if not len(points) or not others:
+            return []
+        tree = cKDTree(points)
+        low, high = self.aabb(instance_id)
+        bounds = self.bounds[[self._place[i] for i in others]]
+        apart = np.maximum(bounds[:, 0] - high, low - bounds[:, 1]).clip(min=0)
+        least = np.sqrt((apart**2).sum(axis=1)) * (1 - 1e-9)
+        kept: list[tuple[float, int]] = []
+        for n in np.argsort(least, kind="stable"):
+            if len(kept) >= count and least[n] > kept[-1][0]:
+                break
+            bound = kept[-1][0] if len(kept) >= count else np.inf
+            distances, _ = tree.query(self.index.of(others[n]), distance_upper_bound=max(bound * (1 + 1e-9), 1e-30))
+            kept = heapq.nsmallest(count, [*kept, (float(distances.min()), others[n])])
+        return [entry for entry in kept if np.isfinite(entry[0])]
+
+    def _apart(self, instance_id: int, region: Region) -> bool:
+        """True when the bounds alone say that no point is inside."""
+        if not isinstance(region, OrientedBox):
+            return False
+        corners = region.center + (_CORNERS * region.extent) @ region.rotation
+        low, high = self.aabb(instance_id)
+        return bool((corners.max(axis=0) < low - 1e-9).any() or (corners.min(axis=0) > high + 1e-9).any())
+
+
+def _squared(points: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Squared distances [P] in float64 of points [P, 3] to one [3]."""
+    difference = np.asarray(points, np.float64) - point
+    return np.einsum("ij,ij->i", difference, difference)

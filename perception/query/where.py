@@ -1,0 +1,105 @@
+"""Filters on a question: where, how far, how big, called what."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.query.frames import Frame, check_similarity, move_points, scale_of
+from perception.query.regions import Region, check_region, move_region, region_from_json
+
+_KEYS = ("region", "share", "near", "within", "min_size", "max_size", "labels")
+
+
+@dataclass(frozen=True)
+class Where:
+    """What an instance must fulfil to be an answer; what is None asks nothing.
+
+    region: at least `share` of its points lie in this box or prism. near: a point [3] or a pose [4, 4] whose origin
+    counts; hits then carry their distance. within: the instance has a point at most this far from `near`.
+    min_size, max_size: bounds on the longest side of its box. labels: it has one of these labels (upper and lower
+    case alike). Lengths in the unit of the frame of the question.
+    """
+
+    region: Region | None = None
+    share: float = 0.5
+    near: np.ndarray | Sequence[float] | None = None
+    within: float | None = None
+    min_size: float | None = None
+    max_size: float | None = None
+    labels: Collection[str] | None = None
+
+    def __post_init__(self) -> None:
+        if self.region is not None:
+            object.__setattr__(self, "region", check_region(self.region))
+        if self.near is not None:
+            object.__setattr__(self, "near", place(self.near))
+        if self.labels is not None:
+            names = [self.labels] if isinstance(self.labels, str) else list(self.labels)
+            if not all(isinstance(name, str) for name in names):
+                raise InputError(f"where: labels are {names[:3]}, expected texts")
+            object.__setattr__(self, "labels", frozenset(tidy(name) for name in names))
+        for name in ("share", "within", "min_size", "max_size"):
+            value = getattr(self, name)
+            if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float, np.number))):
+                raise InputError(f"where: {name} is {value!r}, expected a number")
+            if value is not None and not 0 <= value < np.inf:
+                raise InputError(f"where: {name} is {value}, expected a number of at least 0")
+        if not 0 < self.share <= 1:
+            raise InputError(f"where: share is {self.share}, expected more than 0 and at most 1")
+        if self.within is not None and self.near is None:
+            raise InputError("where: within needs near, the point or pose it is measured from")
+
+    def in_map(self, frame: Frame | None) -> Where:
+        """The same filter in the map's frame, given the frame it is spoken in."""
+        if frame is None:
+            return self
+        map_from_frame = frame.to_map
+        scale = scale_of(map_from_frame)
+        within, least, most = (None if x is None else x * scale for x in (self.within, self.min_size, self.max_size))
+        return replace(
+            self,
+            region=None if self.region is None else move_region(map_from_frame, self.region),
+            near=None if self.near is None else move_points(map_from_frame, np.asarray(self.near)),
+            within=within,
+            min_size=least,
+            max_size=most,
+        )
+
+
+def place(point_or_pose: Any) -> np.ndarray:
+    """[3] float64: a point as it is, or the origin of a pose [4, 4] (map_from_robot)."""
+    try:
+        array = np.asarray(point_or_pose, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"near: expected a point [3] or a pose [4, 4], found {str(point_or_pose)[:60]!r}") from error
+    if array.shape == (4, 4):
+        return check_similarity(array, "near")[:3, 3]
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise InputError(f"near: expected a finite point [3] or pose [4, 4], found shape {list(array.shape)}")
+    return array
+
+
+def tidy(text: str) -> str:
+    """A label for comparison: white space and case do not count."""
+    return " ".join(text.casefold().split())
+
+
+def where_from_json(value: Any) -> Where:
+    """A filter from JSON with the keys of `Where`; unknown keys are an InputError."""
+    if not isinstance(value, dict):
+        raise InputError(f"where: found {type(value).__name__}, expected an object with {', '.join(_KEYS)}")
+    for key in value:
+        if key not in _KEYS:
+            raise InputError(f"where: found '{str(key)[:40]}', expected one of {', '.join(_KEYS)}")
+    known = {key: item for key, item in value.items() if item is not None}
+    if "region" in known:
+        known["region"] = region_from_json(known["region"])
+    labels = known.get("labels")
+    if labels is not None and not isinstance(labels, (str, list)):
+        raise InputError(f"where: labels is {type(labels).__name__}, expected a list of texts")
+    return Where(**known)

@@ -1,0 +1,50 @@
+"""Every failure is one JSON object with one clear line: {"error": line, "status": code}."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+
+from perception.errors import InputError
+from perception.query.engine import AnswerTimeout, EngineBusy, EngineClosed
+from perception.query.opened import UnknownInstance
+
+_log = logging.getLogger("perception.serve")
+
+
+class OtherMap(Exception):
+    """The client asked about a map that has been replaced."""
+
+
+def problem(status: int, line: str, headers: Mapping[str, str] | None = None) -> JSONResponse:
+    """An error as JSON."""
+    return JSONResponse({"error": " ".join(line.split()), "status": status}, status, headers)
+
+
+async def told(request: Request, error: Exception) -> JSONResponse:
+    """The answer to an exception that a handler raised."""
+    if isinstance(error, UnknownInstance):
+        return problem(404, str(error))
+    if isinstance(error, InputError):
+        return problem(400, str(error))
+    if isinstance(error, OtherMap):
+        return problem(409, str(error))
+    if isinstance(error, (EngineBusy, EngineClosed)):
+        return problem(503, str(error), {"Retry-After": "1"})
+    if isinstance(error, AnswerTimeout):
+        return problem(504, str(error))
+    if isinstance(error, HTTPException):
+        known = {404: f"{request.url.path}: no such page; see /openapi.json", 405: f"{request.method} is not allowed"}
+        return problem(error.status_code, known.get(error.status_code, error.detail), error.headers)
+    _log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    return problem(500, "the server failed on this request; its log says why")
+
+
+HANDLERS: dict[Any, Any] = dict.fromkeys(
+    (InputError, OtherMap, EngineBusy, EngineClosed, AnswerTimeout, HTTPException, Exception), told
+)

@@ -1,0 +1,147 @@
+"""What stands before every request: who asks, how often, how much, and how long it may take to say it."""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+from perception.serve.errors import problem
+from perception.serve.settings import ServeSettings
+
+OPEN = {"/", "/page.js", "/page.css", "/openapi.json", "/health"}
+"""Paths that tell nothing of the map without a token; /health then says only its status."""
+_LOCAL_NAMES = {"localhost", "127.0.0.1", "[::1]"}
+_MOST_CLIENTS = 4096
+_MOST_DROPPED = 8 << 20
+_HEADERS = [
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cache-control", b"no-store"),
+    (
+        b"content-security-policy",
+        b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
+        b"frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
+    ),
+]
+
+Message = dict[str, Any]
+
+
+class Guard:
+    """ASGI middleware. Sets scope["state"]["trusted"]: whether the client showed the token, or none is asked for.
+
+    A web page opened in a browser on this machine could send requests here too. So without a token the Host header
+    must name this machine (against DNS rebinding), and a POST must say it is JSON, which pages of other origins
+    may only send after a preflight that is never granted.
+    """
+
+    def __init__(self, app: Any, settings: ServeSettings, clock: Callable[[], float] = time.monotonic) -> None:
+        self.app, self.settings, self._clock = app, settings, clock
+        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        scope.setdefault("state", {})["trusted"] = trusted = self._has_token(headers)
+        refusal = self._refusal(scope, headers, trusted)
+        if refusal is None and scope["method"] in ("POST", "PUT", "PATCH"):
+            refusal, receive = await self._body(receive)
+        if refusal is not None:
+            await refusal(scope, receive, _with_headers(send))
+            return
+        await self.app(scope, receive, _with_headers(send))
+
+    def _refusal(self, scope: Any, headers: dict[str, str], trusted: bool) -> Any:
+        """The answer that turns the request away, or None."""
+        settings = self.settings
+        if settings.token is None:
+            name = headers.get("host", "").rsplit(":", 1)[0] if not headers.get("host", "").endswith("]") else "[::1]"
+            if name not in {*_LOCAL_NAMES, settings.host, f"[{settings.host}]"}:
+                return problem(403, f"Host '{name[:80]}' is not this machine; ask for 127.0.0.1 or localhost")
+        wait = self._wait(scope["client"][0] if scope.get("client") else "")
+        if wait > 0:
+            told = f"more than {settings.rate:g} requests a second; ask again in {wait:.1f} s"
+            return problem(429, told, {"Retry-After": str(max(1, round(wait)))})
+        if not trusted and scope["path"] not in OPEN:
+            why = "the token is wrong" if "authorization" in headers else "a token is needed"
+            return problem(401, f"{why}; send it as 'Authorization: Bearer TOKEN'", {"WWW-Authenticate": "Bearer"})
+        if scope["method"] == "POST" and headers.get("content-type", "").split(";")[0].strip() != "application/json":
+            found = headers.get("content-type", "none")[:80]
+            return problem(415, f"Content-Type is '{found}', expected application/json")
+        return None
+
+    def _has_token(self, headers: dict[str, str]) -> bool:
+        if self.settings.token is None:
+            return True
+        kind, _, given = headers.get("authorization", "").partition(" ")
+        return kind.lower() == "bearer" and hmac.compare_digest(given.strip().encode(), self.settings.token.encode())
+
+    def _wait(self, client: str) -> float:
+        """Seconds until this client may ask again; 0 takes a drop from its bucket."""
+        rate = self.settings.rate
+        if rate == 0:
+            return 0.0
+        now, most = self._clock(), max(1.0, 2 * rate)
+        level, before = self._buckets.pop(client, (most, now))
+        level = min(most, level + (now - before) * rate)
+        short = max(0.0, (1 - level) / rate)
+        self._buckets[client] = (level if short else level - 1, now)
+        if len(self._buckets) > _MOST_CLIENTS:
+            self._buckets.popitem(last=False)
+        return short
+
+    async def _body(self, receive: Any) -> tuple[Any, Any]:
+        """Reads the body within its limits; (refusal, None) or (None, a receive that gives it again).
+
+        What is too much is read and dropped up to a bound, because a client that is still sending when the connection
+        closes never sees the answer.
+        """
+        most, kept, size = self.settings.max_body, bytearray(), 0
+        deadline = time.monotonic() + self.settings.timeout
+        more = True
+        while more and size <= _MOST_DROPPED:
+            try:
+                message = await asyncio.wait_for(receive(), max(0.01, deadline - time.monotonic()))
+            except (TimeoutError, asyncio.TimeoutError):
+                told = f"the request did not arrive within {self.settings.timeout:g} s"
+                return problem(408, told, {"Connection": "close"}), receive
+            if message["type"] == "http.disconnect":
+                return problem(400, "the request was cut short"), receive
+            part = message.get("body", b"")
+            size += len(part)
+            if size <= most:
+                kept += part
+            more = bool(message.get("more_body"))
+        if size > most:
+            told = f"the request has more than {most} bytes, the most that is read"
+            return problem(413, told, {"Connection": "close"}), receive
+        return None, _replay(bytes(kept), receive)
+
+
+def _replay(body: bytes, receive: Any) -> Any:
+    sent = False
+
+    async def again() -> Message:
+        nonlocal sent
+        if sent:
+            message: Message = await receive()
+            return message
+        sent = True
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    return again
+
+
+def _with_headers(send: Any) -> Any:
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            message = {**message, "headers": [*message.get("headers", []), *_HEADERS]}
+        await send(message)
+
+    return sending

@@ -1,0 +1,207 @@
+"""The viewer's page: viser's splat renderer and controls around a `Session`."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import socket
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.viewer.panel import Panel
+from perception.viewer.picking import covariances
+from perception.viewer.session import Session
+
+FRUSTUM_PHOTO = 96
+"""Pixels of the longer side of the photo drawn in a camera's frustum."""
+
+
+class Viewer:
+    """A running page. `url` is where; `stop` ends it."""
+
+    def __init__(self, path: Path, host: str = "127.0.0.1", port: int = 8090):
+        viser = _viser()
+        _check_port(host, port)
+        self.session = Session(path)
+        with contextlib.redirect_stdout(io.StringIO()):  # viser greets on stdout, which belongs to --json
+            self.server = viser.ViserServer(host=host, port=port, label=f"perception · {path.name}", verbose=False)
+        self.url = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0', '::') else host}:{port}"
+        self._drawing = threading.Lock()
+        self._overlays: dict[str, list[Any]] = {"cameras": [], "boxes": [], "names": []}
+        self._overlays_on = dict.fromkeys(self._overlays, False)
+        self._frame_map()
+        gmap = self.session.editor.original
+        self._splats = self.server.scene.add_gaussian_splats(
+            "/map/splats",
+            centers=gmap.means * self.scale,
+            covariances=covariances(gmap) * self.scale**2,
+            rgbs=self.session.colors(),
+            opacities=self.session.opacities()[:, None],
+        )
+        self.panel = Panel(self)
+        self.server.scene.on_click()(lambda event: self._clicked(event, add=False))
+        self.server.scene.on_click(modifier="shift")(lambda event: self._clicked(event, add=True))
+
+    def stop(self) -> None:
+        """Closes the page and its port."""
+        self.server.stop()
+
+    # ------------------------------------------------------------------ drawing
+
+    def _frame_map(self) -> None:
+        """Up, the first camera, and the scale: the page keeps half precision, so the map is brought to size 10."""
+        gmap = self.session.editor.original
+        low, high = np.percentile(gmap.means, [5, 95], axis=0) if len(gmap) else (np.zeros(3), np.ones(3))
+        self.scale = 10 / max(float(np.linalg.norm(high - low)), 1e-9)
+        poses = gmap.cameras.get("camera_from_world", np.zeros((0, 4, 4)))
+        if len(poses) == 0:
+            return
+        self.server.scene.set_up_direction(tuple(-poses[:, 1, :3].mean(axis=0)))
+        pose = poses[len(poses) // 2]
+        eye = -pose[:3, :3].T @ pose[:3, 3]
+        depth = np.median((gmap.means @ pose[2, :3] + pose[2, 3]).clip(min=0)) if len(gmap) else 1.0
+        camera = self.server.initial_camera
+        camera.position = tuple(eye * self.scale)
+        camera.look_at = tuple((eye + pose[2, :3] * max(float(depth), 1e-6)) * self.scale)
+
+    def redraw(self, client: Any = None) -> None:
+        """Colours and opacities anew, in one message; overlays that are on follow."""
+        with self._drawing:
+            camera = None if client is None or self.session.mode != "depth" else self._camera_of(client)
+            self._splats.set_gaussians(
+                self._splats.centers,
+                self._splats.covariances,
+                self.session.colors(camera),
+                self.session.opacities()[:, None],
+            )
+            for kind, on in self._overlays_on.items():
+                if on and kind != "cameras":
+                    self._draw(kind)
+
+    def overlay(self, kind: str, on: bool) -> None:
+        """Shows or hides "cameras", "boxes" or "names"."""
+        with self._drawing:
+            self._overlays_on[kind] = on
+            self._draw(kind)
+
+    def _draw(self, kind: str) -> None:
+        for handle in self._overlays[kind]:
+            handle.remove()
+        draw = {"cameras": self._cameras, "boxes": self._boxes, "names": self._names}[kind]
+        self._overlays[kind] = draw() if self._overlays_on[kind] else []
+
+    def _visible_entries(self) -> list[dict[str, Any]]:
+        session = self.session
+        entries = [entry for entry in session.editor.instances if not entry.get("hidden")]
+        chosen = session.selected or [hit.instance_id for hit in session.hits]
+        return [entry for entry in entries if not chosen or entry["id"] in chosen]
+
+    def _boxes(self) -> list[Any]:
+        from perception.pictures import instance_palette
+
+        handles = []
+        for entry in self._visible_entries():
+            box = entry["obb"]
+            corners = np.array([[i >> a & 1 for a in range(3)] for i in range(8)]) - 0.5
+            points = np.array(box["center"]) + (corners * box["extent"]) @ np.array(box["rotation"])
+            edges = [(i, i | 1 << a) for i in range(8) for a in range(3) if not i >> a & 1]
+            segments = (points[np.array(edges)] * self.scale).astype(np.float32)
+            color = tuple(int(c) for c in instance_palette(np.array([entry["id"]]))[0])
+            name = f"/map/boxes/{entry['id']}"
+            handles.append(
+                self.server.scene.add_line_segments(name, segments, color, thickness=2, thickness_units="screen")
+            )
+        return handles
+
+    def _names(self) -> list[Any]:
+        add = self.server.scene.add_label
+        return [
+            add(
+                f"/map/names/{entry['id']}",
+                self.session.name(entry),
+                position=tuple(np.array(entry["centroid"]) * self.scale),
+            )
+            for entry in self._visible_entries()
+        ]
+
+    def _cameras(self) -> list[Any]:
+        from scipy.spatial.transform import Rotation
+
+        from perception.io.photos import load_photo
+
+        handles = []
+        centres = [-v.camera_from_world[:3, :3].T @ v.camera_from_world[:3, 3] for v in self.session.views.values()]
+        spread = float(np.ptp(np.array(centres), axis=0).max()) if centres else 1.0
+        for view, centre in zip(self.session.views.values(), centres, strict=True):
+            try:
+                image = load_photo(view, FRUSTUM_PHOTO)
+            except InputError:  # the photo has moved: the frustum is drawn without it
+                image = None
+            wxyz = Rotation.from_matrix(view.camera_from_world[:3, :3].T).as_quat()[[3, 0, 1, 2]]
+            handles.append(
+                self.server.scene.add_camera_frustum(
+                    f"/map/cameras/{view.name}",
+                    fov=2 * float(np.arctan(view.height / 2 / view.K[1, 1])),
+                    aspect=view.width / view.height,
+                    scale=max(0.03 * spread, 1e-6) * self.scale,
+                    image=image,
+                    wxyz=tuple(wxyz),
+                    position=tuple(centre * self.scale),
+                )
+            )
+        return handles
+
+    # ------------------------------------------------------------------- events
+
+    def _camera_of(self, client: Any) -> np.ndarray:
+        from perception.geometry import rotation_from_quaternion
+
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_from_quaternion(np.array(client.camera.wxyz)).T
+        pose[:3, 3] = -pose[:3, :3] @ (np.array(client.camera.position) / self.scale)
+        return pose
+
+    def _clicked(self, event: Any, add: bool) -> None:
+        self.session.pick(np.array(event.ray_origin) / self.scale, np.array(event.ray_direction), add)
+        self.panel.refresh()
+        self.redraw()
+
+    def guarded(self, action: Callable[[], object], client: Any = None, edited: bool = False) -> None:
+        """Runs what a control asks for; what is wrong is told in the page, and everything is drawn anew."""
+        try:
+            action()
+        except InputError as error:
+            self.panel.tell(client, str(error))
+            return
+        if edited:
+            self.session.edited()
+        self.panel.refresh()
+        self.redraw(client)
+
+
+def start_viewer(path: Path, host: str = "127.0.0.1", port: int = 8090) -> Viewer:
+    """Opens a map in a page at http://host:port. Raises InputError for no map, a port in use, or viser missing."""
+    return Viewer(Path(path), host, port)
+
+
+def _viser() -> Any:
+    try:
+        import viser
+    except ImportError as error:
+        raise InputError('the viewer needs viser: pip install "perception[view]" (or pip install viser)') from error
+    return viser
+
+
+def _check_port(host: str, port: int) -> None:
+    """viser would silently take another port; a person who wrote one down must be told."""
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise InputError(f"--port {port}: cannot be opened on {host} ({error.strerror}); choose another") from error

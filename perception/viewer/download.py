@@ -1,0 +1,28 @@
+"""The selection as a file for the person's own disk."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.ply import write_ply
+from perception.io.store import GaussianMap
+from perception.viewer.paint import base_colors
+
+
+def selection_ply(gmap: GaussianMap, chosen: list[int]) -> bytes:
+    """A binary PLY of the chosen instances' Gaussian means: x y z, red green blue, instance_id."""
+    if not chosen:
+        raise InputError("nothing is selected; click a thing first")
+    rows = np.isin(gmap.instance_ids, chosen)
+    points, colors = gmap.means[rows].astype(np.float32), base_colors(gmap)[rows]
+    table = {axis: np.ascontiguousarray(points[:, i]) for i, axis in enumerate("xyz")}
+    table |= {name: np.ascontiguousarray(colors[:, i]) for i, name in enumerate(("red", "green", "blue"))}
+    table["instance_id"] = gmap.instance_ids[rows].astype(np.int32)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "selection.ply"
+        write_ply(path, {"vertex": table})
+        return path.read_bytes()

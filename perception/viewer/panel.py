@@ -1,0 +1,176 @@
+"""The controls beside the scene: ask, show, select, correct."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from perception.viewer.paint import MODES
+
+if TYPE_CHECKING:
+    from perception.viewer.app import Viewer
+
+
+class Panel:
+    """Builds viser's controls and keeps their words true."""
+
+    def __init__(self, viewer: Viewer):
+        self.viewer = viewer
+        self.session = viewer.session
+        self.gui = viewer.server.gui
+        self.gui.configure_theme(control_width="large", show_share_button=False)
+        self._facts = self.gui.add_markdown("")
+        self._build_ask()
+        self._build_show()
+        self._build_selection()
+        self._build_history()
+        self.refresh()
+
+    # ----------------------------------------------------------------- building
+
+    def _build_ask(self) -> None:
+        with self.gui.add_form("Ask") as form:
+            self._text = self.gui.add_text("prompt", "", hint='a thing, such as "red mug"; Enter asks')
+            button = self.gui.add_button("Search")
+        button.on_click(lambda _: form.submit())
+        form.on_submit(lambda event: self.viewer.guarded(lambda: self._ask(), event.client))
+        self._answer = self.gui.add_markdown("")
+        self._hits_folder = self.gui.add_folder("Hits", visible=False)
+        self._hit_buttons: list[Any] = []
+
+    def _ask(self) -> None:
+        self.session.ask(self._text.value)
+
+    def _build_show(self) -> None:
+        with self.gui.add_folder("Show"):
+            mode = self.gui.add_dropdown("colours", MODES, initial_value=self.session.mode)
+            boxes = [(kind, self.gui.add_checkbox(kind, False)) for kind in ("boxes", "names", "cameras")]
+            clear = self.gui.add_button("Clear selection")
+
+        def choose(event: Any) -> None:
+            self.session.mode = mode.value
+            self.viewer.redraw(event.client)
+
+        mode.on_update(choose)
+        for kind, box in boxes:
+            box.on_update(lambda _, kind=kind, box=box: self.viewer.overlay(kind, box.value))
+        clear.on_click(lambda event: self.viewer.guarded(self._clear, event.client))
+
+    def _clear(self) -> None:
+        self.session.hits, self.session.question = [], ""
+        self.session.select(None)
+
+    def _build_selection(self) -> None:
+        editor, session = self.session.editor, self.session
+        self._selection = self.gui.add_folder("Selected")
+        with self._selection:
+            self._words = self.gui.add_markdown("")
+            self._photo: Any = None
+            with self.gui.add_form(None) as form:
+                self._name = self.gui.add_text("name", "", hint="Enter renames")
+                rename = self.gui.add_button("Rename")
+            rename.on_click(lambda _: form.submit())
+            self._actions(
+                "instance",
+                {
+                    "Hide": lambda: editor.hide(session.chosen()),
+                    "Merge": lambda: session.select(editor.merge(session.selected)),
+                    "Split": lambda: editor.split(session.chosen()),
+                    "Remove": lambda: editor.remove(session.chosen()),
+                },
+            )
+            export = self.gui.add_button("Download points (PLY)")
+        form.on_submit(
+            lambda event: self.viewer.guarded(
+                lambda: editor.rename(session.chosen(), self._name.value), event.client, edited=True
+            )
+        )
+        export.on_click(lambda event: self.viewer.guarded(lambda: self._export(event.client), event.client))
+
+    def _actions(self, label: str, actions: dict[str, Callable[[], object]]) -> None:
+        """A row of buttons, each an edit."""
+        row = self.gui.add_button_group(label, tuple(actions))
+        row.on_click(lambda event: self.viewer.guarded(actions[row.value], event.client, edited=True))
+
+    def _build_history(self) -> None:
+        editor = self.session.editor
+        with self.gui.add_folder("Corrections"):
+            self._actions("history", {"Undo": editor.undo, "Redo": editor.redo})
+            self._actions("map", {"Show hidden": self._unhide, "Delete floaters": editor.delete_floaters})
+            save = self.gui.add_button("Save into the map")
+            save.on_click(lambda event: self.viewer.guarded(editor.save, event.client))
+            self._history = self.gui.add_markdown("")
+
+    def _unhide(self) -> None:
+        for entry in self.session.editor.instances:
+            if entry.get("hidden"):
+                self.session.editor.hide(entry["id"], False)
+
+    def _export(self, client: Any) -> None:
+        from perception.viewer.download import selection_ply
+
+        client.send_file_download("selection.ply", selection_ply(self.session.editor.current(), self.session.selected))
+
+    # ------------------------------------------------------------------- words
+
+    def tell(self, client: Any, text: str) -> None:
+        """A notice in the browser that asked, or in all."""
+        receivers = [client] if client is not None else list(self.viewer.server.get_clients().values())
+        for receiver in receivers:
+            receiver.add_notification("perception", text, auto_close_seconds=8, color="orange")
+
+    def refresh(self) -> None:
+        """Every word of the panel from the session's state."""
+        session, editor = self.session, self.session.editor
+        unit = "m" if editor.original.info.get("metric") else "map units"
+        self._facts.content = f"**{int(editor.kept.sum()):,} Gaussians · {len(editor.instances)} instances**"
+        self._refresh_answer()
+        if not session.selected:
+            self._words.content = "Click a thing; shift-click adds another."
+            self._show_photo(None)
+        elif len(session.selected) > 1:
+            names = [session.name(editor.entry(i)) for i in session.selected]
+            self._words.content = f"{len(names)} selected: {', '.join(names)}"
+            self._show_photo(None)
+        else:
+            entry = editor.entry(session.selected[0])
+            sides = " × ".join(f"{side:.2f}" for side in entry["obb"]["extent"])
+            self._words.content = (
+                f"**{session.name(entry)}** (id {entry['id']})  \nconfidence {entry['score']:.2f} · "
+                f"{entry['num_gaussians']} Gaussians  \nbox {sides} {unit}"
+            )
+            self._name.value = entry.get("label") or ""
+            self._show_photo(session.crop(entry["id"]))
+        last = editor.history[-3:]
+        unsaved = "unsaved changes" if editor.dirty else "all saved"
+        self._history.content = f"*{unsaved}*" + "".join(f"  \n{what}" for what in reversed(last))
+
+    def _refresh_answer(self) -> None:
+        session = self.session
+        for button in self._hit_buttons:
+            button.remove()
+        self._hit_buttons = []
+        self._hits_folder.visible = bool(session.hits)
+        if not session.question:
+            self._answer.content = ""
+            return
+        if not session.hits:
+            self._answer.content = f'"{session.question}": **not present**'
+            return
+        self._answer.content = f'"{session.question}": {len(session.hits)} found'
+        with self._hits_folder:
+            for rank, hit in enumerate(session.hits, start=1):
+                entry = session.editor.entry(hit.instance_id)
+                button = self.gui.add_button(f"{rank}. {session.name(entry)} · {hit.score:.2f}")
+                button.on_click(
+                    lambda event, i=hit.instance_id: self.viewer.guarded(lambda: session.select(i), event.client)
+                )
+                self._hit_buttons.append(button)
+
+    def _show_photo(self, picture: Any) -> None:
+        if self._photo is not None:
+            self._photo.remove()
+            self._photo = None
+        if picture is not None:
+            with self._selection:
+                self._photo = self.gui.add_image(picture, label="best photo", order=0)

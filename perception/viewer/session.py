@@ -1,0 +1,142 @@
+"""What the viewer shows and knows, without any browser: an edited map, a question and its hits, a selection."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.editing import Editor
+from perception.errors import InputError
+from perception.io.photos import load_photo
+from perception.io.scene_cache import view_from_json
+from perception.query import Hit, LoadedMap
+from perception.types import View
+from perception.viewer.paint import highlight, paint
+from perception.viewer.picking import pick
+
+CROP_SIDE = 320
+"""Pixels of the longer side of the photo shown beside a selected instance."""
+
+
+class Session:
+    """Shared by all browsers of one viewer: they see the same map, and edits come one after the other."""
+
+    def __init__(self, path: Path):
+        self.editor = Editor(path)
+        self.mode = "photo"
+        self.selected: list[int] = []
+        self.question = ""
+        self.hits: list[Hit] = []
+        self._lock = threading.RLock()
+        self._opened: tuple[int, LoadedMap] | None = None
+        self._edits = 0
+        self.views: dict[str, View] = {}
+        for entry in self.editor.original.info.get("views", []):
+            view = view_from_json(entry)
+            self.views[view.name] = view
+
+    # ------------------------------------------------------------------ asking
+
+    def _loaded(self) -> LoadedMap:
+        if self._opened is None or self._opened[0] != self._edits:
+            self._opened = (self._edits, LoadedMap(self.editor.current(), self.editor.path))
+        return self._opened[1]
+
+    def ask(self, text: str, top_k: int = 5) -> list[Hit]:
+        """Ranked hits, which are then highlighted; empty when the text is not present. Hidden ones are left out."""
+        with self._lock:
+            hidden = {entry["id"] for entry in self.editor.instances if entry.get("hidden")}
+            found = self._loaded().query(text, top_k + len(hidden))
+            self.question = " ".join(text.split())
+            self.hits = [hit for hit in found if hit.instance_id not in hidden][:top_k]
+            self.selected = [hit.instance_id for hit in self.hits[:1]]
+            return self.hits
+
+    # --------------------------------------------------------------- selecting
+
+    def select(self, instance: int | None, add: bool = False) -> None:
+        """Selects an instance, or takes it in and out of the selection; None selects nothing."""
+        with self._lock:
+            if instance is None:
+                self.selected = self.selected if add else []
+            elif not add:
+                self.selected = [instance]
+            elif instance in self.selected:
+                self.selected = [i for i in self.selected if i != instance]
+            else:
+                self.selected = [*self.selected, instance]
+
+    def pick(self, origin: np.ndarray, direction: np.ndarray, add: bool = False) -> int | None:
+        """Selects what a ray in the map frame meets first."""
+        instance = pick(self.editor.original, self.editor.ids, self.shown(), origin, direction)
+        self.select(instance, add)
+        return instance
+
+    def chosen(self) -> int:
+        """The one selected instance; raises InputError when none or several are."""
+        if len(self.selected) != 1:
+            raise InputError(f"{len(self.selected)} instances are selected; click exactly one")
+        return self.selected[0]
+
+    # ----------------------------------------------------------------- editing
+
+    def edited(self) -> None:
+        """To be called after an edit: what no longer exists is no longer selected."""
+        with self._lock:
+            self._edits += 1
+            known = {entry["id"] for entry in self.editor.instances}
+            self.selected = [instance for instance in self.selected if instance in known]
+            self.hits = [hit for hit in self.hits if hit.instance_id in known]
+
+    # ----------------------------------------------------------------- showing
+
+    def shown(self) -> np.ndarray:
+        """[N] bool: Gaussians that are neither deleted nor of a hidden instance."""
+        hidden = [entry["id"] for entry in self.editor.instances if entry.get("hidden")]
+        return np.asarray(self.editor.kept & ~np.isin(self.editor.ids, hidden))
+
+    def colors(self, camera_from_world: np.ndarray | None = None) -> np.ndarray:
+        """[N, 3] uint8 in the present mode, the selection (or the hits) highlighted."""
+        scores = {int(entry["id"]): float(entry["score"]) for entry in self.editor.instances}
+        colors = paint(self.editor.original, self.editor.ids, self.mode, scores, camera_from_world)
+        return highlight(colors, self.editor.ids, self.selected or [hit.instance_id for hit in self.hits])
+
+    def opacities(self) -> np.ndarray:
+        """[N] float32, 0 for what is not shown."""
+        return np.where(self.shown(), self.editor.original.opacities, 0).astype(np.float32)
+
+    def name(self, entry: dict[str, Any]) -> str:
+        """How an instance is called: by its label, else by its number."""
+        return entry.get("label") or f"instance {entry['id']}"
+
+    def crop(self, instance: int) -> np.ndarray | None:
+        """The best photo of an instance, cut out with a margin; None when no photo shows it or it is gone."""
+        gmap = self._loaded().gmap
+        place = next(i for i, entry in enumerate(gmap.instances) if entry["id"] == instance)
+        if not gmap.language or gmap.language["view_counts"][place] == 0:
+            return None
+        row = int(gmap.language["view_counts"][:place].sum())
+        view = self.views.get(str(gmap.language["view_names"][row]))
+        if view is None:
+            return None
+        try:
+            photo = load_photo(view, int(gmap.info["config"]["photos"]["max_side"]))
+        except InputError:  # photos may have moved since the map was made; the map itself is whole
+            return None
+        return _cut(photo, gmap.language["view_boxes"][row])
+
+
+def _cut(photo: np.ndarray, box: np.ndarray) -> np.ndarray:
+    import cv2
+
+    x0, y0, x1, y1 = (int(v) for v in box)
+    margin = 6 + max(x1 - x0, y1 - y0) // 5
+    photo = photo.copy()
+    cv2.rectangle(photo, (x0, y0), (x1, y1), (255, 214, 10), 2)
+    crop = photo[max(0, y0 - margin) : y1 + margin, max(0, x0 - margin) : x1 + margin]
+    scale = min(1.0, CROP_SIDE / max(crop.shape[:2]))
+    size = (max(1, round(crop.shape[1] * scale)), max(1, round(crop.shape[0] * scale)))
+    return np.asarray(cv2.resize(crop, size, interpolation=cv2.INTER_AREA))

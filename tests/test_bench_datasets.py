@@ -1,0 +1,206 @@
+"""The dataset benches, from miniature copies of the downloads' layouts to the table."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from perception.bench import lerf_mask, lerf_ovs, scannetpp
+from perception.bench.datasets import by_reference
+from perception.cli import main
+from perception.demo import load_truth
+from perception.errors import InputError
+from perception.io.cloud import write_cloud
+from perception.types import PointCloud
+
+QUICK = [
+    *("--set", "train.iterations=300", "--set", "train.budget=5000", "--set", "densify.every=50"),
+    *("--set", "instances.min_cluster_size=15", "--set", "instances.min_samples=5"),
+]
+TESTS = ["003.jpg", "009.jpg"]
+
+
+def write_colmap(folder: Path, truth, names: list[str]) -> None:
+    """cameras.txt, images.txt, points3D.txt as COLMAP writes them, from exact cameras."""
+    folder.mkdir(parents=True)
+    first = truth.cameras[0]
+    fx, fy, cx, cy = first.K[0, 0], first.K[1, 1], first.K[0, 2], first.K[1, 2]
+    (folder / "cameras.txt").write_text(f"1 PINHOLE {first.width} {first.height} {fx} {fy} {cx} {cy}\n")
+    lines = []
+    for number, (name, camera) in enumerate(zip(names, truth.cameras, strict=True), 1):
+        x, y, z, w = Rotation.from_matrix(camera.camera_from_world[:3, :3]).as_quat()
+        t = camera.camera_from_world[:3, 3]
+        lines += [f"{number} {w} {x} {y} {z} {t[0]} {t[1]} {t[2]} 1 {name}", "10 10 -1"]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    rows = np.random.default_rng(0).choice(len(truth.points), 1500, replace=False)
+    points = [
+        f"{i} {p[0]} {p[1]} {p[2]} {c[0]} {c[1]} {c[2]} 0.5"
+        for i, (p, c) in enumerate(zip(truth.points[rows], truth.colors[rows], strict=True), 1)
+    ]
+    (folder / "points3D.txt").write_text("\n".join(points) + "\n")
+
+
+@pytest.fixture(scope="module")
+def truth(small_scene: Path):
+    return load_truth(small_scene / "truth")
+
+
+@pytest.fixture(scope="module")
+def downloads(small_scene: Path, truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """LERF-mask and LERF-OVS side by side: one scene that can be mapped, and one whose poses were not downloaded."""
+    root = tmp_path_factory.mktemp("downloads")
+    ball = next(thing for thing in truth.things if "ball" in thing.name)
+    others = [thing for thing in truth.things if thing.id != ball.id][:2]
+    scene = root / "lerf_mask" / "table"
+    shutil.copytree(small_scene / "images", scene / "images")
+    write_colmap(scene / "sparse" / "0", truth, truth.names)
+    (scene / "images_train").mkdir()
+    for name in truth.names:
+        if name not in TESTS:
+            shutil.copy(small_scene / "images" / name, scene / "images_train")
+    for number, name in enumerate(TESTS):
+        (scene / "test_mask" / str(number)).mkdir(parents=True)
+        for thing in [ball, *others]:
+            mask = np.where(truth.labels(name) == thing.id, 255, 0).astype(np.uint8)
+            cv2.imwrite(str(scene / "test_mask" / str(number) / f"{thing.name}.png"), mask)
+    (root / "lerf_mask" / "broken").mkdir()
+    shutil.copytree(scene / "images", root / "lerf_mask" / "broken" / "images")
+    shutil.copytree(scene / "test_mask", root / "lerf_mask" / "broken" / "test_mask")
+    (root / "lerf_mask" / "broken" / "transforms.json").write_text("{}")
+
+    ovs = root / "lerf_ovs"
+    shutil.copytree(scene / "images", ovs / "table" / "images")
+    shutil.copytree(scene / "sparse", ovs / "table" / "sparse")
+    (ovs / "label" / "table").mkdir(parents=True)
+    for name in TESTS:
+        mask = truth.labels(name) == ball.id
+        outline, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        polygon = max(outline, key=len)[:, 0].tolist()
+        label = {"info": {"height": 96, "width": 128}, "objects": [{"category": "ball", "segmentation": polygon}]}
+        (ovs / "label" / "table" / f"{Path(name).stem}.json").write_text(json.dumps(label))
+    return root
+
+
+@pytest.fixture(scope="module")
+def ovs_run(downloads: Path, small_scene: Path, truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run, after which the user names the instance that is the ball."""
+    work = tmp_path_factory.mktemp("ovs")
+    masks = f"labels:{small_scene / 'labels'}"
+    brief = ["--set", "language.views=1", "--set", "language.zooms=1"]
+    lerf_ovs.main([str(downloads / "lerf_ovs"), "-o", str(work), "--masks", masks, *QUICK, *brief])
+    path = work / "maps" / "table.gsmap" / "instances.json"
+    found = json.loads(path.read_text())
+    ball = next(thing for thing in truth.things if "ball" in thing.name)
+    middle = truth.points[truth.instance_ids == ball.id].mean(axis=0)
+    nearest = min(found["instances"], key=lambda entry: float(np.linalg.norm(entry["centroid"] - middle)))
+    nearest["label"] = "ball"
+    path.write_text(json.dumps(found))
+    return work
+
+
+def test_lerf_ovs_from_download_to_table(ovs_run: Path, downloads: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = json.loads((ovs_run / "lerf_ovs.json").read_text())
+    assert first["failed"] == {} and first["maps"]["table"]["quality"]["psnr"] > 10
+    held = np.load(ovs_run / "maps" / "table.gsmap" / "cameras.npz")
+    assert sorted(held["names"][held["held_out"]]) == TESTS
+    # A second run renders nothing anew: it scores the predictions as they lie there.
+    for picture in (ovs_run / "predictions").rglob("*.png"):
+        cv2.imwrite(str(picture), np.zeros((96, 128), np.uint8))
+    again = [str(downloads / "lerf_ovs"), "-o", str(ovs_run)]
+    lerf_ovs.main(again)
+    assert json.loads((ovs_run / "lerf_ovs.json").read_text())["result"]["mean"]["miou"] == 0
+    # Without them they are made again from the map, where the ball now has its name.
+    shutil.rmtree(ovs_run / "predictions")
+    lerf_ovs.main(again)
+    result = json.loads((ovs_run / "lerf_ovs.json").read_text())["result"]
+    assert result["mean"]["miou"] > 0.5 and result["mean"]["macc25"] == 1.0
+    protocol = result["protocol"]
+    assert protocol["occlusion"] == "off" and "top-1" in protocol["selection"] and "held out" in protocol["test_views"]
+    assert "occlusion: off" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("select", ["truth", "reference", "query"])
+def test_lerf_mask_from_download_to_table(
+    select: str, ovs_run: Path, downloads: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    how = select
+    if select == "reference":  # a detector that found but one of the things, in the first test view
+        found = downloads / "lerf_mask/table/test_mask/0"
+        (tmp_path / "detector" / "table").mkdir(parents=True)
+        ball = next(path for path in found.iterdir() if "ball" in path.name)
+        shutil.copy(ball, tmp_path / "detector" / "table")
+        how = f"reference:{tmp_path / 'detector'}"
+    maps = ["--maps", str(ovs_run / "maps")]
+    code = main(["bench", "lerf-mask", str(downloads / "lerf_mask"), "-o", str(tmp_path), *maps, "--select", how])
+    assert code == 0
+    facts = json.loads((tmp_path / "lerf_mask.json").read_text())
+    table = facts["result"]["scenes"]["table"]
+    if select == "truth":
+        assert table["miou"] > 0.5
+    if select == "reference":
+        scored = [row["miou"] > 0 for row in table["prompts"].values()]
+        assert sum(scored) == 1
+    assert facts["result"]["scenes"]["broken"]["miou"] == 0 and list(facts["failed"]) == ["broken"]
+    assert facts["result"]["mean"]["miou"] == pytest.approx(table["miou"] / 2)
+    out = capsys.readouterr().out
+    assert "broken failed and scores 0" in out and "selection" in out and "with occlusion, > 0.2" in out
+
+
+def test_scannetpp_from_download_to_table(
+    small_scene: Path, truth, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = tmp_path / "spp" / "data" / "0a1b"
+    shutil.copytree(small_scene / "images", scene / "dslr" / "resized_images")
+    write_colmap(scene / "dslr" / "colmap", truth, truth.names)
+    (scene / "dslr" / "train_test_lists.json").write_text(json.dumps({"train": truth.names[1:], "test": TESTS}))
+    (scene / "scans").mkdir()
+    rows = np.arange(0, len(truth.points), 2)
+    write_cloud(scene / "scans" / "mesh_aligned_0.05.ply", PointCloud(truth.points[rows], truth.colors[rows]))
+    ids = truth.instance_ids[rows]
+    names = {thing.id: thing.name for thing in truth.instances}
+    (scene / "scans" / "segments.json").write_text(json.dumps({"segIndices": (10 * ids).tolist()}))
+    groups = [{"label": names[i], "objectId": i, "segments": [10 * i]} for i in np.unique(ids).tolist() if i in names]
+    everything = {"label": "floor", "objectId": 999, "segments": (10 * np.unique(ids)).tolist()}  # larger: loses
+    (scene / "scans" / "segments_anno.json").write_text(json.dumps({"segGroups": [everything, *groups]}))
+    (scene / "scans" / "mesh_aligned_0.05_mask.txt").write_text("0\n1\n2\n")
+
+    labels = f"labels:{small_scene / 'labels'}"
+    quick = ["--set", "language.encoder=none", *QUICK]
+    scannetpp.main([str(tmp_path / "spp"), "-o", str(tmp_path / "w"), "--masks", labels, "--no-train-on-test", *quick])
+    facts = json.loads((tmp_path / "w" / "scannetpp.json").read_text())
+    assert facts["result"]["ap50"] > 0.3
+    assert facts["result"]["protocol"]["test_photos"] == "held out"
+    assert "84" not in facts["result"]["protocol"]["classes"] and "smallest object" in str(facts["result"]["protocol"])
+    assert "protocol scannetpp" in capsys.readouterr().out
+
+    written = np.loadtxt(tmp_path / "w" / "truth" / "instance-classes" / "0a1b.txt", dtype=int)
+    assert (written[:3] == -2).all() and len(written) == len(rows)
+    for i in np.unique(ids[3:]).tolist():
+        values = np.unique(written[3:][ids[3:] == i])
+        assert len(values) == 1  # one truth id an object, whatever lies around it
+        assert (values[0] > 0) == (i in names and names[i] not in ("wall", "floor", "ceiling"))
+
+
+def test_reference_takes_what_lies_inside_by_more_than_the_share() -> None:
+    ids = np.full((10, 10), -1, np.int32)
+    ids[:, :5], ids[:, 5:7], ids[0, 7:] = 0, 1, 3
+    reference = np.zeros((10, 10), bool)
+    reference[:, :6] = True  # all of 0, half of 1, nothing of 3
+    assert by_reference(ids, reference) == [0]
+    assert by_reference(ids, reference, share=0.4) == [0, 1]
+
+
+def test_what_is_not_a_dataset_is_told(tmp_path: Path, downloads: Path) -> None:
+    for bench, word in ((lerf_mask, "test_mask"), (lerf_ovs, "label"), (scannetpp, "scans")):
+        with pytest.raises(InputError, match=word):
+            bench.main([str(tmp_path), "-o", str(tmp_path / "w")])
+    with pytest.raises(InputError, match="no scene 'ramen'; found broken, table"):
+        lerf_mask.main([str(downloads / "lerf_mask"), "-o", str(tmp_path / "w"), "--scenes", "ramen"])
+    with pytest.raises(InputError, match="reference:DIR"):
+        lerf_mask.main([str(downloads / "lerf_mask"), "-o", str(tmp_path / "w"), "--select", "guess"])

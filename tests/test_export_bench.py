@@ -1,0 +1,103 @@
+"""The reach of a map measured from its spacing, and the benches on small clouds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perception.bench import clouds, smoothing
+from perception.cli import main
+from perception.errors import InputError
+from perception.export.assign import auto_distance
+from perception.export.labels import ExportOptions, export_labels
+from perception.io.cloud import read_cloud, write_cloud
+from perception.types import PointCloud
+
+
+def test_auto_distance_is_twice_the_spacing_of_a_grid() -> None:
+    grid = np.stack(np.meshgrid(*[np.arange(12.0)] * 3), axis=-1).reshape(-1, 3) * 0.25
+    assert auto_distance(grid) == pytest.approx(0.5, rel=1e-6)
+    assert auto_distance(grid * 8) == pytest.approx(4.0, rel=1e-6)  # in the map's own unit
+    assert auto_distance(grid[:1]) is None and auto_distance(np.ones((5, 3))) is None
+
+
+def test_points_beyond_the_map_stay_unlabelled_under_auto() -> None:
+    grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), axis=-1).reshape(-1, 3)
+    ids = (grid[:, 0] > 3).astype(np.int32)
+    points = np.array([[0, 0, 0], [7, 7, 7], [3.5, 3.5, 3.5], [7, 7, 8.9], [7, 7, 9.2], [-40, 0, 0]], np.float32)
+    labels = export_labels(grid, ids, None, PointCloud(points), ExportOptions(max_distance="auto", smooth=False))
+    assert labels.tolist()[:2] == [0, 1] and labels[3] == 1 and labels.tolist()[4:] == [-1, -1]
+    unlimited = export_labels(grid, ids, None, PointCloud(points), ExportOptions(smooth=False))
+    assert (unlimited >= 0).all()  # off by default, as in the paper
+    for bad in ("far", -1.0):
+        with pytest.raises(InputError, match="max_distance"):
+            export_labels(grid, ids, None, PointCloud(points), ExportOptions(max_distance=bad))
+
+
+def test_all_trees_give_the_same_neighbours_and_segments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("open3d")
+    points, means = clouds.surfaces(3000, 1, 0.002), clouds.surfaces(500, 2, 0.01)
+    labels = (points[:, 0] * 4).astype(np.int32)
+    answers = [clouds.nearest(tree, points, means) for tree in clouds.TREES]
+    votes = [clouds.smoothed(tree, points, labels) for tree in clouds.TREES]
+    for other in (1, 2):
+        assert (answers[0] == answers[other]).mean() > 0.999  # equal distances may go either way
+        assert (votes[0] == votes[other]).mean() > 0.999
+
+
+def test_bench_clouds_measures_in_processes_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small = ["--points", "2000", "--gaussians", "300", "--turns", "1", "--tasks", "assignment"]
+    assert main(["bench", "clouds", *small, "--json", str(tmp_path / "r.json")]) == 0
+    turns = json.loads((tmp_path / "r.json").read_text())["turns"]
+    assert len({round(rows[0]["mark"], 6) for rows in turns.values()}) == 1  # the same answer from all of them
+    assert all(rows[0]["cpu_seconds"] > 0 for rows in turns.values())
+    assert "assignment perception" in capsys.readouterr().out
+
+
+def test_bench_smoothing_tells_what_smoothing_is_worth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points = clouds.surfaces(20_000, 3)
+    ids = 1 + (points[:, 0] > 4) + 2 * (points[:, 2] > 0)
+    write_cloud(tmp_path / "c.ply", PointCloud(points, labels={"instance_id": ids.astype(np.int32)}))
+    smoothing.main([str(tmp_path / "c.ply"), "--gaussians", "8000", "--json"])
+    rows = {row["variant"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
+    assert rows["nearest, not smoothed"]["ap"] < 0.9  # 15 % of the Gaussians are wrong
+    assert {"nearest, knn graph", "nearest, radius graph"} <= rows.keys()
+    write_cloud(tmp_path / "bare.ply", PointCloud(points))
+    with pytest.raises(InputError, match="instance_id"):
+        smoothing.main([str(tmp_path / "bare.ply")])
+
+
+def test_eval_takes_the_switches_of_a_protocol(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gt = np.repeat([1, 2, 3, 9], 50)
+    cloud = PointCloud(np.zeros((200, 3), np.float32))
+    cloud.labels = {"instance_id": gt.astype(np.int32), "semantic_id": np.repeat([4, 4, 5, 7], 50).astype(np.int32)}
+    write_cloud(tmp_path / "gt.ply", cloud)
+    pred = np.where(gt == 3, -1, gt).astype(np.int32)
+    cloud.labels["instance_id"] = pred
+    write_cloud(tmp_path / "pred.ply", cloud)
+    assert len(read_cloud(tmp_path / "pred.ply").points) == 200
+    scores = {"instances": {str(i): {"score": i / 10} for i in (1, 2, 9)}}
+    (tmp_path / "other.json").write_text(json.dumps(scores))
+
+    def run(*flags: str) -> dict:
+        paths = [str(tmp_path / "pred.ply"), str(tmp_path / "gt.ply")]
+        assert main(["eval", "instances", *paths, "--json", *flags]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    assert run()["num_truth"] == 0  # 50 points are under ScanNet's 100
+    small = run("--min-region", "10")
+    # 3 of 4 found: the curve is (recall .75, precision 1), closed by (0, 1)
+    assert small["ap"] == pytest.approx(0.75) and small["num_truth"] == 4
+    assert run("--min-region", "10", "--void", "0,3")["ap"] == pytest.approx(1.0)
+    by_class = run("--min-region", "10", "--by-class")
+    assert {k: v["ap"] for k, v in by_class["classes"].items()} == {"4": 1.0, "5": 0.0, "7": 1.0}
+    assert by_class["ap"] == pytest.approx(2 / 3)
+    assert run("--min-region", "10", "--by-class", "--classes", "4,7")["ap"] == pytest.approx(1.0)
+    named = run("--min-region", "10", "--scores", str(tmp_path / "other.json"))
+    assert named["protocol"]["confidence"].endswith("other.json")
+    assert run("--constant-score")["protocol"]["confidence"] == "constant 1.0"
+    assert main(["eval", "instances", "a.ply", "b.ply", "--void", "wall"]) == 2
+    assert "\n" not in capsys.readouterr().err.strip()
