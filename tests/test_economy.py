@@ -48,11 +48,11 @@ def test_growth_ends_where_all_that_was_gained_would_not_pay_for_it() -> None:
 def test_a_harmonic_is_kept_when_its_trial_gains_more_than_one_without() -> None:
     held = economy(0.0, [])
     degrees = []
-    for score in (20.0, 20.1, 20.4, 20.45):  # base trial +.1; degree 1 +.3: kept; degree 2 +.05: taken back
+    for score in (18.0, 20.0, 20.1, 20.4, 20.45):  # base trial +.1; degree 1 +.3: kept; degree 2 +.05: taken back
         held.scores.append(score)
         degree, _ = held.harmonics_step(degrees[-1] if degrees else 0)
         degrees.append(degree)
-    assert degrees == [0, 1, 2, 1] and held.settled
+    assert degrees == [0, 0, 1, 2, 1] and held.settled
 
 
 def test_rates_cool_down_over_the_last_share_only() -> None:

@@ -24,7 +24,7 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.profile import Profile
 from perception.gaussians.rasterize import Rasterization, rasterize
-from perception.gaussians.views import TrainingView, cooling, depth_image, psnr, render_view, scene_extent
+from perception.gaussians.views import TrainingView, cooling, depth_image, psnr, render_view, scene_extent, visible_in
 
 __all__ = ["TrainRecord", "Trainer", "TrainingView", "depth_image", "psnr", "render_view", "scene_extent"]
 
@@ -176,6 +176,8 @@ class Trainer:
                 self._densify(progress)
             if self.progress >= self.economy.due and not self.economy.finished:
                 self._end_trial()
+        if self.progress >= 1.0:
+            self._prune_unseen()
         if self.iteration % (5 * every) == 0 or self.progress >= 1.0:
             self._note(progress)
         return losses
@@ -287,6 +289,18 @@ class Trainer:
             self._sync()
             if len(born):
                 self._decide(f"holes: {empty:.2%} of the pictures were empty, {len(born)} Gaussians placed there")
+
+    def _prune_unseen(self) -> None:
+        """Drops at the end what adds to no photo: no training view's picture changes by it."""
+        seen = torch.zeros(len(self.gaussians), dtype=torch.bool)
+        with self.profile("evaluation"):
+            for view in self.views:
+                seen |= visible_in(self.gaussians, view)
+        if not bool(seen.all()):
+            self._decide(f"pruned: {int((~seen).sum())} Gaussians that no photo sees")
+            self.optimiser.keep(torch.nonzero(seen).flatten())
+            self._sync()
+            self.statistics = Statistics.zeros(len(self.gaussians))
 
     # ---------------------------------------------------------------- economy
 

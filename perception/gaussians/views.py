@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.rasterize import rasterize
+from perception.gaussians.rasterize import Rasterization, rasterize
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,18 @@ def scene_extent(views: list[TrainingView]) -> float:
 @torch.no_grad()
 def render_view(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
     """The photo as the map sees it, [H, W, 3] float32 in [0, 1], black where nothing is."""
+    return _render(gaussians, view).colors[0].clamp(0, 1)
+
+
+@torch.no_grad()
+def visible_in(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
+    """[N] bool: adds to some pixel of the view."""
+    return _render(gaussians, view).visible[0]
+
+
+def _render(gaussians: Gaussians, view: TrainingView) -> Rasterization:
     height, width = view.photo.shape[:2]
-    out = rasterize(
+    return rasterize(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
@@ -57,7 +67,6 @@ def render_view(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
         sh_degree=gaussians.sh_degree,
         depth=False,
     )
-    return out.colors[0].clamp(0, 1)
 
 
 @torch.no_grad()
