@@ -82,7 +82,7 @@ def test_growth_and_training_end_where_they_do_not_pay(small_scene: Path, tmp_pa
     cloud = read_cloud(scene / "truth" / "gt_points.ply")
     write_cloud(scene / "truth" / "gt_points.ply", PointCloud(cloud.points[::100], cloud.colors[::100]))
     labels = f"masks=labels:{scene / 'labels'}"
-    pairs = [*SMALL, labels, "train.iterations=400", "train.budget=20000"]
+    pairs = [*SMALL, labels, "train.iterations=300", "train.budget=8000", "train.sh_degree=0"]
     found = {}
     for rate in (-99, 50):
         config = load_config(None, [*pairs, f"train.exchange_db={rate}"])
@@ -91,11 +91,12 @@ def test_growth_and_training_end_where_they_do_not_pay(small_scene: Path, tmp_pa
     assert any(text.startswith("growth: ended") for text in decisions)
     assert any(text.startswith("stop: 10 %") for text in decisions)
     assert len(found[50]) < 0.7 * len(found[-99])
-    assert found[50].info["training"]["iterations"] < 400 == found[-99].info["training"]["iterations"]
+    assert found[50].info["training"]["iterations"] < 300 == found[-99].info["training"]["iterations"]
 
 
 def test_nothing_held_out_works_on_training_views(small_scene: Path, tmp_path: Path) -> None:
     pairs = [*SMALL[:-1], "photos.holdout=0", f"masks=labels:{small_scene / 'labels'}", "train.iterations=200"]
+    pairs.append("train.sh_degree=0")
     gmap = build_map(
         small_scene / "transforms.json", tmp_path / "m.gsmap", load_config(None, [*pairs, "train.exchange_db=50"])
     )

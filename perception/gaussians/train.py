@@ -313,9 +313,11 @@ class Trainer:
         if progress < self.config.densify.stop and economy.growing:
             if progress > self.config.train.coarse_until + 2 * TRIAL:
                 self._decide(economy.growth_pays(count, self._allowed(progress + TRIAL)))
-        elif not economy.settled:
-            if not economy.harmonics:
-                self._decide(f"growth: {count} of at most {self.config.train.budget} Gaussians")
+            return
+        if economy.growing:
+            economy.growing = False
+            self._decide(f"growth: {count} of at most {self.config.train.budget} Gaussians")
+        if not economy.settled:
             degree, told = economy.harmonics_step(self.gaussians.sh_degree)
             self._decide(told)
             if degree != self.gaussians.sh_degree:
