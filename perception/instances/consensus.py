@@ -47,7 +47,9 @@ class MergeTree:
 class _Merger:
     """The state of the agglomeration. Tables lie mask-major, so that the few masks a segment is in are whole rows."""
 
-    def __init__(self, table: np.ndarray, view: np.ndarray, prototypes: np.ndarray, sizes: np.ndarray, near: np.ndarray):
+    def __init__(
+        self, table: np.ndarray, view: np.ndarray, prototypes: np.ndarray, sizes: np.ndarray, near: np.ndarray
+    ):
         count = len(table)
         self.view = np.unique(view, return_inverse=True)[1].reshape(-1)
         self.views = int(self.view.max(initial=-1)) + 1

@@ -31,9 +31,7 @@ def over_segment(means: np.ndarray, features: np.ndarray, count: int, seed: int 
 
 def _nearest(rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
     half = 0.5 * (centres**2).sum(axis=1)
-    parts = [
-        (half - rows[begin : begin + CHUNK] @ centres.T).argmin(axis=1) for begin in range(0, len(rows), CHUNK)
-    ]
+    parts = [(half - rows[begin : begin + CHUNK] @ centres.T).argmin(axis=1) for begin in range(0, len(rows), CHUNK)]
     return np.concatenate(parts) if parts else np.zeros(0, np.int64)
 
 

@@ -1,7 +1,7 @@
 """What the 2D masks say of every Gaussian: how much of it each mask of each photo shows.
 
-The weight of Gaussian n in mask m is Σ_{p ∈ m} w_n(p), w_n(p) = its alpha times the transmittance before it: the very weight
-with which its colour enters the picture. Rendering is linear in features, so these sums are the gradient of the
+The weight of Gaussian n in mask m is Σ_{p ∈ m} w_n(p), w_n(p) = its alpha times the transmittance before it: the very
+weight with which its colour enters the picture. Rendering is linear in features, so these sums are the gradient of the
 rendered mask indicator with respect to features, and one backward pass yields 16 masks for all Gaussians.
 """
 

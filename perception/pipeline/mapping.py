@@ -289,6 +289,7 @@ def _assemble(
         info=record,
         cameras=cameras,
         language=found.language,
+        parts=found.parts,
     )
 
 
