@@ -27,10 +27,17 @@ class PhotoConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Length and step sizes of the optimisation (Kerbl et al. 2023, shortened: progress drives every schedule)."""
+    """Length and step sizes of the optimisation (Kerbl et al. 2023, shortened: progress drives every schedule).
+
+    exchange_db: dB of held-out PSNR that 10 % more time must buy, else growth or training ends. stop_psnr: dB at which
+    training ends. cooldown: last share of the course, over which all rates fall.
+    """
 
     iterations: int = 3000
     time_limit: float | None = None
+    stop_psnr: float | None = None
+    exchange_db: float = 0.03
+    cooldown: float = 0.1
     budget: int = 100_000
     lr_means: float = 1.6e-4
     lr_means_final: float = 1.6e-6
@@ -58,6 +65,9 @@ class DensifyConfig:
     percent_dense: float = 0.01
     prune_opacity: float = 0.005
     opacity_decay: float = 1e-2
+    by_error: bool = False
+    error_floor: float = 0.01
+    error_power: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -190,13 +200,21 @@ def load_config(file: Path | None = None, pairs: list[str] | None = None, preset
     if file is not None:
         for key, value in _read_toml(file).items():
             config = set_value(config, key, value, str(file))
-    for pair in pairs or []:
+    for key, text in read_pairs(pairs or []).items():
+        config = set_value(config, key, text)
+    check(config)
+    return config
+
+
+def read_pairs(pairs: list[str]) -> dict[str, Any]:
+    """KEY=VALUE texts by key; the last of equal keys counts."""
+    values: dict[str, Any] = {}
+    for pair in pairs:
         key, separator, value = pair.partition("=")
         if not separator:
             raise InputError(f"--set: found '{pair}', expected KEY=VALUE")
-        config = set_value(config, key.strip(), value.strip())
-    check(config)
-    return config
+        values[key.strip()] = value.strip()
+    return values
 
 
 def _read_toml(file: Path) -> dict[str, Any]:
@@ -252,6 +270,9 @@ def check(config: MapConfig) -> None:
         ),
     ]
     limit = config.train.time_limit
+    train = config.train
+    rules.append(("train.cooldown", train.cooldown, 0 <= train.cooldown <= 0.5, "0 to 0.5"))
+    rules.append(("train.stop_psnr", train.stop_psnr, train.stop_psnr is None or train.stop_psnr > 0, "dB above 0"))
     rules.append(("train.time_limit", limit, limit is None or limit > 0, "seconds above 0"))
     for name, value, fine, expected in rules:
         if not fine:

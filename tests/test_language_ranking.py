@@ -33,6 +33,7 @@ class Table:
     """A hand-made encoder: known words have known vectors, every other text a fixed random direction."""
 
     identity, dim, templates, references = "table", DIM, ("{}",), None
+    margin, canonical = 0.0, ()
 
     def __init__(self, known: dict[str, np.ndarray]) -> None:
         self.known = known

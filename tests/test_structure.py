@@ -26,11 +26,12 @@ LAYERS = [
         "models",
         "editing",
     },
-    {"pipeline", "bench"},
     {
         "serve",
         "node",
+        "pipeline",
         "viewer",
+        "bench",
     },
     {"cli"},
 ]

@@ -11,5 +11,11 @@ BENCHES = (
     "scannetpp",
     "clouds",
     "smoothing",
+    "queries",
+    "map",
+    "switches",
+    "scaling",
+    "ablation",
+    "export",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""

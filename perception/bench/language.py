@@ -12,55 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from perception.bench.prompts import ABSENT, accuracy, chance
 from perception.bench.truth import TruthScene, read_truth, truth_view_scores
 from perception.instances.crops import choose_views
 from perception.instances.describe import describe_instances
 from perception.language.base import Encoder, make_encoder
 from perception.language.description import InstanceDescription
 from perception.language.ranking import PRESENT, Ranker
-
-ABSENT = [
-    "elephant",
-    "car",
-    "airplane",
-    "bicycle",
-    "motorcycle",
-    "train",
-    "horse",
-    "giraffe",
-    "sailing boat",
-    "fire truck",
-    "traffic light",
-    "church",
-    "bridge",
-    "palm tree",
-    "shark",
-    "penguin",
-    "tractor",
-    "helicopter",
-    "snowman",
-    "waterfall",
-    "castle",
-    "whale",
-    "lighthouse",
-    "tank",
-    "skateboard",
-    "surfboard",
-    "umbrella",
-    "piano",
-    "toothbrush",
-    "hair dryer",
-    "washing machine",
-    "refrigerator",
-    "bathtub",
-    "toilet",
-    "violin",
-    "ladder",
-    "wheelchair",
-    "tent",
-    "parachute",
-    "lawn mower",
-]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -110,18 +68,18 @@ def score_queries(scene: TruthScene, descriptions: list[InstanceDescription], en
     queries = scene.queries()
     ranker = Ranker(descriptions, encoder)
     answers = [ranker.rank(text) for text, _ in queries]
-    top1, top3 = _accuracy([[i for i, _ in a.hits] for a in answers], [q for _, q in queries])
+    top1, top3 = accuracy([[i for i, _ in a.hits] for a in answers], [q for _, q in queries])
     blind = [
         InstanceDescription(d.embedding, d.per_view, np.zeros_like(d.palette), d.views, d.boxes) for d in descriptions
     ]
     grey = Ranker(blind, encoder)
-    blind1, blind3 = _accuracy([[i for i, _ in grey.rank(t).hits] for t, _ in queries], [q for _, q in queries])
+    blind1, blind3 = accuracy([[i for i, _ in grey.rank(t).hits] for t, _ in queries], [q for _, q in queries])
     said = [
         a.present and any(i in right for i, s in a.hits[:3] if s >= PRESENT)
         for a, (_, right) in zip(answers, queries, strict=True)
     ]
     wrong = [text for text in ABSENT if ranker.rank(text).present]
-    chance1, chance3 = _chance([len(q) for _, q in queries], len(descriptions))
+    chance1, chance3 = chance([len(q) for _, q in queries], len(descriptions))
     return {
         "prompts": len(queries),
         "top1": top1,
@@ -165,21 +123,6 @@ def latency(descriptions: list[InstanceDescription], spec: str, instances: int =
         "query_warm_median_ms": round(float(median), 2),
         "query_warm_p99_ms": round(float(p99), 2),
     }
-
-
-def _accuracy(ranked: list[list[int]], right: list[set[int]]) -> tuple[float, float]:
-    top1 = np.mean([order[0] in answers for order, answers in zip(ranked, right, strict=True)])
-    top3 = np.mean([bool(answers & set(order[:3])) for order, answers in zip(ranked, right, strict=True)])
-    return round(float(top1), 3), round(float(top3), 3)
-
-
-def _chance(sizes: list[int], count: int) -> tuple[float, float]:
-    """Expected accuracy of a random order: 1 − C(count − m, k) / C(count, k)."""
-
-    def hit(m: int, k: int) -> float:
-        return 1.0 - float(np.prod([(count - m - j) / (count - j) for j in range(min(k, count))]).clip(0))
-
-    return round(float(np.mean([hit(m, 1) for m in sizes])), 3), round(float(np.mean([hit(m, 3) for m in sizes])), 3)
 
 
 if __name__ == "__main__":

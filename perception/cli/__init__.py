@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -16,10 +17,13 @@ from perception.errors import InputError
 _MODULES = (
     "mapping",
     "asking",
-    "serving",
+    "labels",
     "clouds",
     "scoring",
+    "serving",
+    "node",
     "viewing",
+    "models",
 )
 """Files of this package that add subcommands, in the order of --help."""
 
@@ -32,6 +36,13 @@ def build_parser() -> argparse.ArgumentParser:
     for name in _MODULES:
         import_module(f"perception.cli.{name}").register(commands)
     return parser
+
+
+def _resume(argv: Sequence[str] | None) -> str:
+    """The command that goes on where this one stopped; only `map` needs to be told."""
+    words = [str(word) for word in (sys.argv[1:] if argv is None else argv)]
+    more = ["--resume"] if words[:1] == ["map"] and "--resume" not in words else []
+    return shlex.join(["perception", *words, *more])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -52,6 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         told = "interrupted; what was done is kept, repeat the command with --resume"
         print(getattr(args, "interrupted", told), file=sys.stderr)
+        print(f"interrupted; what was done is kept, go on with: {_resume(argv)}", file=sys.stderr)
         return 130
     except BrokenPipeError:
         return 0

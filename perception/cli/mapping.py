@@ -30,9 +30,12 @@ def _add_map(commands: Any) -> None:
     p.add_argument("--budget", metavar="N", help="most Gaussians the map may have")
     p.add_argument("--iterations", metavar="N")
     p.add_argument("--time-limit", metavar="S", help="seconds of training; all schedules shrink to fit")
+    p.add_argument("--stop-psnr", metavar="DB", help="held-out PSNR at which training ends")
     p.add_argument("--holdout", metavar="N", help="every N-th view is kept for scoring, 0 trains on all")
     p.add_argument("--seed", metavar="S")
     p.add_argument("--device", help="auto, cpu or cuda")
+    p.add_argument("--labels-from", type=Path, metavar="OLD.gsmap", help="carry over the names given to its instances")
+    p.add_argument("--profile", action="store_true", help="print where the time went")
     p.add_argument("--resume", action="store_true", help="go on with an interrupted run")
 
 
@@ -43,6 +46,7 @@ _SHORTCUTS = {
     "budget": "train.budget",
     "iterations": "train.iterations",
     "time_limit": "train.time_limit",
+    "stop_psnr": "train.stop_psnr",
     "holdout": "photos.holdout",
     "seed": "seed",
     "device": "device",
@@ -57,16 +61,20 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.pipeline.mapping import build_map
     from perception.progress import Progress
 
-    gmap = build_map(args.input, args.output, config, resume=args.resume, progress=Progress())
-    from perception.pipeline.summary import map_facts
+    gmap = build_map(
+        args.input, args.output, config, resume=args.resume, progress=Progress(), labels_from=args.labels_from
+    )
+    from perception.pipeline.summary import map_facts, profile_text
 
-    return map_facts(args.output, gmap.info, len(gmap), len(gmap.instances)), ""
+    facts = map_facts(args.output, gmap.info, len(gmap), len(gmap.instances))
+    return facts, profile_text(gmap.info) if args.profile else ""
 
 
 def _add_info(commands: Any) -> None:
     p = command(commands, "info", _info, "what a map holds, how it was made, how good it is")
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("--verify", action="store_true", help="read every byte and compare it with the checksums")
+    p.add_argument("--sheet", type=Path, metavar="OUT.png", help="picture of every instance with its likeliest names")
 
 
 def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -74,6 +82,11 @@ def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.pipeline.summary import info_text
 
     info = read_info(args.map)
+    if args.sheet is not None:
+        from perception.pipeline.reporting import write_sheet
+        from perception.query import load_map
+
+        write_sheet(load_map(args.map), args.sheet)
     if not args.verify:
         return info, info_text(args.map, info)
     states = verify_map(args.map)

@@ -1,6 +1,4 @@
-"""A labelled cloud and its instances as ROS 2 messages in an MCAP file, through the optional package
-`rosbags`.
-"""
+"""A labelled cloud and its instances as ROS 2 messages in an MCAP file, through the optional package `rosbags`."""
 
 from __future__ import annotations
 
@@ -13,23 +11,10 @@ import numpy as np
 
 from perception.boxes import instance_boxes
 from perception.errors import InputError, missing_extra
+from perception.export.cdr import serialize, typestore
+from perception.export.ros_messages import DETECTIONS, POINT_CLOUD, Stamp, detection, header, packed_rgb, point_cloud2
 from perception.io.atomic import replacing
-from perception.types import PointCloud
-
-# vision_msgs 4 (ROS 2 Humble and later), which rosbags does not carry itself.
-_VISION = {
-    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
-    "vision_msgs/msg/ObjectHypothesisWithPose": (
-        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n"
-    ),
-    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
-    "vision_msgs/msg/Detection3D": (
-        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
-        "vision_msgs/BoundingBox3D bbox\nstring id\n"
-    ),
-    "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections\n",
-}
-_FLOAT32, _INT32, _UINT32 = 7, 5, 6  # sensor_msgs/PointField datatypes
+from perception.types import OrientedBox, PointCloud
 
 
 def write_mcap(
@@ -51,18 +36,17 @@ def write_mcap(
     except ImportError as error:
         raise missing_extra("rosbags", "ros") from error
     path = Path(path)
-    store = typestore()
     stamp = (stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000)
     messages = {
-        "/perception/points": point_cloud2(store, cloud, labels, frame, stamp),
-        "/perception/instances": detections(store, cloud.points, labels, instances, frame, stamp),
+        "/perception/points": (POINT_CLOUD, labelled_cloud(cloud, labels, frame, stamp)),
+        "/perception/instances": (DETECTIONS, detections(cloud.points, labels, instances, frame, stamp)),
     }
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / "bag"
         with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-            for topic, message in messages.items():
-                connection = writer.add_connection(topic, message.__msgtype__, typestore=store)
-                writer.write(connection, stamp_ns, store.serialize_cdr(message, message.__msgtype__))
+            for topic, (kind, message) in messages.items():
+                connection = writer.add_connection(topic, kind, typestore=typestore())
+                writer.write(connection, stamp_ns, serialize(kind, message))
         written = list(bag.glob("*.mcap"))
         if len(written) != 1:
             raise InputError(f"{path}: rosbags wrote {len(written)} MCAP files, expected one; update rosbags")
@@ -71,91 +55,23 @@ def write_mcap(
                 file.write(block)
 
 
-def typestore() -> Any:
-    """rosbags' types of ROS 2 Jazzy with vision_msgs added."""
-    try:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    except ImportError as error:
-        raise missing_extra("rosbags", "ros") from error
-    store = get_typestore(Stores.ROS2_JAZZY)
-    types: dict[str, Any] = {}
-    for name, definition in _VISION.items():
-        types |= get_types_from_msg(definition, name)
-    store.register(types)
-    return store
-
-
-def point_cloud2(store: Any, cloud: PointCloud, labels: np.ndarray, frame: str, stamp: tuple[int, int]) -> Any:
+def labelled_cloud(cloud: PointCloud, labels: np.ndarray, frame: str, stamp: Stamp) -> dict[str, Any]:
     """sensor_msgs/PointCloud2 with x y z (float32), rgb packed as in PCL when known, instance_id (int32)."""
-    columns = {axis: (cloud.points[:, i].astype("<f4"), _FLOAT32) for i, axis in enumerate("xyz")}
+    columns = {axis: cloud.points[:, i].astype(np.float32) for i, axis in enumerate("xyz")}
     if cloud.colors is not None:
-        r, g, b = cloud.colors.astype(np.uint32).T
-        columns["rgb"] = (((r << 16) | (g << 8) | b).astype("<u4"), _UINT32)
-    columns["instance_id"] = (labels.astype("<i4"), _INT32)
-    rows = np.empty(len(cloud.points), [(name, values.dtype.str) for name, (values, _) in columns.items()])
-    for name, (values, _) in columns.items():
-        rows[name] = values
-    field = store.types["sensor_msgs/msg/PointField"]
-    fields = [field(name, 4 * i, kind, 1) for i, (name, (_, kind)) in enumerate(columns.items())]
-    return store.types["sensor_msgs/msg/PointCloud2"](
-        header=_header(store, frame, stamp),
-        height=1,
-        width=len(rows),
-        fields=fields,
-        is_bigendian=False,
-        point_step=rows.itemsize,
-        row_step=rows.nbytes,
-        data=rows.view(np.uint8).reshape(-1),
-        is_dense=bool(np.isfinite(cloud.points).all()),
-    )
+        columns["rgb"] = packed_rgb(cloud.colors)
+    columns["instance_id"] = labels.astype(np.int32)
+    return point_cloud2(columns, frame, stamp)
 
 
 def detections(
-    store: Any,
-    points: np.ndarray,
-    labels: np.ndarray,
-    instances: Mapping[int, Mapping[str, Any]],
-    frame: str,
-    stamp: tuple[int, int],
-) -> Any:
-    """vision_msgs/Detection3DArray: one detection for each instance, its oriented box, label (or id) and
-    score.
-    """
-    t = store.types
-    header = _header(store, frame, stamp)
+    points: np.ndarray, labels: np.ndarray, instances: Mapping[int, Mapping[str, Any]], frame: str, stamp: Stamp
+) -> dict[str, Any]:
+    """vision_msgs/Detection3DArray: one detection for each instance, its oriented box, label (or id) and score."""
+    head = header(frame, stamp)
     found = []
-    for i, box in instance_boxes(points, labels).items():
-        known = instances.get(i, {})
-        pose = _pose(store, box["obb"])
-        hypothesis = t["vision_msgs/msg/ObjectHypothesis"](
-            class_id=known.get("label") or str(i), score=float(known.get("score", 1.0))
-        )
-        with_pose = t["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36))
-        size = t["geometry_msgs/msg/Vector3"](*(float(s) for s in box["obb"]["extent"]))
-        found.append(
-            t["vision_msgs/msg/Detection3D"](
-                header=header,
-                results=[t["vision_msgs/msg/ObjectHypothesisWithPose"](hypothesis=hypothesis, pose=with_pose)],
-                bbox=t["vision_msgs/msg/BoundingBox3D"](center=pose, size=size),
-                id=str(i),
-            )
-        )
-    return t["vision_msgs/msg/Detection3DArray"](header=header, detections=found)
-
-
-def _header(store: Any, frame: str, stamp: tuple[int, int]) -> Any:
-    time = store.types["builtin_interfaces/msg/Time"](sec=stamp[0], nanosec=stamp[1])
-    return store.types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
-
-
-def _pose(store: Any, obb: dict[str, Any]) -> Any:
-    """geometry_msgs/Pose of a box: its rotation takes box axes to the frame (rows of `rotation` are those
-    axes).
-    """
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(np.array(obb["rotation"]).T).as_quat().tolist()
-    return store.types["geometry_msgs/msg/Pose"](
-        position=store.types["geometry_msgs/msg/Point"](*obb["center"]),
-        orientation=store.types["geometry_msgs/msg/Quaternion"](x, y, z, w),
-    )
+    for i, facts in instance_boxes(points, labels).items():
+        known, obb = instances.get(i, {}), facts["obb"]
+        box = OrientedBox(np.array(obb["center"]), np.array(obb["rotation"]), np.array(obb["extent"]))
+        found.append(detection(box, known.get("label") or str(i), known.get("score", 1.0), str(i), head))
+    return {"header": head, "detections": found}

@@ -21,24 +21,38 @@ SPLIT_SHRINK = 1.6
 @dataclass
 class Statistics:
     """Sums since the last densification, all [N]: gradient norms of the 2D mean (in units of half the image's long
-    side), how often a Gaussian was seen, and its largest radius as a share of the image's long side."""
+    side), how often a Gaussian was seen, its largest radius as a share of the image's long side, and the photos' error
+    where it was seen."""
 
     gradient: torch.Tensor
     seen: torch.Tensor
     radius: torch.Tensor
+    error: torch.Tensor
 
     @staticmethod
     def zeros(count: int) -> Statistics:
-        return Statistics(torch.zeros(count), torch.zeros(count), torch.zeros(count))
+        return Statistics(*(torch.zeros(count) for _ in range(4)))
 
-    def add(self, gradient_px: torch.Tensor, radius_px: torch.Tensor, visible: torch.Tensor, long_side: int) -> None:
-        """One view's figures: gradient_px [N] per pixel, radius_px [N] pixels, visible [N] bool."""
+    def add(
+        self,
+        gradient_px: torch.Tensor,
+        radius_px: torch.Tensor,
+        visible: torch.Tensor,
+        long_side: int,
+        error: torch.Tensor | None = None,
+    ) -> None:
+        """One view's figures: gradient_px [N] per pixel, radius_px [N] pixels, visible [N] bool, error [N] or None."""
         self.gradient += torch.where(visible, gradient_px * (0.5 * long_side), 0.0)
         self.seen += visible
         self.radius = torch.maximum(self.radius, torch.where(visible, radius_px / long_side, 0.0))
+        if error is not None:
+            self.error += torch.where(visible, error, 0.0)
 
     def mean_gradient(self) -> torch.Tensor:
         return self.gradient / self.seen.clamp(min=1)
+
+    def mean_error(self) -> torch.Tensor:
+        return self.error / self.seen.clamp(min=1)
 
 
 @dataclass(frozen=True)
@@ -70,7 +84,12 @@ def densify(
     needed = _needed(gaussians, statistics, config)
     room = max(0, allowed - int(needed.sum()))
     score = statistics.mean_gradient()
-    candidates = torch.nonzero(needed & (score > config.grad_threshold)).flatten()
+    wanted = needed & (score > config.grad_threshold)
+    if config.by_error:
+        error = statistics.mean_error()
+        wanted &= error > config.error_floor
+        score = score * error**config.error_power
+    candidates = torch.nonzero(wanted).flatten()
     if len(candidates) > room:
         best = torch.argsort(score[candidates], descending=True, stable=True)[:room]
         candidates = candidates[best].sort().values

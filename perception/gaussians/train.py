@@ -17,50 +17,31 @@ import torch
 
 from perception.config import MapConfig
 from perception.gaussians.densify import Statistics, decay_opacities, densify, target_count
+from perception.gaussians.economy import TRIAL, Economy
 from perception.gaussians.losses import instance_loss, photometric_loss, variance_loss
 from perception.gaussians.model import Gaussians
 from perception.gaussians.optimiser import SparseAdam
-from perception.gaussians.rasterize import rasterize
+from perception.gaussians.profile import Profile
+from perception.gaussians.rasterize import Rasterization, rasterize
+from perception.gaussians.views import TrainingView, cooling, depth_image, error_at, psnr, render_view, scene_extent
 
-
-@dataclass(frozen=True)
-class TrainingView:
-    """One photo ready for training. photo [H, W, 3] uint8; labels [H, W] int32 (0 = unlabelled) or None;
-    K [3, 3] and camera_from_world [4, 4] float32."""
-
-    name: str
-    photo: torch.Tensor
-    labels: torch.Tensor | None
-    K: torch.Tensor
-    camera_from_world: torch.Tensor
-
-    def halved(self) -> TrainingView:
-        """The same view at half the resolution: photo averaged 2 × 2, labels taken at every other pixel."""
-        height, width = self.photo.shape[0] // 2, self.photo.shape[1] // 2
-        blocks = self.photo[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3)
-        photo = (blocks.to(torch.int16).sum(dim=(1, 3)) + 2).div(4, rounding_mode="floor").to(torch.uint8)
-        labels = None if self.labels is None else self.labels[: 2 * height : 2, : 2 * width : 2].contiguous()
-        K = self.K.clone()
-        K[:2] *= 0.5
-        return TrainingView(self.name, photo.contiguous(), labels, K, self.camera_from_world)
+__all__ = ["TrainRecord", "Trainer", "TrainingView", "depth_image", "psnr", "render_view", "scene_extent"]
 
 
 @dataclass
 class TrainRecord:
-    """What training spent and what it bought; JSON-able."""
+    """What training spent and what it bought; JSON-able.
+
+    profile: seconds by part. pairs: contributing (Gaussian, pixel) pairs of all training renders.
+    """
 
     curve: list[dict[str, float]] = field(default_factory=list)
     decisions: list[str] = field(default_factory=list)
+    profile: dict[str, float] = field(default_factory=dict)
+    pairs: int = 0
     seconds: float = 0.0
     iterations: int = 0
     skipped_gradients: int = 0
-
-
-def scene_extent(views: list[TrainingView]) -> float:
-    """1.1 × the largest distance of a camera from the cameras' mean (Kerbl et al. 2023), never 0."""
-    poses = torch.stack([view.camera_from_world for view in views])
-    centres = -torch.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
-    return max(1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max()), 1e-3)
 
 
 class Trainer:
@@ -73,7 +54,10 @@ class Trainer:
         self.held_out = held_out
         self.extent = scene_extent(views)
         self.record = TrainRecord()
+        self.profile = Profile(self.record.profile)
+        self.economy = Economy(config, settled=config.train.sh_degree == 0)
         self.iteration = 0
+        self._jump = 0.0
         self.initial_count = len(gaussians)
         self.gaussians = gaussians
         self.statistics = Statistics.zeros(len(gaussians))
@@ -81,8 +65,6 @@ class Trainer:
         self.coarse: list[TrainingView] = []
         self.has_labels = False
         self.show(views)
-        self._trials: list[float] = []
-        self._sh_settled = config.train.sh_degree == 0
         self._started = time.monotonic()
         self._order: np.ndarray = np.zeros(0, dtype=np.int64)
 
@@ -98,15 +80,16 @@ class Trainer:
     def _rates(self, progress: float) -> dict[str, float | torch.Tensor]:
         train = self.config.train
         decay = (train.lr_means_final / train.lr_means) ** progress
-        sh = torch.full((self.gaussians.sh.shape[1], 3), train.lr_colors / 20)
-        sh[0] = train.lr_colors
+        cool = cooling(progress, train.cooldown)
+        sh = torch.full((self.gaussians.sh.shape[1], 3), cool * train.lr_colors / 20)
+        sh[0] = cool * train.lr_colors
         return {
-            "means": train.lr_means * decay * self.extent,
-            "quats": train.lr_quats,
-            "log_scales": train.lr_scales,
-            "opacity_logits": train.lr_opacities,
+            "means": cool * train.lr_means * decay * self.extent,
+            "quats": cool * train.lr_quats,
+            "log_scales": cool * train.lr_scales,
+            "opacity_logits": cool * train.lr_opacities,
             "sh": sh,
-            "features": train.lr_features,
+            "features": cool * train.lr_features,
         }
 
     @property
@@ -116,9 +99,17 @@ class Trainer:
 
     @property
     def progress(self) -> float:
-        share = self.iteration / self.config.train.iterations
+        share = self.iteration / self.config.train.iterations + self._jump
         limit = self.config.train.time_limit
         return min(1.0, share if limit is None else max(share, self.elapsed / limit))
+
+    @property
+    def expected_iterations(self) -> int:
+        """How many iterations the run will have had, as far as can be told now."""
+        share = self.iteration / self.config.train.iterations + self._jump
+        if self.progress > share:  # the clock rules
+            return max(self.iteration, round(self.iteration / max(self.progress, 1e-6)))
+        return round(self.iteration + (1 - self.progress) * self.config.train.iterations)
 
     def state(self) -> dict[str, Any]:
         """Everything a resumed run needs."""
@@ -128,7 +119,8 @@ class Trainer:
             "optimiser": self.optimiser.state_dict(),
             "statistics": vars(self.statistics),
             "record": dict(vars(self.record), seconds=self.elapsed, iterations=self.iteration),
-            "harmonics": (self._trials, self._sh_settled),
+            "economy": self.economy.state(),
+            "jump": self._jump,
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -138,7 +130,9 @@ class Trainer:
         self.record = TrainRecord(**state["record"])
         self.iteration = state["iteration"]
         self.initial_count = state["initial_count"]
-        self._trials, self._sh_settled = state["harmonics"]
+        self.profile = Profile(self.record.profile)
+        self.economy.load(state["economy"])
+        self._jump = state["jump"]
         self._started = time.monotonic()
 
     def _restart_optimiser(self, state: dict[str, Any]) -> None:
@@ -157,6 +151,8 @@ class Trainer:
         """Trains until progress `until`; `on_step` sees every iteration (progress bars, checkpoints)."""
         while self.progress < until:
             figures = self.step()
+            if until >= 1.0:  # a leg that something waits for is not cut short
+                self._stop_early()
             on_step(self, figures)
         self.record.seconds, self.record.iterations = self.elapsed, self.iteration
         self._started = time.monotonic()
@@ -175,10 +171,10 @@ class Trainer:
         self.iteration += 1
         every = self.config.densify.every
         if self.iteration % every == 0:
-            if self.config.densify.start <= progress < self.config.densify.stop:
+            if self.economy.growing and self.config.densify.start <= progress < self.config.densify.stop:
                 self._densify(progress)
-            elif progress >= self.config.densify.stop:
-                self._settle_harmonics(progress)
+            if self.progress >= self.economy.due and not self.economy.finished:
+                self._end_trial()
         if self.iteration % (5 * every) == 0 or self.progress >= 1.0:
             self._note(progress)
         return losses
@@ -192,12 +188,37 @@ class Trainer:
     def _descend(self, view: TrainingView, progress: float, with_features: bool) -> dict[str, float]:
         config = self.config
         params = {name: tensor.detach().requires_grad_() for name, tensor in vars(self.gaussians).items()}
+        with self.profile("rasterizer forward"):
+            out = self._render(params, view, with_features)
+        with self.profile("losses"):
+            loss = photometric_loss(out.colors[0], view.photo, config.train.ssim_weight)
+            figures = {"rgb": float(loss.detach())}
+            if with_features:
+                loss = loss + self._feature_losses(view, out, figures)
+            images = [image for image in (out.colors, out.features, out.feature_variance) if image is not None]
+            cotangents = torch.autograd.grad(loss, images, allow_unused=True)
+        with self.profile("rasterizer backward"):
+            used = [(image, grad) for image, grad in zip(images, cotangents, strict=True) if grad is not None]
+            torch.autograd.backward([image for image, _ in used], [grad for _, grad in used])
+        visible = out.visible[0]
+        with self.profile("Adam"):
+            gradients = {name: tensor.grad for name, tensor in params.items() if tensor.grad is not None}
+            self.optimiser.rates = self._rates(progress)
+            self.record.skipped_gradients += sum(self.optimiser.step(visible, gradients).skipped.values())
+        if self.economy.growing and progress < config.densify.stop and out.stats.mean2d_grad is not None:
+            with self.profile("densification"):
+                self._watch(view, out)
+        self.record.pairs += out.stats.contributing_pairs
+        figures["loss"] = float(loss.detach())
+        return figures
+
+    def _render(self, params: dict[str, torch.Tensor], view: TrainingView, with_features: bool) -> Rasterization:
         height, width = view.photo.shape[:2]
         background = None
-        if config.train.random_background:
-            colors = np.random.default_rng([config.seed, self.iteration, 1]).random(3, dtype=np.float32)
+        if self.config.train.random_background:
+            colors = np.random.default_rng([self.config.seed, self.iteration, 1]).random(3, dtype=np.float32)
             background = torch.from_numpy(colors)
-        out = rasterize(
+        return rasterize(
             params["means"],
             params["quats"],
             params["log_scales"].exp(),
@@ -212,19 +233,12 @@ class Trainer:
             background=background,
             depth=False,
         )
-        loss = photometric_loss(out.colors[0], view.photo, config.train.ssim_weight)
-        figures = {"rgb": float(loss.detach())}
-        if with_features:
-            loss = loss + self._feature_losses(view, out, figures)
-        loss.backward()
-        visible = out.visible[0]
-        gradients = {name: tensor.grad for name, tensor in params.items() if tensor.grad is not None}
-        self.optimiser.rates = self._rates(progress)
-        self.record.skipped_gradients += sum(self.optimiser.step(visible, gradients).skipped.values())
-        if progress < config.densify.stop and out.stats.mean2d_grad is not None:
-            self.statistics.add(out.stats.mean2d_grad[0], out.stats.radii[0], visible, max(height, width))
-        figures["loss"] = float(loss.detach())
-        return figures
+
+    def _watch(self, view: TrainingView, out: Rasterization) -> None:
+        assert out.stats.mean2d_grad is not None
+        visible, long_side = out.visible[0], max(view.photo.shape[:2])
+        error = error_at(self.gaussians.means, view, out.colors[0].detach()) if self.config.densify.by_error else None
+        self.statistics.add(out.stats.mean2d_grad[0], out.stats.radii[0], visible, long_side, error)
 
     def _feature_losses(self, view: TrainingView, out: Any, figures: dict[str, float]) -> torch.Tensor:
         losses = self.config.losses
@@ -247,42 +261,64 @@ class Trainer:
 
     # ------------------------------------------------------- size of the model
 
+    def _allowed(self, progress: float) -> int:
+        return target_count(progress, self.initial_count, self.config.train.budget, self.config.densify)
+
     def _densify(self, progress: float) -> None:
         config = self.config
-        decay_opacities(self.gaussians, config.densify.opacity_decay)
-        allowed = target_count(progress, self.initial_count, config.train.budget, config.densify)
-        seed = int(np.random.default_rng([config.seed, self.iteration, 2]).integers(2**31))
-        change = densify(self.gaussians, self.statistics, allowed, self.extent, config.densify, seed)
-        self.optimiser.keep(change.keep)
-        self.optimiser.append(vars(change.born))
-        self._sync()
-        self.statistics = Statistics.zeros(len(self.gaussians))
+        with self.profile("densification"):
+            decay_opacities(self.gaussians, config.densify.opacity_decay)
+            seed = int(np.random.default_rng([config.seed, self.iteration, 2]).integers(2**31))
+            allowed = self._allowed(progress)
+            change = densify(self.gaussians, self.statistics, allowed, self.extent, config.densify, seed)
+            self.optimiser.keep(change.keep)
+            self.optimiser.append(vars(change.born))
+            self._sync()
+            self.statistics = Statistics.zeros(len(self.gaussians))
 
-    def _settle_harmonics(self, progress: float) -> None:
-        """Raises the spherical-harmonic degree by one, and takes the raise back if it did not pay.
+    # ---------------------------------------------------------------- economy
 
-        After growth has stopped the run is cut into trials of 5 % each. The first raises nothing and tells what a
-        trial gains by itself; a raise pays when its trial gains `sh_min_gain_db` more than that. Gains are of the
-        held-out PSNR (of the training PSNR where nothing is held out).
-        """
-        if self._sh_settled or progress < self.config.densify.stop + 0.05 * len(self._trials):
+    def _end_trial(self) -> None:
+        """What the trial gained decides about growth while there is growth, then about harmonics."""
+        progress, economy = self.progress, self.economy
+        economy.due = progress + TRIAL
+        economy.scores.append(self.score(limit=8)["psnr"])
+        count = len(self.gaussians)
+        if progress < self.config.densify.stop and economy.growing:
+            if progress > self.config.train.coarse_until + 2 * TRIAL:
+                self._decide(economy.growth_pays(count, self._allowed(progress + TRIAL)))
+        elif not economy.settled:
+            if not economy.harmonics:
+                self._decide(f"growth: {count} of at most {self.config.train.budget} Gaussians")
+            degree, told = economy.harmonics_step(self.gaussians.sh_degree)
+            self._decide(told)
+            if degree != self.gaussians.sh_degree:
+                self._set_degree(degree)
+
+    def _stop_early(self) -> None:
+        """Jumps to the cool-down when the target is reached or more time does not pay."""
+        economy, progress = self.economy, self.progress
+        if economy.finished or self.iteration % self.config.densify.every or not self._may_stop(progress):
             return
-        degree, limit = self.gaussians.sh_degree, self.config.train.sh_degree
-        self._trials.append(self.score(limit=8)["psnr"])
-        if len(self._trials) == 1:
-            return
-        gains = np.diff(self._trials)
-        if len(gains) > 1:
-            extra = float(gains[-1] - gains[0])
-            paid = extra >= self.config.train.sh_min_gain_db
-            self.record.decisions.append(
-                f"harmonics: degree {degree} gained {extra:+.2f} dB, {'kept' if paid else 'taken back'}"
-            )
-            if not paid:
-                self._set_degree(degree - 1)
-            self._sh_settled = not paid or degree == limit
-        if not self._sh_settled:
-            self._set_degree(degree + 1)
+        target, reason = self.config.train.stop_psnr, None
+        if target is not None and economy.scores and economy.scores[-1] >= target:
+            reason = f"stop: held-out PSNR {economy.scores[-1]:.2f} dB, {target:g} were asked"
+        elif economy.settled and progress >= self.config.densify.stop:
+            reason = economy.plateau(progress)
+        if reason is not None:
+            economy.finished, economy.growing = True, False
+            left = 1.0 - self.config.train.cooldown - progress
+            self._jump += left
+            self._decide(f"{reason}; {left:.0%} of the course left out")
+
+    def _may_stop(self, progress: float) -> bool:
+        """Not when the end is near anyway, nor before the features have had their time."""
+        needed = self.config.losses.start + 0.35 if self.has_labels else 0.0
+        return needed <= progress < 1.0 - self.config.train.cooldown - TRIAL
+
+    def _decide(self, told: str | None) -> None:
+        if told is not None:
+            self.record.decisions.append(told)
 
     def _set_degree(self, degree: int) -> None:
         state = self.optimiser.state_dict()
@@ -300,7 +336,8 @@ class Trainer:
         views = self.held_out or self.views
         if limit is not None and len(views) > limit:
             views = [views[i] for i in np.linspace(0, len(views) - 1, limit).round().astype(int)]
-        return {"psnr": float(np.mean([psnr(render_view(self.gaussians, view), view.photo) for view in views]))}
+        with self.profile("evaluation"):
+            return {"psnr": float(np.mean([psnr(render_view(self.gaussians, view), view.photo) for view in views]))}
 
     @torch.no_grad()
     def depth(self, name: str) -> np.ndarray:
@@ -318,49 +355,3 @@ class Trainer:
                 "progress": round(progress, 4),
             }
         )
-
-
-@torch.no_grad()
-def render_view(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
-    """The photo as the map sees it, [H, W, 3] float32 in [0, 1], black where nothing is."""
-    height, width = view.photo.shape[:2]
-    out = rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        view.camera_from_world[None],
-        view.K[None],
-        width,
-        height,
-        sh_degree=gaussians.sh_degree,
-        depth=False,
-    )
-    return out.colors[0].clamp(0, 1)
-
-
-@torch.no_grad()
-def depth_image(
-    gaussians: Gaussians, camera_from_world: torch.Tensor, K: torch.Tensor, width: int, height: int
-) -> torch.Tensor:
-    """Expected depth [H, W] along the optical axis where the map is more than half opaque, 0 elsewhere."""
-    out = rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.base_colors,
-        camera_from_world[None],
-        K[None],
-        width,
-        height,
-    )
-    alpha = out.alphas[0]
-    return torch.where(alpha > 0.5, out.depths[0] / alpha.clamp(min=1e-6), torch.zeros_like(alpha))
-
-
-def psnr(image: torch.Tensor, photo: torch.Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of image [H, W, 3] in [0, 1] against photo uint8."""
-    error = float((image.double() - photo.double() / 255).square().mean())
-    return float("inf") if error == 0 else -10 * float(np.log10(error))

@@ -15,4 +15,153 @@ from uuid import uuid4
 from perception.errors import InputError
 
 _FULL = {errno.ENOSPC, errno.EDQUOT}
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # Linux' fcntl.h and fs.h
 _REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary sibling to write; on success it is synced and renamed to `path`, else removed."""
+    path = Path(path)
+    temporary = _sibling(path, "new")
+    try:
+        with _disk_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield temporary
+            _sync(temporary)
+            temporary.replace(path)
+            _sync(path.parent)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[BinaryIO]:
+    """A binary file to write into; it takes the place of `path` only when the block ends without an error.
+
+    Its folder must exist; whatever the system refuses is an InputError.
+    """
+    path = Path(path)
+    try:
+        if not path.parent.is_dir():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+        with atomic_file(path) as temporary, temporary.open("wb") as file:
+            yield file
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"{path}: cannot be written ({reason}); give a writable place") from error
+
+
+@contextmanager
+def atomic_directory(path: Path) -> Iterator[Path]:
+    """Yield an empty temporary sibling folder to fill; on success it takes the place of `path`, else it is removed.
+
+    On Linux the two folders are exchanged in one step, so there is no instant without a `path`. Where the system
+    cannot, the old folder is moved aside first: between the two renames (microseconds) `path` does not exist, and a
+    process killed right there leaves the old folder beside it for the next `atomic_directory(path)` or
+    `recover(path)` to put back. It is never half of one.
+    """
+    path = Path(path)
+    temporary, old = _sibling(path, "new"), _sibling(path, "old")
+    try:
+        with _disk_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            recover(path)
+            temporary.mkdir()
+            yield temporary
+            for file in temporary.rglob("*"):
+                _sync(file)
+            _sync(temporary)
+            _swap(temporary, path, old)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def recover(path: Path) -> None:
+    """Put `path` back when a writer died between its two renames, and delete leftovers of writers that are gone."""
+    path = Path(path)
+    leftovers = sorted(path.parent.glob(f".{path.name}.*"), key=lambda item: item.stat().st_mtime)
+    for item in leftovers:
+        kind, writer = _parse(item, path)
+        if kind is None or _alive(writer):
+            continue
+        if kind == "old" and not path.exists():
+            item.rename(path)
+        elif item.is_dir():
+            shutil.rmtree(item, ignore_errors=True)
+        else:
+            item.unlink(missing_ok=True)
+
+
+def _swap(new: Path, path: Path, old: Path) -> None:
+    if not path.exists():
+        new.rename(path)
+    elif _exchange(new, path):
+        old = new  # where the old folder lies now
+    else:
+        path.rename(old)
+        try:
+            new.rename(path)
+        except OSError:
+            old.rename(path)
+            raise
+    _sync(path.parent)  # before the old folder goes: a power cut must not leave neither
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _exchange(a: Path, b: Path) -> bool:
+    """Swap two names in one step by Linux' renameat2; False where the system or its file system has no such call."""
+    try:
+        call = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError):
+        return False
+    result: int = call(_AT_FDCWD, os.fsencode(a), _AT_FDCWD, os.fsencode(b), _RENAME_EXCHANGE)
+    if result != 0 and ctypes.get_errno() not in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(b))
+    return result == 0
+
+
+def _sibling(path: Path, kind: str) -> Path:
+    return path.with_name(f".{path.name}.{kind}-{os.getpid()}-{uuid4().hex[:8]}")
+
+
+def _parse(item: Path, path: Path) -> tuple[str | None, int]:
+    parts = item.name[len(path.name) + 2 :].split("-")
+    if len(parts) == 3 and parts[0] in ("new", "old") and parts[1].isdigit():
+        return parts[0], int(parts[1])
+    return None, 0
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # some file systems cannot sync a folder
+            raise
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def _disk_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _FULL:
+            raise InputError(f"{path}: the disk is full, nothing was written; free some space") from error
+        if error.errno in _REFUSED:
+            raise InputError(
+                f"{path}: cannot be written ({error.strerror}); choose a place you may write to"
+            ) from error
+        raise

@@ -18,6 +18,8 @@ class Encoder(Protocol):
     dim: length of an embedding.
     references: [R, D] unit embeddings of many common words, the ruler for how specific a text is; None
     without one. templates: sentences with one {} that a prompt is put into; their embeddings are averaged.
+    margin: spreads above the map's probes from which an answer is believed. canonical: phrases that fit anything, which
+    a prompt must beat; none where sentences do not describe pictures in general.
     """
 
     @property
@@ -28,6 +30,12 @@ class Encoder(Protocol):
 
     @property
     def templates(self) -> tuple[str, ...]: ...
+
+    @property
+    def margin(self) -> float: ...
+
+    @property
+    def canonical(self) -> tuple[str, ...]: ...
 
     @property
     def references(self) -> np.ndarray | None: ...

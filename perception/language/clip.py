@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.model_store import known_names, resolve
 from perception.language.base import check_images, check_texts, unit_rows
 from perception.language.onnx import Device, dtype_of, fingerprint, open_session, shape_of, signature
 from perception.language.preprocess import Preprocess, family_of, find_preprocess
@@ -34,6 +35,9 @@ class ClipEncoder:
     """
 
     references: np.ndarray | None = None
+    # Untried on real weights: none can be had here. The probes of the map and LERF's phrases are all there is.
+    margin: float = 0.0
+    canonical: tuple[str, ...] = ("object", "things", "stuff", "texture")
     templates: tuple[str, ...] = ("an image of {}", "a photo of a {}", "{}")
 
     def __init__(self, image: Path, text: Path, device: Device = "auto") -> None:
@@ -49,7 +53,8 @@ class ClipEncoder:
 
     @classmethod
     def from_spec(cls, argument: str, device: Device = "auto") -> ClipEncoder:
-        """From "IMAGE.onnx,TEXT.onnx", "BOTH.onnx" or a folder that holds them under a usual name."""
+        """From "IMAGE.onnx,TEXT.onnx", "BOTH.onnx" a folder that holds them under a usual name, or a stored name."""
+        argument = resolve(argument)
         parts = [Path(part.strip()).expanduser() for part in argument.split(",")]
         if len(parts) == 2:
             return cls(parts[0], parts[1], device)
@@ -57,7 +62,9 @@ class ClipEncoder:
             return cls(*_find_pair(parts[0]), device)
         if len(parts) == 1 and parts[0].suffix == ".onnx":
             return cls(parts[0], parts[0], device)
-        raise InputError(f"clip:{argument}: expected IMAGE.onnx,TEXT.onnx or a folder that exists")
+        raise InputError(
+            f"clip:{argument}: expected IMAGE.onnx,TEXT.onnx, a folder that exists, or a stored model; {known_names()}"
+        )
 
     @cached_property
     def identity(self) -> str:

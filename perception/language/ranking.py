@@ -7,15 +7,19 @@ best is good enough is told by probes: LERF's canonical phrases (object, things,
 of things that a scene seldom holds. Their best relevancies in this very map, under this very encoder, are
 the distribution of "not here", and
     score_ti = Φ((x_ti − m) / s),   m: their median, s: such that their 80 % quantile scores .8,
-so .8 means "fits better than four probes in five". Colour words are answered by measured colour; a label
-given by the user counts as the instance's name.
+so .8 means "fits better than four probes in five", and less the encoder's own `margin`: what a thing that is not
+there but resembles one that is (a laptop, a book) reaches above the probes. Encoders with canonical phrases must find
+the prompt likelier than each of them as well (LERF's relevancy, temperature 10). Colour words are answered by measured
+colour, words for shapes (floor, wall, picture, ball: see `shape_words`) by the measured shape too, and a label given by
+the user counts as the instance's name.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +28,14 @@ from perception.errors import InputError
 from perception.language.base import Encoder, check_texts, unit_rows
 from perception.language.colors import color_match, color_words, without_color_words
 from perception.language.description import InstanceDescription
+from perception.language.shape_words import HINTS, KINDS, shape_kind
 
 PRESENT = 0.8  # default least score of a hit; the probes are harder than the usual absent thing (see bench)
 QUANTILE, NORMAL_QUANTILE = 0.8, 0.8416  # Φ(.8416) = .8
 BETA = 0.5  # share of the map's mean embedding that is taken away
+SHAPE_WEIGHT = 6.0  # spreads between no and a full match of shape, for kinds that geometry alone decides
+SHAPE_HINT = 3.0  # the same for kinds that are only likelier with a shape: not every box is closed
+TEMPERATURE = 10.0  # LERF's
 COLOR_WEIGHT = 0.1  # relevancy between no and a full colour match
 LABEL_MARGIN = 2.0  # a label means the prompt from 2 + Φ⁻¹(score) spreads above what probes mean to it
 
@@ -51,12 +59,15 @@ class Ranker:
         descriptions: Sequence[InstanceDescription],
         encoder: Encoder,
         labels: Sequence[str | None] | None = None,
+        shapes: Callable[[], np.ndarray] | None = None,
     ) -> None:
-        """labels: the user's name of each instance or None; as many as descriptions."""
+        """labels: the user's name of each instance or None. shapes: gives [I, K], scores of `shape_words.KINDS`; asked
+        when a prompt first names one.
+        """
         if labels is not None and len(labels) != len(descriptions):
             raise InputError(f"labels: expected one per instance ({len(descriptions)}), found {len(labels)}")
-        self._encoder = encoder
-        self._seen = np.array([d.seen for d in descriptions], bool)
+        self._encoder, self._measure_shapes = encoder, shapes
+        self.seen = np.array([d.seen for d in descriptions], bool)
         rows = np.array([d.embedding for d in descriptions], np.float32).reshape(
             len(descriptions), len(descriptions[0].embedding) if descriptions else encoder.dim
         )
@@ -64,8 +75,10 @@ class Ranker:
             raise InputError(
                 f"embeddings have {rows.shape[1]} dimensions, those of encoder '{encoder.identity}' {encoder.dim}"
             )
-        mean = rows[self._seen].mean(axis=0) if self._seen.any() else np.zeros(encoder.dim, np.float32)
-        self._rows = unit_rows(rows - BETA * mean) if self._seen.sum() > 1 else rows
+        mean = rows[self.seen].mean(axis=0) if self.seen.any() else np.zeros(encoder.dim, np.float32)
+        self._rows = unit_rows(rows - BETA * mean) if self.seen.sum() > 1 else rows
+        self._plain = rows
+        self._canonical = self._encode(encoder.canonical)
         self._palettes = np.array([d.palette for d in descriptions])
         self._names = [_words(label) for label in labels or [None] * len(descriptions)]
         self._named = np.flatnonzero([name != "" for name in self._names])
@@ -74,6 +87,10 @@ class Ranker:
         self._null = self._best_of_absent(texts)
         self._label_rows = self._encode([self._names[i] for i in self._named])
         self._label_null = _middle_and_spread(self._label_rows @ texts.T)
+
+    def over(self, descriptions: Sequence[InstanceDescription], shapes: np.ndarray | None = None) -> Ranker:
+        """The same encoder over other instances, without labels. shapes: as of `self.shapes`, for them."""
+        return Ranker(descriptions, self._encoder, shapes=None if shapes is None else lambda: shapes)
 
     def rank(self, prompt: str, min_score: float | None = None) -> Answer:
         """Score every instance for one prompt; see the module's docstring."""
@@ -92,9 +109,30 @@ class Ranker:
         if colors:
             relevancy = relevancy + COLOR_WEIGHT * (color_match(self._palettes, colors) - 0.5)
         middle, spread = self._null
-        scores = np.array([_phi((x - middle) / spread) for x in relevancy])
-        scores[~self._seen] = 0.0
+        z = (relevancy - middle) / spread - self._encoder.margin + self._shape_bonus(text)
+        scores = np.array([_phi(x) for x in z])
+        if len(self._canonical):
+            scores = np.minimum(scores, 2 * PRESENT * self._against_canonical(row))
+        scores[~self.seen] = 0.0
         return self._with_labels(scores, text)
+
+    @cached_property
+    def shapes(self) -> np.ndarray | None:
+        """Scores [I, K] of `shape_words.KINDS`; None where they were never measured."""
+        return None if self._measure_shapes is None else self._measure_shapes()
+
+    def _shape_bonus(self, text: str) -> np.ndarray | float:
+        """What the instances' shapes add [I], in spreads; 0 where the prompt names no shape."""
+        kind = shape_kind(text)
+        if kind is None or self.shapes is None:
+            return 0.0
+        weight = SHAPE_HINT if kind in HINTS else SHAPE_WEIGHT
+        return weight * (self.shapes[:, KINDS.index(kind)] - 0.5)
+
+    def _against_canonical(self, row: np.ndarray) -> np.ndarray:
+        """LERF's relevancy [I]: how likely the prompt [1, D] is beside the canonical phrase that fits best."""
+        rival = (self._plain @ self._canonical.T).max(axis=1)
+        return 1.0 / (1.0 + np.exp(TEMPERATURE * (rival - self._plain @ row[0])))
 
     def _with_labels(self, scores: np.ndarray, text: str) -> np.ndarray:
         """The better of picture and label: 1 where the label is the prompt, Φ(z − margin) where it means
@@ -107,6 +145,10 @@ class Ranker:
             same = self._names[i] == _words(text)
             scores[i] = 1.0 if same else max(scores[i], _phi(float(z[n]) - LABEL_MARGIN))
         return scores
+
+    def relevancy(self, texts: Sequence[str]) -> np.ndarray:
+        """How well each text fits each instance [T, I], colours, shapes and labels left aside."""
+        return self._relevancy(self._encode(texts))
 
     def _relevancy(self, texts: np.ndarray) -> np.ndarray:
         """x [T, I] of text embeddings [T, D] in units of a usual prompt's spread."""
@@ -131,9 +173,9 @@ class Ranker:
         """Median of the probes' best relevancies in this map, and the spread that puts their quantile at
         .8.
         """
-        if not self._seen.any():
+        if not self.seen.any():
             return 0.0, 1.0
-        best = self._relevancy(probe_rows)[:, self._seen].max(axis=1)
+        best = self._relevancy(probe_rows)[:, self.seen].max(axis=1)
         middle, high = np.quantile(best, [0.5, QUANTILE])
         return float(middle), max(float(high - middle) / NORMAL_QUANTILE, 1e-6)
 

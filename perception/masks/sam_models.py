@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.model_store import known_names, resolve
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -91,11 +92,11 @@ class SamModel:
 
     def __init__(self, encoder: Graph, decoder: Graph) -> None:
         self.encoder, self.decoder = encoder, decoder
-        self.family = _family(encoder, decoder)
+        self.family = decoder_family(decoder)
         _check_pair(encoder, decoder)
         self.fingerprint = f"{_digest(encoder.path)}-{_digest(decoder.path)}"
         self.provider = " + ".join(dict.fromkeys(g.session.get_providers()[0] for g in (encoder, decoder)))
-        self.warnings = [w for graph in (encoder, decoder) for w in _provider_warnings(graph)]
+        self.warnings = [w for graph in (encoder, decoder) for w in provider_warnings(graph)]
 
     def encode(self, photo: np.ndarray) -> Encoded:
         """photo: [h, w, 3] uint8 RGB."""
@@ -197,7 +198,8 @@ class SamModel:
 
 
 def open_sam(spec: str) -> SamModel:
-    """spec: a folder with both graphs, the encoder with its decoder beside it, or `ENCODER,DECODER`."""
+    """spec: a folder with both graphs, the encoder with its decoder beside it, `ENCODER,DECODER`, or a stored name."""
+    spec = resolve(spec)
     if "," in spec:
         graphs = [open_graph(Path(part.strip())) for part in spec.split(",")]
     else:
@@ -262,20 +264,31 @@ def _candidates(path: Path) -> list[Path]:
             raise InputError(f"sam:{path}: no .onnx file in this folder; expected an encoder and a decoder")
         return files
     if not path.is_file():
-        raise InputError(f"sam:{path}: no such file or folder; expected a SAM encoder and decoder as ONNX")
+        raise InputError(
+            f"sam:{path}: no such file or folder, nor a stored model; expected a SAM encoder and decoder as ONNX; "
+            f"{known_names()}"
+        )
     partners = [path.with_name(path.name.replace(a, b)) for a, b in (("encoder", "decoder"), ("decoder", "encoder"))]
     beside = [partner for partner in partners if partner != path and partner.is_file()]
     other = [file for file in sorted(path.parent.glob("*.onnx")) if file != path and "decoder" in file.name]
     return [path, *(beside or (other if len(other) == 1 else []))]
 
 
-def _family(encoder: Graph, decoder: Graph) -> str:
+def decoder_family(decoder: Graph) -> str:
+    """The family of a decoder, by the names of its inputs."""
     names = {argument.name for argument in decoder.session.get_inputs()}
     if "batched_point_coords" in names:
         return "EfficientSAM"
     if "high_res_0" in decoder.inputs:
         return "SAM 2"
     return "SAM by optimum" if "input_points" in names else "SAM"
+
+
+def encoder_family(encoder: Graph) -> str:
+    """The family of an encoder as far as it can be told without its decoder."""
+    if "high_res_0" in encoder.outputs:
+        return "SAM 2"
+    return "EfficientSAM" if encoder.inputs["image"].name == "batched_images" else "SAM"
 
 
 def _check_pair(encoder: Graph, decoder: Graph) -> None:
@@ -289,7 +302,8 @@ def _check_pair(encoder: Graph, decoder: Graph) -> None:
         raise InputError(f"{decoder.path}: no output for {' and '.join(lacking)} (found {found}); not a SAM decoder")
 
 
-def _provider_warnings(graph: Graph) -> list[str]:
+def provider_warnings(graph: Graph) -> list[str]:
+    """Says so where the best provider did not come up and onnxruntime took another without a word."""
     wanted, used = wanted_providers()[0], graph.session.get_providers()[0]
     return [] if wanted == used else [f"{graph.path.name}: {wanted} did not come up, running on {used}"]
 

@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.model_store import default_model
 from perception.types import View
 
 
@@ -43,7 +44,8 @@ def make_source(spec: str, *, cache_dir: Path | None = None) -> MaskSource:
     """`auto`, `builtin`, `labels:DIR`, or `sam:PATH` (folder, encoder file, or `ENCODER,DECODER`).
 
     `auto` takes the SAM named by the environment variable PERCEPTION_SAM or by `masks.sam` in the user's
-    configuration (`perception/config.toml` under XDG_CONFIG_HOME), else the built-in segmentation.
+    configuration (`perception/config.toml` under XDG_CONFIG_HOME), or made the default by `perception models add
+    --default`; else the built-in segmentation.
     cache_dir: where a source may keep derived files; no source needs it today.
     """
     kind, _, argument = spec.partition(":")
@@ -66,18 +68,18 @@ def make_source(spec: str, *, cache_dir: Path | None = None) -> MaskSource:
 
 
 def configured_sam() -> str | None:
-    """The path of the user's SAM, or None."""
+    """The user's SAM, a path or a stored name, or None."""
     from_environment = os.environ.get("PERCEPTION_SAM", "").strip()
     if from_environment:
         return from_environment
     home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
     file = home / "perception" / "config.toml"
     if not file.is_file():
-        return None
+        return default_model("sam")
     value = _read_toml(file).get("masks", {}).get("sam")
     if value is not None and not isinstance(value, str):
         raise InputError(f"{file}: masks.sam is {value!r}, expected the path of a SAM model as text")
-    return value
+    return value or default_model("sam")
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

@@ -15,11 +15,12 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
+from perception.instances.survival import carried_text, carry_labels
 from perception.io.inputs import load_scene
 from perception.io.map_lock import writing
 from perception.io.photos import load_photo
 from perception.io.scene_cache import load_saved_scene, save_scene, view_json
-from perception.io.store import GaussianMap, write_map
+from perception.io.store import GaussianMap, read_map, write_map
 from perception.masks import MaskSource, make_source
 from perception.masks.source import GeometryMaskSource
 from perception.masks.store import compute_masks
@@ -42,20 +43,28 @@ def work_folder(output: Path) -> Path:
 
 
 def build_map(
-    source: Path, output: Path, config: MapConfig, *, resume: bool = False, progress: Progress | None = None
+    source: Path,
+    output: Path,
+    config: MapConfig,
+    *,
+    resume: bool = False,
+    progress: Progress | None = None,
+    labels_from: Path | None = None,
 ) -> GaussianMap:
     """Builds a map from photos, a COLMAP workspace or a transforms.json, and writes it to `output`.
 
     Raises InputError for bad input. What was done is kept in `work_folder(output)` until the map is written; with
-    `resume` a run goes on from there. A run refused before it trained leaves nothing behind.
+    `resume` a run goes on from there. Names given to the instances of the map `labels_from` are carried over to those
+    that fill the same place. A run refused before it trained leaves nothing behind.
     """
     if config.device == "cuda":
         raise InputError("--device cuda: this build has no CUDA rasterizer; use --device cpu or auto")
+    labelled = None if labels_from is None else read_map(labels_from)
     fresh = not work_folder(output).exists()
     work = _prepare(source, output, resume)
     with writing(output):
         try:
-            return _build(source, output, work, config, progress or Progress(quiet=True))
+            return _build(source, output, work, config, progress or Progress(quiet=True), labelled)
         except OSError as error:
             if error.errno != errno.ENOSPC:
                 raise
@@ -66,7 +75,9 @@ def build_map(
             raise
 
 
-def _build(source: Path, output: Path, work: Path, config: MapConfig, progress: Progress) -> GaussianMap:
+def _build(
+    source: Path, output: Path, work: Path, config: MapConfig, progress: Progress, labelled: GaussianMap | None
+) -> GaussianMap:
     stages = Stages()
     started = time.monotonic()
 
@@ -79,7 +90,7 @@ def _build(source: Path, output: Path, work: Path, config: MapConfig, progress: 
     with stages("photos"):
         views = _photos(training, config, progress)
         held = _photos(held_out, config, progress)
-    trainer = Trainer(_initial(scene, config), views, config, held)
+    trainer = Trainer(initial_gaussians(scene, config), views, config, held)
     session = _Session(trainer, work, fingerprint(source, config), config, progress)
     depth = None
     if isinstance(source_of_masks, GeometryMaskSource):  # its masks wait for the map's own geometry
@@ -115,6 +126,8 @@ def _build(source: Path, output: Path, work: Path, config: MapConfig, progress: 
         "peak_memory_mib": peak_memory_mib(),
     }
     gmap = _assemble(gaussians, found, scene, held_out, record)
+    if labelled is not None:
+        _carry_labels(labelled, gmap, progress)
     write_map(output, gmap)
     shutil.rmtree(work, ignore_errors=True)
     _tell_result(gmap, output, progress)
@@ -205,7 +218,8 @@ class _Session:
             save_checkpoint(self.path, self.trainer.state(), self.mark)
 
 
-def _initial(scene: Scene, config: MapConfig) -> Gaussians:
+def initial_gaussians(scene: Scene, config: MapConfig) -> Gaussians:
+    """One Gaussian a point of the sparse cloud, a random part of them where there are more than the budget."""
     points, colors = scene.points, scene.point_colors
     if len(points) > config.train.budget:
         keep = np.random.default_rng(config.seed).choice(len(points), config.train.budget, replace=False)
@@ -236,9 +250,7 @@ class _Watch:
     def _draw(self, trainer: Trainer, now: float) -> None:
         assert self.first is not None
         speed = (trainer.iteration - self.first[1]) / max(now - self.first[0], 1e-6)
-        total = self.config.train.iterations
-        if trainer.progress > trainer.iteration / total:  # the clock rules: say how far it lets us come
-            total = max(trainer.iteration, round(trainer.iteration / max(trainer.progress, 1e-6)))
+        total = trainer.expected_iterations
         curve = trainer.record.curve
         self.progress.update(
             "train",
@@ -249,6 +261,7 @@ class _Watch:
             gaussians=len(trainer.gaussians),
             it_s=f"{speed:.1f}",
             left_s=round((total - trainer.iteration) / max(speed, 1e-6)),
+            MiB=round(peak_memory_mib()),
         )
 
 
@@ -291,6 +304,14 @@ def _assemble(
         language=found.language,
         parts=found.parts,
     )
+
+
+def _carry_labels(old: GaussianMap, gmap: GaussianMap, progress: Progress) -> None:
+    carried = carry_labels(old, gmap)
+    for entry in gmap.instances:
+        entry["label"] = carried.labels.get(entry["id"], entry["label"])
+    gmap.info["labels"] = {"carried": len(carried.labels), "dropped": [name for _, name in carried.dropped]}
+    progress.log(carried_text(carried))
 
 
 # ----------------------------------------------------------------------- words

@@ -42,7 +42,7 @@ def write_map_report(
         gaussians_curve=[(entry["iteration"], entry["gaussians"]) for entry in curve],
         views=_view_rows(gmap, album),
         overview=_overview(gmap, album),
-        instances=[_instance_row(opened, i, album) for i in range(len(gmap.instances))],
+        instances=[_instance_row(opened, i, album, names) for i, names in enumerate(_names(opened))],
         metric=opened.metric,
         queries=[_query_row(opened, text, album, (expected or {}).get(text)) for text in queries],
         warnings=[*info["scene"].get("warnings", []), *info["masks"].get("warnings", [])],
@@ -220,13 +220,50 @@ def _best_crop(opened: LoadedMap, index: int, album: _Album, whole: bool) -> np.
     return picture[top : rows[-1] + margin, left : columns[-1] + margin]
 
 
-def _instance_row(opened: LoadedMap, index: int, album: _Album) -> InstanceRow:
+def _names(opened: LoadedMap) -> list[list[str]]:
+    """Likeliest names of the instances; none for a map without language."""
+    return opened.likely_names() if opened.gmap.language else [[] for _ in opened.instances]
+
+
+def write_sheet(opened: LoadedMap, path: Path) -> None:
+    """The contact sheet as a picture file, by suffix."""
+    from PIL import Image
+
+    from perception.io.atomic import atomic_file
+
+    if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise InputError(f"{path}: unknown kind of picture '{path.suffix}', expected .png or .jpg")
+    with atomic_file(path) as file:
+        Image.fromarray(contact_sheet(opened)).save(file, "PNG" if path.suffix.lower() == ".png" else "JPEG")
+
+
+def contact_sheet(opened: LoadedMap, columns: int = 6, side: int = 240) -> np.ndarray:
+    """Every instance's best crop with its id and label or likeliest names, [H, W, 3] uint8; unseen ones left out."""
+    import cv2
+
+    from perception.instances.crops import letterbox
+
+    album = _Album(opened.gmap, as_gaussians(opened.gmap))
+    pictures, titles = [], []
+    for i, names in enumerate(_names(opened)):
+        crop = _best_crop(opened, i, album, whole=False)
+        if crop is None:
+            continue
+        entry = opened.instances[i]
+        pictures.append(cv2.resize(letterbox(crop, 255), (side, side), interpolation=cv2.INTER_AREA))
+        titles.append(f"{entry['id']}: {entry.get('label') or ', '.join(name[:18] for name in names)}")
+    if not pictures:
+        raise InputError(f"{opened.path}: no instance has a photo that can still be read; a sheet needs the photos")
+    return montage(pictures, columns, titles)
+
+
+def _instance_row(opened: LoadedMap, index: int, album: _Album, names: list[str]) -> InstanceRow:
     entry = opened.instances[index]
     return InstanceRow(
         entry["id"],
         _best_crop(opened, index, album, whole=False),
         entry.get("label"),
-        (),
+        names,
         entry["score"],
         entry["obb"]["extent"],
         entry["num_gaussians"],

@@ -22,8 +22,46 @@ def map_facts(path: Path, info: dict[str, Any], gaussians: int, instances: int) 
         "seconds": info["seconds"],
         "peak_memory_mib": info["peak_memory_mib"],
         "iterations": info["training"]["iterations"],
+        "speed": speed(info["training"]),
+        "profile": shares(info["training"]),
+        "decisions": info["training"]["decisions"],
         "scene": scene,
     }
+
+
+def speed(training: dict[str, Any]) -> dict[str, float]:
+    """Iterations, and contributing (Gaussian, pixel) pairs, a second of training."""
+    seconds = max(training.get("seconds", 0.0), 1e-9)
+    return {
+        "iterations_per_second": round(training.get("iterations", 0) / seconds, 2),
+        "pairs_per_second": round(training.get("pairs", 0) / seconds),
+    }
+
+
+def shares(training: dict[str, Any]) -> dict[str, float]:
+    """Shares of the training time by part, largest first; "other" is what no part accounts for."""
+    total = max(training.get("seconds", 0.0), 1e-9)
+    parts = dict(training.get("profile", {}))
+    parts["other"] = max(0.0, total - sum(parts.values()))
+    return {name: round(parts[name] / total, 4) for name in sorted(parts, key=lambda name: -parts[name])}
+
+
+def profile_text(info: dict[str, Any]) -> str:
+    """Where the time went, a line a part: of the run, then of its training."""
+    training, seconds = info["training"], info["seconds"]
+    total = max(seconds["total"], 1e-9)
+    lines = [f"{name:24}{value:9.1f} s {value / total:7.1%}" for name, value in seconds.items() if name != "total"]
+    lines.append(f"{'total':24}{total:9.1f} s")
+    lines.append("of training:")
+    lines += [
+        f"  {name:22}{share * training['seconds']:9.1f} s {share:7.1%}" for name, share in shares(training).items()
+    ]
+    rates = speed(training)
+    lines.append(
+        f"{rates['iterations_per_second']:.1f} iterations/s, {rates['pairs_per_second'] / 1e6:.1f} M contributing "
+        f"pairs/s, peak memory {info['peak_memory_mib']:.0f} MiB"
+    )
+    return "\n".join(lines)
 
 
 def info_text(path: Path, info: dict[str, Any]) -> str:
@@ -35,8 +73,11 @@ def info_text(path: Path, info: dict[str, Any]) -> str:
         f"{info['num_instances']} instances, {'metres' if info.get('metric') else 'units of the reconstruction'}",
         f"made from {info.get('source')} (seed {info.get('seed')}) in {seconds.get('total', 0):.0f} s: "
         + ", ".join(f"{name} {value:.0f}" for name, value in seconds.items() if name != "total"),
-        f"trained {training.get('iterations')} iterations; peak memory {info.get('peak_memory_mib')} MiB",
+        f"trained {training.get('iterations')} iterations ({_rates(training)}); "
+        f"peak memory {info.get('peak_memory_mib')} MiB",
     ]
+    if training.get("profile"):
+        lines.append("of training: " + ", ".join(f"{name} {share:.0%}" for name, share in shares(training).items()))
     if "psnr" in quality:
         lines.append(
             f"held-out views: PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.4f} over {len(quality['views'])}"
@@ -45,6 +86,11 @@ def info_text(path: Path, info: dict[str, Any]) -> str:
     lines += [f"left out: {entry['name']} ({entry['why']})" for entry in scene.get("left_out", [])]
     lines += [f"warning: {text}" for text in scene.get("warnings", [])]
     return "\n".join(lines)
+
+
+def _rates(training: dict[str, Any]) -> str:
+    rates = speed(training)
+    return f"{rates['iterations_per_second']:.1f} it/s, {rates['pairs_per_second'] / 1e6:.1f} M pairs/s"
 
 
 def query_text(answers: list[tuple[str, list[Hit]]], metric: bool) -> str:

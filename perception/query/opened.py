@@ -364,7 +364,21 @@ class LoadedMap:
         if encoder is None:
             raise InputError(f"{self.path}: was mapped without an encoder; map again with language.encoder=conse")
         check_encoder(identity, encoder.identity)
-        return Ranker(descriptions, encoder, [entry.get("label") for entry in self.instances])
+        labels = [entry.get("label") for entry in self.instances]
+        return Ranker(descriptions, encoder, labels, self._shapes)
+
+    def _shapes(self) -> np.ndarray:
+        from perception.instances.shapes import shape_scores
+
+        ids = [entry["id"] for entry in self.instances]
+        poses = self._held.cameras.get("camera_from_world", np.zeros((0, 4, 4)))
+        return shape_scores(self._held.means, self._held.instance_ids, ids, poses)
+
+    def likely_names(self, count: int = 3) -> list[list[str]]:
+        """The likeliest names of every instance, best first, in the order of `instances`."""
+        from perception.language.naming import likely_names
+
+        return likely_names(self._ranker, count) if self.instances else []
 
 
 def load_map(path: str | Path, encoders: Encoders | None = None) -> LoadedMap:

@@ -1,0 +1,122 @@
+"""Minutes against quality: the Pareto front over presets, budget, resolution, iterations, harmonics, features.
+
+Held-out views are scored at each variant's own resolution; those of another resolution than the default's are marked
+and kept off the front, since a smaller picture is an easier one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from perception.bench.sweep import Variant, pareto
+from perception.bench.sweep_cli import (
+    COSTS,
+    FIGURES,
+    chosen,
+    finish,
+    prepare,
+    save_plot,
+    sweep_parser,
+    table,
+    with_minutes,
+)
+from perception.bench.sweep_seeds import over_seeds, seeded
+
+PRESET_NAMES = ("default", "fast", "quality")
+BUDGETS = (12_500, 25_000, 50_000, 200_000)
+ITERATIONS = (750, 1500, 6000)
+SIDES = (240, 360)
+
+
+def variants(masks: str | None) -> list[Variant]:
+    """The presets, then the default with one setting changed."""
+
+    def one(group: str, name: object, *pairs: str) -> Variant:
+        return Variant(group, str(name), pairs, masks)
+
+    return [
+        *(Variant("preset", name, (), masks, preset=name) for name in PRESET_NAMES),
+        *(one("budget", n, f"train.budget={n}") for n in BUDGETS),
+        *(one("iterations", n, f"train.iterations={n}") for n in ITERATIONS),
+        *(one("harmonics", d, f"train.sh_degree={d}", "train.sh_min_gain_db=-100") for d in range(4)),
+        *(one("max_side", n, f"photos.max_side={n}") for n in SIDES),
+        *(one("d", n, f"losses.feature_dim={n}") for n in (4, 16) if masks is not None),
+    ]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line."""
+    options = sweep_parser("map", __doc__).parse_args(arguments)
+    sweep, scenes, masks = prepare(options)
+    if masks is not None and not (scenes[0].root / masks).is_dir():
+        masks = None
+    rows = with_minutes(over_seeds(sweep.run(scenes[0], seeded(chosen(variants(masks), options.only), options.seeds))))
+    native = rows[0]["pixels"]
+    for key in ("psnr", "ssim", "ap"):
+        points = [(row["cpu_minutes"], row.get(key) if row["pixels"] == native else None) for row in rows]
+        front = set(pareto(points))
+        for index, row in enumerate(rows):
+            row[f"front_{key}"] = index in front
+    for row in rows:
+        row["front"] = " ".join(key for key in ("psnr", "ssim", "ap") if row[f"front_{key}"])
+        row["note"] = row["front"] if row["pixels"] == native else "other resolution"
+    text = f"{scenes[0].name}; on the front (CPU minutes against ...):\n"
+    text += table(rows, (*FIGURES, *COSTS, ("front", "note", "s"))) + "\n" + "\n".join(where(rows))
+    _plot(options.output / "map.png", scenes[0].name, rows, native)
+    finish("map", options, {"scene": scenes[0].name, "rows": rows}, text)
+    return 0
+
+
+def where(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """A line a preset: on the front, or what beats it."""
+    lines = []
+    for row in rows:
+        if row["group"] != "preset" or row.get("psnr") is None:
+            continue
+        better = [
+            r
+            for r in rows
+            if r.get("psnr") is not None
+            and r["pixels"] == row["pixels"]
+            and r["cpu_minutes"] <= row["cpu_minutes"]
+            and r["psnr"] > row["psnr"]
+        ]
+        best = max(better, key=lambda r: r["psnr"], default=None)
+        place = "is on the front of PSNR" if best is None else f"is beaten by {best['group']} {best['name']}"
+        if best is not None:
+            place += f": {best['psnr'] - row['psnr']:+.2f} dB in {best['cpu_minutes'] - row['cpu_minutes']:+.2f} min"
+        lines.append(f"{row['name']} {place}")
+    return lines
+
+
+def _plot(path: Path, scene: str, rows: Sequence[dict[str, Any]], native: int) -> None:
+    def draw(figure: Any) -> None:
+        parts = [(key, label) for key, label in (("psnr", "held-out PSNR, dB"), ("ssim", "SSIM"), ("ap", "AP"))]
+        parts = [(key, label) for key, label in parts if any(row.get(key) is not None for row in rows)]
+        for axis, (key, label) in zip(figure.subplots(1, len(parts), squeeze=False)[0], parts, strict=True):
+            held = [row for row in rows if row.get(key) is not None]
+            for row in held:
+                preset = row["group"] == "preset"
+                style = {"marker": "*" if preset else "o", "s": 130 if preset else 28}
+                color = "#cc3311" if preset else "#4477aa" if row["pixels"] == native else "0.7"
+                axis.scatter(row["cpu_minutes"], row[key], color=color, zorder=3 if preset else 2, **style)
+                name = row["name"] if preset else f"{row['group']} {row['name']}"
+                axis.annotate(
+                    name, (row["cpu_minutes"], row[key]), fontsize=6, xytext=(4, 3), textcoords="offset points"
+                )
+            front = sorted((row["cpu_minutes"], row[key]) for row in held if row[f"front_{key}"])
+            axis.plot(*zip(*front, strict=True), color="#4477aa", linewidth=1, zorder=1)
+            axis.set_xscale("log")
+            axis.set_xlabel("CPU minutes of training")
+            axis.set_ylabel(label)
+            axis.grid(alpha=0.3)
+        figure.suptitle(f"{scene}: grey points were scored at another resolution", fontsize=10)
+
+    if any(row.get("psnr") is not None for row in rows):
+        save_plot(path, draw, (12, 4.6))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

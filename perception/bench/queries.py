@@ -1,0 +1,162 @@
+"""How well a finished map answers text on a scene with exact truth: `perception bench queries MAP SCENE_DIR`.
+
+A hit is right when the true object under most of the instance's exported points answers the prompt. Prompts
+are those of scene.json whose objects some photo shows. Absent prompts: 30 things of street, farm, sea and
+museum, and household things that the scene does not name, which are the harder half.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.bench.prompts import ABSENT, HOUSEHOLD, accuracy, chance, singular
+from perception.errors import InputError
+from perception.language.description import InstanceDescription, from_arrays
+from perception.language.ranking import Ranker
+from perception.query import LoadedMap, load_map
+
+MANY = 200
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Prints a table, or one JSON object with --json."""
+    parser = argparse.ArgumentParser(prog="perception bench queries", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("map", type=Path, metavar="MAP", help="a map in the frame of the scene's transforms.json")
+    parser.add_argument("scene", type=Path, metavar="SCENE_DIR", help="folder with scene.json and gt_points.ply")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args(arguments)
+    report = measure(options.map, options.scene)
+    print(json.dumps(report) if options.json else table(report))
+
+
+def measure(map_path: Path, scene: Path) -> dict[str, Any]:
+    """All figures by name. The cold query comes first, before anything else could warm it."""
+    from perception.pipeline.record import versions
+
+    queries, unseen = read_queries(scene)
+    start = time.perf_counter()
+    opened = load_map(map_path)
+    loaded = time.perf_counter() - start
+    opened.query("red mug")
+    cold = time.perf_counter() - start
+    if not opened.instances:
+        raise InputError(f"{map_path}: holds no instances; map again with masks")
+    owners = true_objects(opened, scene)
+    descriptions, _ = from_arrays(opened.gmap.language)
+    report: dict[str, Any] = {"map": str(map_path), "scene": scene.name, "instances": len(opened.instances)}
+    report |= {"encoder": str(opened.gmap.language["encoder"]), "prompts": len(queries), "unseen_prompts": unseen}
+    report |= _figures(opened._ranker, descriptions, owners, queries, read_words(scene))
+    report |= {"load_ms": round(loaded * 1e3, 1), "cold_ms": round(cold * 1e3, 1)}
+    report |= latency(opened._ranker, [text for text, _ in queries], "warm")
+    many = [descriptions[n % len(descriptions)] for n in range(MANY)]
+    report |= latency(opened._ranker.over(many), [text for text, _ in queries], f"warm_{MANY}")
+    return report | {"versions": versions()}
+
+
+def read_queries(scene: Path) -> tuple[list[tuple[str, set[int]]], int]:
+    """Prompts of scene.json with the true ids that answer them, and how many were left out as never seen."""
+    about = _about(scene)
+    visible = {entry["id"] for entry in about["instances"] if entry.get("gt_points", 1)}
+    queries = [(query["text"], set(query["instance_ids"]) & visible) for query in about["queries"]]
+    kept = [(text, ids) for text, ids in queries if ids]
+    return kept, len(queries) - len(kept)
+
+
+def read_words(scene: Path) -> set[str]:
+    """Every word that scene.json uses for its objects: none of them may count as absent."""
+    texts = [query["text"] for query in _about(scene)["queries"]]
+    return {singular(word) for text in texts for word in re.findall(r"[a-z]+", text.lower())}
+
+
+def true_objects(opened: LoadedMap, scene: Path) -> list[int]:
+    """The true id under most exported points of each instance, −1 where none lies."""
+    from perception.export.labels import check_overlap, export_labels
+    from perception.io.cloud import read_cloud
+
+    cloud = read_cloud(scene / "gt_points.ply")
+    if "instance_id" not in cloud.labels:
+        raise InputError(f"{scene / 'gt_points.ply'}: expected a property instance_id, found none")
+    if check_overlap(opened.gmap.means, cloud.points) < 0.5:
+        raise InputError(f"{opened.path}: most of {scene.name}'s points lie outside it; map the scene with its poses")
+    labels = export_labels(opened.gmap.means, opened.gmap.instance_ids, opened.gmap.opacities, cloud)
+    truth = cloud.labels["instance_id"]
+    owners = []
+    for entry in opened.instances:
+        under = truth[(labels == entry["id"]) & (truth > 0)]
+        owners.append(int(np.bincount(under).argmax()) if len(under) else -1)
+    return owners
+
+
+def _figures(
+    ranker: Ranker,
+    descriptions: list[InstanceDescription],
+    owners: list[int],
+    queries: list[tuple[str, set[int]]],
+    words: set[str],
+) -> dict[str, Any]:
+    right = [{n for n, owner in enumerate(owners) if owner in ids} for _, ids in queries]
+    answers = [ranker.rank(text) for text, _ in queries]
+    found = [bool({i for i, _ in a.hits[:3]} & ids) for a, ids in zip(answers, right, strict=True)]
+    top1, top3 = accuracy([[i for i, _ in a.hits] for a in answers], right)
+    grey = ranker.over([_colorless(d) for d in descriptions], ranker.shapes)
+    blind1, blind3 = accuracy([[i for i, _ in grey.rank(text).hits] for text, _ in queries], right)
+    chance1, chance3 = chance([len(ids) for ids in right], len(owners))
+    near = [t for t in HOUSEHOLD if not {singular(w) for w in t.split()} & words]
+    wrong, wrong_near = ([t for t in texts if ranker.rank(t).present] for texts in (ABSENT, near))
+    return {
+        "top1": top1,
+        "top3": top3,
+        "color_blind_top1": blind1,
+        "color_blind_top3": blind3,
+        "random_top1": chance1,
+        "random_top3": chance3,
+        "answered_present": round(float(np.mean([a.present for a in answers])), 3),
+        "present_and_in_top3": round(float(np.mean([a.present and f for a, f in zip(answers, found, strict=True)])), 3),
+        "absent_prompts": len(ABSENT),
+        "false_positives": round(len(wrong) / len(ABSENT), 3),
+        "household_absent_prompts": len(near),
+        "household_false_positives": round(len(wrong_near) / max(len(near), 1), 3),
+        "false_positive_prompts": wrong + wrong_near,
+        "failed_prompts": [text for (text, _), f in zip(queries, found, strict=True) if not f],
+        "unmapped_prompts": [text for (text, _), ids in zip(queries, right, strict=True) if not ids],
+    }
+
+
+def latency(ranker: Ranker, texts: Sequence[str], name: str) -> dict[str, float]:
+    """Median and p99 milliseconds of a prompt never asked before, over at least 100 of them."""
+    seconds = []
+    for n in range(max(100, len(texts))):
+        text = f"{texts[n % len(texts)]} {n}"  # a number more, so that no cache knows it
+        start = time.perf_counter()
+        ranker.rank(text)
+        seconds.append(time.perf_counter() - start)
+    median, p99 = np.quantile(seconds, [0.5, 0.99]) * 1e3
+    return {f"{name}_median_ms": round(float(median), 2), f"{name}_p99_ms": round(float(p99), 2)}
+
+
+def table(report: dict[str, Any]) -> str:
+    """The figures, a line each."""
+    shown = {key: value for key, value in report.items() if key != "versions"}
+    return "\n".join(
+        f"{key:>26}: {', '.join(map(str, value)) if isinstance(value, list) else value}" for key, value in shown.items()
+    )
+
+
+def _colorless(d: InstanceDescription) -> InstanceDescription:
+    return InstanceDescription(d.embedding, d.per_view, np.zeros_like(d.palette), d.views, d.boxes)
+
+
+def _about(scene: Path) -> dict[str, Any]:
+    file = scene / "scene.json"
+    if not file.is_file():
+        raise InputError(f"{scene}: no scene.json there; expected the folder of a scene with truth")
+    about: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return about

@@ -1,0 +1,265 @@
+"""The engine of `bench map`, `switches`, `scaling` and `ablation`: one scene loaded once, many settings trained on it.
+
+A row is kept on disk as soon as it is there, under everything it depends on (scene, settings, threads, the code that
+makes a map), so a sweep that was stopped goes on where it was, and a row is never told of another program.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.config import MapConfig, load_config
+from perception.errors import InputError
+from perception.io.atomic import atomic_file
+
+_CODE = ("gaussians", "instances", "export", "evaluate", "config.py", "_core*")
+TRUTH_CLOUD = "gt_points.ply"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One cell of a sweep: what is varied, its value, and the settings that say so.
+
+    settings: KEY=VALUE over the preset's. masks: folder of label images inside the scene; None = photos alone.
+    threads: 0 = all processors.
+    """
+
+    group: str
+    name: str
+    settings: tuple[str, ...] = ()
+    masks: str | None = "labels"
+    threads: int = 0
+    preset: str = "default"
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What makes a sweep shorter, for every variant alike: iterations divided by `shorten`, and upper bounds."""
+
+    shorten: float = 1.0
+    iterations: int | None = None
+    max_side: int | None = None
+    budget: int | None = None
+    settings: tuple[str, ...] = ()
+
+    def config(self, variant: Variant) -> MapConfig:
+        """The variant's settings within these limits. Growth keeps its number of steps as a run gets shorter."""
+        pairs = [*self.settings, *variant.settings, f"seed={variant.seed}", "language.encoder=none"]
+        config = load_config(None, pairs, variant.preset)
+        train, photos = config.train, config.photos
+        iterations = self.iterations or train.iterations
+        iterations = max(1, round(iterations / self.shorten))
+        every = max(20, round(config.densify.every * min(1.0, iterations / train.iterations)))
+        train = replace(train, iterations=iterations, budget=min(train.budget, self.budget or train.budget))
+        photos = replace(photos, max_side=min(photos.max_side, self.max_side or photos.max_side))
+        return replace(config, train=train, photos=photos, densify=replace(config.densify, every=every))
+
+
+@dataclass
+class SweepScene:
+    """A scene with its photos and label images, each size decoded once. work: folder for what can be kept."""
+
+    folder: Path
+    work: Path
+    held_out_every: int = 8
+    _views: dict[Any, Any] = field(default_factory=dict)
+    _scene: Any = None
+
+    @property
+    def name(self) -> str:
+        return self.folder.parent.name if self.folder.suffix == ".json" else self.folder.name
+
+    @property
+    def root(self) -> Path:
+        """The folder that holds label images and truth."""
+        return self.folder.parent if self.folder.suffix == ".json" else self.folder
+
+    def scene(self) -> Any:
+        """The posed photos and the sparse cloud (perception.types.Scene)."""
+        from perception.io.inputs import load_scene
+        from perception.io.scene_cache import load_saved_scene, save_scene
+
+        if self._scene is None:
+            self._scene = load_saved_scene(self.work / "scene")
+        if self._scene is None:
+            self._scene = load_scene(self.folder, self.work / "sfm")
+            save_scene(self.work / "scene", self._scene)
+        return self._scene
+
+    def photos(self, max_side: int) -> tuple[list[Any], list[Any]]:
+        """(training, held-out) views without labels."""
+        from perception.pipeline.photos import load_all, split_views
+
+        if max_side not in self._views:
+            parts = split_views(self.scene().views, self.held_out_every)
+            self._views[max_side] = tuple(load_all(part, max_side, _silent) for part in parts)
+        return self._views[max_side]
+
+    def training(self, max_side: int, masks: str | None) -> list[Any]:
+        """Training views with the label images of folder `masks`; without it, photos alone."""
+        if masks is None or not (self.root / masks).is_dir():
+            return self.photos(max_side)[0]
+        if (max_side, masks) not in self._views:
+            self._views[max_side, masks] = self._labelled(max_side, masks)
+        return self._views[max_side, masks]
+
+    def _labelled(self, max_side: int, masks: str) -> list[Any]:
+        from perception.io.photos import load_photo
+        from perception.masks import make_source
+        from perception.masks.store import compute_masks
+        from perception.pipeline.photos import split_views, with_labels
+
+        views, _ = split_views(self.scene().views, self.held_out_every)
+        folder = self.work / f"{masks}-{max_side}"
+        source = make_source(f"labels:{self.root / masks}", cache_dir=self.work)
+        compute_masks(views, source, lambda view: load_photo(view, max_side), folder)
+        decoded = self.photos(max_side)[0]
+        return [with_labels(view, of, folder) for view, of in zip(decoded, views, strict=True)]
+
+
+def run_variant(scene: SweepScene, variant: Variant, config: MapConfig) -> dict[str, Any]:
+    """Trains one variant in this process and scores it; a JSON-able row."""
+    import torch
+
+    from perception.gaussians.train import Trainer
+    from perception.pipeline.instances import find_instances
+    from perception.pipeline.mapping import initial_gaussians, score_views
+    from perception.pipeline.record import PeakMemory, Stages
+    from perception.progress import Progress
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(variant.threads or os.cpu_count() or 1)
+    try:
+        views = scene.training(config.photos.max_side, variant.masks)
+        held = scene.photos(config.photos.max_side)[1]
+        peak, stages = PeakMemory(), Stages()
+        trainer = Trainer(initial_gaussians(scene.scene(), config), views, config, held)
+        began, cpu = time.monotonic(), time.process_time()
+        with stages("train"):
+            trainer.run(lambda trainer, figures: None)
+        cpu = time.process_time() - cpu
+        with stages("instances"):
+            found = find_instances(trainer.gaussians, views, scene.scene(), config, Progress(quiet=True))
+        seconds = time.monotonic() - began
+        quality = score_views(trainer.gaussians, held)
+        record = trainer.record
+        row: dict[str, Any] = {
+            "pixels": int(views[0].photo.shape[0] * views[0].photo.shape[1]),
+            "iterations": record.iterations,
+            "gaussians": len(trainer.gaussians),
+            "sh_degree": trainer.gaussians.sh_degree,
+            "seconds": round(seconds, 2),
+            "train_seconds": stages.seconds["train"],
+            "cpu_seconds": round(cpu, 2),
+            "seconds_per_1000": round(1000 * cpu / max(1, record.iterations), 2),
+            "wall_per_1000": round(1000 * stages.seconds["train"] / max(1, record.iterations), 2),
+            "peak_mib": peak.mib(),
+            "psnr": quality.get("psnr"),
+            "ssim": quality.get("ssim"),
+            "decisions": record.decisions,
+            "curve": record.curve,
+            "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        }
+        return row | _instance_scores(scene, trainer.gaussians, found)
+    finally:
+        torch.set_num_threads(before)
+
+
+def _instance_scores(scene: SweepScene, gaussians: Any, found: Any) -> dict[str, Any]:
+    """AP of the exported truth cloud (protocol scannet, class-agnostic); {} without truth or without instances."""
+    from perception.evaluate.instances import evaluate
+    from perception.export.labels import export_labels
+    from perception.io.cloud import read_cloud
+
+    file = scene.root / TRUTH_CLOUD
+    if not file.is_file() or found.report.get("count", 0) == 0:
+        return {}
+    cloud = read_cloud(file)
+    labels = export_labels(gaussians.means.numpy(), found.ids, gaussians.opacities.numpy(), cloud)
+    confidence = {entry["id"]: entry["score"] for entry in found.instances}
+    result = evaluate(labels, confidence, cloud.labels["instance_id"])
+    figures = {key: result[key] for key in ("ap", "ap50", "ap25")}
+    return figures | {"instances": found.report["count"], "noise_share": found.report["noise_share"]}
+
+
+class Sweep:
+    """Rows of a bench in `folder`/rows.json, each written as soon as it is measured."""
+
+    def __init__(self, folder: Path, limits: Limits, tell: Callable[[str], None]):
+        self.folder, self.limits, self.tell = folder, limits, tell
+        self.file = folder / "rows.json"
+        self.rows: dict[str, dict[str, Any]] = {}
+        if self.file.is_file():
+            try:
+                self.rows = json.loads(self.file.read_text(encoding="utf-8"))
+            except ValueError as error:
+                raise InputError(f"{self.file}: not valid JSON ({error}); remove it to start over") from error
+        self._code = code_digest()
+
+    def run(self, scene: SweepScene, variants: Sequence[Variant]) -> list[dict[str, Any]]:
+        """The rows of `variants`, in order; those on disk are taken from there, equal settings are trained once."""
+        rows = []
+        for number, variant in enumerate(variants, start=1):
+            config = self.limits.config(variant)
+            key = self._key(scene, variant, config)
+            known = key in self.rows
+            if not known:
+                self.rows[key] = run_variant(scene, variant, config)
+                with atomic_file(self.file) as aside:
+                    aside.write_text(json.dumps(self.rows, indent=1), encoding="utf-8")
+            row = {"scene": scene.name, **asdict(variant), "config": config.to_json(), **self.rows[key]}
+            rows.append(row)
+            self.tell(f"{scene.name} {number}/{len(variants)} {variant.group} {variant.name}: {_brief(row, known)}")
+        return rows
+
+    def _key(self, scene: SweepScene, variant: Variant, config: MapConfig) -> str:
+        parts = [str(scene.folder.resolve()), variant.masks, variant.threads, config.to_json(), self._code]
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def code_digest() -> str:
+    """Of the files whose change may change a row."""
+    root = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256()
+    for pattern in _CODE:
+        for path in sorted(root.glob(pattern)):
+            for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+                digest.update(file.name.encode() + file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _brief(row: dict[str, Any], known: bool) -> str:
+    figures = [f"{row['psnr']:.2f} dB"] if row.get("psnr") is not None else []
+    figures += [f"AP {row['ap']:.3f}"] if row.get("ap") is not None else []
+    return f"{', '.join(figures)}, {row['seconds']:.0f} s{' (kept)' if known else ''}"
+
+
+def difference(row: dict[str, Any], base: dict[str, Any], key: str) -> float | None:
+    """row − base of a figure; None where either has none."""
+    one, other = row.get(key), base.get(key)
+    return None if one is None or other is None else float(one) - float(other)
+
+
+def pareto(points: Sequence[tuple[float, float | None]]) -> list[int]:
+    """Indices of (cost, value) pairs, cheapest first, that no other beats: at most as dear and at least as good."""
+    kept: list[int] = []
+    best = -np.inf
+    for _, loss, index in sorted((cost, -value, i) for i, (cost, value) in enumerate(points) if value is not None):
+        if -loss > best:
+            kept.append(index)
+            best = -loss
+    return kept
+
+
+def _silent(done: int, total: int) -> None:
+    """Nobody listens."""

@@ -1,0 +1,60 @@
+"""`perception label`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from perception.cli.parser import command
+from perception.errors import InputError
+
+
+def register(commands: Any) -> None:
+    """Adds this module's subcommands."""
+    p = command(commands, "label", _label, "name an instance; queries know the name from then on")
+    p.add_argument("map", type=Path, metavar="MAP")
+    p.add_argument("id", type=int, nargs="?", metavar="ID", help="without one, the labels are listed")
+    p.add_argument("text", nargs="?", metavar="NAME", help='such as "grandma\'s cup"')
+    p.add_argument("--clear", action="store_true", help="take the name away")
+    p.add_argument("--from", type=Path, metavar="OLD.gsmap", dest="old", help="carry over the names of an older map")
+
+
+def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    if sum((args.text is not None, args.clear, args.old is not None)) > 1:
+        raise InputError("label: give a NAME, --clear or --from, only one of them")
+    if args.old is not None:
+        return _carry(args)
+    if args.id is not None:
+        return _set(args)
+    if args.clear:
+        raise InputError("label: --clear needs the ID whose name is taken away")
+    from perception.io.labels import read_instances
+
+    named = {entry["id"]: entry["label"] for entry in read_instances(args.map) if entry.get("label")}
+    return {"labels": named}, "\n".join(f"{i:>5}  {name}" for i, name in named.items()) or "no instance has a name"
+
+
+def _set(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.io.labels import set_labels
+
+    if args.text is None and not args.clear:
+        raise InputError("label: no NAME given; write one, or --clear to take it away")
+    set_labels(args.map, {args.id: args.text})
+    said = (
+        f"instance {args.id} is called “{args.text}” now" if args.text else f"instance {args.id} has no name any more"
+    )
+    return {"id": args.id, "label": args.text}, said
+
+
+def _carry(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.instances.survival import carried_text, carry_labels
+    from perception.io.labels import set_labels
+    from perception.io.store import read_map
+
+    if args.id is not None:
+        raise InputError("label: --from carries all names over and takes no ID")
+    carried = carry_labels(read_map(args.old), read_map(args.map))
+    if carried.labels:
+        set_labels(args.map, dict(carried.labels))
+    return {"labels": carried.labels, "dropped": [name for _, name in carried.dropped]}, carried_text(carried)

@@ -1,0 +1,70 @@
+"""`perception models`."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from perception.cli.parser import Parser, command
+
+
+def register(commands: Any) -> None:
+    """Adds this module's subcommands."""
+    parser = commands.add_parser("models", help="the ONNX models of this user: list, check, add")
+    kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True, parser_class=Parser)
+    command(kinds, "list", _list, "the models in the store")
+    p = command(kinds, "check", _check, "family, inputs, outputs and providers really in use of an ONNX file")
+    p.add_argument("file", metavar="FILE", help="an ONNX file, a folder of them, or a name of the store")
+    p = command(kinds, "add", _add, "put a model into the store, from files or web addresses")
+    p.add_argument("name", metavar="NAME", help="use it as --masks sam:NAME or language.encoder=clip:NAME")
+    p.add_argument("source", nargs="+", metavar="FILE-or-URL", help="encoder and decoder, or a folder")
+    p.add_argument("--sha256", action="append", default=[], metavar="HEX", help="expected digest, one a source")
+    p.add_argument("--offline", action="store_true", help="never touch the network")
+    p.add_argument("--default", action="store_true", help="--masks auto takes this model from now on")
+
+
+def _list(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.io.model_store import models_folder
+    from perception.models import list_models
+
+    found = list_models()
+    lines = [
+        f"{m['name']:24} {m['purpose'] or '-':5} {m['family'] or 'unknown':14} {m['bytes'] / 1e6:9.1f} MB"
+        for m in found
+    ]
+    return {"models": found}, "\n".join(lines) or f"no models in {models_folder()} yet (see perception models add)"
+
+
+def _check(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.models import check_file
+
+    found = check_file(args.file)
+    lines = []
+    for entry in found["files"]:
+        what = f"{entry['family']} {entry['role']}" if entry["role"] else "of no known family"
+        lines.append(f"{entry['file']}: {what}, {entry['bytes'] / 1e6:.1f} MB, runs on {', '.join(entry['providers'])}")
+        for side in ("inputs", "outputs"):
+            lines += [f"  {side[:-1]:6} {v['name']} {v['shape']} {v['type']}" for v in entry[side]]
+    return found, "\n".join(lines + [f"warning: {text}" for text in found["warnings"]])
+
+
+def _add(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.models import add_model, check_file
+    from perception.progress import Progress
+
+    model = add_model(
+        args.name,
+        args.source,
+        sha256=args.sha256,
+        offline=args.offline,
+        default=args.default,
+        progress=Progress(quiet=args.json).update,
+    )
+    warnings = check_file(str(model.folder))["warnings"]
+    use = {"sam": f"--masks sam:{model.name}", "clip": f"--set language.encoder=clip:{model.name}"}
+    lines = [f"{model.folder}: {model.family or 'unknown family'}"]
+    lines += [f"  {entry['sha256']}  {entry['name']}" for entry in model.files]
+    lines += [f"warning: {text}" for text in warnings]
+    lines += [f"use it with {use[model.purpose]}"] if model.purpose else []
+    result = {"name": model.name, "family": model.family, "purpose": model.purpose, "folder": str(model.folder)}
+    return {**result, "files": model.files, "warnings": warnings}, "\n".join(lines)

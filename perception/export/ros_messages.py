@@ -1,0 +1,146 @@
+"""What we know in the words of ROS 2: standard messages as plain dicts, whatever carries them afterwards.
+
+A message is a dict of its fields; fields that are left out have their type's zero. Arrays are numpy, times are
+(seconds, nanoseconds). Layouts: the interface definitions of ROS 2 (common_interfaces, vision_msgs 4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from perception.types import OrientedBox
+
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+DETECTIONS = "vision_msgs/msg/Detection3DArray"
+MARKERS = "visualization_msgs/msg/MarkerArray"
+STRING = "std_msgs/msg/String"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+
+Stamp = tuple[int, int]
+_FIELD_KINDS = {"<i4": 5, "<u4": 6, "<f4": 7}  # sensor_msgs/PointField
+_CUBE, _TEXT, _DELETE_ALL = 1, 9, 3  # visualization_msgs/Marker
+
+
+def header(frame: str, stamp: Stamp) -> dict[str, Any]:
+    """std_msgs/Header."""
+    return {"stamp": {"sec": stamp[0], "nanosec": stamp[1]}, "frame_id": frame}
+
+
+def packed_rgb(colors: np.ndarray) -> np.ndarray:
+    """PCL's packing of colors [P, 3] uint8 into [P] uint32."""
+    r, g, b = colors.astype(np.uint32).T
+    return (r << 16) | (g << 8) | b
+
+
+def point_cloud2(columns: Mapping[str, np.ndarray], frame: str, stamp: Stamp) -> dict[str, Any]:
+    """sensor_msgs/PointCloud2 of one row and one float32, int32 or uint32 field a column [P]; order is kept."""
+    kinds = {name: values.dtype.newbyteorder("<").str for name, values in columns.items()}
+    count = len(next(iter(columns.values())))
+    rows = np.empty(count, list(kinds.items()))
+    for name, values in columns.items():
+        rows[name] = values
+    coordinates = [values for name, values in columns.items() if name in "xyz"]
+    return {
+        "header": header(frame, stamp),
+        "height": 1,
+        "width": count,
+        "fields": [
+            {"name": name, "offset": 4 * i, "datatype": _FIELD_KINDS[kind], "count": 1}
+            for i, (name, kind) in enumerate(kinds.items())
+        ],
+        "is_bigendian": False,
+        "point_step": rows.itemsize,
+        "row_step": rows.nbytes,
+        "data": rows.view(np.uint8).reshape(-1),
+        "is_dense": all(bool(np.isfinite(values).all()) for values in coordinates),
+    }
+
+
+def pose(box: OrientedBox) -> dict[str, Any]:
+    """geometry_msgs/Pose of a box: it takes box axes (the rows of `rotation`) to the frame; xyzw."""
+    w, x, y, z = (float(v) for v in _quaternion(box.rotation.T))
+    return {"position": _xyz(box.center), "orientation": {"x": x, "y": y, "z": z, "w": w}}
+
+
+def detection(
+    box: OrientedBox, class_id: str, score: float, identity: str, head: dict[str, Any], spread: np.ndarray | None = None
+) -> dict[str, Any]:
+    """vision_msgs/Detection3D. spread [3, 3]: covariance of the points, told as that of the position."""
+    covariance = np.zeros((6, 6))
+    if spread is not None:
+        covariance[:3, :3] = spread
+    at = pose(box)
+    hypothesis = {"class_id": class_id, "score": float(score)}
+    return {
+        "header": head,
+        "results": [{"hypothesis": hypothesis, "pose": {"pose": at, "covariance": covariance.reshape(-1)}}],
+        "bbox": {"center": at, "size": _xyz(box.extent)},
+        "id": identity,
+    }
+
+
+def box_markers(
+    boxes: Iterable[tuple[OrientedBox, str]], namespace: str, head: dict[str, Any], least: float = 1e-3
+) -> dict[str, Any]:
+    """visualization_msgs/MarkerArray: a mark that clears what was shown before, then a see-through box and its words
+    for each of `boxes`. Viewers refuse a side of no length, so sides are at least `least`."""
+    markers: list[dict[str, Any]] = [{"header": head, "action": _DELETE_ALL}]
+    for i, (box, words) in enumerate(boxes):
+        at = pose(box)
+        size = {axis: max(side, least) for axis, side in _xyz(box.extent).items()}
+        red, green, blue = _color(i)
+        markers.append(
+            {
+                "header": head,
+                "ns": namespace,
+                "id": 2 * i,
+                "type": _CUBE,
+                "pose": at,
+                "scale": size,
+                "color": {"r": red, "g": green, "b": blue, "a": 0.4},
+            }
+        )
+        above = {"position": at["position"], "orientation": {"w": 1.0}}
+        letters = {"z": max(0.25 * min(size.values()), 0.1 * max(size.values()))}
+        white = {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0}
+        markers.append(
+            {
+                "header": head,
+                "ns": namespace,
+                "id": 2 * i + 1,
+                "type": _TEXT,
+                "pose": above,
+                "scale": letters,
+                "color": white,
+                "text": words,
+            }
+        )
+    return {"markers": markers}
+
+
+def _xyz(vector: np.ndarray) -> dict[str, float]:
+    return dict(zip("xyz", (float(v) for v in vector), strict=True))
+
+
+def _color(i: int) -> tuple[float, float, float]:
+    """Green for the best, then around the wheel."""
+    turn = (1 / 3 + 0.381966 * i) % 1.0
+    return tuple(float(np.clip(abs((turn * 6 + k) % 6 - 3) - 1, 0, 1)) for k in (0, 4, 2))  # type: ignore[return-value]
+
+
+def _quaternion(rotation: np.ndarray) -> np.ndarray:
+    """wxyz with w ≥ 0 of a rotation [3, 3] (Bar-Itzhack 2000: the eigenvector of the largest eigenvalue)."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    matrix = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ]
+    )
+    wxyz = np.linalg.eigh(matrix)[1][:, -1]
+    return -wxyz if wxyz[0] < 0 else wxyz

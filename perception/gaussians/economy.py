@@ -1,0 +1,97 @@
+"""What more is worth its time: harmonics, Gaussians, iterations. One rate decides, told in the run record.
+
+The course of training is cut into trials of 5 %. At the end of each the held-out PSNR is taken (of training views where
+nothing is held out), and time is counted in iterations, so that a run repeats. The exchange rate is the dB that 10 %
+more time must buy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from perception.config import MapConfig
+
+TRIAL = 0.05
+"""Length of a trial, as a share of the whole course."""
+COST_EXPONENT = 0.6
+"""An iteration's time grows like the number of Gaussians to this power (`perception bench scaling`)."""
+
+
+@dataclass
+class Economy:
+    """What was measured and decided so far; `state` and `load` round-trip it through a checkpoint.
+
+    scores: PSNR in dB at the end of each trial. growing: Gaussians may be added. harmonics: PSNR at the ends of the
+    trials that are about harmonics. settled: no harmonics are tried any more. finished: only the cool-down is left.
+    """
+
+    config: MapConfig
+    scores: list[float] = field(default_factory=list)
+    growing: bool = True
+    harmonics: list[float] = field(default_factory=list)
+    settled: bool = False
+    finished: bool = False
+    due: float = TRIAL
+
+    def state(self) -> dict[str, Any]:
+        """Plain values for a checkpoint."""
+        values = asdict(self)
+        del values["config"]
+        return values
+
+    def load(self, values: dict[str, Any]) -> None:
+        """Takes up `state()`."""
+        vars(self).update(values)
+
+    def gain(self) -> float | None:
+        """dB that the best PSNR gained over the last two trials; None before there are three."""
+        if len(self.scores) < 3:
+            return None
+        return max(self.scores) - max(self.scores[:-2])
+
+    def growth_pays(self, gaussians: int, next_count: int) -> str | None:
+        """None while growth pays; else why it ends.
+
+        All that two trials gained, by growth and by mere training, bounds what growth gained in them; when even that
+        is less than the next trial's growth costs at the exchange rate, growth does not pay.
+        """
+        gain = self.gain()
+        if gain is None or next_count <= gaussians:
+            return None
+        tenths = ((next_count / gaussians) ** COST_EXPONENT - 1) / 0.1
+        asked = self.config.train.exchange_db * tenths
+        if gain / 2 >= asked:
+            return None
+        self.growing = False
+        return f"growth: ended at {gaussians} Gaussians, a trial gains {gain / 2:.3f} dB and {asked:.3f} are asked"
+
+    def plateau(self, progress: float) -> str | None:
+        """Why training may cool down now; None while it still pays."""
+        gain = self.gain()
+        if gain is None:
+            return None
+        tenths = 2 * TRIAL / (0.1 * progress)
+        if gain >= self.config.train.exchange_db * tenths:
+            return None
+        return f"stop: 10 % more time gains {gain / tenths:.3f} dB, {self.config.train.exchange_db:g} are asked"
+
+    def harmonics_step(self, degree: int) -> tuple[int, str | None]:
+        """The degree to go on with after a trial, and what was decided about the last raise, if anything.
+
+        The first trial raises nothing and tells what a trial gains by itself; a raise pays when its trial gains
+        `sh_min_gain_db` more than that.
+        """
+        train = self.config.train
+        self.harmonics.append(self.scores[-1])
+        told = None
+        if len(self.harmonics) > 2:
+            before = self.harmonics[1] - self.harmonics[0]
+            extra = self.harmonics[-1] - self.harmonics[-2] - before
+            paid = extra >= train.sh_min_gain_db
+            told = f"harmonics: degree {degree} gained {extra:+.2f} dB, {'kept' if paid else 'taken back'}"
+            degree -= not paid
+            self.settled = not paid or degree == train.sh_degree
+        if len(self.harmonics) > 1 and not self.settled:
+            degree += 1
+        return degree, told

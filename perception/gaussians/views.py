@@ -1,0 +1,117 @@
+"""A photo as the trainer and the scorers see it, and a map seen from there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from perception.gaussians.model import Gaussians
+from perception.gaussians.rasterize import rasterize
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """One photo ready for training. photo [H, W, 3] uint8; labels [H, W] int32 (0 = unlabelled) or None;
+    K [3, 3] and camera_from_world [4, 4] float32."""
+
+    name: str
+    photo: torch.Tensor
+    labels: torch.Tensor | None
+    K: torch.Tensor
+    camera_from_world: torch.Tensor
+
+    def halved(self) -> TrainingView:
+        """The same view at half the resolution: photo averaged 2 × 2, labels taken at every other pixel."""
+        height, width = self.photo.shape[0] // 2, self.photo.shape[1] // 2
+        blocks = self.photo[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3)
+        photo = (blocks.to(torch.int16).sum(dim=(1, 3)) + 2).div(4, rounding_mode="floor").to(torch.uint8)
+        labels = None if self.labels is None else self.labels[: 2 * height : 2, : 2 * width : 2].contiguous()
+        K = self.K.clone()
+        K[:2] *= 0.5
+        return TrainingView(self.name, photo.contiguous(), labels, K, self.camera_from_world)
+
+
+def scene_extent(views: list[TrainingView]) -> float:
+    """1.1 × the largest distance of a camera from the cameras' mean (Kerbl et al. 2023), never 0."""
+    poses = torch.stack([view.camera_from_world for view in views])
+    centres = -torch.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    return max(1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max()), 1e-3)
+
+
+@torch.no_grad()
+def render_view(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
+    """The photo as the map sees it, [H, W, 3] float32 in [0, 1], black where nothing is."""
+    height, width = view.photo.shape[:2]
+    out = rasterize(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.sh,
+        view.camera_from_world[None],
+        view.K[None],
+        width,
+        height,
+        sh_degree=gaussians.sh_degree,
+        depth=False,
+    )
+    return out.colors[0].clamp(0, 1)
+
+
+@torch.no_grad()
+def depth_image(
+    gaussians: Gaussians, camera_from_world: torch.Tensor, K: torch.Tensor, width: int, height: int
+) -> torch.Tensor:
+    """Expected depth [H, W] along the optical axis where the map is more than half opaque, 0 elsewhere."""
+    out = rasterize(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.base_colors,
+        camera_from_world[None],
+        K[None],
+        width,
+        height,
+    )
+    alpha = out.alphas[0]
+    return torch.where(alpha > 0.5, out.depths[0] / alpha.clamp(min=1e-6), torch.zeros_like(alpha))
+
+
+def psnr(image: torch.Tensor, photo: torch.Tensor) -> float:
+    """Peak signal-to-noise ratio in dB of image [H, W, 3] in [0, 1] against photo uint8."""
+    error = float((image.double() - photo.double() / 255).square().mean())
+    return float("inf") if error == 0 else -10 * float(np.log10(error))
+
+
+ERROR_BLOCK = 8
+"""Pixels a side over which a photo's error is averaged before Gaussians read it."""
+
+
+@torch.no_grad()
+def error_at(means: torch.Tensor, view: TrainingView, image: torch.Tensor) -> torch.Tensor:
+    """Mean absolute error [N] of render `image` [H, W, 3] in the block of pixels where each of means [N, 3] lies.
+
+    The view's mean colour error is taken out, so that a photo's exposure does not count as detail that is missing.
+    Outside the picture the nearest block's error is read.
+    """
+    height, width = view.photo.shape[:2]
+    difference = image - view.photo / 255
+    difference = (difference - difference.mean(dim=(0, 1))).abs().mean(dim=2)
+    blocks = torch.nn.functional.avg_pool2d(difference[None, None], ERROR_BLOCK, ceil_mode=True)[0, 0]
+    pose = view.camera_from_world
+    p = torch.addmm(pose[:3, 3], means, pose[:3, :3].T)
+    depth = p[:, 2].clamp(min=1e-6)
+    column = (p[:, 0] / depth * view.K[0, 0] + view.K[0, 2]).clamp(0, width - 1).div(ERROR_BLOCK).long()
+    row = (p[:, 1] / depth * view.K[1, 1] + view.K[1, 2]).clamp(0, height - 1).div(ERROR_BLOCK).long()
+    return blocks[row, column]
+
+
+def cooling(progress: float, share: float) -> float:
+    """Factor of all learning rates at `progress`: 1, and over the last `share` of the course down to .05 (half a
+    cosine)."""
+    if share <= 0 or progress <= 1 - share:
+        return 1.0
+    return 0.05 + 0.95 * 0.5 * (1 + float(np.cos(np.pi * (progress - 1 + share) / share)))

@@ -1,0 +1,112 @@
+"""Which instances of an old map live on in a new one, so that the names given to them can be carried over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perception.geometry import align_similarity
+from perception.io.store import GaussianMap
+
+SHARE = 0.5  # of the points of either must lie nearest to the other: then each has at most one partner
+REACH = 0.1  # of an instance's size: nearest neighbours farther away belong to no common surface
+ALIGNED = 0.02  # of the cameras' spread: larger residuals mean that the two maps know other camera paths
+SAMPLES = 2000  # points of an instance that vote
+
+
+@dataclass
+class Carried:
+    """labels: new id -> name. dropped: (old id, name) of instances that live on nowhere. aligned: whether the frames
+    were brought together by common cameras (else they were taken to be the same)."""
+
+    labels: dict[int, str] = field(default_factory=dict)
+    dropped: list[tuple[int, str]] = field(default_factory=list)
+    aligned: bool = False
+
+
+def carry_labels(old: GaussianMap, new: GaussianMap) -> Carried:
+    """Names of `old`'s instances for those of `new` that fill the same place (more than half, both ways)."""
+    named = {entry["id"]: str(entry["label"]) for entry in old.instances if entry.get("label")}
+    moved, aligned = _into_frame_of(new, old)
+    partners = match_instances(moved, old.instance_ids, new.means, new.instance_ids, list(named))
+    carried = Carried(aligned=aligned)
+    for i, name in named.items():
+        if i in partners:
+            carried.labels[partners[i]] = name
+        else:
+            carried.dropped.append((i, name))
+    return carried
+
+
+def match_instances(
+    old_points: np.ndarray, old_ids: np.ndarray, new_points: np.ndarray, new_ids: np.ndarray, wanted: list[int]
+) -> dict[int, int]:
+    """Old id -> new id for those `wanted` that have a partner. Points [N, 3] in one frame, ids [N], −1 = none.
+
+    j is i's partner when more than SHARE of i's points have their nearest new point in j, and of j's points their
+    nearest old point in i, neighbours farther apart than REACH of i's size not counted.
+    """
+    from scipy.spatial import cKDTree
+
+    partners: dict[int, int] = {}
+    if not wanted or not len(new_points):
+        return partners
+    old_tree, new_tree = cKDTree(old_points), cKDTree(new_points)
+    for i in wanted:
+        points = _sample(old_points[old_ids == i])
+        if not len(points):
+            continue
+        reach = REACH * float(np.linalg.norm(np.ptp(points, axis=0))) + 1e-9
+        nearest = _neighbour_ids(new_tree, new_ids, points, reach)
+        found = nearest[nearest >= 0]
+        if not len(found):
+            continue
+        j = int(np.bincount(found).argmax())
+        back = _neighbour_ids(old_tree, old_ids, _sample(new_points[new_ids == j]), reach)
+        if (nearest == j).mean() > SHARE and (back == i).mean() > SHARE:
+            partners[i] = j
+    return partners
+
+
+def _neighbour_ids(tree: object, ids: np.ndarray, points: np.ndarray, reach: float) -> np.ndarray:
+    distances, rows = tree.query(points, distance_upper_bound=reach)  # type: ignore[attr-defined]
+    return np.where(np.isfinite(distances), ids[np.minimum(rows, len(ids) - 1)], -1)
+
+
+def _sample(points: np.ndarray) -> np.ndarray:
+    """At most SAMPLES of the points, evenly through their order."""
+    step = max(1, len(points) // SAMPLES)
+    return points[::step].astype(np.float64)
+
+
+def _into_frame_of(new: GaussianMap, old: GaussianMap) -> tuple[np.ndarray, bool]:
+    """`old`'s means in `new`'s frame: structure from motion chooses a frame anew, common photos tie the two together.
+
+    Without three common photos, or when their paths differ, the frames are taken to be the same.
+    """
+    names = [str(n) for n in new.cameras.get("names", [])]
+    place = {str(n): k for k, n in enumerate(old.cameras.get("names", []))}
+    common = [(k, place[name]) for k, name in enumerate(names) if name in place]
+    if len(common) < 3:
+        return old.means, False
+    rows = np.array(common)
+    there, here = (_centres(m.cameras["camera_from_world"])[c] for m, c in ((new, rows[:, 0]), (old, rows[:, 1])))
+    if np.linalg.matrix_rank(here - here.mean(axis=0), tol=1e-3 * max(float(np.ptp(here)), 1e-12)) < 2:
+        return old.means, False  # cameras on a line tie no rotation about it
+    scale, rotation, shift = align_similarity(there, here)
+    residual = np.linalg.norm(scale * here @ rotation.T + shift - there, axis=1)
+    if np.median(residual) > ALIGNED * float(np.linalg.norm(np.ptp(there, axis=0))):
+        return old.means, False
+    return (scale * old.means.astype(np.float64) @ rotation.T + shift).astype(np.float32), True
+
+
+def _centres(camera_from_world: np.ndarray) -> np.ndarray:
+    return -np.einsum("nji,nj->ni", camera_from_world[:, :3, :3], camera_from_world[:, :3, 3])
+
+
+def carried_text(carried: Carried) -> str:
+    """What became of the old names, a line each."""
+    lines = [f"instance {i} is called “{name}”" for i, name in carried.labels.items()]
+    lines += [f"warning: “{name}” (old instance {i}) lives on nowhere; dropped" for i, name in carried.dropped]
+    return "\n".join(lines) or "the old map has no names"

@@ -1,0 +1,147 @@
+"""Files over HTTP that survive broken connections: what has arrived stays in a `.part` file and is gone on with.
+
+A `Range` request asks for the rest, `If-Range` makes the server send everything when the file has changed since;
+a server that knows no ranges sends everything too, which is then taken from the start.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import json
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from perception.errors import InputError
+
+CHUNK = 1 << 20
+TIMEOUT = 30.0  # seconds without a byte
+ATTEMPTS = 4  # connections in a row that bring nothing new
+
+Progress = Callable[[int, int], Any]
+
+
+def is_url(source: str) -> bool:
+    """Whether it is to be fetched rather than copied."""
+    return source.lower().startswith(("http://", "https://"))
+
+
+def download(url: str, part: Path, progress: Progress | None = None) -> Path:
+    """Fetches `url` into `part`, taking up what lies there; returns `part`, complete.
+
+    part: its sibling `*.part.json` remembers which version of the file it belongs to. progress(bytes, all) is
+    told after every chunk. Raises InputError when the server refuses or the line stays dead; `part` is kept.
+    """
+    part.parent.mkdir(parents=True, exist_ok=True)
+    fruitless = 0
+    while True:
+        before = _size(part)
+        problem = _attempt(url, part, progress)
+        if problem is None:
+            _memory(part).unlink(missing_ok=True)
+            return part
+        fruitless = fruitless + 1 if _size(part) <= before else 0
+        if fruitless >= ATTEMPTS:
+            raise InputError(f"{url}: {problem}; {_size(part)} bytes are kept, run the command again to go on")
+
+
+def sha256_of(path: Path) -> str:
+    """Hex digest of a file."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(CHUNK):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def _attempt(url: str, part: Path, progress: Progress | None) -> str | None:
+    """One connection: None when the file is complete, else what went wrong in words."""
+    have = _size(part)
+    try:
+        with urllib.request.urlopen(_request(url, part, have), timeout=TIMEOUT) as answer:
+            start, total = _extent(answer, have)
+            if start not in (0, have):
+                return f"the server sent bytes from {start} on, asked for {have}"
+            _memory(part).write_text(json.dumps({"url": url, "mark": _mark(answer)}), encoding="utf-8")
+            return _receive(answer, part, start, total, progress)
+    except urllib.error.HTTPError as error:
+        if error.code == 416 and have:  # nothing lies behind what we have: complete, or another file by now
+            if str(error.headers.get("Content-Range", "")).endswith(f"/{have}"):
+                return None
+            part.unlink()
+            return "the file has changed on the server"
+        if error.code in (408, 425, 429) or error.code >= 500:
+            return f"the server answers {error.code} {error.reason}"
+        raise InputError(f"{url}: the server answers {error.code} {error.reason}; check the address") from error
+    except urllib.error.URLError as error:
+        return f"no connection ({error.reason})"
+    except (http.client.HTTPException, ConnectionError, TimeoutError) as error:
+        return f"the connection broke ({type(error).__name__})"
+    except ValueError as error:
+        raise InputError(f"{url}: not a web address ({error})") from error
+
+
+def _request(url: str, part: Path, have: int) -> urllib.request.Request:
+    headers = {"User-Agent": "perception", "Accept-Encoding": "identity"}
+    if have:
+        known = _recall(part)
+        if known.get("url") == url:
+            headers["Range"] = f"bytes={have}-"
+            if known.get("mark"):
+                headers["If-Range"] = known["mark"]
+    return urllib.request.Request(url, headers=headers)
+
+
+def _extent(answer: Any, have: int) -> tuple[int, int | None]:
+    """First byte that comes, and the size of the whole file where it is told."""
+    length = answer.headers.get("Content-Length")
+    size = int(length) if length is not None and length.isdigit() else None
+    if answer.status != 206:
+        return 0, size
+    span, _, total = str(answer.headers.get("Content-Range", "")).removeprefix("bytes ").partition("/")
+    first = span.split("-")[0]
+    start = int(first) if first.isdigit() else have
+    return start, int(total) if total.isdigit() else (None if size is None else start + size)
+
+
+def _receive(answer: Any, part: Path, start: int, total: int | None, progress: Progress | None) -> str | None:
+    with part.open("r+b" if start else "wb") as file:
+        file.seek(start)
+        file.truncate()
+        done = start
+        while chunk := answer.read(CHUNK):
+            file.write(chunk)
+            done += len(chunk)
+            if progress:
+                progress(done, total or done)
+    if total is not None and done < total:
+        return f"the connection broke at {done} of {total} bytes"
+    return None
+
+
+def _mark(answer: Any) -> str | None:
+    """What tells one version of a file from the next: a strong ETag, else the date."""
+    tag = answer.headers.get("ETag")
+    if tag and not tag.startswith("W/"):
+        return str(tag)
+    date = answer.headers.get("Last-Modified")
+    return str(date) if date else None
+
+
+def _recall(part: Path) -> dict[str, Any]:
+    try:
+        known = json.loads(_memory(part).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return known if isinstance(known, dict) else {}
+
+
+def _memory(part: Path) -> Path:
+    return part.with_name(part.name + ".json")
+
+
+def _size(part: Path) -> int:
+    return part.stat().st_size if part.is_file() else 0

@@ -1,0 +1,119 @@
+"""Where this user's models are kept: one folder a model below the cache, `models/NAME/`, with
+`perception.json` beside the files that says where each came from.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from perception.errors import InputError
+from perception.io.atomic import atomic_file
+
+RECORD = "perception.json"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_DEFAULTS = "defaults.json"
+
+
+@dataclass(frozen=True)
+class StoredModel:
+    """A model of the store. files: name, source, bytes and sha256 of each; purpose: "sam", "clip" or None."""
+
+    name: str
+    folder: Path
+    family: str | None = None
+    purpose: str | None = None
+    files: list[dict[str, Any]] = field(default_factory=list)
+
+
+def cache_folder() -> Path:
+    """This user's derived files and models: $XDG_CACHE_HOME/perception or ~/.cache/perception."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "perception"
+
+
+def models_folder() -> Path:
+    """The folder of all models."""
+    return cache_folder() / "models"
+
+
+def check_name(name: str) -> str:
+    """`name` itself when it can name a folder and cannot be taken for a path."""
+    if not _NAME.fullmatch(name):
+        raise InputError(f"model name '{name}': expected letters, digits, '.', '_' or '-', as in mobile-sam")
+    return name
+
+
+def stored_models() -> list[StoredModel]:
+    """All models of the store, by name."""
+    if not models_folder().is_dir():
+        return []
+    found = (find_model(folder.name) for folder in sorted(models_folder().iterdir()))
+    return [model for model in found if model is not None]
+
+
+def find_model(name: str) -> StoredModel | None:
+    """The stored model of that name; None where there is none. A damaged record is an InputError."""
+    if not _NAME.fullmatch(name):
+        return None
+    folder = models_folder() / name
+    if not (folder / RECORD).is_file():
+        return None
+    try:
+        about = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        return StoredModel(name, folder, about["family"], about["purpose"], list(about["files"]))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{folder / RECORD}: cannot be read ({error}); remove {folder} and add it again") from error
+
+
+def resolve(spec: str) -> str:
+    """`spec` itself, or the folder of the stored model that it names; what exists on disk wins."""
+    if Path(spec).expanduser().exists():
+        return spec
+    model = find_model(spec)
+    return spec if model is None else str(model.folder)
+
+
+def known_names() -> str:
+    """Names for messages: what the store holds."""
+    names = ", ".join(model.name for model in stored_models())
+    return f"the store holds {names}" if names else "the store is empty (see perception models add)"
+
+
+def write_record(folder: Path, family: str | None, purpose: str | None, files: list[dict[str, Any]]) -> None:
+    """The model's record inside its folder."""
+    text = json.dumps({"family": family, "purpose": purpose, "files": files}, indent=1)
+    (folder / RECORD).write_text(text + "\n", encoding="utf-8")
+
+
+def default_model(purpose: str) -> str | None:
+    """Folder of the model that the user chose for a purpose ("sam"), or None."""
+    name = _defaults().get(purpose)
+    if name is None:
+        return None
+    model = find_model(name)
+    if model is None:
+        raise InputError(f"the default {purpose} model '{name}' is not in the store any more; {known_names()}")
+    return str(model.folder)
+
+
+def set_default(model: StoredModel) -> None:
+    """Makes a model the one that is taken where only its purpose is named (`--masks auto`)."""
+    if model.purpose is None:
+        raise InputError(f"{model.name}: its family is unknown, so nothing can be done with it by default")
+    with atomic_file(models_folder() / _DEFAULTS) as file:
+        file.write_text(json.dumps({**_defaults(), model.purpose: model.name}) + "\n", encoding="utf-8")
+
+
+def _defaults() -> dict[str, str]:
+    file = models_folder() / _DEFAULTS
+    if not file.is_file():
+        return {}
+    try:
+        known = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file}: cannot be read ({error}); remove it") from error
+    return known if isinstance(known, dict) else {}

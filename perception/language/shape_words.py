@@ -1,0 +1,52 @@
+"""Words that a shape can answer: which of KINDS the head noun of a prompt names.
+
+English only; a prompt in another language is left to the encoder.
+"""
+
+from __future__ import annotations
+
+import re
+
+KINDS = ("floor", "ceiling", "wall", "table", "picture", "rug", "ball", "box")
+HINTS = ("ball", "box", "rug", "table")
+"""Kinds for which a shape is a hint and no proof: a football may be flat, a box open, a desk heaped."""
+
+# Words of each kind. A carton is a box whose lid may be a gable; a desk is a table with another name.
+_WORDS = {
+    "floor": "floor ground flooring",
+    "ceiling": "ceiling",
+    "wall": "wall",
+    "table": "table desk tabletop counter countertop workbench worktop",
+    "picture": "picture poster painting photograph print artwork portrait placard canvas",
+    "rug": "rug carpet mat doormat",
+    "ball": "ball basketball football softball volleyball sphere globe",
+    "box": "box carton package packet crate cube",
+}
+_KIND = {word: kind for kind, words in _WORDS.items() for word in words.split()}
+# Where the thing itself ends and the rest of a prompt begins: "the rug ON the floor".
+_RELATIONS = re.compile(
+    r"\b(?:on|of|with|without|under|in|inside|at|by|from|near|for|behind|above|below|beside|next|over|to|that|which|"
+    r"between|full|against|beneath|underneath|and|or)\b"
+)
+_MEASURES = re.compile(r"\b(?:pair|piece|set|pile|stack|bunch|sheet|kind|sort)s? of\b")
+_WORD = re.compile(r"[^\W\d_]+")
+
+
+def head_noun(text: str) -> str:
+    """The noun that says what is asked for, singular: "a framed picture of a forest" → "picture"; "" if none."""
+    thing = _MEASURES.sub(" ", text.lower())
+    words = _WORD.findall(_RELATIONS.split(thing)[0]) or _WORD.findall(thing)
+    while len(words) > 1 and len(words[-1]) == 1:  # "wall E": a letter names which one
+        words = words[:-1]
+    return _singular(words[-1]) if words else ""
+
+
+def shape_kind(text: str) -> str | None:
+    """The kind of shape that a prompt asks for, or None."""
+    return _KIND.get(head_noun(text))
+
+
+def _singular(word: str) -> str:
+    if word.endswith("xes"):
+        return word[:-2]
+    return word[:-1] if word.endswith("s") and not word.endswith("ss") else word

@@ -1,0 +1,219 @@
+"""`perception models`: what a model file is, and the user's store of models."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlparse
+
+from perception.errors import InputError
+from perception.io.atomic import atomic_directory
+from perception.io.download import download, is_url, sha256_of
+from perception.io.model_store import (
+    StoredModel,
+    check_name,
+    find_model,
+    known_names,
+    models_folder,
+    set_default,
+    stored_models,
+    write_record,
+)
+
+Progress = Callable[[str, int, int], Any]
+_PARTS = ".parts"
+_KEPT = (".onnx", ".onnx_data", ".data", ".json", ".txt")  # of a folder: graphs, weights beside them, tokenizers
+_PURPOSES = {"encoder": "sam", "decoder": "sam", "image tower": "clip", "text tower": "clip", "both towers": "clip"}
+
+
+def check_file(file: str) -> dict[str, Any]:
+    """What an ONNX file, a folder of them or a stored model is: a dict a file under "files", and warnings.
+
+    Each: file, family, role, inputs and outputs with shapes, providers (those really in use). Raises InputError
+    when a file is no ONNX model, and for a SAM encoder and decoder that do not fit.
+    """
+    stored = find_model(file)
+    path = stored.folder if stored and not Path(file).exists() else Path(file).expanduser()
+    if path.is_dir():
+        graphs = sorted([*path.glob("*.onnx"), *path.glob("onnx/*.onnx")])
+        if not graphs:
+            raise InputError(f"{path}: no .onnx file in this folder; expected ONNX models")
+    elif path.is_file():
+        graphs = [path]
+    else:
+        raise InputError(f"{file}: no such file, folder or stored model; {known_names()}")
+    found = [describe_graph(graph) for graph in graphs]
+    family, purpose, problem = judge(found)
+    warnings = [text for entry in found for text in entry.pop("warnings")] + [problem] * bool(problem)
+    return {"model": str(path), "family": family, "purpose": purpose, "files": found, "warnings": warnings}
+
+
+def describe_graph(path: Path) -> dict[str, Any]:
+    """Family, role, inputs, outputs and providers of one ONNX file."""
+    from perception.masks.sam_models import open_graph, provider_warnings
+
+    graph = open_graph(path)
+    family, role = recognise(graph)
+    return {
+        "file": str(path),
+        "bytes": path.stat().st_size,
+        "family": family,
+        "role": role,
+        "inputs": [_argument(value) for value in graph.session.get_inputs()],
+        "outputs": [_argument(value) for value in graph.session.get_outputs()],
+        "providers": list(graph.session.get_providers()),
+        "warnings": provider_warnings(graph),
+    }
+
+
+def recognise(graph: Any) -> tuple[str | None, str | None]:
+    """(family, role) of an opened graph; (None, None) for one that this program has no use for."""
+    from perception.language.preprocess import family_of
+    from perception.masks.sam_models import decoder_family, encoder_family
+
+    if graph.is_decoder:
+        return decoder_family(graph), "decoder"
+    inputs, outputs = graph.session.get_inputs(), graph.session.get_outputs()
+    rows = any(len(value.shape) == 2 for value in outputs)
+    pixels = any(len(value.shape) == 4 for value in inputs)
+    tokens = any(len(value.shape) == 2 and "int" in value.type and "mask" not in value.name for value in inputs)
+    if rows and (pixels or tokens):
+        role = "both towers" if pixels and tokens else "image tower" if pixels else "text tower"
+        return {"siglip": "SigLIP", "mobileclip": "MobileCLIP", "clip": "CLIP"}[family_of(graph.path)], role
+    return (encoder_family(graph), "encoder") if graph.is_encoder else (None, None)
+
+
+def _argument(value: Any) -> dict[str, Any]:
+    return {"name": value.name, "shape": list(value.shape), "type": value.type}
+
+
+def judge(found: Sequence[dict[str, Any]]) -> tuple[str | None, str | None, str]:
+    """(family, purpose, what is missing in words) of the files of one model."""
+    known = [entry for entry in found if entry["role"]]
+    if not known:
+        return None, None, "the family is unknown: neither a SAM nor a CLIP export was recognised"
+    purpose = _PURPOSES[known[0]["role"]]
+    family = next((e["family"] for e in known if e["role"] in ("decoder", "image tower")), known[0]["family"])
+    roles = {entry["role"] for entry in known}
+    needed = {"sam": {"encoder", "decoder"}, "clip": {"image tower", "text tower"}}[purpose]
+    lacking = set() if "both towers" in roles else needed - roles
+    return family, purpose, f"the {' and '.join(sorted(lacking))} is missing; both are needed" if lacking else ""
+
+
+def list_models() -> list[dict[str, Any]]:
+    """The store: name, family, purpose, bytes and folder of each model."""
+    return [
+        {
+            "name": model.name,
+            "family": model.family,
+            "purpose": model.purpose,
+            "bytes": sum(int(entry["bytes"]) for entry in model.files),
+            "files": model.files,
+            "folder": str(model.folder),
+        }
+        for model in stored_models()
+    ]
+
+
+def add_model(
+    name: str,
+    sources: Sequence[str],
+    *,
+    sha256: Sequence[str] = (),
+    offline: bool = False,
+    default: bool = False,
+    progress: Progress | None = None,
+) -> StoredModel:
+    """Puts files (or all files of a folder, or web addresses) into the store under `name`, whole or not at all.
+
+    sha256: expected digests, as many as sources or none. offline: a web address is an InputError unless this
+    very file is in the store under that name already. default: `--masks auto` takes this model from now on.
+    """
+    check_name(name)
+    expected = _expected(sources, sha256)
+    known = find_model(name)
+    if known is None or not _same(known, sources, expected):
+        parts = models_folder() / _PARTS
+        files = [file for source in sources for file in _local(source, expected.get(source), offline, parts, progress)]
+        _install(name, files, expected)
+        known = find_model(name)
+        _forget(parts, sources)
+    assert known is not None  # just written
+    if default:
+        set_default(known)
+    return known
+
+
+def _expected(sources: Sequence[str], sha256: Sequence[str]) -> dict[str, str]:
+    if sha256 and len(sha256) != len(sources):
+        raise InputError(f"--sha256: {len(sha256)} digests for {len(sources)} files; give one for each, in order")
+    for digest in sha256:
+        if len(digest) != 64 or set(digest.lower()) - set("0123456789abcdef"):
+            raise InputError(f"--sha256 {digest[:70]}: expected 64 hexadecimal digits")
+    return dict(zip(sources, (digest.lower() for digest in sha256), strict=False))
+
+
+def _same(model: StoredModel, sources: Sequence[str], expected: dict[str, str]) -> bool:
+    """Whether the stored model is these very web addresses, with these digests."""
+    if not all(is_url(source) for source in sources) or [f["source"] for f in model.files] != list(sources):
+        return False
+    whole = all((model.folder / f["name"]).is_file() for f in model.files)
+    return whole and all(expected.get(f["source"], f["sha256"]) == f["sha256"] for f in model.files)
+
+
+def _local(
+    source: str, expected: str | None, offline: bool, parts: Path, progress: Progress | None
+) -> list[tuple[str, Path, str]]:
+    """(file name, where it lies now, source): a download, a file with its side files, or a folder's files."""
+    if is_url(source):
+        if offline:
+            raise InputError(f"{source}: not in the store, and --offline forbids to fetch it; give a local file")
+        file_name = Path(unquote(urlparse(source).path)).name.lstrip(".") or "model.onnx"
+        part = _part(parts, source)
+        download(source, part, None if progress is None else lambda done, of: progress(file_name, done, of))
+        if expected is not None and sha256_of(part) != expected:
+            found = sha256_of(part)
+            part.unlink()
+            raise InputError(f"{source}: sha256 is {found}, expected {expected}; what was fetched is thrown away")
+        return [(file_name, part, source)]
+    path = Path(source).expanduser()
+    if path.is_dir():
+        files = [f for f in sorted(path.rglob("*")) if f.is_file() and f.suffix in _KEPT]
+        return [(str(f.relative_to(path)), f, str(f)) for f in files]
+    if not path.is_file():
+        raise InputError(f"{source}: no such file or folder, and no http(s) address")
+    if expected is not None and sha256_of(path) != expected:
+        raise InputError(f"{source}: sha256 is {sha256_of(path)}, expected {expected}; is it the right file?")
+    beside = [path.with_name(path.name + suffix) for suffix in ("_data", ".data")]
+    return [(p.name, p, str(p)) for p in [path, *beside] if p.is_file()]
+
+
+def _install(name: str, files: Sequence[tuple[str, Path, str]], expected: dict[str, str]) -> None:
+    names = [file_name for file_name, _, _ in files]
+    twice = {n for n in names if names.count(n) > 1}
+    if twice:
+        raise InputError(f"models add {name}: two files are called {', '.join(sorted(twice))}; rename one")
+    if not any(n.endswith(".onnx") for n in names):
+        raise InputError(f"models add {name}: no .onnx file among {', '.join(names) or 'nothing'}")
+    with atomic_directory(models_folder() / name) as folder:
+        entries = []
+        for file_name, path, source in files:
+            target = folder / file_name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, target)
+            size, digest = target.stat().st_size, sha256_of(target)
+            entries.append({"name": file_name, "source": source, "bytes": size, "sha256": digest})
+        family, purpose, _ = judge([describe_graph(graph) for graph in sorted(folder.rglob("*.onnx"))])
+        write_record(folder, family, purpose, entries)
+
+
+def _part(parts: Path, source: str) -> Path:
+    return parts / f"{hashlib.sha256(source.encode()).hexdigest()[:24]}.part"
+
+
+def _forget(parts: Path, sources: Sequence[str]) -> None:
+    for source in sources:
+        _part(parts, source).unlink(missing_ok=True)

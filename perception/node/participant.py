@@ -1,0 +1,193 @@
+"""A seat on the DDS network under ROS 2's conventions: writers and readers by ROS name and type, raw CDR in and out.
+
+Both the node and its clients in Python sit here. Topics are `rt/NAME`; a service is `rq/NAMERequest` and
+`rr/NAMEReply`, whose messages carry rmw_cyclonedds' header: the client's id (uint64) and the request's number (int64).
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import struct
+import threading
+from collections.abc import Iterator
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+from perception.errors import InputError, missing_extra
+from perception.node.channels import DEPTH
+from perception.node.idl import sample_type
+
+_HEADER = struct.Struct("<Qq")
+_MOST_BYTES = 256 << 20
+"""Of one message, in or out; a larger one is dropped by the network layer, unread."""
+_BLOCKED_MS = 100
+"""How long a writer may wait for readers that are behind before it gives the message up."""
+
+
+class Participant:
+    """A DDS participant. network: see NodeConfig. Raises InputError when the network cannot be used."""
+
+    def __init__(self, domain: int, network: str | None = None) -> None:
+        dds = self._dds = _Modules()
+        try:
+            _open_domain(dds, domain, network)
+            self.participant = dds.domain.DomainParticipant(domain)
+        except dds.core.DDSException as error:
+            raise InputError(
+                f"node: DDS cannot start on domain {domain}, network {network or 'as the system has it'} ({error}); "
+                "check that the interface exists and is up (`ip addr`), or give --network localhost"
+            ) from error
+        self._publications = dds.builtin.BuiltinDataReader(self.participant, dds.builtin.BuiltinTopicDcpsPublication)
+
+    def writer(self, name: str, kind: str, *, latched: bool = False, headed: bool = False) -> Writer:
+        """A reliable writer of ROS type `kind` on DDS topic `name`; latched: the last sample waits for late readers."""
+        topic = self._dds.topic.Topic(self.participant, name, sample_type(kind, headed))
+        return Writer(
+            self._dds, self._dds.pub.DataWriter(self.participant, topic, qos=self._qos(latched)), kind, headed
+        )
+
+    def reader(self, name: str, kind: str, *, latched: bool = False, headed: bool = False) -> Reader:
+        """A reliable reader; holds at most DEPTH samples, the newest."""
+        topic = self._dds.topic.Topic(self.participant, name, sample_type(kind, headed))
+        return Reader(self._dds, self._dds.sub.DataReader(self.participant, topic, qos=self._qos(latched)), headed)
+
+    def wait_set(self, readers: list[Reader]) -> Any:
+        """Something whose `wait(nanoseconds)` returns when one of the readers has samples."""
+        waiting = self._dds.core.WaitSet(self.participant)
+        for reader in readers:
+            waiting.attach(reader.condition)
+        return waiting
+
+    def writers_elsewhere(self, name: str) -> int:
+        """How many writers of DDS topic `name` other participants have, as discovered so far."""
+        own = self.participant.guid
+        alive = self._dds.core.InstanceState.Alive
+        condition = self._dds.core.ReadCondition(
+            self._publications, self._dds.core.SampleState.Any | self._dds.core.ViewState.Any | alive
+        )
+        found = self._publications.read(10_000, condition=condition)
+        return sum(1 for one in found if one.topic_name == name and one.participant_key != own)
+
+    def close(self) -> None:
+        """Leaves the network: others learn it now and not when the lease ends. Writers and readers end with it."""
+        self.participant.__del__()  # CycloneDDS has no other name for it; harmless when repeated
+
+    def _qos(self, latched: bool) -> Any:
+        policy, duration = self._dds.qos.Policy, self._dds.util.duration
+        return self._dds.qos.Qos(
+            policy.Reliability.Reliable(duration(milliseconds=_BLOCKED_MS)),
+            policy.Durability.TransientLocal if latched else policy.Durability.Volatile,
+            policy.History.KeepLast(1 if latched else DEPTH),
+            policy.DataRepresentation(use_cdrv0_representation=True),
+        )
+
+
+_OPENING = threading.Lock()
+_DOMAINS: dict[int, Any] = {}
+
+
+def _open_domain(dds: _Modules, domain: int, network: str | None) -> None:
+    """Settles how this process sits on a domain; the first to come decides for the rest of its life."""
+    with _OPENING:
+        if domain not in _DOMAINS:
+            own = os.environ.get("CYCLONEDDS_URI", "")  # what the user sets there has the last word
+            _DOMAINS[domain] = dds.domain.Domain(domain, ",".join(filter(None, [network_settings(network), own])))
+
+
+class Writer:
+    """Sends CDR bytes. `given_up` counts messages that slow readers would not take in time."""
+
+    def __init__(self, dds: _Modules, writer: Any, kind: str, headed: bool) -> None:
+        self._dds, self._writer, self._kind, self._headed = dds, writer, kind, headed
+        self.given_up = 0
+
+    def write(self, cdr: bytes, header: tuple[int, int] | None = None) -> bool:
+        """False when it was given up. header: client and number of a service's message."""
+        if header is not None:
+            cdr = cdr[:4] + _HEADER.pack(*header) + cdr[4:]
+        try:
+            self._writer.write(sample_type(self._kind, self._headed)(cdr))
+        except self._dds.core.DDSException:
+            self.given_up += 1
+            return False
+        return True
+
+    @property
+    def readers(self) -> int:
+        """How many readers are matched."""
+        return len(self._writer.get_matched_subscriptions())
+
+
+class Reader:
+    """Receives CDR bytes."""
+
+    def __init__(self, dds: _Modules, reader: Any, headed: bool) -> None:
+        self._reader, self._headed = reader, headed
+        states = dds.core.SampleState.Any | dds.core.ViewState.Any | dds.core.InstanceState.Any
+        self.condition = dds.core.ReadCondition(reader, states)
+
+    def take(self) -> Iterator[tuple[bytes, tuple[int, int] | None]]:
+        """What has arrived: CDR bytes and, for services, client and number. Too short ones come as empty bytes."""
+        for sample in self._reader.take(DEPTH):
+            if not sample.sample_info.valid_data:  # a writer has gone
+                continue
+            data = bytes(sample.data)
+            if not self._headed:
+                yield data, None
+            elif len(data) < 4 + _HEADER.size:
+                yield b"", None
+            else:
+                order = "<" if data[1] & 1 else ">"
+                client, number = struct.unpack_from(f"{order}Qq", data, 4)
+                yield data[:4] + data[4 + _HEADER.size :], (client, number)
+
+    @property
+    def writers(self) -> int:
+        """How many writers are matched."""
+        return len(self._reader.get_matched_publications())
+
+
+def network_settings(network: str | None) -> str:
+    """CycloneDDS configuration (XML) for a network: an interface's name, "localhost", or None for what ROS's own
+    variables say, else CycloneDDS' choice."""
+    chosen = network or _from_environment()
+    interfaces, discovery = "", ""
+    if chosen == "localhost":
+        interfaces = '<AllowMulticast>false</AllowMulticast><Interfaces><NetworkInterface name="lo"/></Interfaces>'
+        discovery = _ON_THIS_MACHINE
+    elif chosen:
+        interfaces = f"<Interfaces><NetworkInterface name={quoteattr(chosen)}/></Interfaces>"
+    return (
+        f"<CycloneDDS><Domain><General>{interfaces}<MaxMessageSize>65500B</MaxMessageSize>"
+        f"<FragmentSize>60000B</FragmentSize></General>{discovery}"
+        "<Compatibility><AllowInvalidTryConstruct>true</AllowInvalidTryConstruct></Compatibility>"
+        f"<Internal><MaxSampleSize>{_MOST_BYTES}B</MaxSampleSize></Internal></Domain></CycloneDDS>"
+    )
+
+
+_ON_THIS_MACHINE = (
+    "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>63</MaxAutoParticipantIndex>"
+    '<Peers><Peer address="127.0.0.1"/></Peers></Discovery>'
+)
+"""Without multicast, as ROS 2 does it on one machine: well-known ports, each of them asked."""
+
+
+def _from_environment() -> str | None:
+    if os.environ.get("ROS_LOCALHOST_ONLY") == "1":
+        return "localhost"
+    return "localhost" if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() in ("LOCALHOST", "OFF") else None
+
+
+class _Modules:
+    """CycloneDDS' modules, imported when a node or client is made."""
+
+    def __init__(self) -> None:
+        try:
+            for name in ("builtin", "core", "domain", "pub", "qos", "sub", "topic", "util"):
+                setattr(self, name, importlib.import_module(f"cyclonedds.{name}"))
+        except ImportError as error:
+            raise missing_extra("cyclonedds", "ros") from error
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(name)

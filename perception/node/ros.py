@@ -1,0 +1,168 @@
+"""The node where ROS 2 is: the same messages through rclpy, whatever middleware it uses."""
+
+from __future__ import annotations
+
+import array
+import importlib
+import re
+import threading
+import time
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.node import channels
+from perception.node.channels import DEPTH, Topic
+from perception.node.config import NodeConfig
+from perception.node.core import Core, Message
+
+_SEQUENCE = re.compile(r"(?:sequence<)?(\w+/\w+)(?:, \d+)?>?(?:\[\d+\])?")
+_EXTRA_SECONDS = 1.0
+"""Beyond the engine's time-out before a service call is given up; the engine answers in time, with an error if need be."""
+
+
+class RosTransport:
+    """Publishers, subscription and services of one rclpy node. `serve` blocks."""
+
+    def __init__(self, config: NodeConfig) -> None:
+        if config.network is not None:
+            raise InputError("node.network: only for --transport dds; with rclpy set ROS_AUTOMATIC_DISCOVERY_RANGE")
+        import rclpy
+        from rclpy.signals import SignalHandlerOptions
+
+        self._config = config
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=config.domain_id, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = rclpy.create_node("node", namespace=f"/{config.namespace}", context=self._context)
+        self._answer_name = f"/{channels.ANSWER.path(config.namespace)}"
+        self._publishers: dict[Topic, Any] = {}
+        self._absent: list[str] = []
+
+    def others(self) -> int:
+        """Nodes of this name that were on the network `discovery_seconds` after this one came."""
+        end = time.monotonic() + self._config.discovery_seconds
+        while time.monotonic() < end and not self._answerers():
+            time.sleep(0.02)
+        return self._answerers()
+
+    def _answerers(self) -> int:
+        own = 1 if channels.ANSWER in self._publishers else 0
+        return max(0, len(self._node.get_publishers_info_by_topic(self._answer_name)) - own)
+
+    def open(self) -> None:
+        """Shows topics to the network. A message type that this ROS 2 lacks (vision_msgs) is left out and told."""
+        for topic in channels.OUTPUTS:
+            try:
+                kind = _class(topic.kind)
+            except ImportError:
+                self._absent.append(f"{topic.name} is not published: {topic.kind.split('/')[0]} is not installed")
+                continue
+            name = f"/{topic.path(self._config.namespace)}"
+            self._publishers[topic] = self._node.create_publisher(kind, name, _qos(topic.latched))
+
+    def publish(self, topic: Topic, message: Message) -> None:
+        """Sends a message; not even built when nobody reads."""
+        publisher = self._publishers.get(topic)
+        if publisher is not None and (topic.latched or publisher.get_subscription_count()):
+            publisher.publish(fill(_class(topic.kind)(), message))
+
+    def warnings(self) -> list[str]:
+        """What is wrong now."""
+        others = self._answerers()
+        return [f"{others} other node(s) answer on {self._config.namespace}"] if others else []
+
+    def figures(self) -> dict[str, Any]:
+        """What this ROS 2 cannot do."""
+        return {"left_out": "; ".join(self._absent)} if self._absent else {}
+
+    def serve(self, core: Core, stop: threading.Event) -> None:
+        """Hands what arrives to the core, and lets it tell its health, until `stop`."""
+        from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+        from rclpy.executors import MultiThreadedExecutor
+
+        calls, space = ReentrantCallbackGroup(), self._config.namespace
+        self._node.create_subscription(
+            _class(channels.PROMPT.kind),
+            f"/{channels.PROMPT.path(space)}",
+            lambda message: core.prompt(message.data),
+            _qos(False),
+            callback_group=MutuallyExclusiveCallbackGroup(),
+        )
+        for service, answer in ((channels.QUERY, self._query), (channels.RELOAD, self._reload)):
+            self._node.create_service(
+                _class(service.kind),
+                f"/{service.path(space)}",
+                lambda request, response, answer=answer: answer(core, request, response),  # type: ignore[misc]
+                callback_group=calls,
+            )
+        self._node.create_timer(
+            self._config.health_seconds, core.send_health, callback_group=MutuallyExclusiveCallbackGroup()
+        )
+        executor = MultiThreadedExecutor(num_threads=self._config.workers + 3, context=self._context)
+        executor.add_node(self._node)
+        while not stop.is_set():
+            executor.spin_once(timeout_sec=0.1)
+        executor.shutdown(timeout_sec=self._config.timeout)
+
+    def _query(self, core: Core, request: Any, response: Any) -> Any:
+        done, answered = threading.Event(), []
+
+        def finish(values: Message) -> None:
+            answered.append(values)
+            done.set()
+
+        core.query(list(request.names), finish)
+        done.wait(self._config.timeout + _EXTRA_SECONDS)
+        return fill(response, answered[0]) if answered else response
+
+    def _reload(self, core: Core, request: Any, response: Any) -> Any:
+        del request
+        return fill(response, core.reload())
+
+    def close(self) -> None:
+        """Leaves the network."""
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+
+def fill(message: Any, values: Message) -> Any:
+    """A ROS message with the fields of a dict set; KeyError for a field it has not."""
+    kinds = message.get_fields_and_field_types()
+    for name, value in values.items():
+        setattr(message, name, _converted(kinds[name], getattr(message, name), value))
+    return message
+
+
+def _converted(kind: str, current: Any, value: Any) -> Any:
+    if isinstance(value, dict):
+        return fill(current, value)
+    if kind == "octet":
+        return bytes([value])
+    if isinstance(current, array.array):  # a sequence of numbers: its bytes, and no look at each of them
+        return array.array(current.typecode, np.asarray(value, np.dtype(current.typecode)).tobytes())
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        inner = _SEQUENCE.fullmatch(kind)
+        if inner is None:
+            raise KeyError(kind)
+        made = _class(inner[1].replace("/", "/msg/"))
+        return [fill(made(), item) for item in value]
+    return value
+
+
+@cache
+def _class(kind: str) -> Any:
+    """The Python class of `sensor_msgs/msg/PointCloud2` or `std_srvs/srv/Trigger`; ImportError when not there."""
+    package, space, name = kind.split("/")
+    return getattr(importlib.import_module(f"{package}.{space}"), name)
+
+
+def _qos(latched: bool) -> Any:
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    return QoSProfile(
+        depth=1 if latched else DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )

@@ -1,0 +1,272 @@
+"""The model store against a local HTTP server that breaks off, lies, or knows no ranges; and what check says."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+from onnx_files import FLOAT, INT64, SAM_DECODER, write_onnx
+
+from perception.cli import main
+from perception.errors import InputError
+from perception.io.download import download
+from perception.io.model_store import find_model, models_folder
+from perception.masks import make_source
+from perception.models import add_model, check_file
+
+IMAGE = ((1, 3, 1024, 1024), FLOAT)
+
+
+class Server(ThreadingHTTPServer):
+    """files: path -> bytes. breaks: how many answers stop half way. ranges: whether Range is understood."""
+
+    daemon_threads = True
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.files: dict[str, bytes] = {}
+        self.breaks, self.ranges, self.asked = 0, True, []
+        self.dead = False
+        self.statuses: list[int] = []
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}"
+
+
+class Handler(BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        server: Server = self.server
+        body = server.files.get(self.path)
+        server.asked.append(self.headers.get("Range"))
+        if server.statuses:
+            self.send_error(server.statuses.pop(0))
+            return
+        if body is None:
+            self.send_error(404)
+            return
+        tag, start = f'"{hashlib.md5(body).hexdigest()}"', 0
+        wanted = self.headers.get("Range")
+        if wanted and server.ranges and self.headers.get("If-Range") in (None, tag):
+            start = int(wanted.removeprefix("bytes=").split("-")[0])
+            if start >= len(body):
+                self.send_response(416)
+                self.send_header("Content-Range", f"bytes */{len(body)}")
+                self.send_header("Content-Length", "0")
+                self.end_headers()
+                return
+            self.send_response(206)
+            self.send_header("Content-Range", f"bytes {start}-{len(body) - 1}/{len(body)}")
+        else:
+            self.send_response(200)
+        rest = body[start:]
+        self.send_header("ETag", tag)
+        self.send_header("Content-Length", str(len(rest)))
+        self.end_headers()
+        if server.dead:
+            return
+        if server.breaks > 0:
+            server.breaks -= 1
+            rest = rest[: len(rest) // 2]
+        self.wfile.write(rest)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    server = Server()
+    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+    yield server
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.delenv("PERCEPTION_SAM", raising=False)
+
+
+@pytest.fixture
+def sam(tmp_path: Path) -> tuple[Path, Path]:
+    """Encoder and decoder by SAM's signatures that do nothing."""
+    embedding = np.zeros((1, 2, 64, 64), np.float32)
+    masks, iou = np.zeros((1, 1, 8, 8), np.float32), np.zeros((1, 1), np.float32)
+    folder = tmp_path / "published"
+    folder.mkdir()
+    write_onnx(folder / "a.encoder.onnx", {"x": IMAGE}, {"image_embeddings": embedding})
+    write_onnx(folder / "a.decoder.onnx", SAM_DECODER, {"masks": masks, "iou_predictions": iou})
+    return folder / "a.encoder.onnx", folder / "a.decoder.onnx"
+
+
+def noise(size: int) -> bytes:
+    return np.random.default_rng(0).bytes(size)
+
+
+# ----------------------------------------------------------------------- downloads
+
+
+def test_a_download_survives_broken_connections(server: Server, tmp_path: Path) -> None:
+    server.files["/big"], server.breaks = noise(300_000), 3
+    part = download(f"{server.url}/big", tmp_path / "big.part")
+    assert part.read_bytes() == server.files["/big"]
+    assert server.asked == [None, "bytes=150000-", "bytes=225000-", "bytes=262500-"]
+
+
+def test_a_later_run_goes_on(server: Server, tmp_path: Path) -> None:
+    server.files["/big"], server.breaks = noise(100_000), 1
+    server.statuses = []
+    part = tmp_path / "big.part"
+    from perception.io import download as module
+
+    assert "broke" in str(module._attempt(f"{server.url}/big", part, None)) and part.stat().st_size == 50_000
+    told: list[tuple[int, int]] = []
+    download(f"{server.url}/big", part, lambda done, of: told.append((done, of)))
+    assert part.read_bytes() == server.files["/big"] and told[-1] == (100_000, 100_000)
+    assert server.asked[-1] == "bytes=50000-"
+
+
+def test_without_ranges_it_starts_over(server: Server, tmp_path: Path) -> None:
+    server.files["/big"], server.breaks, server.ranges = noise(100_000), 1, False
+    assert download(f"{server.url}/big", tmp_path / "p").read_bytes() == server.files["/big"]
+
+
+def test_a_file_that_changed_is_fetched_anew(server: Server, tmp_path: Path) -> None:
+    from perception.io import download as module
+
+    server.files["/big"], server.breaks = noise(100_000), 1
+    module._attempt(f"{server.url}/big", tmp_path / "p", None)
+    server.files["/big"] = noise(90_000)[::-1]
+    assert download(f"{server.url}/big", tmp_path / "p").read_bytes() == server.files["/big"]
+
+
+def test_a_part_that_is_whole_already_is_taken(server: Server, tmp_path: Path) -> None:
+    from perception.io import download as module
+
+    server.files["/big"] = noise(1000)
+    assert module._attempt(f"{server.url}/big", tmp_path / "p", None) is None
+    assert download(f"{server.url}/big", tmp_path / "p").read_bytes() == server.files["/big"]
+
+
+def test_a_dead_line_and_a_wrong_address_are_told(server: Server, tmp_path: Path) -> None:
+    server.files["/big"], server.dead = noise(1000), True
+    with pytest.raises(InputError, match=r"broke at 0 of 1000 bytes; 0 bytes are kept, run the command again"):
+        download(f"{server.url}/big", tmp_path / "p")
+    with pytest.raises(InputError, match="404"):
+        download(f"{server.url}/none", tmp_path / "q")
+    server.dead, server.statuses = False, [503, 503]
+    assert download(f"{server.url}/big", tmp_path / "p").read_bytes() == server.files["/big"]
+
+
+# ----------------------------------------------------------------------- the store
+
+
+def test_add_fetches_checks_and_is_found_by_name(server: Server, sam: tuple[Path, Path]) -> None:
+    for file in sam:
+        server.files[f"/models/{file.name}"] = file.read_bytes()
+    urls = [f"{server.url}/models/{file.name}" for file in sam]
+    digests = [hashlib.sha256(file.read_bytes()).hexdigest() for file in sam]
+    server.breaks = 1
+    model = add_model("tiny", urls, sha256=digests)
+    assert (model.family, model.purpose) == ("SAM", "sam")
+    assert [f["sha256"] for f in model.files] == digests
+    assert not list((models_folder() / ".parts").iterdir())
+    assert make_source("sam:tiny").name.startswith("sam (SAM")
+    asked = len(server.asked)
+    add_model("tiny", urls, sha256=digests, offline=True)  # it is there: nothing is fetched
+    assert len(server.asked) == asked
+
+
+def test_a_wrong_checksum_leaves_nothing(server: Server, sam: tuple[Path, Path]) -> None:
+    server.files["/e.onnx"] = sam[0].read_bytes()
+    with pytest.raises(InputError, match=r"sha256 is [0-9a-f]{64}, expected 0{64}; what was fetched is thrown away"):
+        add_model("tiny", [f"{server.url}/e.onnx"], sha256=["0" * 64])
+    assert find_model("tiny") is None and not list((models_folder() / ".parts").glob("*.part"))
+    with pytest.raises(InputError, match="expected 64 hexadecimal digits"):
+        add_model("tiny", [str(sam[0])], sha256=["12"])
+    with pytest.raises(InputError, match="2 digests for 1 files"):
+        add_model("tiny", [str(sam[0])], sha256=["0" * 64] * 2)
+
+
+def test_offline_never_touches_the_network(sam: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("the network was touched")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    with pytest.raises(InputError, match="--offline forbids"):
+        add_model("tiny", ["https://example.org/sam.onnx"], offline=True)
+    assert add_model("tiny", [str(sam[0].parent)], offline=True).family == "SAM"
+
+
+def test_a_stored_default_is_what_auto_means(sam: tuple[Path, Path]) -> None:
+    assert make_source("auto").name.startswith("built")
+    add_model("tiny", [str(sam[0]), str(sam[1])], default=True)
+    assert make_source("auto").name.startswith("sam (SAM")
+
+
+def test_what_is_no_model_is_not_stored(tmp_path: Path, sam: tuple[Path, Path]) -> None:
+    (tmp_path / "fake.onnx").write_bytes(b"<html>not found</html>")
+    with pytest.raises(InputError, match="not an ONNX model"):
+        add_model("fake", [str(tmp_path / "fake.onnx")])
+    assert find_model("fake") is None and not list(models_folder().glob("*fake*"))
+    for name in ("../up", "a/b", "", ".hidden"):
+        with pytest.raises(InputError, match="model name"):
+            add_model(name, [str(sam[0])])
+    with pytest.raises(InputError, match=r"no \.onnx file"):
+        add_model("text", [__file__])
+    with pytest.raises(InputError, match="no such file"):
+        add_model("gone", [str(tmp_path / "gone.onnx")])
+
+
+# ----------------------------------------------------------------------- check
+
+
+def test_check_names_family_roles_and_providers(sam: tuple[Path, Path], tmp_path: Path) -> None:
+    whole = check_file(str(sam[0].parent))
+    assert (whole["family"], whole["purpose"], whole["warnings"]) == ("SAM", "sam", [])
+    assert [entry["role"] for entry in whole["files"]] == ["decoder", "encoder"]
+    decoder = whole["files"][0]
+    assert decoder["inputs"][0] == {"name": "image_embeddings", "shape": [1, 2, 64, 64], "type": "tensor(float)"}
+    assert decoder["providers"] == ["CPUExecutionProvider"]
+    assert check_file(str(sam[1]))["warnings"] == ["the encoder is missing; both are needed"]
+
+    rows = np.zeros((1, 8), np.float32)
+    write_onnx(tmp_path / "siglip_text.onnx", {"input_ids": (("n", 64), INT64)}, {"text_embeds": rows})
+    write_onnx(tmp_path / "vision.onnx", {"pixel_values": IMAGE}, {"image_embeds": rows})
+    write_onnx(tmp_path / "other.onnx", {"audio": ((1, 5), FLOAT)}, {"sound": np.zeros((5,), np.float32)})
+    text, vision, other = (check_file(str(tmp_path / f"{n}.onnx")) for n in ("siglip_text", "vision", "other"))
+    assert (text["family"], text["files"][0]["role"]) == ("SigLIP", "text tower")
+    assert (vision["family"], vision["files"][0]["role"]) == ("CLIP", "image tower")
+    assert other["family"] is None and "unknown" in other["warnings"][0]
+
+
+def test_a_cuda_that_did_not_come_up_is_told(sam: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    import onnxruntime
+
+    names = ["CUDAExecutionProvider", "CPUExecutionProvider"]
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: names)
+    warnings = check_file(str(sam[0].parent))["warnings"]
+    assert warnings[0] == "a.decoder.onnx: CUDAExecutionProvider did not come up, running on CPUExecutionProvider"
+
+
+def test_the_command_line(sam: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["models", "list"]) == 0 and "no models" in capsys.readouterr().out
+    assert main(["models", "add", "tiny", str(sam[0]), str(sam[1])]) == 0
+    assert "use it with --masks sam:tiny" in capsys.readouterr().out
+    assert main(["models", "list", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)["models"]
+    assert [(m["name"], m["family"]) for m in listed] == [("tiny", "SAM")]
+    assert main(["models", "check", "tiny"]) == 0
+    assert "runs on CPUExecutionProvider" in capsys.readouterr().out
+    assert main(["models", "check", "nowhere"]) == 2
+    assert "the store holds tiny" in capsys.readouterr().err
