@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.instances.votes import MaskVotes
+from perception.instances.votes import MaskVotes, Table
 
 CHUNK = 20_000
 NEIGHBOURS = 8
@@ -12,13 +12,9 @@ LEAST_AGREEMENT = 0.5
 MARGIN = 0.15
 
 
-def mask_shares(table: np.ndarray, votes: MaskVotes) -> np.ndarray:
-    """[K, M]: of what a view shows of instance k, the share in each of its masks. table: of `votes.table`."""
-    if table.shape[1] == 0:
-        return table
-    number = np.cumsum(np.diff(votes.view, prepend=-1) > 0) - 1
-    each = np.add.reduceat(table, votes.starts, axis=1)
-    return table / np.maximum(each[:, number], 1e-12)
+def mask_shares(table: Table) -> np.ndarray:
+    """[K, M]: of what a view's masks show of instance k, the share in each of them."""
+    return table.pixels / np.maximum(table.by_view[:, table.view], 1e-12)
 
 
 def affinities(votes: MaskVotes, shares: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -31,7 +27,7 @@ def affinities(votes: MaskVotes, shares: np.ndarray, rows: np.ndarray) -> tuple[
 def memberships(ids: np.ndarray, votes: MaskVotes) -> np.ndarray:
     """[N] float32 in [0, 1]: how well each Gaussian's masks agree with its instance (`affinities`); 0 for noise."""
     count = int(ids.max(initial=-1)) + 1
-    shares = mask_shares(votes.table(ids, count), votes)
+    shares = mask_shares(votes.table(ids, count))
     found = np.zeros(len(ids), np.float32)
     for begin in range(0, len(ids), CHUNK):
         rows = begin + np.flatnonzero(ids[begin : begin + CHUNK] >= 0)
@@ -57,7 +53,7 @@ def settle(
         return settled
     from scipy.spatial import cKDTree
 
-    shares = mask_shares(votes.table(ids, count), votes)
+    shares = mask_shares(votes.table(ids, count))
     tree = cKDTree(means[voters])
     near = min(NEIGHBOURS + 1, len(voters))
     finite = np.flatnonzero(np.isfinite(means).all(axis=1))

@@ -1,6 +1,6 @@
 """A score in [0, 1] for each instance, from what is known without truth, calibrated to the chance that it is right.
 
-    raw = geometric mean of  agreement · membership · support / (support + 2)
+    raw = geometric mean of  agreement · membership · (support + ½) / (support + 2½)
 
 agreement: IoU of its pixels with the best 2D mask under them, mean over the training views. membership: how well its
 Gaussians one by one agree with it. support: photos in which a mask singles it out.
@@ -22,7 +22,7 @@ def raw_scores(ids: np.ndarray, membership: np.ndarray, found: Evidence) -> np.n
     member = ids >= 0
     sizes = np.maximum(np.bincount(ids[member], minlength=count), 1)
     strength = np.bincount(ids[member], weights=membership[member], minlength=count) / sizes
-    factors = (found.agreement, strength, found.support / (found.support + 2.0))
+    factors = (found.agreement, strength, (found.support + 0.5) / (found.support + 2.5))
     product = np.prod([np.clip(factor, 0, 1) for factor in factors], axis=0)
     return np.asarray(product ** (1 / len(factors)))
 

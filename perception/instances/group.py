@@ -97,8 +97,8 @@ def _by_consensus(
     sizes = np.bincount(segments, minlength=count)
     sums = [np.bincount(segments, column, minlength=count) for column in features[solid].T]
     near = touching(means[solid], segments, count)
-    tree = merge_tree(table, votes.view, np.stack(sums, axis=1) / sizes[:, None], sizes, near)
-    found = node_evidence(tree, table, votes.view, votes.area)
+    tree = merge_tree(table, np.stack(sums, axis=1) / sizes[:, None], sizes, near)
+    found = node_evidence(tree, table)
     instance, part, parents = _cut(tree, found)
     ids[solid], parts[solid] = instance[segments], part[segments]
     return ids, parts, parents
@@ -126,14 +126,14 @@ def _judged(
     """Drops specks, orders by size, and scores what is left."""
     count = int(ids.max(initial=-1)) + 1
     sizes = np.bincount(ids[ids >= 0], minlength=count)
-    support = evidence(votes.table(ids, count), votes.view, votes.area).support
+    support = evidence(votes.table(ids, count)).support
     kept = (sizes >= config.min_cluster_size) | ((sizes >= LEAST) & (support >= 2))
     before = np.where((ids >= 0) & np.append(kept, False)[ids], ids, -1)
     ids = by_falling_size(before)
     rename = np.full(count + 1, -1)
     rename[before] = ids  # every kept instance has members; the last entry stands for −1
     membership = memberships(ids, votes)
-    found = evidence(votes.table(ids, int(ids.max(initial=-1)) + 1), votes.view, votes.area)
+    found = evidence(votes.table(ids, int(ids.max(initial=-1)) + 1))
     raw = raw_scores(ids, membership, found)
     part_ids, owners, scores, views = _judged_parts(ids, parts, rename[:-1][parents], votes)
     return Grouping(ids, membership, raw, calibrated(raw), found, part_ids, owners, scores, views)
@@ -149,7 +149,7 @@ def _judged_parts(
     rename = np.full(len(parents) + 1, -1)
     rename[left] = np.arange(len(left))
     number = rename[inside]
-    found = evidence(votes.table(number, len(left)), votes.view, votes.area)
+    found = evidence(votes.table(number, len(left)))
     first = int(ids.max(initial=-1)) + 1
     part_ids = np.where(number >= 0, number + first, -1).astype(np.int32)
     return part_ids, parents[left].tolist(), np.clip(found.agreement, 0, 1).tolist(), found.views.tolist()
