@@ -139,12 +139,17 @@ def merge_tree(
 @dataclass(frozen=True)
 class Evidence:
     """Of each group: pixels under masks; matched: the sum over them of the IoU between the group and the pixel's mask;
-    views that show it, and support: views in which one mask singles it out."""
+    views that show it; fit [·, V]: IoU with the best mask of each view, 0 where the view shows too little of it."""
 
     pixels: np.ndarray
     matched: np.ndarray
     views: np.ndarray
-    support: np.ndarray
+    fit: np.ndarray
+
+    @property
+    def support(self) -> np.ndarray:
+        """[·] views in which one mask singles it out."""
+        return np.asarray((self.fit >= SUPPORT).sum(axis=1))
 
     @property
     def agreement(self) -> np.ndarray:
@@ -161,7 +166,7 @@ def evidence(table: Table, smallest: float = 8.0) -> Evidence:
     """
     if table.pixels.shape[1] == 0:
         none = np.zeros(len(table.pixels))
-        return Evidence(none, none, none.astype(np.int64), none.astype(np.int64))
+        return Evidence(none, none, none.astype(np.int64), none.reshape(-1, 1)[:, :0])
     starts = np.flatnonzero(np.diff(table.view, prepend=-1) > 0)
     rows = table.pixels.astype(np.float64)
     each = table.by_view.astype(np.float64)
@@ -173,7 +178,7 @@ def evidence(table: Table, smallest: float = 8.0) -> Evidence:
         each.sum(axis=1),
         (rows * iou).sum(axis=1),
         shown.sum(axis=1),
-        (shown & (best >= SUPPORT)).sum(axis=1),
+        np.where(shown, best, 0),
     )
 
 
@@ -184,7 +189,7 @@ def node_evidence(tree: MergeTree, table: Table) -> Evidence:
     for number, (a, b) in enumerate(tree.children.tolist()):
         joined = rows[tree.leaves + number] = rows.pop(a) + rows.pop(b)
         whole.append(evidence(joined))
-    names = ("pixels", "matched", "views", "support")
+    names = ("pixels", "matched", "views", "fit")
     return Evidence(*(np.concatenate([getattr(part, name) for part in whole]) for name in names))
 
 
@@ -206,14 +211,16 @@ def best_cut(tree: MergeTree, matched: np.ndarray) -> list[int]:
 
 
 def parts_of(tree: MergeTree, node: int, found: Evidence, largest: float = 0.8, least_views: int = 2) -> list[int]:
-    """Parts of an instance: the highest nodes below it that masks single out in `least_views` photos or more.
+    """Parts of an instance: the highest nodes below it that masks single out in `least_views` photos or more, and fit
+    better there than any fits the whole.
 
     A part fills at most `largest` of the whole's pixels: it is not the whole once more.
     """
     parts, stack = [], tree.kids(node)
     while stack:
         at = stack.pop()
-        if found.support[at] >= least_views and found.pixels[at] <= largest * found.pixels[node]:
+        single = (found.fit[at] >= SUPPORT) & (found.fit[at] > found.fit[node])
+        if single.sum() >= least_views and found.pixels[at] <= largest * found.pixels[node]:
             parts.append(at)
         else:
             stack += tree.kids(at)

@@ -22,7 +22,7 @@ from perception.instances.consensus import (
 from perception.instances.segments import over_segment, touching
 from perception.instances.votes import MaskVotes
 
-PER_SEGMENT = 64  # Gaussians; fewer make segments that photos say little about
+PER_SEGMENT = 16  # Gaussians; fewer make segments that photos say little about
 LEAST = 4  # Gaussians; below that an instance is a speck even if masks single it out
 
 
@@ -72,7 +72,9 @@ def group(
     else:
         ids, parts, parents = _by_consensus(means, opacities, features, votes, config, seed)
     ids = settle(ids, means, opacities, votes, config.min_opacity)
-    return _judged(ids, parts, parents, votes, config)
+    ids = _without_specks(ids, votes, config)
+    ids = settle(ids, means, opacities, votes, config.min_opacity)
+    return _judged(ids, parts, parents, votes)
 
 
 def _by_consensus(
@@ -116,22 +118,25 @@ def _cut(tree: MergeTree, found: Evidence) -> tuple[np.ndarray, np.ndarray, np.n
     return instance, part, np.array(parents, np.int64)
 
 
-def _judged(
-    ids: np.ndarray,
-    parts: np.ndarray,
-    parents: np.ndarray,
-    votes: MaskVotes,
-    config: InstanceConfig,
-) -> Grouping:
-    """Drops specks, orders by size, and scores what is left."""
+def _without_specks(ids: np.ndarray, votes: MaskVotes, config: InstanceConfig) -> np.ndarray:
+    """ids with −1 for groups under `min_cluster_size` that fewer than two photos single out, and for those that none
+    does and that have under a quarter of the median group's Gaussians: what is left over between things."""
     count = int(ids.max(initial=-1)) + 1
+    if count == 0:
+        return ids
     sizes = np.bincount(ids[ids >= 0], minlength=count)
     support = evidence(votes.table(ids, count)).support
     kept = (sizes >= config.min_cluster_size) | ((sizes >= LEAST) & (support >= 2))
-    before = np.where((ids >= 0) & np.append(kept, False)[ids], ids, -1)
+    kept &= (support > 0) | (sizes >= 0.25 * np.median(sizes[sizes > 0]))
+    return np.where((ids >= 0) & np.append(kept, False)[ids], ids, -1)
+
+
+def _judged(ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: MaskVotes) -> Grouping:
+    """Orders the instances by size and scores them and their parts."""
+    before = ids
     ids = by_falling_size(before)
-    rename = np.full(count + 1, -1)
-    rename[before] = ids  # every kept instance has members; the last entry stands for −1
+    rename = np.full(max(int(before.max(initial=-1)) + 2, int(parents.max(initial=-1)) + 2), -1)
+    rename[before] = ids  # of groups without members −1; the last entry stands for −1
     membership = memberships(ids, votes)
     found = evidence(votes.table(ids, int(ids.max(initial=-1)) + 1))
     raw = raw_scores(ids, membership, found)
