@@ -89,21 +89,17 @@ def orbit(count: int, distance: float, height: float, target: np.ndarray) -> lis
     return [(target + eye, target) for eye in ring]
 
 
-def random_scene(seed: int, count: int = 25, dim: int = 8, views: int = 24) -> BlobScene:
-    """`count` balls strewn over a square, features a margin apart on average, masks perfect."""
+def random_scene(
+    seed: int, count: int = 25, dim: int = 8, views: int = 24, crowding: float = 1.0, feature_noise: float = 0.12
+) -> BlobScene:
+    """`count` balls strewn over a square (crowding > 1: into one another), features a margin apart on average."""
     rng = np.random.default_rng(seed)
-    side = 0.5 * np.sqrt(count)
+    side = 0.5 * np.sqrt(count) / crowding
     centres = np.stack([*rng.uniform(-side, side, (2, count)), rng.uniform(0, 0.6, count)], axis=1)
     features = rng.normal(0, 0.35, (count, dim))
-    sizes = rng.integers(30, 400, count)
-    return make_scene(
-        centres,
-        features,
-        orbit(views, 2.2 * side, 1.5 * side, np.zeros(3)),
-        each=sizes.tolist(),
-        feature_noise=0.12,
-        seed=seed,
-    )
+    sizes = rng.integers(30, 400, count).tolist()
+    cameras = orbit(views, 2.2 * side, 1.5 * side, np.zeros(3))
+    return make_scene(centres, features, cameras, each=sizes, feature_noise=feature_noise, seed=seed)
 
 
 def with_errors(scene: BlobScene, rng: np.random.Generator, rate: float = 0.3) -> BlobScene:
