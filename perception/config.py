@@ -97,8 +97,14 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class InstanceConfig:
-    """Clustering of Gaussians by feature (HDBSCAN) and what is kept of it."""
+    """Gaussians into instances and what is kept of them.
 
+    method "consensus": segments of like feature and place, merged as the masks of all photos agree. "hdbscan": the
+    paper's clustering of features alone, then split where space does.
+    """
+
+    method: str = "consensus"
+    max_segments: int = 1000
     min_cluster_size: int = 32
     min_samples: int = 16
     min_opacity: float = 0.1
@@ -257,6 +263,13 @@ def check(config: MapConfig) -> None:
             config.losses.positive in ("per-mask", "per-pixel"),
             "per-mask or per-pixel",
         ),
+        (
+            "instances.method",
+            config.instances.method,
+            config.instances.method in ("consensus", "hdbscan"),
+            "consensus or hdbscan",
+        ),
+        ("instances.max_segments", config.instances.max_segments, config.instances.max_segments >= 2, ">= 2"),
         (
             "losses.negative",
             config.losses.negative,

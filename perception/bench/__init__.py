@@ -20,5 +20,8 @@ BENCHES = (
     "scaling",
     "ablation",
     "export",
+    "instances",
+    "collisions",
+    "clustering",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""
