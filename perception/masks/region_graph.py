@@ -59,6 +59,10 @@ class RegionGraph:
             columns += _surface_features(mean_a, mean_b)
         return np.stack(columns, axis=1)
 
+    def size(self, a: int) -> float:
+        """Pixels: the larger of two lives on."""
+        return float(self.sums[a, _AREA])
+
     def negligible(self, a: int, smallest: float) -> bool:
         """Under `smallest` pixels, or so thin that it is but the blur of a border."""
         area = self.sums[a, _AREA]
@@ -106,7 +110,7 @@ def agglomerate(
             continue
         if watch is not None:
             watch(graph, a, b)
-        if graph.sums[a, _AREA] < graph.sums[b, _AREA]:
+        if graph.size(a) < graph.size(b):
             a, b = b, a
         graph.merge(a, b)
         parent[b] = a
