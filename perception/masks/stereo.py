@@ -127,7 +127,8 @@ def choose_neighbours(eyes: list[Eye]) -> list[list[int]]:
     chosen: list[list[int]] = []
     for i, eye in enumerate(eyes):
         points = _sample(eye)
-        useful = np.stack([np.zeros(len(points)) if j == i else _usefulness(eye, o, points) for j, o in enumerate(eyes)])
+        useful = np.stack([_usefulness(eye, other, points) for other in eyes])
+        useful[i] = 0
         first = second = np.zeros(len(points))  # how well the best two so far serve each point
         found: list[int] = []
         while len(found) < min(NEIGHBOURS, len(eyes) - 1):
@@ -169,18 +170,23 @@ def _usefulness(eye: Eye, other: Eye, points: np.ndarray) -> np.ndarray:
     return np.asarray(inside * alike * np.exp(-(((angle - 12) / width) ** 2) / 2))
 
 
-def confirmed(depth: np.ndarray, eye: Eye, others: list[Eye], their_depths: list[np.ndarray]) -> np.ndarray:
-    """[h, w] number of `others` whose own depth, carried here, agrees."""
+def confirmed(
+    depth: np.ndarray, eye: Eye, others: list[Eye], their_depths: list[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """How many of `others` agree with each depth, [h, w] int32, and the mean [h, w] of what those and it say."""
     h, w = depth.shape
     y, x = np.mgrid[:h, :w]
     rays = np.stack([x + 0.5, y + 0.5, np.ones((h, w))], axis=-1) @ np.linalg.inv(eye.K).T
     world = (rays * depth[..., None] - eye.camera_from_world[:3, 3]) @ eye.camera_from_world[:3, :3]
-    count = np.zeros((h, w), np.int32)
+    count, ratios = np.zeros((h, w), np.int32), np.ones((h, w))
     for other, theirs in zip(others, their_depths, strict=True):
         local = world @ other.camera_from_world[:3, :3].T + other.camera_from_world[:3, 3]
         z = np.maximum(local[..., 2], 1e-9)
         pixel = np.floor(local @ other.K.T / z[..., None])[..., :2]
         inside = (local[..., 2] > 0) & (pixel >= 0).all(axis=-1) & (pixel < np.array(theirs.shape[::-1])).all(axis=-1)
         column, row = (np.where(inside, pixel[..., i], 0).astype(np.int64) for i in (0, 1))
-        count += inside & (np.abs(theirs[row, column] - z) < _AGREE * z)
-    return count
+        ratio = theirs[row, column] / z  # seen from nearly the same side, a change of their depth is one of ours
+        agrees = inside & (np.abs(ratio - 1) < _AGREE)
+        count += agrees
+        ratios += np.where(agrees, ratio, 0)
+    return count, (depth * ratios / (1 + count)).astype(np.float32)

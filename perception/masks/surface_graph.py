@@ -10,6 +10,7 @@ import numpy as np
 
 from perception import _core
 from perception.masks.cues import COLOUR_WORDS, DepthCues, PhotoCues
+from perception.masks.region_graph import neighbours
 from perception.masks.surface import Surface
 
 FEATURES = 24
@@ -77,7 +78,8 @@ class SurfaceGraph:
         z = depth.points[..., 2]
         maps = [np.ones(len(flat)), *photo.lab[inside].T, photo.texture[inside], z[inside]]
         self.sums[:, :_VOXELS] += _sum_by(flat, np.stack(maps, axis=1), self.count)
-        words = np.bincount(flat.astype(np.int64) * COLOUR_WORDS + photo.word[inside], minlength=self.count * COLOUR_WORDS)
+        words = flat.astype(np.int64) * COLOUR_WORDS + photo.word[inside]
+        words = np.bincount(words, minlength=self.count * COLOUR_WORDS)
         self.sums[:, _WORDS] += words.reshape(self.count, COLOUR_WORDS)
         for axis in (0, 1):
             first, second = neighbours(regions, axis)
@@ -189,11 +191,6 @@ def _thickness(shape: np.ndarray) -> np.ndarray:
     full[:, _UPPER[0], _UPPER[1]] = full[:, _UPPER[1], _UPPER[0]] = shape[:, _SQUARES]
     mean = shape[:, _POINT]
     return np.sqrt(np.maximum(np.linalg.eigvalsh(full - mean[:, :, None] * mean[:, None, :])[:, 0], 0))
-
-
-def neighbours(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Each pixel and its right (axis 0) or lower (axis 1) neighbour."""
-    return (image[:, :-1], image[:, 1:]) if axis == 0 else (image[:-1], image[1:])
 
 
 def _sum_by(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
