@@ -55,8 +55,8 @@ def cast(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def painted(points: np.ndarray, ids: np.ndarray) -> np.ndarray:
     """Photo [h, w, 3] uint8: a speckle fixed to the surface, and for each part a tint of its own."""
-    waves = np.random.default_rng(5).normal(0, 1, (40, 3)) * np.geomspace(8, 45, 40)[:, None]
-    speckle = np.cos(points @ waves.T + np.arange(40)).sum(axis=-1) * 7
+    waves = np.random.default_rng(5).normal(0, 1, (40, 3)) * np.geomspace(15, 110, 40)[:, None]
+    speckle = np.cos(points @ waves.T + np.arange(40)).sum(axis=-1) * 6
     tint = np.array([[0, 0, 0], [150, 140, 120], [120, 140, 150], [150, 90, 80]])[ids]
     return (tint + speckle[..., None]).clip(0, 255).astype(np.uint8)
 
@@ -262,7 +262,7 @@ def test_a_photo_that_sees_another_place_takes_part_alone(tmp_path):
         depth_key="1",
     )
     assert report["photos"] == 10 and report["empty"] == []
-    assert score_photo(load_labels(tmp_path, views[0]), world()[0][3]).best_iou.mean() > 0.75
+    assert score_photo(load_labels(tmp_path, views[0]), world()[0][3]).best_iou.mean() > 0.6
 
 
 def test_normals_and_creases_of_known_surfaces():

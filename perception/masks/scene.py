@@ -22,10 +22,10 @@ from perception.types import View
 # Log odds that two patches are one object, fitted by `python -m perception.bench.fit_masks --surface` on two rendered
 # scenes, in the order of SurfaceGraph.features; they are all that was learned.
 WEIGHTS = np.array(
-    [6.81, -1.42, -0.16, 0.16, -3.46, -0.58, 0.23, -0.27, -0.58, 1.83, 0.2, -2.69,
-     -0.55, -1.62, 0.85, -3.02, 2.15, -0.69, 2.46, 7.43, 2.08, -6.26, -7.36, 0.98]
+    [5.99, -1.07, -0.89, 0.23, -3.48, -0.75, 0.42, -0.24, -0.47, 0.69, 0.16, 1.57,
+     -2.46, -0.1, 0.53, -2.85, 0.71, -0.39, 3.08, 0.26, 0.18, -2.49, 0.43, 0.35]
 )  # fmt: skip
-THRESHOLD = 2.0  # above even odds: a merged pair is lost, a split one costs less
+THRESHOLD = 1.2  # above even odds: a merged pair is lost, a split one costs less
 _SMOOTH = 0.03  # of the depth: a pixel over which the surface jumps farther shows no surface
 _CONFIRMED = 2  # photos that must agree with a depth for it to shape the surface
 SMALLEST = (
@@ -164,12 +164,13 @@ def surface_graph(sights: Iterable[Sight], surface: Surface) -> SurfaceGraph:
 
 
 def segments(graph: SurfaceGraph, weights: np.ndarray, threshold: float) -> np.ndarray:
-    """[V] int32 segment 1.. of each voxel, 1 the largest."""
-    ends = agglomerate(graph, weights, threshold, SMALLEST)[graph.patch]
-    _, index, counts = np.unique(ends, return_inverse=True, return_counts=True)
+    """[V] int32 segment 1.. of each voxel, 1 the largest; 0 for crumbs that touch nothing."""
+    ends = agglomerate(graph, weights, threshold, SMALLEST)
+    crumbs = np.array([graph.negligible(end, SMALLEST) for end in ends.tolist()])[graph.patch]
+    _, index, counts = np.unique(ends[graph.patch], return_inverse=True, return_counts=True)
     rank = np.empty(len(counts), np.int32)
     rank[np.argsort(-counts, kind="stable")] = np.arange(1, len(counts) + 1)
-    return rank[index]
+    return np.where(crumbs, 0, rank[index]).astype(np.int32)
 
 
 def label_sight(sight: Sight, surface: Surface, segment: np.ndarray) -> np.ndarray:

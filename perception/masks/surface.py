@@ -8,7 +8,7 @@ import numpy as np
 
 from perception.masks.cues import DepthCues, PhotoCues
 
-_FOOTPRINTS = 4.0  # side of a voxel in pixels at the median depth
+_FOOTPRINTS = 4.0  # side of a voxel in pixels at the median depth: above the noise of depth
 _MOST = 400_000  # voxels; a larger scene takes larger ones
 _LEAST_PIXELS = 3  # that must fall into a voxel over all photos for it to be more than a stray
 _OFFSET = 1 << 20  # makes voxel indices positive; 2^21 of them a side
