@@ -28,9 +28,9 @@ WEIGHTS = np.array(
 THRESHOLD = 1.2  # above even odds: a merged pair is lost, a split one costs less
 _SMOOTH = 0.03  # of the depth: a pixel over which the surface jumps farther shows no surface
 _CONFIRMED = 2  # photos that must agree with a depth for it to shape the surface
-SMALLEST = (
-    2e-4  # area, in squared distances it is photographed from, under which a patch joins its neighbour
-)
+SMALLEST = 2e-4  # area, in squared distances it is photographed from, under which a patch joins its neighbour
+_LARGE = 0.1  # area, in the same measure, from which a flat segment may be a part of a floor, a wall, a table
+_FLAT = 0.03  # of the depth: standard deviation of such a segment across its plane, low things upon it included
 _LEAST_VOXELS = 100
 _LEAST_DEPTH = 0.05  # share of a photo's pixels that must have depth for it to take part
 
@@ -165,12 +165,26 @@ def surface_graph(sights: Iterable[Sight], surface: Surface) -> SurfaceGraph:
 
 def segments(graph: SurfaceGraph, weights: np.ndarray, threshold: float) -> np.ndarray:
     """[V] int32 segment 1.. of each voxel, 1 the largest; 0 for crumbs that touch nothing."""
-    ends = agglomerate(graph, weights, threshold, SMALLEST)
+    ends = join_planes(graph, agglomerate(graph, weights, threshold, SMALLEST))
     crumbs = np.array([graph.negligible(end, SMALLEST) for end in ends.tolist()])[graph.patch]
     _, index, counts = np.unique(ends[graph.patch], return_inverse=True, return_counts=True)
     rank = np.empty(len(counts), np.int32)
     rank[np.argsort(-counts, kind="stable")] = np.arange(1, len(counts) + 1)
     return np.where(crumbs, 0, rank[index]).astype(np.int32)
+
+
+def join_planes(graph: SurfaceGraph, ends: np.ndarray) -> np.ndarray:
+    """Floors and tables that things stand on fall into parts; large flat parts of one plane and look are one again.
+
+    ends: [R] the segment that each patch ended in. Returns the same, joined parts under one name."""
+    names = np.unique(ends)
+    large = [int(i) for i in names if graph.share(int(i)) > _LARGE and graph.flatness(int(i)) < _FLAT]
+    joined = np.arange(graph.count)
+    for place, a in enumerate(large):
+        for b in large[place + 1 :]:
+            if graph.one_plane(a, b):
+                joined[joined == joined[b]] = joined[a]
+    return joined[ends]
 
 
 def label_sight(sight: Sight, surface: Surface, segment: np.ndarray) -> np.ndarray:

@@ -17,6 +17,8 @@ FEATURES = 24
 NEIGHBOURS = 8
 _STEP = 0.012  # of the depth: what counts as a step between surfaces
 _STEP_CAP = 0.06
+_TURN, _OFFSET = 0.02, 0.025  # of one plane: 1 − cosine of the normals; distance, in units of the depth
+_ALIKE = 0.5  # share of their colours that parts of one plane have in common when they do not touch
 _SHARP = 12.0  # border gradient that counts as an edge
 
 # Columns of the sums over a patch's pixels and voxels, and over border pixels of two patches.
@@ -156,10 +158,36 @@ class SurfaceGraph:
             axis=1,
         )
 
+    def depth(self, a: int) -> float:
+        """Mean depth at which the photos show it."""
+        return float(self.sums[a, _DEPTH] / max(self.sums[a, _AREA], 1))
+
+    def share(self, a: int) -> float:
+        """Area in squared distances that it was photographed from."""
+        return float(self.sums[a, _VOXELS] * self.unit / max(self.depth(a), 1e-9) ** 2)
+
+    def flatness(self, a: int) -> float:
+        """Standard deviation across its own plane, in units of its depth."""
+        return float(_thickness(self.sums[a][None] / self.sums[a, _VOXELS])[0] / max(self.depth(a), 1e-9))
+
+    def one_plane(self, a: int, b: int) -> bool:
+        """Whether both are parts of one plane: they lie in it, and touch without an edge (a picture lies in the plane
+        of its wall), or do not touch but have the same colours."""
+        shape_a, shape_b = (self.sums[i] / self.sums[i, _VOXELS] for i in (a, b))
+        normal_a, normal_b = _direction(shape_a), _direction(shape_b)
+        chord = shape_b[_POINT] - shape_a[_POINT]
+        offset = max(abs(float(chord @ normal)) for normal in (normal_a, normal_b))
+        if 1 - abs(float(normal_a @ normal_b)) > _TURN or offset > _OFFSET * (self.depth(a) + self.depth(b)) / 2:
+            return False
+        border = self.borders[a].get(b)
+        if border is not None:
+            return bool(border[_SHARPS] < 0.5 * border[_LENGTH])
+        words = (self.sums[i, _WORDS] / max(self.sums[i, _AREA], 1) for i in (a, b))
+        return bool(np.minimum(*words).sum() > _ALIKE)
+
     def negligible(self, a: int, smallest: float) -> bool:
         """Smaller than `smallest`, in shares of the squared distance it was photographed from."""
-        depth = self.sums[a, _DEPTH] / max(self.sums[a, _AREA], 1)
-        return bool(self.sums[a, _VOXELS] * self.unit < smallest * depth**2)
+        return self.share(a) < smallest
 
     def merge(self, a: int, b: int) -> None:
         """b becomes part of a."""
@@ -185,12 +213,22 @@ def _surface_features(shape_a: np.ndarray, shape_b: np.ndarray, depth: np.ndarra
     return [turn, 5 * np.minimum(offset, 0.2), np.maximum(-bend, 0), np.maximum(bend, 0), same_plane]
 
 
-def _thickness(shape: np.ndarray) -> np.ndarray:
-    """[M] standard deviation of each patch across its own plane, from mean points and squares [M, C]."""
+def _direction(shape: np.ndarray) -> np.ndarray:
+    """[3] the normal of the plane through a patch, of either sign, from its mean point and squares [C]."""
+    return np.asarray(np.linalg.eigh(_covariance(shape[None])[0])[1][:, 0])
+
+
+def _covariance(shape: np.ndarray) -> np.ndarray:
+    """[M, 3, 3] of the voxels of each patch, from mean points and squares [M, C]."""
     full = np.zeros((len(shape), 3, 3))
     full[:, _UPPER[0], _UPPER[1]] = full[:, _UPPER[1], _UPPER[0]] = shape[:, _SQUARES]
     mean = shape[:, _POINT]
-    return np.sqrt(np.maximum(np.linalg.eigvalsh(full - mean[:, :, None] * mean[:, None, :])[:, 0], 0))
+    return full - mean[:, :, None] * mean[:, None, :]
+
+
+def _thickness(shape: np.ndarray) -> np.ndarray:
+    """[M] standard deviation of each patch across its own plane."""
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(_covariance(shape))[:, 0], 0))
 
 
 def _sum_by(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
