@@ -90,7 +90,7 @@ class LossConfig:
     positive: str = "per-mask"
     negative: str = "squared"
     start: float = 0.3
-    geometry_start: float = 0.5
+    geometry_start: float = 0.3
     every: int = 2
     half_resolution: bool = True
 
