@@ -17,8 +17,7 @@ NAMES = ["mug", "banana", "laptop", "teapot", "kettle", "lamp", "violin", "ancho
 class HashEncoder:
     """Every text its own random direction: exact names fit, everything else is unrelated."""
 
-    identity, dim, templates, references = "hash-test", 256, ("{}",), None
-    margin, canonical = 0.0, ()
+    identity, dim, templates = "hash-test", 256, ("{}",)
 
     def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
         rows = []
