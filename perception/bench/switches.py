@@ -39,11 +39,7 @@ SWITCHES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("random background", "off", ("train.random_background=false",)),
     ("variance loss", "off", ("losses.variance_weight=0",)),
     ("rates cool down", "off", ("train.cooldown=0",)),
-    (
-        "rates of means, scales, colours",
-        "as Kerbl et al.",
-        ("train.lr_means=1.6e-4", "train.lr_means_final=1.6e-6", "train.lr_scales=5e-3", "train.lr_colors=2.5e-3"),
-    ),
+    ("rates of scales and colours", "as Kerbl et al.", ("train.lr_scales=5e-3", "train.lr_colors=2.5e-3")),
     ("holes are filled", "off", ("densify.fill_every=0",)),
     ("exchange rate", "off: no early end", ("train.exchange_db=-1000",)),
     ("exchange rate", "0.1 dB", ("train.exchange_db=0.1",)),

@@ -82,8 +82,9 @@ def _placed(
     rows, columns = ((low + high) / 2).T
     K = view.K.numpy()
     rays = np.stack([(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones(len(empty))], axis=1)
-    camera = torch.from_numpy((rays * depth[:, None]).astype(np.float32))
-    pose = view.camera_from_world
+    pose = view.camera_from_world.double().numpy()
+    # Sums written out: a matrix product may round otherwise on another number of threads.
+    means = ((rays * depth[:, None] - pose[:3, 3])[:, :, None] * pose[:3, :3]).sum(axis=1)
     colors = torch.nn.functional.avg_pool2d(view.photo.float().permute(2, 0, 1)[None], BLOCK, ceil_mode=True)[0]
     sh = torch.zeros(len(empty), *like.sh.shape[1:])
     sh[:, 0] = (colors[:, torch.from_numpy(holes)].T / 255 - 0.5) / SH_C0
@@ -91,7 +92,7 @@ def _placed(
     quats[:, 0] = 1.0
     scale = torch.from_numpy(depth) * (0.5 * BLOCK / float(K[0, 0]))
     return Gaussians(
-        means=(camera - pose[:3, 3]) @ pose[:3, :3],
+        means=torch.from_numpy(means.astype(np.float32)),
         quats=quats,
         log_scales=scale.clamp(min=1e-9).log()[:, None].repeat(1, 3),
         opacity_logits=torch.full((len(empty),), math.log(OPACITY / (1 - OPACITY))),
