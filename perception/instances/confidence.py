@@ -12,8 +12,19 @@ import numpy as np
 
 from perception.instances.consensus import Evidence
 
-CALIBRATION = ((0.0, 0.0), (1.0, 1.0))
-"""Raw score → chance of IoU > .5 with a true object."""
+CALIBRATION = (
+    (0.0, 0.0),
+    (0.2, 0.662),
+    (0.3, 0.782),
+    (0.4, 0.829),
+    (0.5, 0.904),
+    (0.6, 0.996),
+    (0.7, 0.997),
+    (0.85, 0.998),
+    (1.0, 1.0),
+)
+"""Raw score → chance of IoU > .5 with a true object: isotonic fit on 662 instances of 40 random scenes of balls whose
+masks err, 537 of them right (`perception bench instances --calibrate`); strictly rising, so that ranks survive."""
 
 
 def raw_scores(ids: np.ndarray, membership: np.ndarray, found: Evidence) -> np.ndarray:

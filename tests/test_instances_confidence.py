@@ -1,0 +1,72 @@
+"""Scores in [0, 1] that rank, collision counts by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("perception._core")
+from perception.bench.collisions import collision_rate, pair_scene
+from perception.bench.instances import _best_iou
+from perception.instances.confidence import CALIBRATION, calibrated, raw_scores
+from perception.instances.consensus import evidence
+from perception.instances.votes import Table
+
+
+def table(*rows: list[float], area: list[float], view: list[int]) -> Table:
+    pixels = np.array(rows, np.float32)
+    return Table(pixels, np.zeros((len(rows), max(view) + 1), np.float32), np.array(view), np.array(area))
+
+
+def test_calibration_rises_strictly_within_its_bounds() -> None:
+    raw = np.linspace(0, 1, 101)
+    score = calibrated(raw)
+    assert (np.diff(score) > 0).all() and score[0] == 0 and score[-1] == 1
+    assert [x for x, _ in CALIBRATION] == sorted(x for x, _ in CALIBRATION)
+
+
+def test_evidence_by_hand() -> None:
+    # Two views. Group 0 fills all of mask 0 (100 px) in view 0 and half of mask 2 (200 px) in view 1.
+    # Group 1 fills mask 1 (50 px) in view 0 and the other half of mask 2 in view 1.
+    found = evidence(table([100, 0, 100], [0, 50, 100], area=[100, 50, 200], view=[0, 0, 1]))
+    assert found.matched.tolist() == [100 * 1 + 100 * 0.5, 50 * 1 + 100 * 0.5]
+    assert found.support.tolist() == [1, 1] and found.views.tolist() == [2, 2]
+    assert found.agreement.tolist() == pytest.approx([0.75, 100 / 150])
+
+
+def test_unmasked_pixels_are_part_of_the_extent() -> None:
+    seen = table([100.0], area=[100], view=[0])
+    half_blank = Table(seen.pixels, np.array([[100.0]], np.float32), seen.view, seen.area)
+    assert evidence(seen).agreement[0] == 1 and evidence(half_blank).agreement[0] == 0.5
+
+
+def test_better_evidence_scores_higher() -> None:
+    found = evidence(
+        table([90.0, 0, 90, 0, 90, 0], [0, 40.0, 0, 40, 0, 40], area=[100.0, 100] * 3, view=[0, 0, 1, 1, 2, 2])
+    )
+    ids, membership = np.repeat([0, 1], 10).astype(np.int32), np.repeat([0.9, 0.8], 10)
+    raw = raw_scores(ids, membership, found)
+    assert 1 > raw[0] > raw[1] > 0
+
+
+def test_collisions_by_hand() -> None:
+    together = np.eye(3, dtype=bool)
+    together[0, 1] = together[1, 0] = True
+    truth = np.array([0, 0, 1, 1, 2, 2])
+    assert (
+        collision_rate(np.array([5, 5, 5, 5, 6, 6]), truth, together)["collisions"] == 0
+    )  # 0 and 1 were seen together
+    assert collision_rate(np.array([5, 5, 6, 6, 5, 5]), truth, together) == {"pairs": 2, "collisions": 1, "rate": 0.5}
+
+
+def test_the_two_rows_share_no_photo() -> None:
+    scene, together = pair_scene(2.0, pairs=3)
+    assert not together[:3, 3:].any() and together[0, 0] and together[0, 1]
+    features = scene.gaussians.features.numpy()
+    means = [features[scene.truth == k].mean(axis=0) for k in (0, 3)]
+    assert np.abs(means[0] - means[1]).max() < 0.05
+
+
+def test_best_iou() -> None:
+    truth, ids = np.array([0, 0, 0, 1]), np.array([0, 0, -1, 1])
+    assert _best_iou(ids, truth, 2).tolist() == pytest.approx([2 / 3, 1])
