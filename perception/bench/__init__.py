@@ -5,12 +5,14 @@ BENCHES = (
     "training",
     "masks",
     "language",
+    "query",
     "view",
     "lerf-mask",
     "lerf-ovs",
     "scannetpp",
     "clouds",
     "smoothing",
+    "calibrate",
     "queries",
     "sam",
     "map",
@@ -18,5 +20,8 @@ BENCHES = (
     "scaling",
     "ablation",
     "export",
+    "instances",
+    "collisions",
+    "clustering",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""

@@ -11,6 +11,11 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from perception import __version__
+from perception.cli import asking, clouds, mapping, robot_inputs, scoring
+from perception.cli.parser import Parser
+from perception.errors import InputError
+
+_MODULES = (mapping, asking, clouds, scoring, robot_inputs)
 from perception.cli.parser import Parser
 from perception.errors import InputError
 
@@ -61,9 +66,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        told = "interrupted; what was done is kept, repeat the command with --resume"
+        told = f"interrupted; what was done is kept, go on with: {_resume(argv)}"
         print(getattr(args, "interrupted", told), file=sys.stderr)
-        print(f"interrupted; what was done is kept, go on with: {_resume(argv)}", file=sys.stderr)
         return 130
     except BrokenPipeError:
         return 0
