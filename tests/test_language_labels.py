@@ -122,3 +122,21 @@ def test_merged_split_and_moved_instances_have_no_partner() -> None:
     assert match_instances(cube, ones, cube + 0.01, ones + 6, [0]) == {0: 6}
     mostly = (cube[:, 0] > 0.8).astype(int)
     assert match_instances(cube, ones, cube, mostly, [0]) == {0: 0}  # four fifths of it live on
+
+
+def test_a_map_made_again_keeps_the_names(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command line of it, on two runs that give the same map."""
+    make = ["map", str(small_scene), "--masks", f"labels:{small_scene / 'labels'}", "--iterations", "60"]
+    make += ["--budget", "4000", "--set", "language.encoder=none"]
+    old, new = tmp_path / "old.gsmap", tmp_path / "new.gsmap"
+    assert main([*make, "-o", str(old)]) == 0
+    largest = max(read_map(old).instances, key=lambda entry: entry["num_gaussians"])
+    assert main(["label", str(old), str(largest["id"]), "the big one"]) == 0
+    assert main([*make, "-o", str(new), "--labels-from", str(old)]) == 0
+    assert "is called “the big one”" in capsys.readouterr().err
+    (named,) = [entry for entry in read_map(new).instances if entry["label"]]
+    assert named["id"] == largest["id"]
+    assert main([*make, "-o", str(tmp_path / "x.gsmap"), "--labels-from", str(tmp_path / "none.gsmap")]) == 2
+    assert not (tmp_path / "x.gsmap.work").exists()
