@@ -18,7 +18,7 @@ DIM = 16
 class WordEncoder:
     """Each text is a direction of its own, fixed by its bytes."""
 
-    identity, dim, templates, references = "words-1", DIM, ("{}",), None
+    identity, dim, templates, references, canonical, margin = "words-1", DIM, ("{}",), None, (), 0.0
 
     def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
         raise AssertionError("the node shows no pictures to an encoder")

@@ -182,7 +182,8 @@ def test_everything_in_another_frame_is_the_same_thing_moved(
     z_turn = Frame("turned", np.array([[0, -1.0, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
     # In the turned frame y is the map's x: the half plane y <= .5 there is x <= .5 here.
     assert [hit.instance_id for hit in gmap.find(prism, frame=z_turn)] == [3, 6, 9]
-    size = Where(min_size=scale * float(np.sort([max(gmap.get(k).obb.extent) for k in range(3, 12)])[4]) * 0.9999)
+    longest = np.sort([max(gmap.get(k).obb.extent) for k in range(3, 12)])
+    size = Where(min_size=scale * float(longest[3] + longest[4]) / 2)
     assert len(gmap.find(size, frame=base)) == 5
 
 

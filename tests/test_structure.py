@@ -32,6 +32,7 @@ LAYERS = [
         "pipeline",
         "viewer",
         "bench",
+        "launch",
     },
     {"cli"},
 ]

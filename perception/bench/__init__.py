@@ -5,6 +5,7 @@ BENCHES = (
     "training",
     "masks",
     "language",
+    "query",
     "view",
     "lerf-mask",
     "lerf-ovs",
@@ -13,10 +14,14 @@ BENCHES = (
     "smoothing",
     "calibrate",
     "queries",
+    "sam",
     "map",
     "switches",
     "scaling",
     "ablation",
     "export",
+    "instances",
+    "collisions",
+    "clustering",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""

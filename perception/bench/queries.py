@@ -53,11 +53,11 @@ def measure(map_path: Path, scene: Path) -> dict[str, Any]:
     descriptions, _ = from_arrays(opened.gmap.language)
     report: dict[str, Any] = {"map": str(map_path), "scene": scene.name, "instances": len(opened.instances)}
     report |= {"encoder": str(opened.gmap.language["encoder"]), "prompts": len(queries), "unseen_prompts": unseen}
-    report |= _figures(opened._ranker, descriptions, owners, queries, read_words(scene))
+    report |= _figures(opened.ranker, descriptions, owners, queries, read_words(scene))
     report |= {"load_ms": round(loaded * 1e3, 1), "cold_ms": round(cold * 1e3, 1)}
-    report |= latency(opened._ranker, [text for text, _ in queries], "warm")
+    report |= latency(opened.ranker, [text for text, _ in queries], "warm")
     many = [descriptions[n % len(descriptions)] for n in range(MANY)]
-    report |= latency(opened._ranker.over(many), [text for text, _ in queries], f"warm_{MANY}")
+    report |= latency(opened.ranker.over(many), [text for text, _ in queries], f"warm_{MANY}")
     return report | {"versions": versions()}
 
 

@@ -62,9 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        told = "interrupted; what was done is kept, repeat the command with --resume"
+        told = f"interrupted; what was done is kept, go on with: {_resume(argv)}"
         print(getattr(args, "interrupted", told), file=sys.stderr)
-        print(f"interrupted; what was done is kept, go on with: {_resume(argv)}", file=sys.stderr)
         return 130
     except BrokenPipeError:
         return 0

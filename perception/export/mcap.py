@@ -11,9 +11,9 @@ import numpy as np
 
 from perception.boxes import instance_boxes
 from perception.errors import InputError, missing_extra
-from perception.export.cdr import serialize, typestore
-from perception.export.ros_messages import DETECTIONS, POINT_CLOUD, Stamp, detection, header, packed_rgb, point_cloud2
 from perception.io.atomic import replacing
+from perception.io.cdr import serialize, typestore
+from perception.io.ros_messages import DETECTIONS, POINT_CLOUD, Stamp, detection, header, packed_rgb, point_cloud2
 from perception.types import OrientedBox, PointCloud
 
 

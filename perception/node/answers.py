@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from perception.export.ros_messages import Stamp, box_markers, detection, header, packed_rgb, point_cloud2
+from perception.io.ros_messages import Stamp, box_markers, detection, header, packed_rgb, point_cloud2
 from perception.query import Hit, LoadedMap, Reply
 
 _STRING, _DOUBLE_ARRAY = 4, 8  # rcl_interfaces/ParameterType

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.export.cdr import deserialize, serialize
+from perception.io.cdr import deserialize, serialize
 from perception.node import channels
 from perception.node.config import NodeConfig
 from perception.node.participant import Participant
@@ -43,12 +43,13 @@ class NodeClient:
         self._config, self._retry = config or NodeConfig(), retry
         self._seat = Participant(self._config.domain_id, self._config.network)
         space = self._config.namespace
+        query = channels.QUERY
+        # The network tells of readers in the order they are made: who answers on the last of them knows them all.
+        self._replies = self._seat.reader(f"rr/{query.path(space)}Reply", f"{query.kind}_Response", headed=True)
         self._answers = {
             topic: self._seat.reader(f"rt/{topic.path(space)}", topic.kind)
             for topic in (channels.POINTS, channels.BOXES, channels.MARKS, channels.ANSWER)
         }
-        query = channels.QUERY
-        self._replies = self._seat.reader(f"rr/{query.path(space)}Reply", f"{query.kind}_Response", headed=True)
         self._requests = self._seat.writer(f"rq/{query.path(space)}Request", f"{query.kind}_Request", headed=True)
         self._prompts = self._seat.writer(f"rt/{channels.PROMPT.path(space)}", channels.PROMPT.kind)
         self._reply_wait = self._seat.wait_set([self._replies])
@@ -62,13 +63,18 @@ class NodeClient:
         self._seat.close()
 
     def wait_for_node(self, timeout: float = 10.0) -> None:
-        """Returns once a node is there; TimeoutError otherwise."""
+        """Returns once a node is there that sees this client too; TimeoutError otherwise.
+
+        That we see the node does not mean that it sees us, and what it sends before it does is lost: an empty prompt,
+        which it refuses, shows that its answers arrive.
+        """
         end = time.monotonic() + timeout
         readers = [self._replies, *self._answers.values()]
         while not (self._requests.readers and self._prompts.readers and all(reader.writers for reader in readers)):
             if time.monotonic() > end:
                 raise TimeoutError(f"no node serves '{self._config.namespace}' on domain {self._config.domain_id}")
             time.sleep(0.01)
+        self.ask({"text": ""}, max(0.1, end - time.monotonic()), retry=0.1)
 
     # ----------------------------------------------------------------- service
 
@@ -99,7 +105,7 @@ class NodeClient:
 
     # ------------------------------------------------------------------ topics
 
-    def ask(self, prompt: str | dict[str, Any], timeout: float = 10.0) -> TopicAnswer:
+    def ask(self, prompt: str | dict[str, Any], timeout: float = 10.0, retry: float | None = None) -> TopicAnswer:
         """An answer over the topics, with its cloud, detections and markers."""
         asked = {"text": prompt} if isinstance(prompt, str) else dict(prompt)
         identity = asked.setdefault("id", uuid.uuid4().hex)
@@ -125,10 +131,17 @@ class NodeClient:
             return TopicAnswer(facts, *parts) if parts and all(part is not None for part in parts) else None
 
         with self._lock:
-            return self._until(lambda: self._prompts.write(data), found, self._answer_wait, timeout)
+            return self._until(lambda: self._prompts.write(data), found, self._answer_wait, timeout, retry)
 
-    def _until(self, send: Callable[[], Any], found: Callable[[], Any], waiting: Any, timeout: float) -> Any:
-        """Sends, and again each `retry` seconds, until `found` finds."""
+    def _until(
+        self,
+        send: Callable[[], Any],
+        found: Callable[[], Any],
+        waiting: Any,
+        timeout: float,
+        retry: float | None = None,
+    ) -> Any:
+        """Sends, and again each `retry` seconds (the client's own when None), until `found` finds."""
         end, again = time.monotonic() + timeout, 0.0
         while True:
             now = time.monotonic()
@@ -136,7 +149,7 @@ class NodeClient:
                 raise TimeoutError(f"no answer from '{self._config.namespace}' within {timeout:g} s")
             if now >= again:
                 send()
-                again = now + self._retry
+                again = now + (self._retry if retry is None else retry)
             waiting.wait(int(min(end, again) * _NS) - int(now * _NS))
             answer = found()
             if answer is not None:

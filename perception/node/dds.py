@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from perception.export.cdr import deserialize, serialize
+from perception.io.cdr import deserialize, serialize
 from perception.node import channels
 from perception.node.channels import Service, Topic
 from perception.node.config import NodeConfig

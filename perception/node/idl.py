@@ -17,7 +17,7 @@ from functools import cache
 from typing import Any
 
 from perception.errors import missing_extra
-from perception.export.cdr import typestore
+from perception.io.cdr import typestore
 
 _HASHING = threading.Lock()
 

@@ -20,7 +20,7 @@ from perception.node.core import Core, Message
 
 _SEQUENCE = re.compile(r"(?:sequence<)?(\w+/\w+)(?:, \d+)?>?(?:\[\d+\])?")
 _EXTRA_SECONDS = 1.0
-"""Beyond the engine's time-out before a service call is given up; the engine answers in time, with an error if need be."""
+"""Beyond the engine's time-out before a service call is given up; the engine answers in time, if with an error."""
 
 
 class RosTransport:

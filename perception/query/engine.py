@@ -6,31 +6,25 @@ Servers (HTTP, DDS, ROS) only convert messages; waiting, refusing, timing out an
 from __future__ import annotations
 
 import asyncio
-import queue
 import threading
 import time
-from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeout
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
-
-import numpy as np
 
 from perception.errors import InputError
 from perception.io.store import map_signature
 from perception.language.base import Encoder, make_encoder
+from perception.query.line import Figures, Job, Line
 from perception.query.opened import LoadedMap, load_map
 from perception.query.requests import Reply, Request
 
 T = TypeVar("T")
 _SELDOM = 32
 """A new map that cannot be opened is tried again at most this many looks later."""
-_REMEMBERED = 1000
-"""Latencies kept for the health figures."""
 
 
 class EngineBusy(RuntimeError):
@@ -43,14 +37,6 @@ class AnswerTimeout(TimeoutError):
 
 class EngineClosed(RuntimeError):
     """The engine has been closed."""
-
-
-@dataclass
-class _Job:
-    work: Callable[[LoadedMap], Any]
-    future: Future[Any]
-    asked: float
-    deadline: float
 
 
 class QueryEngine:
@@ -71,17 +57,17 @@ class QueryEngine:
         queue_size: int = 64,
         timeout: float = 10.0,
         watch: float | None = 1.0,
-        encoders: Callable[[str], Encoder | None] = make_encoder,
+        encoders: Callable[[str], Encoder | None] | None = None,
     ) -> None:
         for name, value, least in (("workers", workers, 1), ("queue_size", queue_size, 1), ("timeout", timeout, 1e-3)):
             if not value >= least:
                 raise InputError(f"engine: {name} is {value}, expected at least {least}")
         self.path, self.timeout = Path(path), timeout
-        self._encoders = _Shared(encoders)
+        self._encoders = _Shared(encoders or make_encoder)
         self._signature = map_signature(self.path)
         self._map = self._open()
-        self._jobs: queue.Queue[_Job | None] = queue.Queue(queue_size)
-        self._figures = _Figures()
+        self._figures = Figures()
+        self._line = Line(queue_size, self._drop)
         self._reloading = threading.Lock()
         self._listeners: list[Callable[[LoadedMap], None]] = []
         self._problem: str | None = None
@@ -120,12 +106,12 @@ class QueryEngine:
         if self._closed.is_set():
             raise EngineClosed(f"{self.path}: the engine has been closed")
         now = time.monotonic()
-        job = _Job(work, Future(), now, now + (self.timeout if timeout is None else timeout))
-        try:
-            self._jobs.put_nowait(job)
-        except queue.Full:
+        job = Job(work, Future(), now, now + (self.timeout if timeout is None else timeout))
+        if not self._line.join(job):
+            if self._closed.is_set():
+                raise EngineClosed(f"{self.path}: the engine has been closed")
             self._figures.count("refused")
-            raise EngineBusy(f"{self._jobs.maxsize} questions are waiting already; ask again later") from None
+            raise EngineBusy(f"{self._line.most} questions are waiting already; ask again later")
         return job.future
 
     def wait(self, future: Future[T], timeout: float | None = None) -> T:
@@ -221,8 +207,8 @@ class QueryEngine:
             "metric": gmap.metric,
             "instances": len(gmap.instances),
             "gaussians": int(gmap.info.get("num_gaussians", 0)),
-            "waiting": self._jobs.qsize(),
-            "queue_size": self._jobs.maxsize,
+            "waiting": len(self._line),
+            "queue_size": self._line.most,
             **self._figures.to_json(),
         }
 
@@ -231,16 +217,12 @@ class QueryEngine:
         if self._closed.is_set():
             return
         self._closed.set()
-        self._drain()
-        for _ in self._threads:
-            try:
-                self._jobs.put_nowait(None)
-            except queue.Full:
-                break
+        for job in self._line.close():
+            if job.future.set_running_or_notify_cancel():
+                job.future.set_exception(EngineClosed(f"{self.path}: the engine has been closed"))
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(timeout=self.timeout)
-        self._drain()
 
     def __enter__(self) -> QueryEngine:
         return self
@@ -250,29 +232,20 @@ class QueryEngine:
 
     # ----------------------------------------------------------------- workers
 
-    def _drain(self) -> None:
-        while True:
-            try:
-                job = self._jobs.get_nowait()
-            except queue.Empty:
-                return
-            if job is not None and job.future.set_running_or_notify_cancel():
-                job.future.set_exception(EngineClosed(f"{self.path}: the engine has been closed"))
-
     def _work(self) -> None:
-        while not self._closed.is_set():
-            job = self._jobs.get()
-            if job is None:
-                return
-            if not job.future.set_running_or_notify_cancel():
-                continue
+        while (job := self._line.next()) is not None:
             if time.monotonic() > job.deadline:
-                self._figures.count("timed_out")
-                job.future.set_exception(AnswerTimeout("the question waited too long and was dropped"))
-                continue
-            self._answer(job)
+                self._drop(job)
+            elif job.future.set_running_or_notify_cancel():
+                self._answer(job)
 
-    def _answer(self, job: _Job) -> None:
+    def _drop(self, job: Job) -> None:
+        """Tells who asked that the time is over; nothing when they have gone already."""
+        if job.future.set_running_or_notify_cancel():
+            self._figures.count("timed_out")
+            job.future.set_exception(AnswerTimeout("the question waited too long and was dropped"))
+
+    def _answer(self, job: Job) -> None:
         try:
             result = job.work(self._map)
         except InputError as error:
@@ -297,34 +270,3 @@ class _Shared:
             if spec not in self._made:
                 self._made[spec] = self._make(spec)
             return self._made[spec]
-
-
-class _Figures:
-    """Totals and recent latencies."""
-
-    _NAMES = ("answered", "bad_input", "failed", "refused", "timed_out", "reloads")
-
-    def __init__(self) -> None:
-        self._totals: Counter[str] = Counter()
-        self._recent: deque[float] = deque(maxlen=_REMEMBERED)
-        self._lock = threading.Lock()
-        self._started = time.monotonic()
-
-    def count(self, name: str) -> None:
-        with self._lock:
-            self._totals[name] += 1
-
-    def answered(self, seconds: float) -> None:
-        with self._lock:
-            self._totals["answered"] += 1
-            self._recent.append(seconds)
-
-    def to_json(self) -> dict[str, Any]:
-        with self._lock:
-            recent = np.array(self._recent) * 1e3
-            totals = {name: self._totals[name] for name in self._NAMES}
-        latency = {}
-        if len(recent):
-            median, high = np.percentile(recent, [50, 99])
-            latency = {"median_ms": round(float(median), 2), "p99_ms": round(float(high), 2)}
-        return {"uptime_s": round(time.monotonic() - self._started, 1), **totals, **latency}

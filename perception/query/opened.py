@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -21,16 +19,12 @@ from perception.query.hit import Description, Hit, Neighbor
 from perception.query.requests import Request
 from perception.query.space import Space
 from perception.query.where import Where, place, tidy
+from perception.query.words import Encoders, Words
 from perception.types import OrientedBox
 
 if TYPE_CHECKING:
-    from perception.language.base import Encoder
     from perception.language.ranking import Answer, Ranker
 
-    Encoders = Callable[[str], Encoder | None]
-
-_REMEMBERED = 256
-"""Prompts whose ranking is kept: planners ask the same thing again and again."""
 _NEIGHBORS = 3
 _LEAST_COLOR = 0.05
 
@@ -50,13 +44,12 @@ class LoadedMap:
     """
 
     def __init__(self, held: GaussianMap | MapFiles, path: Path | None = None, encoders: Encoders | None = None):
-        self._held, self.path, self._encoders = held, path, encoders
+        self._held, self.path = held, path
+        self._words = Words(held, path, encoders, lambda: self._index)
         self._lock = threading.RLock()
-        self._ranked: OrderedDict[tuple[str, float | None], Answer] = OrderedDict()
         self._covariances: dict[int, np.ndarray] = {}
         self._made_gmap: GaussianMap | None = None
         self._made_space: Space | None = None
-        self._made_ranker: Ranker | InputError | None = None
 
     # ------------------------------------------------------------------- facts
 
@@ -98,16 +91,18 @@ class LoadedMap:
     @property
     def problem(self) -> str | None:
         """Why prompts cannot be answered (no embeddings, no encoder), one line; None when they can."""
-        try:
-            _ = self._ranker
-        except InputError as error:
-            return str(error)
-        return None
+        return self._words.problem
+
+    @property
+    def ranker(self) -> Ranker:
+        """What ranks the instances for a prompt; InputError when the map has no words."""
+        return self._words.ranker
 
     def warm(self) -> None:
         """Does now what the first questions would wait for."""
         _ = self._space
         if self.problem is None and self.instances:
+            _ = self.ranker.shapes
             self.query("thing")
 
     # --------------------------------------------------------------- questions
@@ -130,7 +125,7 @@ class LoadedMap:
         Request(text, top_k, min_score)
         if not self.instances:
             return []
-        answer = self._rank(text, min_score)
+        answer = self._words.rank(text, min_score)
         if where is None:
             if not answer.present:
                 return []
@@ -198,6 +193,12 @@ class LoadedMap:
             tuple(Neighbor(i, labels.get(i), gap * scale) for gap, i in beside),
         )
 
+    def likely_names(self, count: int = 3) -> list[list[str]]:
+        """The likeliest names of every instance, best first, in the order of `instances`."""
+        from perception.language.naming import likely_names
+
+        return likely_names(self.ranker, count) if self.instances else []
+
     def hit(self, position: int, score: float | None = None) -> Hit:
         """The instance at place `position` of instances.json; score: its own confidence when None."""
         entry = self.instances[position]
@@ -233,19 +234,6 @@ class LoadedMap:
         return names[0], (x0, y0, x1, y1)
 
     # --------------------------------------------------------------- internals
-
-    def _rank(self, text: str, min_score: float | None) -> Answer:
-        key = (" ".join(text.split()), min_score)
-        with self._lock:
-            if key in self._ranked:
-                self._ranked.move_to_end(key)
-                return self._ranked[key]
-        answer = self._ranker.rank(text, min_score)
-        with self._lock:
-            self._ranked[key] = answer
-            if len(self._ranked) > _REMEMBERED:
-                self._ranked.popitem(last=False)
-        return answer
 
     def _query_where(
         self, answer: Answer, top_k: int, min_score: float | None, where: Where, frame: Frame | None
@@ -335,50 +323,6 @@ class LoadedMap:
             if self._made_space is None:
                 self._made_space = Space(self._held.instance_index())
             return self._made_space
-
-    @property
-    def _ranker(self) -> Ranker:
-        with self._lock:
-            if isinstance(self._made_ranker, InputError):
-                raise InputError(str(self._made_ranker))
-            if self._made_ranker is None:
-                try:
-                    self._made_ranker = self._make_ranker()
-                except InputError as error:
-                    self._made_ranker = error
-                    raise
-            return self._made_ranker
-
-    def _make_ranker(self) -> Ranker:
-        from perception.language import make_encoder
-        from perception.language.description import check_encoder, from_arrays
-        from perception.language.ranking import Ranker
-
-        if not self._held.language:
-            raise InputError(
-                f"{self.path}: holds no language embeddings; map again with an encoder (language.encoder=…)"
-            )
-        descriptions, identity = from_arrays(self._held.language)
-        spec = self.info.get("config", {}).get("language", {}).get("encoder", "auto")
-        encoder = (self._encoders or make_encoder)("conse" if spec == "auto" else spec)
-        if encoder is None:
-            raise InputError(f"{self.path}: was mapped without an encoder; map again with language.encoder=conse")
-        check_encoder(identity, encoder.identity)
-        labels = [entry.get("label") for entry in self.instances]
-        return Ranker(descriptions, encoder, labels, self._shapes)
-
-    def _shapes(self) -> np.ndarray:
-        from perception.instances.shapes import shape_scores
-
-        ids = [entry["id"] for entry in self.instances]
-        poses = self._held.cameras.get("camera_from_world", np.zeros((0, 4, 4)))
-        return shape_scores(self._held.means, self._held.instance_ids, ids, poses)
-
-    def likely_names(self, count: int = 3) -> list[list[str]]:
-        """The likeliest names of every instance, best first, in the order of `instances`."""
-        from perception.language.naming import likely_names
-
-        return likely_names(self._ranker, count) if self.instances else []
 
 
 def load_map(path: str | Path, encoders: Encoders | None = None) -> LoadedMap:

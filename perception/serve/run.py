@@ -10,13 +10,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 from perception.errors import InputError, missing_extra
+from perception.language.base import Encoder
 from perception.query.engine import QueryEngine
 from perception.serve.settings import ServeSettings
 
 _MOST_CONNECTIONS = 256
 
 
-def serve(path: Path, settings: ServeSettings, say: Callable[[str], None] | None = None) -> None:
+def serve(
+    path: Path,
+    settings: ServeSettings,
+    say: Callable[[str], None] | None = None,
+    encoders: Callable[[str], Encoder | None] | None = None,
+) -> None:
     """Serves the map at `path` until SIGINT or SIGTERM, finishing what is being answered.
 
     InputError when the map cannot be opened, the port is taken, or the packages of the extra `serve` are missing.
@@ -37,6 +43,7 @@ def serve(path: Path, settings: ServeSettings, say: Callable[[str], None] | None
             queue_size=settings.queue_size,
             timeout=settings.timeout,
             watch=settings.watch or None,
+            encoders=encoders,
         ) as engine,
     ):
         host = f"[{settings.host}]" if ":" in settings.host else settings.host

@@ -62,7 +62,8 @@ def deserialize(kind: str, data: bytes) -> dict[str, Any]:
 
 def plain(message: Any) -> dict[str, Any]:
     """A rosbags message as the dict of its fields."""
-    return {field.name: _plain(getattr(message, field.name)) for field in dataclasses.fields(message)}
+    names = [field.name for field in dataclasses.fields(message) if not field.name.startswith("__")]
+    return {name: _plain(getattr(message, name)) for name in names}
 
 
 def _plain(value: Any) -> Any:
@@ -74,13 +75,15 @@ def _plain(value: Any) -> Any:
 
 
 def build(kind: str, message: dict[str, Any]) -> Any:
-    """The rosbags message of a dict; fields left out are zero, unknown ones are a KeyError."""
+    """The rosbags message of a dict; fields left out have ROS's default, unknown ones are a KeyError."""
     store = typestore()
     fields = store.fielddefs[kind][1]
     unknown = message.keys() - {name for name, _ in fields}
     if unknown:
         raise KeyError(f"{kind} has no field {sorted(unknown)}")
-    return store.types[kind](**{name: _value(definition, message.get(name)) for name, definition in fields})
+    usual = _DEFAULTS.get(kind, {})
+    values = {name: _value(definition, message.get(name, usual.get(name))) for name, definition in fields}
+    return store.types[kind](**values)
 
 
 def _value(definition: tuple[Any, Any], value: Any) -> Any:
@@ -98,6 +101,8 @@ def _value(definition: tuple[Any, Any], value: Any) -> Any:
     return np.zeros(length, dtype) if value is None else np.ascontiguousarray(value, dtype)
 
 
+_DEFAULTS = {"geometry_msgs/msg/Quaternion": {"w": 1.0}}
+"""The only default that is not zero in the types used here; rosbags does not carry it."""
 _DTYPES = {"byte": "uint8", "octet": "uint8", "char": "uint8"}
 
 

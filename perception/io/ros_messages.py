@@ -1,6 +1,6 @@
 """What we know in the words of ROS 2: standard messages as plain dicts, whatever carries them afterwards.
 
-A message is a dict of its fields; fields that are left out have their type's zero. Arrays are numpy, times are
+A message is a dict of its fields; fields that are left out have ROS's default. Arrays are numpy, times are
 (seconds, nanoseconds). Layouts: the interface definitions of ROS 2 (common_interfaces, vision_msgs 4).
 """
 

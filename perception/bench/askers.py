@@ -1,0 +1,86 @@
+"""Ways to ask a served map, for the load test of `bench query`: each is a server and clients that ask it.
+
+A contender is a context manager over the path of a map; it yields `Served`: a function that makes one client, and the
+process that answers. A client takes a prompt and returns (instance id, number of points) of the best hit, None when not
+present.
+"""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+Best = tuple[int, int] | None
+Ask = Callable[[str], Best]
+
+
+@dataclass(frozen=True)
+class Served:
+    """client: makes one asker. process: the id of the process that answers, whose memory is looked at."""
+
+    client: Callable[[], Ask]
+    process: int
+
+
+Contender = Callable[[Path], AbstractContextManager[Served]]
+
+
+@contextmanager
+def engine_askers(path: Path) -> Iterator[Served]:
+    """Threads of one process ask the engine itself."""
+    from perception.query.engine import QueryEngine
+    from perception.query.requests import Request
+
+    with QueryEngine(path, watch=None, timeout=60) as engine:
+
+        def ask(text: str) -> Best:
+            hits = engine.ask(Request(text, 1)).hits
+            return (hits[0].instance_id, len(hits[0].points)) if hits else None
+
+        yield Served(lambda: ask, os.getpid())
+
+
+@contextmanager
+def http_askers(path: Path) -> Iterator[Served]:
+    """`perception serve` in a process of its own on the loopback; each client keeps one connection."""
+    command = [sys.executable, "-m", "perception.cli", "serve", str(path), "--port", "0"]
+    options = ["--rate", "0", "--watch", "0", "--timeout", "60"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    server = subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True, env=environment)
+    try:
+        assert server.stderr is not None
+        told = server.stderr.readline()
+        if not told.startswith("serving "):
+            raise RuntimeError(f"the server did not start: {told}{server.stderr.read()}")
+        port = int(told.rsplit(":", 1)[1].split()[0])
+
+        def client() -> Ask:
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+
+            def ask(text: str) -> Best:
+                body = json.dumps({"text": text, "top_k": 1})
+                connection.request("POST", "/query", body, {"Content-Type": "application/json"})
+                answer: dict[str, Any] = json.loads(connection.getresponse().read())
+                (result,) = answer["results"]
+                if result["text"] != text:
+                    raise RuntimeError(f"asked for {text!r}, answered {result['text']!r}")
+                hits = result["hits"]
+                return (hits[0]["instance_id"], hits[0]["num_points"]) if hits else None
+
+            return ask
+
+        yield Served(client, server.pid)
+    finally:
+        server.terminate()
+        server.wait()
+
+
+CONTENDERS: dict[str, Contender] = {"engine": engine_askers, "http": http_askers}

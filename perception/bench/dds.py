@@ -1,0 +1,87 @@
+"""Contenders of `bench query` that go through the query node on DDS: `dds` by its service, `dds-topics` by topics.
+
+On topics every client gets the answers of all, and one that is more than 64 behind loses some: it asks again after two
+seconds, as a planner would, so such an answer is late (see the 99 %) and not lost.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from perception.bench.askers import Ask, Best, Contender, Served
+from perception.node.client import NodeClient, cloud_rows
+from perception.node.config import NodeConfig
+
+_SECONDS = 60.0
+
+
+@contextmanager
+def _node(path: Path) -> Iterator[tuple[NodeConfig, int]]:
+    """`perception node` in a process of its own on the loopback, on a domain nobody else here has."""
+    config = NodeConfig(
+        namespace=f"bench{os.getpid()}", transport="dds", domain=20 + os.getpid() % 200, network="localhost"
+    )
+    command = [sys.executable, "-m", "perception.cli", "node", str(path), "--transport", "dds"]
+    seat = ["--namespace", config.namespace, "--domain", str(config.domain), "--network", "localhost"]
+    more = ["--set", f"timeout={_SECONDS}", "--set", "watch=3600", "--set", "discovery_seconds=0.2"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    node = subprocess.Popen([*command, *seat, *more], stderr=subprocess.PIPE, text=True, env=environment)
+    try:
+        assert node.stderr is not None
+        told = node.stderr.readline()
+        if not told.startswith("serving "):
+            raise RuntimeError(f"the node did not start: {told}{node.stderr.read()}")
+        yield config, node.pid
+    finally:
+        node.terminate()
+        node.wait()
+
+
+@contextmanager
+def service_askers(path: Path) -> Iterator[Served]:
+    """Each client is a DDS participant that calls the query service; the answer is JSON."""
+    with _node(path) as (config, process):
+
+        def client() -> Ask:
+            asker = NodeClient(config, retry=_SECONDS)
+            asker.wait_for_node(_SECONDS)
+
+            def ask(text: str) -> Best:
+                (told,) = asker.query([{"text": text, "top_k": 1}], _SECONDS)
+                if not isinstance(told, dict) or told["text"] != text:
+                    raise RuntimeError(f"asked for {text!r}, answered {str(told)[:80]}")
+                hits = told["hits"]
+                return (hits[0]["instance_id"], hits[0]["num_points"]) if hits else None
+
+            return ask
+
+        yield Served(client, process)
+
+
+@contextmanager
+def topic_askers(path: Path) -> Iterator[Served]:
+    """Each client publishes its prompt and waits for all four messages of the answer, points included."""
+    with _node(path) as (config, process):
+
+        def client() -> Ask:
+            asker = NodeClient(config)
+            asker.wait_for_node(_SECONDS)
+
+            def ask(text: str) -> Best:
+                answer = asker.ask({"text": text, "top_k": 1}, _SECONDS)
+                if answer.facts["text"] != text or answer.points is None:
+                    raise RuntimeError(f"asked for {text!r}, answered {str(answer.facts)[:80]}")
+                rows = cloud_rows(answer.points)
+                return (int(rows["instance_id"][0]), len(rows)) if len(rows) else None
+
+            return ask
+
+        yield Served(client, process)
+
+
+DDS_CONTENDERS: dict[str, Contender] = {"dds": service_askers, "dds-topics": topic_askers}

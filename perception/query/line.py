@@ -1,0 +1,104 @@
+"""What stands behind the engine: the line of waiting questions, and the figures of what became of them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from perception.query.opened import LoadedMap
+
+_REMEMBERED = 1000
+"""Latencies kept for the health figures."""
+
+
+@dataclass(eq=False)
+class Job:
+    """A question, who waits for its answer, and since and until when (monotonic seconds)."""
+
+    work: Callable[[LoadedMap], Any]
+    future: Future[Any]
+    asked: float
+    deadline: float
+
+
+class Line:
+    """Jobs waiting their turn, at most `most`; those nobody waits for any more make room for others."""
+
+    def __init__(self, most: int, drop: Callable[[Job], None]) -> None:
+        self.most, self._drop = most, drop
+        self._jobs: deque[Job] = deque()
+        self._changed = threading.Condition()
+        self._open = True
+
+    def __len__(self) -> int:
+        return len(self._jobs)
+
+    def join(self, job: Job) -> bool:
+        """False when the line is full or closed."""
+        late: list[Job] = []
+        with self._changed:
+            if len(self._jobs) >= self.most:
+                now = time.monotonic()
+                late = [waiting for waiting in self._jobs if waiting.future.cancelled() or now > waiting.deadline]
+                self._jobs = deque(waiting for waiting in self._jobs if waiting not in late)
+            taken = self._open and len(self._jobs) < self.most
+            if taken:
+                self._jobs.append(job)
+                self._changed.notify()
+        for waiting in late:
+            self._drop(waiting)
+        return taken
+
+    def next(self) -> Job | None:
+        """The job that waited longest, None once the line is closed; blocks."""
+        with self._changed:
+            while self._open and not self._jobs:
+                self._changed.wait()
+            return self._jobs.popleft() if self._open else None
+
+    def close(self) -> list[Job]:
+        """Ends the line; returns those that still waited."""
+        with self._changed:
+            self._open = False
+            self._changed.notify_all()
+            left, self._jobs = list(self._jobs), deque()
+        return left
+
+
+class Figures:
+    """Totals and recent latencies."""
+
+    _NAMES = ("answered", "bad_input", "failed", "refused", "timed_out", "reloads")
+
+    def __init__(self) -> None:
+        self._totals: Counter[str] = Counter()
+        self._recent: deque[float] = deque(maxlen=_REMEMBERED)
+        self._lock = threading.Lock()
+        self._started = time.monotonic()
+
+    def count(self, name: str) -> None:
+        with self._lock:
+            self._totals[name] += 1
+
+    def answered(self, seconds: float) -> None:
+        with self._lock:
+            self._totals["answered"] += 1
+            self._recent.append(seconds)
+
+    def to_json(self) -> dict[str, Any]:
+        with self._lock:
+            recent = np.array(self._recent) * 1e3
+            totals = {name: self._totals[name] for name in self._NAMES}
+        latency = {}
+        if len(recent):
+            median, high = np.percentile(recent, [50, 99])
+            latency = {"median_ms": round(float(median), 2), "p99_ms": round(float(high), 2)}
+        return {"uptime_s": round(time.monotonic() - self._started, 1), **totals, **latency}
