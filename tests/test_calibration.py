@@ -166,7 +166,8 @@ def test_too_few_too_alike_and_never_seen(pictures, tmp_path, capsys) -> None:
     alike = tmp_path / "alike"
     alike.mkdir()
     for number in range(8):  # moved, never tilted
-        pose = np.array([0.0, 0, 0, -0.08 + 0.02 * (number % 3), -0.1 + 0.03 * (number // 3), 0.3])
+        far = 0.3 if camera.model == "pinhole" else 0.15
+        pose = np.array([0.0, 0, 0, -0.1 + 0.02 * (number % 3), -0.12 + 0.02 * (number // 3), far])
         cv2.imwrite(str(alike / f"{number}.png"), render_board(CHARUCO, camera, pose, number))
     assert "too alike" in told(alike)
 
@@ -187,6 +188,22 @@ def test_too_few_too_alike_and_never_seen(pictures, tmp_path, capsys) -> None:
     assert "--squares" in told(folder, "--squares", "eight")
     assert "--dictionary" in told(folder, "--dictionary", "9X9_1")
     assert "--marker" in told(folder, "--marker", "0.5")
+
+
+def test_refined_corners_lie_where_the_board_is() -> None:
+    camera = CAMERAS["pinhole"]
+    coarse, fine = [], []
+    for number, pose in enumerate(board_views(CHARUCO, camera, 4)):
+        picture = render_board(CHARUCO, camera, pose, number)
+        found = CHARUCO.detect("x", picture)
+        assert found is not None
+        true = project("pinhole", camera.values, pose, found.board_points)[0]
+        fine.append(np.linalg.norm(found.pixels - true, axis=1))
+        corners = np.asarray(CHARUCO._charuco_board().getChessboardCorners())
+        pixels, ids = cv2.aruco.CharucoDetector(CHARUCO._charuco_board()).detectBoard(picture)[:2]
+        true = project("pinhole", camera.values, pose, corners[ids.ravel()])[0]
+        coarse.append(np.linalg.norm(pixels.reshape(-1, 2) - true, axis=1))
+    assert np.median(np.concatenate(fine)) < 0.03 < np.median(np.concatenate(coarse))
 
 
 def test_distinct_views_are_those_that_moved() -> None:

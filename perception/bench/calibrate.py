@@ -70,7 +70,7 @@ def calibrate_known(work: Path, board: Board, camera: KnownCamera, args: argpars
     """One rendered set calibrated: rows of every parameter, and the camera file's path."""
     make_boards(work / "boards", board, camera, args.views, args.noise)
     began = time.process_time()
-    result, _ = run_calibration(work / "boards", work / "camera.yaml", board, "auto", work / "detections")
+    result, _ = run_calibration(work / "boards", work / "camera.yaml", board, camera.model, work / "detections")
     found = result["parameters"]
     rows = {
         name: {"true": float(true), **found.get(name, {"value": 0.0, "sigma": 0.0})}
@@ -80,7 +80,6 @@ def calibrate_known(work: Path, board: Board, camera: KnownCamera, args: argpars
         row["error"] = row["value"] - row["true"]
     return {
         "model": camera.model,
-        "found_model": result["model"],
         "board": str(board),
         "views": len(result["views"]),
         "reprojection_error_px": result["reprojection_error_px"],
@@ -173,7 +172,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _table(result: dict[str, Any]) -> str:
     lines = [
-        f"{result['model']} (found: {result['found_model']}), {result['board']}, {result['views']} views, "
+        f"{result['model']}, {result['board']}, {result['views']} views, "
         f"{result['reprojection_error_px']:.3f} px, corners cover {result['coverage']:.0%}, "
         f"{result['cpu_seconds']:.1f} CPU s",
         f"{'':6}{'true':>12}{'error':>12}{'sigma':>12}{'error/sigma':>12}",

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from perception.calibration.refine import refine
 from perception.errors import InputError
 
 MIN_CORNERS = 8
@@ -65,8 +66,7 @@ class Board:
         """The board as a picture [H, W] uint8, its top left square starting `margin` pixels from the corner."""
         columns, rows = self.squares
         if self.kind == "charuco":
-            size = (columns * pixels_per_square + 2 * margin, rows * pixels_per_square + 2 * margin)
-            return np.asarray(self._charuco_board().generateImage(size, None, margin))
+            return self._print(self._charuco_board(), pixels_per_square, margin)
         cells = (np.add.outer(np.arange(rows), np.arange(columns)) % 2 * 255).astype(np.uint8)
         grid = np.kron(cells, np.ones((pixels_per_square, pixels_per_square), np.uint8))
         return np.pad(grid, margin, constant_values=255)
@@ -78,20 +78,27 @@ class Board:
         return board
 
     @cached_property
-    def _detectors(self) -> list[tuple[Any, np.ndarray]]:
-        """Today's pattern, then that of boards printed with OpenCV before 4.6, which differs for even rows."""
+    def _detectors(self) -> list[tuple[Any, np.ndarray, np.ndarray]]:
+        """(detector, corners, print) of today's pattern, then of boards printed with OpenCV before 4.6, which differ
+        for even rows."""
         boards = [self._charuco_board(legacy) for legacy in (False, True)]
-        return [(cv2.aruco.CharucoDetector(board), np.asarray(board.getChessboardCorners())) for board in boards]
+        return [
+            (cv2.aruco.CharucoDetector(board), np.asarray(board.getChessboardCorners()), self._print(board))
+            for board in boards
+        ]
+
+    def _print(self, board: Any, per_square: int = 60, margin: int = 30) -> np.ndarray:
+        columns, rows = self.squares
+        size = (columns * per_square + 2 * margin, rows * per_square + 2 * margin)
+        return np.asarray(board.generateImage(size, None, margin))
 
     def _charuco(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        best = None
-        for detector, corners in self._detectors:
+        for detector, corners, texture in self._detectors:
             pixels, ids, _, _ = detector.detectBoard(picture)
-            if ids is not None and (best is None or len(ids) > len(best[0])):
-                best = corners[np.ravel(ids)], np.reshape(pixels, (-1, 2))
-            if best is not None and len(best[0]) >= MIN_CORNERS:
-                break
-        return best
+            if ids is not None and len(ids) >= MIN_CORNERS:
+                points = corners[np.ravel(ids)]
+                return points, refine(picture, points, np.reshape(pixels, (-1, 2)), self.square, texture, 60, 30)
+        return None
 
     def _checkerboard(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         columns, rows = self.squares[0] - 1, self.squares[1] - 1
