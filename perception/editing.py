@@ -121,7 +121,10 @@ class Editor:
         arrays["instance_ids"] = now.ids[kept]
         arrays["membership"] = np.where(now.ids[kept] >= 0, self.original.membership[kept], 0).astype(np.float32)
         language = to_arrays(now.descriptions, self._encoder) if self._encoder else {}
-        return dataclasses.replace(self.original, **arrays, instances=list(now.instances), language=language)
+        parts = {name: array[kept] if name == "ids" else array for name, array in self.original.parts.items()}
+        return dataclasses.replace(
+            self.original, **arrays, instances=list(now.instances), language=language, parts=parts
+        )
 
     # ------------------------------------------------------------------ editing
 

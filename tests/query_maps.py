@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.bench.synthetic_map import write_synthetic_map
+from perception.language.colors import without_color_words
 
 NAMES = ["mug", "banana", "laptop", "teapot", "kettle", "lamp", "violin", "anchor", "drum"]
 
@@ -22,7 +23,8 @@ class HashEncoder:
     def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
         rows = []
         for text in texts:
-            seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little")
+            words = without_color_words(text)  # which the ranking takes off a prompt
+            seed = int.from_bytes(hashlib.sha256(words.encode()).digest()[:8], "little")
             rows.append(np.random.default_rng(seed).normal(size=self.dim))
         out = np.array(rows).reshape(-1, self.dim)
         return (out / np.linalg.norm(out, axis=1, keepdims=True)).astype(np.float32)

@@ -22,7 +22,7 @@ def cloud(count: int = 50, seed: int = 0) -> Gaussians:
 
 
 def statistics(count: int, gradient: float = 1.0) -> Statistics:
-    return Statistics(torch.full((count,), gradient), torch.ones(count), torch.ones(count), torch.ones(count))
+    return Statistics(torch.full((count,), gradient), torch.ones(count), torch.ones(count))
 
 
 @pytest.mark.parametrize("allowed", [0, 10, 50, 51, 70, 1000])

@@ -21,7 +21,7 @@ from perception.bench.truth import read_truth, truth_view_scores  # noqa: E402
 from perception.errors import InputError  # noqa: E402
 from perception.instances.crops import choose_views  # noqa: E402
 from perception.instances.describe import describe_instances  # noqa: E402
-from perception.language.conse import SIDE, TOP, ConseEncoder, _cached, class_names  # noqa: E402
+from perception.language.conse import SIDE, TAU, TOP, ConseEncoder, _cached, class_names  # noqa: E402
 from perception.language.minilm import MiniLM, _wheel_folder  # noqa: E402
 from perception.language.ranking import Ranker  # noqa: E402
 
@@ -82,10 +82,26 @@ def test_combination_is_the_formula(encoder: Any) -> None:
         mean = sentences.encode(names[c]).astype(np.float64).mean(0)
         assert np.allclose(encoder._classes[c], mean / np.linalg.norm(mean), atol=1e-5)
     classes = encoder._classes.astype(np.float64)
-    for row, found in zip(p, encoder.combine(p), strict=True):
+    for row, found in zip(p.astype(np.float64), encoder.combine(p), strict=True):
         top = np.argsort(-row)[:TOP]
-        expected = (np.sqrt(row[top].astype(np.float64))[:, None] * (classes[top] - classes.mean(0))).sum(0)
-        assert np.allclose(found, expected / np.linalg.norm(expected), atol=1e-5)
+        sentence = (np.sqrt(row[top])[:, None] * (classes[top] - classes.mean(0))).sum(0)
+        expected = np.concatenate([sentence / np.linalg.norm(sentence), np.sqrt(row)])
+        assert np.allclose(found, expected / np.sqrt(2), atol=1e-3)  # √p is kept in steps of 1/1024
+
+
+def test_a_text_means_its_nearest_classes(encoder: Any) -> None:
+    """√q against the definition in float64; a class's own name means mostly that class."""
+    classes = encoder._classes.astype(np.float64)
+    centred = classes - classes.mean(0)
+    centred /= np.linalg.norm(centred, axis=1, keepdims=True)
+    meant = encoder.encode_texts(["teapot", "household pet"])[:, 384:].astype(np.float64) * np.sqrt(2)
+    for text, row in zip(["teapot", "household pet"], meant, strict=True):
+        s = MiniLM().encode([text])[0] - classes.mean(0)
+        cosines = centred @ (s / np.linalg.norm(s))
+        q = np.exp(cosines / TAU) / np.exp(cosines / TAU).sum()
+        assert np.allclose(row, np.sqrt(q), atol=1e-3)
+    assert meant[0].argmax() == 849 and meant[0].max() ** 2 > 0.5
+    assert 151 <= meant[1].argmax() <= 285  # dogs and cats
 
 
 def test_texts_and_classes_share_the_space(encoder: Any) -> None:
@@ -104,7 +120,7 @@ def test_batching_changes_nothing(encoder: Any) -> None:
     rows = encoder.encode_texts(many[:50])
     assert np.allclose(rows[7], encoder.encode_texts([many[7]])[0], atol=1e-5)
     every = encoder.encode_texts(many)
-    assert every.shape == (10_000, 384) and np.allclose(every, np.tile(rows, (200, 1)), atol=1e-5)
+    assert every.shape == (10_000, 1384) and np.allclose(every, np.tile(rows, (200, 1)), atol=1e-5)
 
 
 def test_class_cache_is_used_and_survives_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,7 +26,7 @@ from perception.language.colors import palette
 class MeanColor:
     """A hand-made encoder: the mean colour of a picture, scaled to length 1."""
 
-    identity, dim, templates, references = "mean-color", 3, ("{}",), None
+    identity, dim, templates = "mean-color", 3, ("{}",)
 
     def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
         means = np.array([i.reshape(-1, 3).mean(0) for i in images], np.float32)

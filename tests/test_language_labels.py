@@ -12,7 +12,7 @@ from perception.cli import main
 from perception.errors import InputError
 from perception.geometry import look_at
 from perception.instances.survival import carry_labels, match_instances
-from perception.io.labels import set_labels
+from perception.io.labels import give_names
 from perception.io.store import GaussianMap, read_map, write_map
 
 PLACES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1.2, 1, 0.2]])
@@ -30,7 +30,11 @@ def a_map(places: np.ndarray, seed: int, names: list[str | None] | None = None) 
     return GaussianMap(
         means.astype(np.float32), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, 3)), np.zeros(count),
         np.zeros((count, 1, 3)), np.zeros((count, 2)), ids.astype(np.int32), np.ones(count),
-        [{"id": i, "label": name, "score": 1.0} for i, name in enumerate(labels)], {},
+        [
+            {"id": i, "label": name, "score": 1.0, "centroid": places[i].tolist(), "num_gaussians": 300,
+             "obb": {"center": places[i].tolist(), "rotation": np.eye(3).tolist(), "extent": [0.2, 0.2, 0.2]}}
+            for i, name in enumerate(labels)
+        ], {},
         {"names": np.array([f"{k}.jpg" for k in range(6)]), "camera_from_world": poses},
     )  # fmt: skip
 
@@ -60,7 +64,7 @@ def test_label_and_clear(map_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["9", "cup"], "has no instance 9; its ids are 0 to 3"),
+        (["9", "cup"], "has no instance 9; it has 4"),
         (["1", "  "], "label: it is empty"),
         (["1", "x" * 300], "300 characters"),
         (["1"], "no NAME given"),
@@ -80,7 +84,7 @@ def test_bad_labels_change_nothing(
 
 def test_no_map_is_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is no map"):
-        set_labels(tmp_path, {0: "cup"})
+        give_names(tmp_path, {0: "cup"})
 
 
 def test_names_follow_the_place_not_the_id(tmp_path: Path) -> None:

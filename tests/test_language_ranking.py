@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from perception.errors import InputError
+from perception.language.base import Part, Reading
 from perception.language.colors import (
     color_match,
     color_share,
@@ -25,6 +28,7 @@ from perception.language.description import (
     unseen,
 )
 from perception.language.ranking import Ranker, probes, rank
+from perception.language.shape_words import KINDS
 
 DIM = 24
 
@@ -32,8 +36,7 @@ DIM = 24
 class Table:
     """A hand-made encoder: known words have known vectors, every other text a fixed random direction."""
 
-    identity, dim, templates, references = "table", DIM, ("{}",), None
-    margin, canonical = 0.0, ()
+    identity, dim, templates = "table", DIM, ("{}",)
 
     def __init__(self, known: dict[str, np.ndarray]) -> None:
         self.known = known
@@ -203,3 +206,80 @@ def test_stored_form_round_trips(scene: tuple[Table, list[InstanceDescription]])
 def test_another_encoder_is_refused() -> None:
     with pytest.raises(InputError, match="made by 'conse-2', the encoder in use is 'clip/x'"):
         check_encoder("conse-2", "clip/x")
+
+
+class Read(Table):
+    """The table with a reading of its own."""
+
+    def __init__(self, known: dict[str, np.ndarray], reading: Reading) -> None:
+        super().__init__(known)
+        self.reading = reading
+
+
+def _z(scores: list[tuple[int, float]]) -> np.ndarray:
+    """Scores back on the normal scale, in the order of the instances."""
+    return np.array([norm.ppf(s) for _, s in sorted(scores)])
+
+
+def test_a_margin_is_taken_off_every_answer(scene: tuple[Table, list[InstanceDescription]]) -> None:
+    encoder, things = scene
+    for text in ("plate", "vague prompt"):
+        plain = _z(rank(text, things, encoder).hits)
+        strict = _z(rank(text, things, Read(encoder.known, Reading(margin=0.7))).hits)
+        assert np.allclose(plain - strict, 0.7, atol=1e-6)
+
+
+def test_shapes_add_by_kind_and_only_where_named(scene: tuple[Table, list[InstanceDescription]]) -> None:
+    encoder, things = scene
+    shapes = np.zeros((len(things), len(KINDS)))
+    shapes[3, KINDS.index("wall")], shapes[1, KINDS.index("box")] = 1.0, 0.75
+    flat, shaped = Ranker(things, encoder), Ranker(things, encoder, shapes=lambda: shapes)
+    wall = _z(shaped.rank("brick wall").hits) - _z(flat.rank("brick wall").hits)
+    assert np.allclose(wall, [-3, -3, -3, 3], atol=1e-6)
+    box = _z(shaped.rank("box").hits) - _z(flat.rank("box").hits)
+    assert np.allclose(box, [0, 1.5, 0, 0], atol=1e-6)
+    assert shaped.rank("plate").hits == flat.rank("plate").hits
+    assert flat.shapes is None and shaped.over(things, shapes).rank("box").hits == shaped.rank("box").hits
+
+
+def test_canonical_phrases_cap_what_they_fit_better() -> None:
+    """LERF's relevancy by hand: at equal fit one half, which is the threshold; below it no answer is present."""
+    axes = np.eye(DIM)
+    known = {"mug": axes[0], "thing": (axes[0] + axes[1]) / np.sqrt(2)}
+    things = [_thing(axes[0]), _thing((axes[0] + 2 * axes[1]) / np.sqrt(5)), _thing(axes[3])]
+    free = dict(Ranker(things, Table(known)).rank("mug").hits)
+    capped = dict(Ranker(things, Read(known, Reading(canonical=("thing",)))).rank("mug").hits)
+    for i, thing in enumerate(things):
+        own, rival = (float(thing.embedding @ known[name]) for name in ("mug", "thing"))
+        relevancy = np.exp(10 * own) / (np.exp(10 * own) + np.exp(10 * rival))
+        assert capped[i] == pytest.approx(min(free[i], 1.6 * relevancy), abs=1e-6)
+    assert capped[1] < 0.1
+
+
+def test_parts_are_compared_each_on_its_own() -> None:
+    """Two parts of weight .3 and .7: what another length of one part's numbers would change, changes nothing."""
+    rng = np.random.default_rng(0)
+    halves = rng.normal(size=(5, 2, DIM // 2))
+    halves /= np.linalg.norm(halves, axis=2, keepdims=True)
+    texts = {name: rng.normal(size=DIM) for name in ("mug", "plate")}
+    reading = Reading((Part(DIM // 2, 0.3), Part(DIM, 0.7)))
+    orders = []
+    for scale in (1.0, 5.0):
+        rows = np.concatenate([halves[:, 0], scale * halves[:, 1]], axis=1) / np.sqrt(1 + scale**2)
+        ranker = Ranker([_thing(row) for row in rows], Read(texts, reading))
+        orders.append([ranker.rank(name).hits for name in texts])
+    for (i, a), (j, b) in zip(chain(*orders[0]), chain(*orders[1]), strict=True):
+        assert i == j and a == pytest.approx(b, abs=1e-5)
+    less = halves - 0.5 * halves.mean(axis=0)
+    less /= np.linalg.norm(less, axis=2, keepdims=True)
+    mug = texts["mug"].reshape(2, -1) / np.linalg.norm(texts["mug"].reshape(2, -1), axis=1, keepdims=True)
+    x = 0.3 * less[:, 0] @ mug[0] + 0.7 * less[:, 1] @ mug[1]
+    assert [i for i, _ in orders[0][0]] == np.argsort(-x).tolist()
+    assert np.allclose(ranker.relevancy(["mug"])[0], x, atol=1e-5)
+
+
+@pytest.mark.parametrize("text", ["красная кружка", "赤いマグカップ", "🙂", "كوب", "mug; DROP TABLE", "a" * 5000])
+def test_any_script_gets_an_answer(scene: tuple[Table, list[InstanceDescription]], text: str) -> None:
+    encoder, things = scene
+    hits = rank(text, things, encoder).hits
+    assert sorted(i for i, _ in hits) == [0, 1, 2, 3] and all(0 <= s <= 1 for _, s in hits)

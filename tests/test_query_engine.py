@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -197,6 +200,27 @@ def test_a_map_deleted_or_spoilt_while_served_is_told_and_the_old_one_answers(pa
         shutil.rmtree(path)
         shutil.copytree(spare, path)
         _until(lambda: engine.health()["status"] == "ok")
+
+
+def test_files_cut_in_place_while_served_do_not_end_the_process(path: Path) -> None:
+    """Whoever reads a mapped page behind the end of a cut file dies by SIGBUS, so answers must need none."""
+    code = (
+        "import sys; from pathlib import Path; from query_maps import NAMES, encoders\n"
+        "from perception.query import QueryEngine, Where\n"
+        "path = Path(sys.argv[1])\n"
+        "with QueryEngine(path, watch=None, encoders=encoders) as engine:\n"
+        "    for file in path.iterdir():\n        file.open('r+b').truncate(0)\n"
+        "    found = [engine.ask(name).hits[0].instance_id for name in NAMES]\n"
+        "    near = engine.wait(engine.run(lambda gmap: gmap.nearest([0, 0, 0], 9, where=Where(min_size=0.1))))\n"
+        "    told = engine.wait(engine.run(lambda gmap: gmap.describe(3).to_json()))\n"
+        "    assert found == list(range(9)) and len(near) == 9 and told['num_points'] > 0\n"
+    )
+    tests = Path(__file__).resolve().parent
+    environment = {**os.environ, "PYTHONPATH": f"{tests.parent}{os.pathsep}{tests}"}
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(path)], env=environment, cwd=path.parent, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_encoders_are_shared_between_the_old_map_and_the_new(path: Path) -> None:

@@ -200,3 +200,46 @@ def test_non_contiguous_input_is_accepted():
         for k, v in inputs.items()
     }
     assert torch.equal(perception.rasterize(**strided).colors, perception.rasterize(**inputs).colors)
+
+
+def huge_gaussians(n, width, height):
+    """Faint Gaussians that each cover the whole picture; inputs of the low-level functions."""
+    g = torch.Generator().manual_seed(4)
+    uniform = lambda *shape: torch.rand(shape, generator=g, dtype=torch.float64)  # noqa: E731
+    means = (uniform(n, 3) - 0.5) * 0.5 + torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64)
+    k = torch.tensor([[[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]], dtype=torch.float64)
+    view = torch.eye(4, dtype=torch.float64)[None]
+    return (
+        means,
+        uniform(n, 4) - 0.5,
+        3 + uniform(n, 3),
+        0.01 * uniform(n) + 0.01,
+        uniform(n, 3),
+        uniform(n, 3),
+        view,
+        k,
+    )
+
+
+def test_gradients_do_not_depend_on_the_records_held_at_once():
+    from perception.gaussians.rasterize import Settings, rasterize_backward, rasterize_forward
+
+    inputs, results = huge_gaussians(90, 300, 200), []
+    for max_records in (0, 1, 100, 700):  # 20 tiles × 90 Gaussians: in one part, a tile a part, several
+        settings = Settings(300, 200, threads=2, max_records=max_records)
+        out = rasterize_forward(inputs, None, settings)
+        cotangents = (torch.sin(out.colors * 40), None, None, torch.cos(out.features * 30), out.feature_variance)
+        grads, mean2d = rasterize_backward(inputs, None, settings, out, cotangents, (True,) * 7)
+        results.append([*grads, mean2d])
+    for other in results[1:]:
+        for a, b in zip(results[0], other, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10 * float(a.abs().max()))
+
+
+def test_more_tiles_than_the_lists_hold_are_refused_before_they_take_memory():
+    inputs = [t.float() for t in huge_gaussians(20_000, 1 << 14, 1 << 14)]
+    means, quats, scales, opacities, colors, _, viewmats, ks = inputs
+    with pytest.raises(
+        perception.InputError, match=r"20000 Gaussians in view touch 1310720000 tiles .* at most 536870912"
+    ):
+        perception.rasterize(means, quats, scales, opacities, colors, viewmats, ks, 1 << 14, 1 << 14, depth=False)

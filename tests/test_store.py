@@ -216,9 +216,14 @@ def test_an_array_that_claims_to_be_giant_allocates_nothing(copied: Path) -> Non
 
 @pytest.mark.filterwarnings("ignore:Reading `.npy` or `.npz` file required additional header parsing")
 @given(name=st.sampled_from([*STRICT, "map.json", "instances.json"]), seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(
+    max_examples=int(os.environ.get("PERCEPTION_FUZZ", "150")), deadline=None, suppress_health_check=list(HealthCheck)
+)
 def test_random_damage_without_checksums_never_escapes_as_anything_else(mangled: Path, name: str, seed: int) -> None:
-    """Bytes changed, cut out or repeated anywhere, most often in the header: an InputError, or a map that is whole."""
+    """Bytes changed, cut out or repeated anywhere, most often in the header: an InputError, or a map that is whole.
+
+    PERCEPTION_FUZZ=10000 for a longer run.
+    """
     raw = (mangled / name).read_bytes()
     rng = np.random.default_rng(seed)
     changed = bytearray(raw)
@@ -340,7 +345,7 @@ def test_many_writers_at_once_lose_no_label(copied: Path) -> None:
 
 
 def test_a_writer_killed_at_any_moment_leaves_a_map_that_opens(copied: Path) -> None:
-    """SIGKILL at fixed delays while one process rewrites the map and its labels over and over."""
+    """SIGKILL while a process rewrites the map and its labels over and over; PERCEPTION_KILLS=100 for a longer run."""
     code = (
         "import sys; from pathlib import Path; from perception.io.store import read_map, set_labels, write_map\n"
         "path = Path(sys.argv[1]); gmap = read_map(path); print('go', flush=True); n = 0\n"
@@ -348,7 +353,7 @@ def test_a_writer_killed_at_any_moment_leaves_a_map_that_opens(copied: Path) -> 
     )
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     means = read_map(copied).means
-    for delay in (0.0, 0.003, 0.011, 0.029, 0.05):
+    for delay in np.random.default_rng(0).uniform(0, 0.08, int(os.environ.get("PERCEPTION_KILLS", "4"))):
         writer = subprocess.Popen(
             [sys.executable, "-c", code, str(copied)], stdout=subprocess.PIPE, env=environment, cwd=copied.parent
         )

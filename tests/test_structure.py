@@ -15,7 +15,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "perception"
 LAYERS = [
     {"errors", "types", "config", "boxes", "geometry", "progress", "_core", "pictures"},
     {"io"},
-    {"masks", "demo"},
+    {"masks", "demo", "calibration", "bags"},
     {"gaussians"},
     {"language", "instances"},
     {

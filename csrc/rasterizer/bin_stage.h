@@ -1,14 +1,32 @@
 // Stage 3: the list of splats of every 64x64-pixel tile, by bounding box, in depth order.
 #pragma once
 #include <algorithm>
+#include <stdexcept>
+#include <string>
 
 #include "scratch.h"
 
 namespace perception::PERCEPTION_LEVEL {
 
+// How many tiles the splats' boxes touch in all; refuses more than the lists may hold.
+template <class T>
+uint64_t count_listed(const Frame<T> &f) {
+  uint64_t total = 0;
+  for (uint32_t i = 0; i < f.count; ++i) {
+    const Splat<T> &s = f.splats[i];
+    total += static_cast<uint64_t>(s.x1 - s.x0 + 1) * (s.y1 - s.y0 + 1);
+  }
+  if (total > kMaxListed)
+    throw std::length_error(std::to_string(f.count) + " Gaussians in view touch " + std::to_string(total) +
+                            " tiles of 64 x 64 pixels, expected at most " + std::to_string(kMaxListed) +
+                            "; render fewer or smaller Gaussians, or a smaller image");
+  return total;
+}
+
 template <class T>
 void bin_splats(const Options &opt, Frame<T> &f, Scratch<T> &scratch) {
   const int tiles = f.tiles_x * f.tiles_y;
+  uint32_t *list = f.list.reserve(count_listed(f));
   const uint32_t n = f.count;
   const int parts = static_cast<int>(n / 16384 + 1 < static_cast<uint32_t>(opt.threads) ? n / 16384 + 1 : opt.threads);
   const uint32_t *order = scratch.order[0].data();
@@ -37,9 +55,7 @@ void bin_splats(const Options &opt, Frame<T> &f, Scratch<T> &scratch) {
     }
     tile_order[tile] = tile;
   }
-  if (total >= UINT32_MAX) throw std::bad_alloc();
   offsets[tiles] = static_cast<uint32_t>(total);
-  uint32_t *list = f.list.reserve(total);
   parallel_for(parts, parts, [&](std::size_t part, int) {
     uint32_t *h = histograms + part * tiles;
     each_tile(part, [h, list](int tile, uint32_t splat) { list[h[tile]++] = splat; });

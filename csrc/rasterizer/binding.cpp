@@ -89,6 +89,7 @@ struct Arguments {
   T near_plane;
   int threads;
   bool depth, variance;
+  int64_t max_records;
 
   perception::Inputs<T> inputs() {
     perception::Inputs<T> in{};
@@ -125,7 +126,8 @@ struct Arguments {
   }
   perception::Options options(const perception::Inputs<T> &in) const {
     if (threads < 1 || threads > 1024) throw std::invalid_argument("threads: expected 1 to 1024");
-    return {threads, depth || in.dims > 0, variance && in.dims > 0};
+    if (max_records < 0) throw std::invalid_argument("max_records: expected 0 or more");
+    return {threads, depth, variance && in.dims > 0, max_records};
   }
 };
 
@@ -210,14 +212,15 @@ void bind(nb::module_ &m, const char *suffix) {
           [](Arguments<T> *self, Array<const T> means, Array<const T> quats, Array<const T> scales,
              Array<const T> opacities, Array<const T> colors, Optional<const T> features, Array<const T> viewmats,
              Array<const T> Ks, Optional<const T> background, int width, int height, int sh_degree, double near_plane,
-             int threads, bool depth, bool variance) {
+             int threads, bool depth, bool variance, int64_t max_records) {
             new (self) Arguments<T>{means, quats, scales, opacities, colors, features, viewmats, Ks, background,
-                                    width, height, sh_degree, static_cast<T>(near_plane), threads, depth, variance};
+                                    width, height, sh_degree, static_cast<T>(near_plane), threads, depth, variance,
+                                    max_records};
           },
           "means"_a.noconvert(), "quats"_a.noconvert(), "scales"_a.noconvert(), "opacities"_a.noconvert(),
           "colors"_a.noconvert(), "features"_a.noconvert().none(), "viewmats"_a.noconvert(), "Ks"_a.noconvert(),
           "background"_a.noconvert().none(), "width"_a, "height"_a, "sh_degree"_a, "near_plane"_a, "threads"_a,
-          "depth"_a, "variance"_a);
+          "depth"_a, "variance"_a, "max_records"_a);
   m.def(name("rasterize_forward").c_str(),
         [](Arguments<T> &inputs, Array<T> colors, Array<T> alphas, Optional<T> depths, Optional<T> features,
            Optional<T> variance, Array<uint8_t> visible, Optional<T> radii, const std::string &simd) {

@@ -1,13 +1,14 @@
 // Stage 5: the backward pass, splat by splat over each 16x16 tile, replaying the blending front to back. With
 //   cg = Σ_channels (cotangent · value of this splat),  R = Σ over the splats behind of w cg,
-// dL/dalpha = T cg - R / (1 - alpha): two numbers a pixel, T and R, whatever the number of channels.
+// dL/dalpha = T cg - R / (1 - alpha), so dL/d ln alpha = w (cg - R / T'), T' the transmittance behind this splat: two
+// numbers a pixel, T and R, whatever the number of channels.
 //
 // The variance enters linearly: with V = Σ w f² - S², S = Σ w f, and any constant c (here the features of the tile's
 // first splat, so that large common offsets do not cancel), e = f - c:
 //   g S + v V has dL/dw = (g - 2 v (S - c)) e + v e² + const,  const = c g + v (c² - 2 S c),
 // and a constant channel is the accumulated alpha, whose gradient is const T_final / (1 - alpha).
 #pragma once
-#include "supertile.h"
+#include "blend_forward.h"
 
 namespace perception::PERCEPTION_LEVEL {
 
@@ -18,98 +19,121 @@ constexpr int kGeometry = 16;
 
 template <class T, int NF, bool VAR, bool DEPTH>
 struct BackwardTile {
-  static constexpr int kBase = DEPTH ? 4 : 3;
-  static constexpr int kFeatures = NF * (VAR ? 2 : 1);                                     // channels e, e²
-  static constexpr int kRow = (kFeatures + Vec<T>::kLanes - 1) / Vec<T>::kLanes * Vec<T>::kLanes;  // padded
-  static constexpr int kRecord = kGeometry + kRow;
-  alignas(64) T cotangent[16][kBase + kFeatures][16];
-  alignas(64) T by_pixel[16][16][kRow ? kRow : 1];  // the features' cotangents again, a row a pixel
-  alignas(64) T weight[16][16];
-  alignas(64) T transmittance[16][16], behind[16][16];
-  Mask<T> live[16][kParts<T>];
-  uint32_t open;  // granules with a live pixel
+  static constexpr int kChunk = NF ? 64 : 128, kBase = DEPTH ? 4 : 3, kFeatures = NF * (VAR ? 2 : 1);
+  static constexpr int kRow = kFeatureRow<T, NF, VAR>, kRecord = kGeometry + kRow;
+  alignas(64) T px[16][16], py[16][16], transmittance[16][16];
+  alignas(64) T behind[16][16];                                // R
+  alignas(64) T cotangent[16][kBase][16];                      // of red, green, blue, depth
+  alignas(64) T by_channel[16][NF ? kRow : 1][16];             // cotangents of e, e²: a row of pixels a channel
+  alignas(64) T by_pixel[16][16][NF ? kRow : 1];               // the same, a row of channels a pixel
+  alignas(64) T products[NF ? 16 : 1][NF ? kChunk + 32 : 1][16];  // per granule and splat: first Σ_c e g, then the weights
+  uint32_t open;                                               // granules with a pixel that takes light
+  uint32_t counts[16], done[16];                               // splats listed, splats blended
+  uint32_t lists[16][kChunk + 64];
+  uint32_t splats[kChunk];                                     // of the chunk, those that touch a granule
+  uint16_t masks[kChunk + 16];                                 // and which
 };
 
-// Feature channels of one pixel: their cotangents in terms of e = f - shift go to row (e, then e²). Returns what they
-// add to R and, through `constant`, to the alpha channel.
-template <class T, int NF, bool VAR>
-inline T load_pixel_features(int64_t at, int count, const T *shift, T a, const Outputs<T> &out, const Cotangents<T> &grad,
-                             T *row, T &constant) {
+// Sum of NF (a power of two) numbers, in pairs; overwrites them.
+template <int NF, class T>
+inline T pairwise_sum(T *values) {
+  for (int half = NF / 2; half > 0; half /= 2)
+    for (int c = 0; c < half; ++c) values[c] += values[c + half];
+  return values[0];
+}
+
+// Feature channels of one pixel (COUNT of them, a constant NF but in the last slice): their cotangents in terms of
+// e = f - shift go to row (e, then e²). Returns what they add to R and, through `constant`, to the alpha channel.
+template <class T, int NF, bool VAR, class Count>
+inline T load_pixel_features(int64_t at, Count count, const T *shift, T a, const Outputs<T> &out,
+                             const Cotangents<T> &grad, T *row, T &constant) {
   T g[NF] = {}, sum[NF] = {}, behind[NF], steady[NF];
-  copy_channels<NF>(sum, out.features + at, count);
-  if (grad.features) copy_channels<NF>(g, grad.features + at, count);
+  for (int c = 0; c < count; ++c) sum[c] = out.features[at + c];
+  if (grad.features)
+    for (int c = 0; c < count; ++c) g[c] = grad.features[at + c];
   for (int c = 0; c < NF; ++c) behind[c] = g[c] * (sum[c] - shift[c] * a), steady[c] = g[c] * shift[c];
   if constexpr (VAR) {
     T v[NF] = {}, variance[NF] = {};
-    if (grad.variance) {
-      copy_channels<NF>(v, grad.variance + at, count);
-      copy_channels<NF>(variance, out.variance + at, count);
-    }
+    if (grad.variance)
+      for (int c = 0; c < count; ++c) v[c] = grad.variance[at + c], variance[c] = out.variance[at + c];
     for (int c = 0; c < NF; ++c) {
       const T e = sum[c] - shift[c] * a, twice = 2 * v[c] * (sum[c] - shift[c]);
       const T square = variance[c] + e * e - (1 - a) * shift[c] * (shift[c] * a + 2 * e);  // Σ w e²
       g[c] -= twice;
       behind[c] += v[c] * square - twice * e;
       steady[c] += v[c] * shift[c] * (shift[c] - 2 * sum[c]);
-      row[NF + c] = v[c];
     }
+    for (int c = 0; c < NF; ++c) row[NF + c] = v[c];
   }
-  T total = 0;
-  for (int c = 0; c < NF; ++c) row[c] = g[c], total += behind[c], constant += steady[c];
-  return total;
+  for (int c = 0; c < NF; ++c) row[c] = g[c];
+  constant += pairwise_sum<NF>(steady);
+  return pairwise_sum<NF>(behind);
 }
 
-// One pixel's cotangents and R before the first splat.
-template <class T, int NF, bool VAR, bool DEPTH>
-inline void load_pixel(const Inputs<T> &in, const T *background, int64_t pixel, Slice slice, const T *shift,
-                       const Outputs<T> &out, const Cotangents<T> &grad, int g, int i,
-                       BackwardTile<T, NF, VAR, DEPTH> &tile) {
-  const T a = out.alphas[pixel], t = 1 - a;
-  T constant = 0, behind = 0;
+// Cotangents and R before the first splat of row `row`, `columns` of it inside the image (a constant 16 but at the edge).
+template <class T, int NF, bool VAR, bool DEPTH, class Columns, class Count>
+inline void load_row(const Inputs<T> &in, const T *background, int64_t pixel, int row, Columns columns, Slice slice,
+                     Count count, const T *shift, const Outputs<T> &out, const Cotangents<T> &grad,
+                     BackwardTile<T, NF, VAR, DEPTH> &tile) {
+  using Tile = BackwardTile<T, NF, VAR, DEPTH>;
+  T constant[16] = {}, behind[16] = {}, cotangent[4][16] = {};
   if (slice.begin == 0) {
-    if (grad.alphas) constant = grad.alphas[pixel];
-    for (int c = 0; c < 3; ++c) {
-      const T v = grad.colors ? grad.colors[3 * pixel + c] : T(0);
-      tile.cotangent[g][c][i] = v;
-      behind += v * (out.colors[3 * pixel + c] - t * background[c]);
-      constant -= v * background[c];
-    }
-    if constexpr (DEPTH) {
-      const T v = grad.depths ? grad.depths[pixel] : T(0);
-      tile.cotangent[g][3][i] = v;
-      if (grad.depths) behind += v * out.depths[pixel];
-    }
+    if (grad.alphas)
+      for (int i = 0; i < columns; ++i) constant[i] = grad.alphas[pixel + i];
+    if (grad.colors)
+      for (int c = 0; c < 3; ++c)
+        for (int i = 0; i < columns; ++i) {
+          const T g = grad.colors[3 * (pixel + i) + c], t = 1 - out.alphas[pixel + i];
+          cotangent[c][i] = g;
+          behind[i] += g * (out.colors[3 * (pixel + i) + c] - t * background[c]);
+          constant[i] -= g * background[c];
+        }
+    if constexpr (DEPTH)
+      if (grad.depths)
+        for (int i = 0; i < columns; ++i) {
+          cotangent[3][i] = grad.depths[pixel + i];
+          behind[i] += cotangent[3][i] * out.depths[pixel + i];
+        }
   }
   if constexpr (NF > 0)
-    behind += load_pixel_features<T, NF, VAR>(pixel * in.dims + slice.begin, slice.count, shift, a, out, grad,
-                                              tile.by_pixel[g][i], constant);
-  tile.behind[g][i] = behind - constant * t;
+    for (int i = 0; i < columns; ++i)
+      behind[i] += load_pixel_features<T, NF, VAR>(
+          (pixel + i) * in.dims + slice.begin, count, shift, out.alphas[pixel + i], out, grad,
+          tile.by_pixel[(row >> 2) * 4 + (i >> 2)][(row & 3) * 4 + (i & 3)], constant[i]);
+  for (int i = 0; i < columns; ++i) behind[i] -= constant[i] * (1 - out.alphas[pixel + i]);
+  row_to_granules(behind, row, tile.behind[0], 16);
+  for (int c = 0; c < Tile::kBase; ++c) row_to_granules(cotangent[c], row, tile.cotangent[0][c], Tile::kBase * 16);
 }
 
+// (x, y): the 16x16 tile relative to its 64x64 tile at (x0, y0).
 template <class T, int NF, bool VAR, bool DEPTH>
-void load_tile(const Inputs<T> &in, int camera, int x, int y, Slice slice, const T *shift, const Outputs<T> &out,
-               const Cotangents<T> &grad, BackwardTile<T, NF, VAR, DEPTH> &tile) {
-  using Tile = BackwardTile<T, NF, VAR, DEPTH>;
+void load_tile(const Inputs<T> &in, int camera, int x0, int y0, int x, int y, Slice slice, const T *shift,
+               const Outputs<T> &out, const Cotangents<T> &grad, BackwardTile<T, NF, VAR, DEPTH> &tile) {
   T background[3] = {};
   if (in.background) std::memcpy(background, in.background + 3 * camera, sizeof background);
+  const bool full = x0 + x + 16 <= in.width && y0 + y + 16 <= in.height;
   tile.open = 0;
   for (int g = 0; g < 16; ++g) {
-    const uint32_t inside = pixels_inside(x, y, g, in.width, in.height);
+    const uint32_t inside = pixels_inside(x0 + x, y0 + y, g, in.width, in.height);
     tile.open |= static_cast<uint32_t>(inside != 0) << g;
-    for (int p = 0; p < kParts<T>; ++p) tile.live[g][p] = mask_from_bits<T>(inside >> (p * Vec<T>::kLanes));
+    granule_pixels(x, y, g, inside, tile.px[g], tile.py[g]);
     for (T &t : tile.transmittance[g]) t = 1;
-    if (inside != 0xffff || slice.begin > 0) {  // what load_pixel leaves out is zero
-      std::memset(tile.cotangent[g], 0, sizeof tile.cotangent[g]);
-      std::memset(tile.by_pixel[g], 0, sizeof tile.by_pixel[g]);
-      std::memset(tile.behind[g], 0, sizeof tile.behind[g]);
-    }
-    const int64_t first = (static_cast<int64_t>(camera) * in.height + y + (g >> 2) * 4) * in.width + x + (g & 3) * 4;
-    for (int i = 0; i < 16; ++i)
-      if (inside >> i & 1)
-        load_pixel(in, background, first + static_cast<int64_t>(i >> 2) * in.width + (i & 3), slice, shift, out, grad, g, i, tile);
-    for (int c = 0; c < Tile::kFeatures; ++c)
-      for (int i = 0; i < 16; ++i) tile.cotangent[g][Tile::kBase + c][i] = tile.by_pixel[g][i][c];
   }
+  if (!full) {
+    std::memset(tile.behind, 0, sizeof tile.behind);
+    std::memset(tile.cotangent, 0, sizeof tile.cotangent);
+    std::memset(tile.by_pixel, 0, sizeof tile.by_pixel);
+  }
+  for (int row = 0; row < 16 && y0 + y + row < in.height; ++row) {
+    const int64_t pixel = (static_cast<int64_t>(camera) * in.height + y0 + y + row) * in.width + x0 + x;
+    if (full && slice.count == NF)
+      load_row(in, background, pixel, row, std::integral_constant<int, 16>(), slice, std::integral_constant<int, NF>(),
+               shift, out, grad, tile);
+    else
+      load_row(in, background, pixel, row, std::min(16, in.width - x0 - x), slice, slice.count, shift, out, grad, tile);
+  }
+  if constexpr (NF > 0)
+    for (int g = 0; g < 16; ++g) transpose<16, BackwardTile<T, NF, VAR, DEPTH>::kRow>(tile.by_pixel[g][0], tile.by_channel[g][0]);
 }
 
 // The sums over pixels that one splat gathers, a lane a pixel.
@@ -132,100 +156,129 @@ struct Moments {
   }
 };
 
-// One splat over one register of pixels of granule g.
+// One splat over some pixels of granule g. product: the features' part of cg on entry, the weights on return.
 template <class T, int NF, bool VAR, bool DEPTH>
-inline void backward_step(const Splat<T> &s, const T *features, Vec<T> px, Vec<T> py, int g, int p,
+inline void backward_step(const Splat<T> &s, bool clamps, int g, int lane, T *product,
                           BackwardTile<T, NF, VAR, DEPTH> &tile, Moments<T, DEPTH> &m) {
-  using V = Vec<T>;
-  using Tile = BackwardTile<T, NF, VAR, DEPTH>;
-  const int lane = p * V::kLanes;
-  const V t = V::load(tile.transmittance[g] + lane);
-  const Blend<T> b = blend(s, px, py, t, tile.live[g][p]);
+  using P = Pack<T>;
+  P px = P::load(tile.px[g] + lane);
+  bool stopped = false;
+  const Blend<T> b = blend(s, px, P::load(tile.py[g] + lane), P::load(tile.transmittance[g] + lane), stopped);
   b.next.store(tile.transmittance[g] + lane);
-  const T(*cotangent)[16] = reinterpret_cast<const T(*)[16]>(&tile.cotangent[g][0][lane]);
-  const V w = b.weight;
-  const V g0 = V::load(cotangent[0]), g1 = V::load(cotangent[1]), g2 = V::load(cotangent[2]);
-  V cg = fma(V(s.b), g2, fma(V(s.g), g1, V(s.r) * g0));
-  m.rgb[0] = fma(w, g0, m.rgb[0]), m.rgb[1] = fma(w, g1, m.rgb[1]), m.rgb[2] = fma(w, g2, m.rgb[2]);
-  if constexpr (DEPTH) {
-    const V gz = V::load(cotangent[3]);
-    cg = fma(V(s.z), gz, cg);
-    m.z = fma(w, gz, m.z);
+  if (__builtin_expect(stopped, 0)) {
+    px.store(tile.px[g] + lane);
+    bool open = false;
+    for (int i = 0; i < 16; ++i) open |= tile.px[g][i] < kFar<T>;
+    if (!open) tile.open &= ~(1u << g);
   }
+  const P w = b.weight;
+  const P red = P::load(tile.cotangent[g][0] + lane), green = P::load(tile.cotangent[g][1] + lane),
+          blue = P::load(tile.cotangent[g][2] + lane);
+  P cg;
   if constexpr (NF > 0) {
-    V cg2(T(0));
-    for (int c = 0; c < Tile::kFeatures; c += 2) {
-      cg = fma(V(features[c]), V::load(cotangent[Tile::kBase + c]), cg);
-      cg2 = fma(V(features[c + 1]), V::load(cotangent[Tile::kBase + c + 1]), cg2);
-    }
-    cg = cg + cg2;
-    w.store(tile.weight[g] + lane);
+    cg = fma(P(s.r), red, P::load(product + lane));
+    w.store(product + lane);
+  } else {
+    cg = P(s.r) * red;
   }
-  const V behind = fnma(w, cg, V::load(tile.behind[g] + lane));
+  cg = fma(P(s.b), blue, fma(P(s.g), green, cg));
+  P depth;
+  if constexpr (DEPTH) {
+    depth = P::load(tile.cotangent[g][3] + lane);
+    cg = fma(P(s.z), depth, cg);
+  }
+  const P behind = fnma(w, cg, P::load(tile.behind[g] + lane));
   behind.store(tile.behind[g] + lane);
-  const V g_alpha = fnma(behind, reciprocal(V(T(1)) - b.alpha), t * cg);
-  const Mask<T> moves = b.mask & (V(kMaxAlpha<T>) >= b.raw);  // a clamped alpha does not move
-  const V h = keep(moves, b.raw * g_alpha);
-  const V hu = h * b.u, hy = h * b.dy;
-  m.h = m.h + h, m.hu = m.hu + hu, m.hy = m.hy + hy;
-  m.huu = fma(hu, b.u, m.huu), m.huy = fma(hu, b.dy, m.huy), m.hyy = fma(hy, b.dy, m.hyy);
+  P h = w * fnma(behind, reciprocal(b.next), cg);
+  if (clamps) h = keep(P(kMaxAlpha<T>) >= b.raw, h);  // a clamped alpha does not move
+  const P hu = h * b.u, hy = h * b.dy;
+  m.h = add(h, m.h), m.hu = add(hu, m.hu), m.hy = add(hy, m.hy);
+  m.huu = add_product(hu, b.u, m.huu), m.huy = add_product(hu, b.dy, m.huy), m.hyy = add_product(hy, b.dy, m.hyy);
+  m.rgb[0] = add_product(w, red, m.rgb[0]), m.rgb[1] = add_product(w, green, m.rgb[1]);
+  m.rgb[2] = add_product(w, blue, m.rgb[2]);
+  if constexpr (DEPTH) m.z = add_product(w, depth, m.z);
 }
 
-// Σ over the pixels of the granules in `mask` of weight times the row of feature cotangents.
+// Splats [begin, end) of the list that touch an open granule, with their masks; returns how many.
 template <class T, int NF, bool VAR, bool DEPTH>
-inline void feature_sums(uint32_t mask, const BackwardTile<T, NF, VAR, DEPTH> &tile, T *record, bool first) {
-  using V = Vec<T>;
-  constexpr int kRow = BackwardTile<T, NF, VAR, DEPTH>::kRow, kVectors = kRow / V::kLanes, kChains = kVectors >= 4 ? 1 : 4 / kVectors;
-  V acc[kChains][kVectors];
-  for (auto &chain : acc)
-    for (V &v : chain) v = V(T(0));
-  for (; mask; mask &= mask - 1) {
-    const int g = __builtin_ctz(mask);
-    for (int i = 0; i < 16; i += kChains)
-      for (int k = 0; k < kChains; ++k) {
-        const V w(tile.weight[g][i + k]);
-        for (int v = 0; v < kVectors; ++v) acc[k][v] = fma(w, V::load(tile.by_pixel[g][i + k] + v * V::kLanes), acc[k][v]);
-      }
+inline int list_splats(const Worker<T> &w, int x, int y, const uint32_t *list, int begin, int end,
+                       BackwardTile<T, NF, VAR, DEPTH> &tile) {
+  int n = 0;
+  for (int j = begin; j < end; ++j) {
+    const Splat<T> &s = w.splats[list[j]];
+    const uint32_t mask = boxes_touched<T, 1>(s, s.x - x, s.y - y) & tile.open;
+    tile.splats[n] = list[j], tile.masks[n] = static_cast<uint16_t>(mask);
+    n += mask != 0;
   }
-  for (int v = 0; v < kVectors; ++v) {
-    V s = acc[0][v];
-    for (int k = 1; k < kChains; ++k) s = s + acc[k][v];
-    (first ? s : s + V::load(record + v * V::kLanes)).store(record + v * V::kLanes);
+  return n;
+}
+
+// products[g][k] = Σ_c e_c g_c at the pixels of granule g for the k-th of the splats that touch it.
+template <class T, int NF, bool VAR, bool DEPTH>
+inline void feature_products(const Worker<T> &w, int n, BackwardTile<T, NF, VAR, DEPTH> &tile) {
+  constexpr int kRow = BackwardTile<T, NF, VAR, DEPTH>::kRow;
+  std::memset(tile.counts, 0, sizeof tile.counts), std::memset(tile.done, 0, sizeof tile.done);
+  std::memset(tile.masks + n, 0, 16 * sizeof *tile.masks);
+  for (int i = 0; i < n; i += 16)
+    append_to_lists(tile.masks + i, tile.splats + i, tile.lists[0], sizeof tile.lists[0] / sizeof(uint32_t), tile.counts);
+  for (uint32_t rest = tile.open; rest; rest &= rest - 1) {
+    const int g = __builtin_ctz(rest);
+    uint32_t *list = tile.lists[g];
+    for (int k = 0; k < 16; ++k) list[tile.counts[g] + k] = w.n;  // a spare row
+    multiply_rows<kRow, 16, false>(
+        tile.counts[g], [&](int k) { return w.features.data() + static_cast<std::size_t>(list[k]) * kRow; },
+        tile.by_channel[g][0], [&](int k) { return tile.products[g][k]; });
+  }
+}
+
+// Adds to the splats' records Σ over a granule's pixels of the weight times the row of feature cotangents.
+template <class T, int NF, bool VAR, bool DEPTH>
+inline void feature_gradients(const Worker<T> &w, BackwardTile<T, NF, VAR, DEPTH> &tile) {
+  using Tile = BackwardTile<T, NF, VAR, DEPTH>;
+  for (int g = 0; g < 16; ++g) {
+    uint32_t *list = tile.lists[g];
+    for (int k = 0; k < 16; ++k) list[tile.done[g] + k] = w.n;  // a spare record
+    multiply_rows<16, Tile::kRow, true>(
+        tile.done[g], [&](int k) { return tile.products[g][k]; }, tile.by_pixel[g][0],
+        [&](int k) { return w.records.data() + static_cast<std::size_t>(list[k]) * Tile::kRecord + kGeometry; });
   }
 }
 
 template <class T, int NF, bool VAR, bool DEPTH>
 void backward_tile(Worker<T> &w, int x, int y, const uint32_t *list, int n, BackwardTile<T, NF, VAR, DEPTH> &tile) {
-  using V = Vec<T>;
   using Tile = BackwardTile<T, NF, VAR, DEPTH>;
-  alignas(64) T px[4][16], py[4][16];  // pixel centres by the granule's column, row
-  for (int column = 0; column < 4; ++column)
-    for (int i = 0; i < 16; ++i) {
-      px[column][i] = T(x) + T(column * 4 + 0.5) + T(i & 3), py[column][i] = T(y) + T(column * 4 + 0.5) + T(i >> 2);
-    }
-  for (int j = 0; j < n && tile.open; ++j) {
-    const uint32_t at = list[j];
-    const Splat<T> s = w.splats[at];
-    const uint32_t mask = boxes_touched<T, 1>(s, s.x - x, s.y - y) & tile.open;
-    if (!mask) continue;
-    const T *features = w.features.data() + static_cast<std::size_t>(at) * Tile::kFeatures;
-    Moments<T, DEPTH> m;
-    for (uint32_t rest = mask; rest; rest &= rest - 1) {
-      const int g = __builtin_ctz(rest);
-      bool live = false;
-      for (int p = 0; p < kParts<T>; ++p) {
-        const int lane = p * V::kLanes;
-        backward_step(s, features, V::load(px[g & 3] + lane), V::load(py[g >> 2] + lane), g, p, tile, m);
-        live |= any(tile.live[g][p]);
+  for (int begin = 0; begin < n && tile.open; begin += Tile::kChunk) {
+    const int count = list_splats(w, x, y, list, begin, n < begin + Tile::kChunk ? n : begin + Tile::kChunk, tile);
+    if constexpr (NF > 0) feature_products(w, count, tile);
+    for (int j = 0; j < count; ++j) {
+      uint32_t mask = tile.masks[j] & tile.open;
+      if (!mask) continue;
+      const uint32_t at = tile.splats[j];
+      const Splat<T> &s = w.splats[at];
+      const bool clamps = s.log_opacity > T(-0.002);  // log2 of a little less than the largest alpha
+      Moments<T, DEPTH> m;
+      for (; mask; mask &= mask - 1) {
+        const int g = __builtin_ctz(mask);
+        T *product = NF > 0 ? tile.products[g][tile.done[g]++] : nullptr;
+        for (int lane = 0; lane < 16; lane += Pack<T>::kLanes) backward_step(s, clamps, g, lane, product, tile, m);
       }
-      if (!live) tile.open &= ~(1u << g);
+      T *record = w.records.data() + static_cast<std::size_t>(at) * Tile::kRecord;
+      const bool first = !w.touched[at];
+      m.store(record, first);
+      if (NF > 0 && first) std::memset(record + kGeometry, 0, Tile::kRow * sizeof(T));
+      w.touched[at] = 1;
     }
-    T *record = w.records.data() + static_cast<std::size_t>(at) * Tile::kRecord;
-    const bool first = !w.touched[at];
-    m.store(record, first);
-    if constexpr (NF > 0) feature_sums(mask, tile, record + kGeometry, first);
-    w.touched[at] = 1;
+    if constexpr (NF > 0) feature_gradients(w, tile);
   }
+}
+
+// How many tiles of a splat's box come before tile `tile` in row-major order.
+template <class T>
+inline uint64_t box_tiles_before(const Splat<T> &s, int tiles_x, int tile) {
+  auto within = [](int value, int limit) { return value < 0 ? 0 : value > limit ? limit : value; };
+  const int width = s.x1 - s.x0 + 1, height = s.y1 - s.y0 + 1, row = tile / tiles_x - s.y0;
+  const int in_row = row >= 0 && row < height ? within(tile % tiles_x - s.x0, width) : 0;
+  return static_cast<uint64_t>(within(row, height)) * width + in_row;
 }
 
 // Writes the records of one 64x64 tile to their slots (one a splat and tile it touches): the geometry's moments, then
@@ -237,9 +290,10 @@ void store_records(const Frame<T> &f, int index, const Worker<T> &w, Scratch<T> 
   for (int j = 0; j < w.n; ++j) {
     if (!w.touched[j]) continue;
     const Splat<T> &s = w.splats[j];
-    const uint64_t slot = scratch.slots[w.source[j]] + (ty - s.y0) * (s.x1 - s.x0 + 1) + (tx - s.x0);
+    const uint64_t place = static_cast<uint64_t>(ty - s.y0) * (s.x1 - s.x0 + 1) + (tx - s.x0);
+    const uint64_t slot = scratch.slots[w.source[j]] + place - box_tiles_before(s, f.tiles_x, scratch.first_tile);
     const T *from = w.records.data() + static_cast<std::size_t>(j) * Tile::kRecord;
-    const T *e = w.features.data() + static_cast<std::size_t>(j) * Tile::kFeatures;
+    const T *e = w.features.data() + static_cast<std::size_t>(j) * Tile::kRow;
     T *to = scratch.records.data() + slot * (kGeometry + NF);
     for (int c = 0; c < kGeometry + NF; ++c) to[c] = from[c];
     if constexpr (VAR)
@@ -252,25 +306,29 @@ template <class T, int NF, bool VAR, bool DEPTH>
 void backward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int index, Slice slice, Scratch<T> &scratch,
                         Worker<T> &w, const Outputs<T> &out, const Cotangents<T> &grad) {
   using Tile = BackwardTile<T, NF, VAR, DEPTH>;
-  load_supertile<NF, Tile::kFeatures>(in, f, index, slice, w);
+  load_supertile<NF, Tile::kRow>(in, f, index, slice, w);
   if (!w.n) return;
   T shift[NF ? NF : 1] = {};
   for (int c = 0; c < NF; ++c) shift[c] = w.features[c];
-  for (int j = 0; j < w.n; ++j) {
-    T *f_row = w.features.data() + static_cast<std::size_t>(j) * Tile::kFeatures;
-    for (int c = 0; c < NF; ++c) {
-      f_row[c] -= shift[c];
-      if constexpr (VAR) f_row[NF + c] = f_row[c] * f_row[c];
+  if constexpr (NF > 0) {
+    for (int j = 0; j < w.n; ++j) {
+      T *row = w.features.data() + static_cast<std::size_t>(j) * Tile::kRow;
+      for (int c = 0; c < NF; ++c) {
+        row[c] -= shift[c];
+        if constexpr (VAR) row[NF + c] = row[c] * row[c];
+      }
+      for (int c = Tile::kFeatures; c < Tile::kRow; ++c) row[c] = 0;
     }
+    std::memset(w.features.data() + static_cast<std::size_t>(w.n) * Tile::kRow, 0, Tile::kRow * sizeof(T));
   }
-  std::memset(w.touched.reserve(w.n), 0, w.n);
-  w.records.reserve(static_cast<std::size_t>(w.n) * Tile::kRecord);
+  std::memset(w.touched.reserve(w.n), 0, w.n * sizeof(uint16_t));
+  w.records.reserve(static_cast<std::size_t>(w.n + 1) * Tile::kRecord);
   Tile &tile = *reinterpret_cast<Tile *>(w.tile.reserve(sizeof(Tile) / sizeof(T) + 1));
   const int x0 = index % f.tiles_x * 64, y0 = index / f.tiles_x * 64;
   for (int q = 0; q < 16; ++q) {
     const int x = (q & 3) * 16, y = (q >> 2) * 16;
     if (x0 + x >= in.width || y0 + y >= in.height || !w.counts[q]) continue;
-    load_tile(in, camera, x0 + x, y0 + y, slice, shift, out, grad, tile);
+    load_tile(in, camera, x0, y0, x, y, slice, shift, out, grad, tile);
     backward_tile(w, x, y, w.lists.data() + q * static_cast<std::size_t>(w.stride), w.counts[q], tile);
   }
   store_records<T, NF, VAR, DEPTH>(f, index, w, scratch);

@@ -1,171 +1,184 @@
 // Stage 4: front-to-back blending. Granule by granule, so that a granule's state stays in registers while its list
-// of splats runs by.
+// of splats runs by; feature channels follow as a product of the kept weights with the splats' feature rows.
 #pragma once
+#include "matrix.h"
 #include "supertile.h"
 
 namespace perception::PERCEPTION_LEVEL {
 
-// The channels of one granule register: colours, depth, and for every feature channel either its sum, or, with the
-// variance, a shift c and the sums of w (f - c) and w (f - c)². The shift is the first contributor's value, so
-// neither sum cancels (their ratio to the variance is bounded by 1/w_first <= 255), however large the features.
-template <int NF, bool VAR, bool DEPTH>
-struct Channels {
-  static constexpr int kDepth = 3, kBase = DEPTH ? 4 : 3;
-  static constexpr int kSum = kBase, kSquare = kBase + NF, kShift = kBase + 2 * NF;
-  static constexpr int kCount = kBase + NF * (VAR ? 3 : 1);
-};
+// A feature row is e = f - shift and, with the variance, e² after it. The shift is a granule's own (its first splat's
+// value), so that neither sum cancels however large the features are against their spread.
+template <class T, int NF, bool VAR>
+constexpr int kFeatureRow = padded<T>(NF * (VAR ? 2 : 1));
 
 template <class T, int NF, bool VAR, bool DEPTH>
 struct ForwardTile {
-  using C = Channels<NF, VAR, DEPTH>;
-  static constexpr int kChunk = 128;
-  alignas(64) T sums[16][C::kCount][16];
-  alignas(64) T transmittance[16][16];
-  uint16_t live[16];
+  static constexpr int kChunk = NF ? 128 : 256, kColors = DEPTH ? 4 : 3, kRow = kFeatureRow<T, NF, VAR>;
+  alignas(64) T px[16][16], py[16][16], transmittance[16][16];
+  alignas(64) T colors[16][kColors][16];                  // red, green, blue, depth
+  alignas(64) T features[16][NF ? 16 : 1][kRow ? kRow : 1];  // a row a pixel
+  T shift[16][NF ? NF : 1];
   uint32_t counts[16];
   uint32_t lists[16][kChunk + 32];
+  alignas(64) T weights[NF ? kChunk : 1][16];
+  alignas(64) T rows[NF ? kChunk : 1][kRow ? kRow : 1];
 };
 
-// Runs one granule's register of pixels over a list of splats; returns the lanes still open, counts the pairs.
+// Runs some of a granule's pixels over a list of splats. False when none of them is open any more.
 template <class T, int NF, bool VAR, bool DEPTH>
-inline uint32_t blend_list(const Splat<T> *splats, const T *features, uint8_t *touched, const uint32_t *list, int n,
-                           Vec<T> px, Vec<T> py, uint32_t live_bits, T *transmittance, T (*sums)[16],
-                           uint64_t &evaluated, uint64_t &contributing) {
-  using V = Vec<T>;
-  using C = Channels<NF, VAR, DEPTH>;
-  Mask<T> live = mask_from_bits<T>(live_bits);
-  V t = V::load(transmittance);
-  [[maybe_unused]] Mask<T> fresh = t >= V(T(1));
-  V acc[C::kCount];
-  for (int c = 0; c < C::kCount; ++c) acc[c] = V::load(sums[c]);
+inline bool blend_list(Worker<T> &w, int n, int g, int lane, ForwardTile<T, NF, VAR, DEPTH> &tile) {
+  using P = Pack<T>;
+  const Splat<T> *splats = w.splats.data();
+  uint16_t *touched = w.touched.data();
+  const uint32_t *list = tile.lists[g];
+  P px = P::load(tile.px[g] + lane);
+  const P py = P::load(tile.py[g] + lane);
+  P t = P::load(tile.transmittance[g] + lane);
+  P red = P::load(tile.colors[g][0] + lane), green = P::load(tile.colors[g][1] + lane),
+    blue = P::load(tile.colors[g][2] + lane), depth;
+  if constexpr (DEPTH) depth = P::load(tile.colors[g][3] + lane);
   int i = 0, pairs = 0;
+  bool open = true;
   while (i < n) {
     const uint32_t at = list[i++];
     const Splat<T> &s = splats[at];
-    const Blend<T> b = blend(s, px, py, t, live);
+    bool stopped = false;
+    const Blend<T> b = blend(s, px, py, t, stopped);
     t = b.next;
-    const V w = b.weight;
-    const uint32_t mask = bits(b.mask);
-    touched[at] |= mask != 0;
+    red = fma(b.weight, P(s.r), red), green = fma(b.weight, P(s.g), green), blue = fma(b.weight, P(s.b), blue);
+    if constexpr (DEPTH) depth = fma(b.weight, P(s.z), depth);
+    if constexpr (NF > 0) b.weight.store(tile.weights[i - 1] + lane);
+    const uint32_t mask = bits(P(T(0)) < b.weight);
+    touched[at] |= static_cast<uint16_t>(mask);
     pairs += __builtin_popcount(mask);
-    acc[0] = fma(w, V(s.r), acc[0]);
-    acc[1] = fma(w, V(s.g), acc[1]);
-    acc[2] = fma(w, V(s.b), acc[2]);
-    if constexpr (DEPTH) acc[C::kDepth] = fma(w, V(s.z), acc[C::kDepth]);
-    if constexpr (NF > 0) {
-      const T *f = features + static_cast<std::size_t>(at) * NF;
-      if constexpr (VAR) {
-        const Mask<T> first = b.mask & fresh;
-        if (__builtin_expect(any(first), 0)) {
-          for (int c = 0; c < NF; ++c) acc[C::kShift + c] = select(first, V(f[c]), acc[C::kShift + c]);
-          fresh = and_not(fresh, first);
-        }
-        for (int c = 0; c < NF; ++c) {
-          const V e = V(f[c]) - acc[C::kShift + c], we = w * e;
-          acc[C::kSum + c] = acc[C::kSum + c] + we;
-          acc[C::kSquare + c] = fma(we, e, acc[C::kSquare + c]);
-        }
-      } else {
-        for (int c = 0; c < NF; ++c) acc[C::kSum + c] = fma(w, V(f[c]), acc[C::kSum + c]);
-      }
+    if (__builtin_expect(stopped, 0)) {
+      px.store(tile.px[g] + lane);
+      open = any(px < P(kFar<T>));
+      if (!open) break;
     }
-    if (__builtin_expect(!any(live), 0)) break;
   }
-  evaluated += static_cast<uint64_t>(i) * V::kLanes, contributing += pairs;
-  t.store(transmittance);
-  for (int c = 0; c < C::kCount; ++c) acc[c].store(sums[c]);
-  return bits(live);
+  w.evaluated += static_cast<uint64_t>(i) * P::kLanes, w.contributing += pairs;
+  t.store(tile.transmittance[g] + lane);
+  red.store(tile.colors[g][0] + lane), green.store(tile.colors[g][1] + lane), blue.store(tile.colors[g][2] + lane);
+  if constexpr (DEPTH) depth.store(tile.colors[g][3] + lane);
+  if constexpr (NF > 0)
+    for (; i < n; ++i) P(T(0)).store(tile.weights[i] + lane);
+  return open;
 }
 
-// (x, y): the 16x16 tile relative to its 64x64 tile.
+// Adds granule g's list to its pixels' feature sums.
 template <class T, int NF, bool VAR, bool DEPTH>
-void forward_tile(Worker<T> &w, int x, int y, const uint32_t *list, int n, ForwardTile<T, NF, VAR, DEPTH> &tile) {
-  using V = Vec<T>;
-  constexpr int kChunk = ForwardTile<T, NF, VAR, DEPTH>::kChunk;
-  const Grid<T> &grid = kGrid<T>;
-  uint32_t open = 0;
-  for (int g = 0; g < 16; ++g) open |= static_cast<uint32_t>(tile.live[g] != 0) << g;
-  for (int begin = 0; begin < n && open; begin += kChunk) {
-    const int end = n < begin + kChunk ? n : begin + kChunk;
-    std::memset(tile.counts, 0, sizeof tile.counts);
-    for (int i = begin; i < end; i += 16) {
-      uint16_t masks[16] = {};
-      for (int j = 0; j < 16 && i + j < end; ++j) {
-        const Splat<T> &s = w.splats[list[i + j]];
-        masks[j] = static_cast<uint16_t>(boxes_touched<T, 1>(s, s.x - x, s.y - y));
-      }
-      append_to_lists(masks, list + i, tile.lists[0], kChunk + 32, tile.counts);
+inline void blend_features(const T *features, int n, int g, ForwardTile<T, NF, VAR, DEPTH> &tile) {
+  const uint32_t *list = tile.lists[g];
+  const T *shift = tile.shift[g];
+  for (int k = 0; k < n; ++k) {
+    const T *f = features + static_cast<std::size_t>(list[k]) * NF;
+    T *row = tile.rows[k];
+    for (int c = 0; c < NF; ++c) {
+      const T e = f[c] - shift[c];
+      row[c] = e;
+      if constexpr (VAR) row[NF + c] = e * e;
     }
+    for (int c = NF * (VAR ? 2 : 1); c < kFeatureRow<T, NF, VAR>; ++c) row[c] = 0;
+  }
+  add_weighted_rows<kFeatureRow<T, NF, VAR>>(tile.weights[0], tile.rows[0], n, tile.features[g][0]);
+}
+
+// Masks of the granules that splats [begin, end) of the list touch, appended to the granules' lists.
+template <class T>
+void list_granules(const Worker<T> &w, int x, int y, const uint32_t *list, int begin, int end, uint32_t *lists, int stride,
+                   uint32_t *counts) {
+  std::memset(counts, 0, 16 * sizeof *counts);
+  for (int i = begin; i < end; i += 16) {
+    uint16_t masks[16] = {};
+    for (int j = 0; j < 16 && i + j < end; ++j) {
+      const Splat<T> &s = w.splats[list[i + j]];
+      masks[j] = static_cast<uint16_t>(boxes_touched<T, 1>(s, s.x - x, s.y - y));
+    }
+    append_to_lists(masks, list + i, lists, stride, counts);
+  }
+}
+
+// (x, y): the 16x16 tile relative to its 64x64 tile. open: granules with a pixel in the image.
+template <class T, int NF, bool VAR, bool DEPTH>
+void forward_tile(Worker<T> &w, int x, int y, const uint32_t *list, int n, uint32_t open,
+                  ForwardTile<T, NF, VAR, DEPTH> &tile) {
+  constexpr int kChunk = ForwardTile<T, NF, VAR, DEPTH>::kChunk;
+  uint32_t fresh = 0xffff;  // granules that have no shift yet
+  for (int begin = 0; begin < n && open; begin += kChunk) {
+    list_granules(w, x, y, list, begin, n < begin + kChunk ? n : begin + kChunk, tile.lists[0], kChunk + 32, tile.counts);
     for (uint32_t rest = open; rest; rest &= rest - 1) {
-      const int g = __builtin_ctz(rest);
-      if (!tile.counts[g]) continue;
-      uint32_t live = 0;
-      for (int p = 0; p < kParts<T>; ++p) {
-        const int lane = p * V::kLanes;
-        const uint32_t before = tile.live[g] >> lane & ((1u << V::kLanes) - 1);
-        if (!before) continue;
-        alignas(64) T px[V::kLanes], py[V::kLanes];
-        for (int i = 0; i < V::kLanes; ++i) {
-          px[i] = T(x) + grid.box_x[1][g] + T((lane + i) & 3), py[i] = T(y) + grid.box_y[1][g] + T((lane + i) >> 2);
-        }
-        live |= blend_list<T, NF, VAR, DEPTH>(w.splats.data(), w.features.data(), w.touched.data(), tile.lists[g],
-                                              tile.counts[g], V::load(px), V::load(py), before,
-                                              tile.transmittance[g] + lane,
-                                              reinterpret_cast<T(*)[16]>(&tile.sums[g][0][lane]), w.evaluated,
-                                              w.contributing)
-                << lane;
+      const int g = __builtin_ctz(rest), count = static_cast<int>(tile.counts[g]);
+      if (!count) continue;
+      bool still_open = false;
+      for (int lane = 0; lane < 16; lane += Pack<T>::kLanes) still_open |= blend_list(w, count, g, lane, tile);
+      if constexpr (NF > 0) {
+        if (fresh >> g & 1)
+          std::memcpy(tile.shift[g], w.features.data() + static_cast<std::size_t>(tile.lists[g][0]) * NF, NF * sizeof(T));
+        fresh &= ~(1u << g);
+        blend_features(w.features.data(), count, g, tile);
       }
-      tile.live[g] = static_cast<uint16_t>(live);
-      if (!live) open &= ~(1u << g);
+      if (!still_open) open &= ~(1u << g);
     }
   }
 }
 
 // Feature sums and variances of one pixel, from the sums about a shift: with the mean m and the centred second moment
 // M2 of the weighted features, Var = Σ w f² - (Σ w f)² = M2 + A (1 - A) m², both terms non-negative.
-template <class T, int NF, bool VAR>
-inline void write_features(const T (*sums)[16], int i, T t, int count, T *features, T *variance) {
+template <class T, int NF, bool VAR, class Count>
+inline void write_features(const T *sums, const T *shift, T t, Count count, T *features, T *variance) {
+  const T a = 1 - t;
   T sum[NF], var[NF];
+  for (int c = 0; c < NF; ++c) sum[c] = shift[c] * a + sums[c];
   if constexpr (VAR) {
-    const T a = 1 - t, inverse = a > 0 ? 1 / a : T(0);
+    const T inverse = a > 0 ? 1 / a : T(0);
     for (int c = 0; c < NF; ++c) {
-      const T s1 = sums[c][i], s2 = sums[NF + c][i], shift = sums[2 * NF + c][i];
-      const T offset = s1 * inverse, mean = shift + offset, m2 = s2 - s1 * offset;
-      sum[c] = shift * a + s1;
+      const T offset = sums[c] * inverse, mean = shift[c] + offset, m2 = sums[NF + c] - sums[c] * offset;
       var[c] = (m2 > 0 ? m2 : T(0)) + a * t * mean * mean;
     }
-    copy_channels<NF>(variance, var, count);
-  } else {
-    for (int c = 0; c < NF; ++c) sum[c] = sums[c][i];
+    std::memcpy(variance, var, count * sizeof(T));
   }
-  copy_channels<NF>(features, sum, count);
+  std::memcpy(features, sum, count * sizeof(T));
+}
+
+// Row `row` of a tile, `columns` of it inside the image (a constant 16 but at the right edge).
+template <class T, int NF, bool VAR, bool DEPTH, class Columns, class Count>
+inline void write_row(const Inputs<T> &in, const T *background, int64_t pixel, int row, Columns columns, Slice slice,
+                      Count count, const ForwardTile<T, NF, VAR, DEPTH> &tile, const Outputs<T> &out) {
+  using Tile = ForwardTile<T, NF, VAR, DEPTH>;
+  T t[16], color[4][16];
+  row_from_granules(tile.transmittance[0], 16, row, t);
+  if (slice.begin == 0) {
+    for (int c = 0; c < Tile::kColors; ++c) row_from_granules(tile.colors[0][c], Tile::kColors * 16, row, color[c]);
+    for (int i = 0; i < columns; ++i) {
+      for (int c = 0; c < 3; ++c) out.colors[3 * (pixel + i) + c] = color[c][i] + t[i] * background[c];
+      out.alphas[pixel + i] = 1 - t[i];
+    }
+    if constexpr (DEPTH)
+      if (out.depths)
+        for (int i = 0; i < columns; ++i) out.depths[pixel + i] = color[3][i];
+  }
+  if constexpr (NF > 0)
+    for (int i = 0; i < columns; ++i) {
+      const int g = (row >> 2) * 4 + (i >> 2);
+      const int64_t at = (pixel + i) * in.dims + slice.begin;
+      write_features<T, NF, VAR>(tile.features[g][(row & 3) * 4 + (i & 3)], tile.shift[g], t[i], count,
+                                 out.features + at, VAR ? out.variance + at : nullptr);
+    }
 }
 
 template <class T, int NF, bool VAR, bool DEPTH>
 void write_tile(const Inputs<T> &in, int camera, int x, int y, Slice slice, const ForwardTile<T, NF, VAR, DEPTH> &tile,
                 const Outputs<T> &out) {
-  using C = Channels<NF, VAR, DEPTH>;
   T background[3] = {};
   if (in.background) std::memcpy(background, in.background + 3 * camera, sizeof background);
-  for (int g = 0; g < 16; ++g) {
-    const uint32_t inside = pixels_inside(x, y, g, in.width, in.height);
-    const int64_t first = (static_cast<int64_t>(camera) * in.height + y + (g >> 2) * 4) * in.width + x + (g & 3) * 4;
-    for (int i = 0; i < 16; ++i) {
-      if (!(inside >> i & 1)) continue;
-      const int64_t pixel = first + static_cast<int64_t>(i >> 2) * in.width + (i & 3);
-      const T t = tile.transmittance[g][i];
-      const T(*sums)[16] = tile.sums[g];
-      if (slice.begin == 0) {
-        for (int c = 0; c < 3; ++c) out.colors[3 * pixel + c] = sums[c][i] + t * background[c];
-        out.alphas[pixel] = 1 - t;
-        if constexpr (DEPTH)
-          if (out.depths) out.depths[pixel] = sums[C::kDepth][i];
-      }
-      if constexpr (NF > 0) {
-        const int64_t at = pixel * in.dims + slice.begin;
-        write_features<T, NF, VAR>(sums + C::kSum, i, t, slice.count, out.features + at, VAR ? out.variance + at : nullptr);
-      }
-    }
+  for (int row = 0; row < 16 && y + row < in.height; ++row) {
+    const int64_t pixel = (static_cast<int64_t>(camera) * in.height + y + row) * in.width + x;
+    if (x + 16 <= in.width && slice.count == NF)
+      write_row(in, background, pixel, row, std::integral_constant<int, 16>(), slice, std::integral_constant<int, NF>(),
+                tile, out);
+    else
+      write_row(in, background, pixel, row, std::min(16, in.width - x), slice, slice.count, tile, out);
   }
 }
 
@@ -174,18 +187,23 @@ void forward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int i
                        const Outputs<T> &out) {
   using Tile = ForwardTile<T, NF, VAR, DEPTH>;
   load_supertile<NF, NF>(in, f, index, slice, w);
-  std::memset(w.touched.reserve(w.n + 1), 0, w.n);
+  std::memset(w.touched.reserve(w.n + 1), 0, w.n * sizeof(uint16_t));
   Tile &tile = *reinterpret_cast<Tile *>(w.tile.reserve(sizeof(Tile) / sizeof(T) + 1));
   const int x0 = index % f.tiles_x * 64, y0 = index / f.tiles_x * 64;
   for (int q = 0; q < 16; ++q) {
     const int x = (q & 3) * 16, y = (q >> 2) * 16;
     if (x0 + x >= in.width || y0 + y >= in.height) continue;
-    std::memset(tile.sums, 0, sizeof tile.sums);
+    std::memset(tile.colors, 0, sizeof tile.colors);
+    std::memset(tile.shift, 0, sizeof tile.shift);
+    if constexpr (NF > 0) std::memset(tile.features, 0, sizeof tile.features);
+    uint32_t open = 0;
     for (int g = 0; g < 16; ++g) {
+      const uint32_t inside = pixels_inside(x0 + x, y0 + y, g, in.width, in.height);
+      open |= static_cast<uint32_t>(inside != 0) << g;
+      granule_pixels(x, y, g, inside, tile.px[g], tile.py[g]);
       for (T &t : tile.transmittance[g]) t = 1;
-      tile.live[g] = static_cast<uint16_t>(pixels_inside(x0 + x, y0 + y, g, in.width, in.height));
     }
-    forward_tile(w, x, y, w.lists.data() + q * static_cast<std::size_t>(w.stride), w.counts[q], tile);
+    forward_tile(w, x, y, w.lists.data() + q * static_cast<std::size_t>(w.stride), w.counts[q], open, tile);
     write_tile(in, camera, x0 + x, y0 + y, slice, tile, out);
   }
   for (int j = 0; j < w.n; ++j)

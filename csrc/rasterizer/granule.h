@@ -41,34 +41,36 @@ inline uint32_t boxes_touched(const Splat<T> &s, T x, T y) {
   return mask;
 }
 
-// One splat over one register of pixels: everything the two passes must compute alike.
+// A pixel that takes no more (opaque, or outside the image) stands this far to the right, out of every splat's reach.
+template <class T>
+constexpr T kFar = T(1e18);
+
+// One splat over some pixels: everything the two passes must compute alike.
 template <class T>
 struct Blend {
-  Vec<T> u, dy;        // px
-  Vec<T> raw, alpha;   // before and after the clamp
-  Vec<T> weight;       // alpha T, 0 where the splat does not contribute
-  Vec<T> next;         // transmittance behind
-  Mask<T> mask;        // contributes
+  Pack<T> u, dy;       // px
+  Pack<T> raw;         // alpha before the clamp
+  Pack<T> weight;      // alpha T, 0 where the splat does not contribute
+  Pack<T> next;        // transmittance behind
 };
 
+// Pixels that would fall under the least transmittance stop before: px moves to kFar, `stopped` becomes true.
 template <class T>
-inline Blend<T> blend(const Splat<T> &s, Vec<T> px, Vec<T> py, Vec<T> transmittance, Mask<T> &live) {
-  using V = Vec<T>;
+inline Blend<T> blend(const Splat<T> &s, Pack<T> &px, Pack<T> py, Pack<T> transmittance, bool &stopped) {
+  using P = Pack<T>;
   Blend<T> b;
-  const V dx = V(s.x) - px;
-  b.dy = V(s.y) - py;
-  b.u = fma(V(s.k), b.dy, dx);
-  const V e = fma(V(s.a) * b.u, b.u, fma(V(s.d) * b.dy, b.dy, V(s.log_opacity)));
-  b.mask = live & (e >= V(kLogThreshold<T>));
+  const P dx = P(s.x) - px;
+  b.dy = P(s.y) - py;
+  b.u = fma(P(s.k), b.dy, dx);
+  const P e = fma(P(s.a) * b.u, b.u, fma(P(s.d) * b.dy, b.dy, P(s.log_opacity)));
   b.raw = exp2_nonpositive(e);
-  b.alpha = min(b.raw, V(kMaxAlpha<T>));
-  b.weight = keep(b.mask, b.alpha * transmittance);
+  b.weight = keep(e >= P(kLogThreshold<T>), min(b.raw, P(kMaxAlpha<T>)) * transmittance);
   b.next = transmittance - b.weight;
-  const Mask<T> stop = b.mask & (b.next < V(kMinTransmittance<T>));
+  const PackMask<T> stop = b.next < P(kMinTransmittance<T>);
   if (__builtin_expect(any(stop), 0)) {
-    live = and_not(live, stop);
-    b.mask = and_not(b.mask, stop);
-    b.weight = keep(b.mask, b.weight);
+    stopped = true;
+    px = select(stop, P(kFar<T>), px);
+    b.weight = select(stop, P(T(0)), b.weight);
     b.next = select(stop, transmittance, b.next);
   }
   return b;
@@ -81,6 +83,25 @@ inline uint32_t pixels_inside(int x, int y, int g, int width, int height) {
   for (int i = 0; i < 16; ++i)
     m |= static_cast<uint32_t>(x + (g & 3) * 4 + (i & 3) < width && y + (g >> 2) * 4 + (i >> 2) < height) << i;
   return m;
+}
+
+// Pixel centres of granule g of the 16x16 tile at (tile_x, tile_y) of its 64x64 tile; those not in `inside` are far.
+template <class T>
+inline void granule_pixels(int tile_x, int tile_y, int g, uint32_t inside, T *px, T *py) {
+  const T x = T(tile_x) + kGrid<T>.box_x[1][g], y = T(tile_y) + kGrid<T>.box_y[1][g];
+  for (int i = 0; i < 16; ++i) px[i] = inside >> i & 1 ? x + T(i & 3) : kFar<T>, py[i] = y + T(i >> 2);
+}
+
+// Row `row` of a 16x16 tile (16 pixels) to and from four granules, whose channel stands `stride` numbers apart.
+template <class T>
+inline void row_to_granules(const T *row_values, int row, T *channel, std::size_t stride) {
+  for (int q = 0; q < 4; ++q)
+    std::memcpy(channel + ((row >> 2) * 4 + q) * stride + (row & 3) * 4, row_values + 4 * q, 4 * sizeof(T));
+}
+template <class T>
+inline void row_from_granules(const T *channel, std::size_t stride, int row, T *row_values) {
+  for (int q = 0; q < 4; ++q)
+    std::memcpy(row_values + 4 * q, channel + ((row >> 2) * 4 + q) * stride + (row & 3) * 4, 4 * sizeof(T));
 }
 
 }  // namespace perception::PERCEPTION_LEVEL

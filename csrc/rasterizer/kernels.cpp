@@ -43,13 +43,22 @@ struct Shape {
 
 template <class Body>
 void for_each_slice(int dims, const Options &opt, Body &&body) {
-  if (dims == 0) return opt.depth ? body(Slice{0, 0}, Shape<0, false, true>()) : body(Slice{0, 0}, Shape<0, false, false>());
+  auto with_depth = [&](Slice slice, auto width, auto variance) {
+    if (opt.depth)
+      body(slice, Shape<width(), variance(), true>());
+    else
+      body(slice, Shape<width(), variance(), false>());
+  };
+  auto with_variance = [&](Slice slice, auto width) {
+    opt.variance ? with_depth(slice, width, std::true_type()) : with_depth(slice, width, std::false_type());
+  };
+  if (dims == 0) return with_depth(Slice{0, 0}, std::integral_constant<int, 0>(), std::false_type());
   for (int begin = 0; begin < dims; begin += 16) {
     const Slice slice{begin, dims - begin < 16 ? dims - begin : 16};
     if (slice.count <= 8)
-      opt.variance ? body(slice, Shape<8, true, true>()) : body(slice, Shape<8, false, true>());
+      with_variance(slice, std::integral_constant<int, 8>());
     else
-      opt.variance ? body(slice, Shape<16, true, true>()) : body(slice, Shape<16, false, true>());
+      with_variance(slice, std::integral_constant<int, 16>());
   }
 }
 
@@ -72,17 +81,32 @@ void forward(const Inputs<T> &in, int camera, const Options &opt, const Frame<T>
 template <class T>
 void backward(const Inputs<T> &in, int camera, const Options &opt, const Frame<T> &f, Scratch<T> &scratch,
               const Outputs<T> &out, const Cotangents<T> &grad, const Gradients<T> &result, Stats &stats) {
-  const uint64_t slots = assign_slots(f, scratch);
+  const int tiles = f.tiles_x * f.tiles_y;
+  const uint64_t limit = opt.max_records > 0 ? opt.max_records : std::max<uint64_t>(1 << 20, 4 * uint64_t{f.count});
   for_each_slice(in.dims, opt, [&](Slice slice, auto shape) {
     using S = decltype(shape);
-    timed(stats, kBlendBackward, [&] {
-      std::memset(scratch.touched.reserve(slots), 0, slots);
-      scratch.records.reserve(slots * (kGeometry + S::NF));
-      parallel_for(opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
-        backward_supertile<T, S::NF, S::VAR, S::DEPTH>(in, camera, f, f.tile_order[i], slice, scratch,
-                                                       scratch.workers[worker], out, grad);
+    constexpr int kSize = kGeometry + S::NF;
+    const bool parts = next_range(f, 0, limit).end < tiles;  // the records of the whole picture are too many
+    if (parts) {
+      std::memset(scratch.sum_touched.reserve(f.count), 0, f.count);
+      scratch.sums.reserve(static_cast<std::size_t>(f.count) * kSize);
+    }
+    for (TileRange range{0, 0}; range.end < tiles;) {
+      range = next_range(f, range.end, limit);
+      timed(stats, kBlendBackward, [&] {
+        const uint64_t slots = assign_slots(f, range, scratch);
+        std::memset(scratch.touched.reserve(slots), 0, slots);
+        scratch.records.reserve(slots * kSize);
+        parallel_for(opt.threads, tiles, [&](std::size_t i, int worker) {
+          const int tile = f.tile_order[i];
+          if (tile < range.begin || tile >= range.end) return;
+          backward_supertile<T, S::NF, S::VAR, S::DEPTH>(in, camera, f, tile, slice, scratch, scratch.workers[worker],
+                                                         out, grad);
+        });
       });
-    });
+      if (parts) timed(stats, kReduce, [&] { add_records(opt, f, kSize, scratch); });
+    }
+    if (parts) take_sums(f, scratch);
     timed(stats, kReduce, [&] { reduce_gradients(in, opt, f, camera, slice, S::NF, scratch, result); });
   });
 }

@@ -55,7 +55,7 @@ struct Gradients {
 
 // A Gaussian as one camera sees it. exponent in base 2: log2(alpha) = log_opacity + a (dx + k dy)² + d dy².
 template <class T>
-struct Splat {
+struct alignas(64) Splat {
   T x, y;         // px
   T a, k, d, log_opacity;
   T r, g, b, z;
@@ -90,6 +90,7 @@ struct Options {
   int threads;
   bool depth;     // blend the depth channel
   bool variance;  // blend the variance channels
+  int64_t max_records = 0;  // gradient records held at once; 0: 4 a splat, at least 2^20
 };
 
 // Where the first non-finite value was found.
@@ -140,6 +141,11 @@ FramesPtr<T> rasterize_forward(const Inputs<T> &, const Options &, Level, const 
 template <class T>
 void rasterize_backward(const Inputs<T> &, const Options &, Frames<T> &, const Outputs<T> &, const Cotangents<T> &,
                         const Gradients<T> &);
+
+// Memory beyond the arrays passed in, all of it kept and reused: a splat takes 64 bytes and 4 for every 64x64-pixel tile
+// its box touches, of which there may be kMaxListed; a backward pass adds max_records records of 4 (16 + features) bytes;
+// every thread the splats of its current tile, some 400 bytes each.
+constexpr uint64_t kMaxListed = uint64_t{1} << 29;
 
 // Frees what the pools keep between calls.
 void release_memory();

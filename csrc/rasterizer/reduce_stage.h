@@ -5,17 +5,31 @@
 
 namespace perception::PERCEPTION_LEVEL {
 
-// Slots: splat i owns as many records as the 64x64 tiles its box touches.
+// Tiles [begin, end), in row-major order.
+struct TileRange {
+  int begin, end;
+};
+
+// Slots: splat i owns as many records as its box has tiles in the range. Returns how many there are.
 template <class T>
-uint64_t assign_slots(const Frame<T> &f, Scratch<T> &scratch) {
+uint64_t assign_slots(const Frame<T> &f, TileRange range, Scratch<T> &scratch) {
   uint64_t *slots = scratch.slots.reserve(f.count + 1), total = 0;
+  scratch.first_tile = range.begin;
   for (uint32_t i = 0; i < f.count; ++i) {
     const Splat<T> &s = f.splats[i];
     slots[i] = total;
-    total += static_cast<uint64_t>(s.x1 - s.x0 + 1) * (s.y1 - s.y0 + 1);
+    total += box_tiles_before(s, f.tiles_x, range.end) - box_tiles_before(s, f.tiles_x, range.begin);
   }
   slots[f.count] = total;
   return total;
+}
+
+// The longest range from `begin` on whose splats need no more than `limit` records; at least one tile.
+template <class T>
+TileRange next_range(const Frame<T> &f, int begin, uint64_t limit) {
+  int end = begin + 1;
+  while (end < f.tiles_x * f.tiles_y && f.offsets[end + 1] - f.offsets[begin] <= limit) ++end;
+  return {begin, end};
 }
 
 // Sum of splat i's records; false when no tile touched it.
@@ -29,6 +43,30 @@ bool sum_records(const Scratch<T> &scratch, uint32_t i, int size, T *sum) {
     found = true;
   }
   return found;
+}
+
+// Adds the records of a range to one sum a splat.
+template <class T>
+void add_records(const Options &opt, const Frame<T> &f, int size, Scratch<T> &scratch) {
+  const std::size_t blocks = (f.count + kBlock - 1) / kBlock;
+  parallel_for(opt.threads, blocks, [&](std::size_t block, int) {
+    const uint32_t end = static_cast<uint32_t>(std::min<std::size_t>(f.count, (block + 1) * kBlock));
+    T sum[kGeometry + 16];
+    for (uint32_t i = static_cast<uint32_t>(block * kBlock); i < end; ++i) {
+      if (!sum_records(scratch, i, size, sum)) continue;
+      T *to = scratch.sums.data() + static_cast<std::size_t>(i) * size;
+      for (int c = 0; c < size; ++c) to[c] = scratch.sum_touched[i] ? to[c] + sum[c] : sum[c];
+      scratch.sum_touched[i] = 1;
+    }
+  });
+}
+
+// Makes the sums the records, one a splat.
+template <class T>
+void take_sums(const Frame<T> &f, Scratch<T> &scratch) {
+  for (uint32_t i = 0; i <= f.count; ++i) scratch.slots[i] = i;
+  std::swap(scratch.records, scratch.sums);
+  std::swap(scratch.touched, scratch.sum_touched);
 }
 
 template <class T>
@@ -93,11 +131,11 @@ void color_gradient(const Inputs<T> &in, const Camera<T> &cam, const Splat<T> &s
       for (int c = 0; c < 3; ++c) out.colors[3 * i + c] += g_rgb[c];
     return;
   }
-  T v[3], gv[3], unused[3 * kMaxShCoefficients] = {};
+  T v[3], gv[3];
   const T gated[3] = {s.r > 0 ? g_rgb[0] : 0, s.g > 0 ? g_rgb[1] : 0, s.b > 0 ? g_rgb[2] : 0};
   view_vector(cam, in.means + 3 * i, v);
   sh_color_vjp(in.sh_degree, v, in.colors + 3 * i * in.sh_stride, gated,
-               out.colors ? out.colors + 3 * i * in.sh_stride : unused, gv);
+               out.colors ? out.colors + 3 * i * in.sh_stride : nullptr, gv);
   for (int c = 0; c < 3; ++c) {  // v = mean + Rᵀ t
     g_mean[c] += gv[c];
     for (int k = 0; k < 3; ++k) g_R[3 * k + c] += cam.t[k] * gv[c], g_t[k] += cam.R[3 * k + c] * gv[c];

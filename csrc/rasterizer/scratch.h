@@ -21,7 +21,7 @@ struct Worker {
   int stride = 0;
   uint32_t counts[16];
   int n = 0;
-  Buffer<uint8_t> touched;       // [n]
+  Buffer<uint16_t> touched;      // [n] pixels of some granule, 0 for none
   Buffer<T> records;             // [n, record]
   Buffer<T> tile;                // per-pixel state
   uint64_t evaluated = 0, contributing = 0;  // pairs of the forward pass
@@ -33,8 +33,11 @@ struct Scratch {
   Buffer<uint32_t> order[2];
   Buffer<uint32_t> histograms;
   Buffer<uint64_t> slots;        // first gradient record of every splat
+  int first_tile = 0;            // the tiles at hand begin here
   Buffer<uint8_t> touched;       // per record
   Buffer<T> records;
+  Buffer<uint8_t> sum_touched;   // the same summed over several parts of the picture, one a splat
+  Buffer<T> sums;
   Buffer<double> camera_sums;
   std::vector<Worker<T>> workers;
 };

@@ -3,6 +3,7 @@
 #pragma once
 #include <cstdint>
 #include <cstring>
+#include <type_traits>
 
 #if defined(PERCEPTION_LEVEL_avx512)
 #include "simd_avx512.h"
@@ -20,7 +21,7 @@ constexpr int kParts = 16 / Vec<T>::kLanes;  // registers per granule of 16 pixe
 // 2^x for x in (-100, 0]; results for other x are arbitrary and must be masked out.
 // float: minimax polynomial of degree 5 on [0, 1), relative error 1.5e-7. double: Taylor of degree 17, 1 ulp or so.
 inline Vec<float> exp2_nonpositive(Vec<float> x) {
-  Vec<float> whole = floor(x), r = x - whole;
+  Vec<float> whole, r = fraction(x, whole);
   Vec<float> p = Vec<float>(1.8775767e-3f);
   p = fma(p, r, Vec<float>(8.9893397e-3f));
   p = fma(p, r, Vec<float>(5.5826318e-2f));
@@ -38,11 +39,62 @@ inline Vec<double> exp2_nonpositive(Vec<double> x) {
                                 1.3215486790144305e-06, 1.5252733804059838e-05, 0.00015403530393381606,
                                 0.0013333558146428441, 0.009618129107628477, 0.055504108664821576,
                                 0.2402265069591007, 0.6931471805599453};
-  Vec<double> whole = floor(x), r = x - whole;
+  Vec<double> whole, r = fraction(x, whole);
   Vec<double> p = Vec<double>(kTaylor[0]);
   for (int k = 1; k < 17; ++k) p = fma(p, r, Vec<double>(kTaylor[k]));
   p = fma(p, r, Vec<double>(1.0));
   return scale_by_power_of_two(p, whole);
 }
+
+// Two registers side by side: they share what is broadcast and hide each other's latency.
+template <class T>
+struct PairMask {
+  Mask<T> a, b;
+  friend PairMask and_not(PairMask x, PairMask y) { return {and_not(x.a, y.a), and_not(x.b, y.b)}; }
+  friend bool any(PairMask x) { return any(x.a | x.b); }
+  friend uint32_t bits(PairMask x) { return bits(x.a) | bits(x.b) << Vec<T>::kLanes; }
+};
+
+template <class T>
+struct Pair {
+  static constexpr int kLanes = 2 * Vec<T>::kLanes;
+  using V = Vec<T>;
+  V a, b;
+  Pair() = default;
+  Pair(V x, V y) : a(x), b(y) {}
+  explicit Pair(T x) : a(x), b(a) {}
+  static Pair load(const T *p) { return {V::load(p), V::load(p + V::kLanes)}; }
+  void store(T *p) const { a.store(p), b.store(p + V::kLanes); }
+  friend Pair operator+(Pair x, Pair y) { return {x.a + y.a, x.b + y.b}; }
+  friend Pair operator-(Pair x, Pair y) { return {x.a - y.a, x.b - y.b}; }
+  friend Pair operator*(Pair x, Pair y) { return {x.a * y.a, x.b * y.b}; }
+  friend Pair fma(Pair x, Pair y, Pair z) { return {fma(x.a, y.a, z.a), fma(x.b, y.b, z.b)}; }
+  friend Pair fnma(Pair x, Pair y, Pair z) { return {fnma(x.a, y.a, z.a), fnma(x.b, y.b, z.b)}; }
+  friend Pair min(Pair x, Pair y) { return {min(x.a, y.a), min(x.b, y.b)}; }
+  friend Pair reciprocal(Pair x) { return {reciprocal(x.a), reciprocal(x.b)}; }
+  friend Pair exp2_nonpositive(Pair x) { return {exp2_nonpositive(x.a), exp2_nonpositive(x.b)}; }
+  friend Pair keep(PairMask<T> m, Pair x) { return {keep(m.a, x.a), keep(m.b, x.b)}; }
+  friend Pair select(PairMask<T> m, Pair x, Pair y) { return {select(m.a, x.a, y.a), select(m.b, x.b, y.b)}; }
+  friend PairMask<T> operator>=(Pair x, Pair y) { return {x.a >= y.a, x.b >= y.b}; }
+  friend PairMask<T> operator<(Pair x, Pair y) { return {x.a < y.a, x.b < y.b}; }
+  // Both registers into one sum.
+  friend V add(Pair x, V sum) { return sum + x.a + x.b; }
+  friend V add_product(Pair x, Pair y, V sum) { return fma(x.b, y.b, fma(x.a, y.a, sum)); }
+};
+
+template <class T>
+inline Vec<T> add(Vec<T> x, Vec<T> sum) {
+  return sum + x;
+}
+template <class T>
+inline Vec<T> add_product(Vec<T> x, Vec<T> y, Vec<T> sum) {
+  return fma(x, y, sum);
+}
+
+// What the blending loops work on: a granule's register, or two where it takes more than one.
+template <class T>
+using Pack = std::conditional_t<kParts<T> == 1, Vec<T>, Pair<T>>;
+template <class T>
+using PackMask = std::conditional_t<kParts<T> == 1, Mask<T>, PairMask<T>>;
 
 }  // namespace perception::PERCEPTION_LEVEL

@@ -31,7 +31,8 @@ inline VF fma(VF a, VF b, VF c) { return _mm256_fmadd_ps(a.v, b.v, c.v); }
 inline VF fnma(VF a, VF b, VF c) { return _mm256_fnmadd_ps(a.v, b.v, c.v); }
 inline VF min(VF a, VF b) { return _mm256_min_ps(a.v, b.v); }
 inline VF max(VF a, VF b) { return _mm256_max_ps(a.v, b.v); }
-inline VF floor(VF a) { return _mm256_floor_ps(a.v); }
+// a - floor(a), and what scale_by_power_of_two wants of the rest
+inline VF fraction(VF a, VF &whole) { return whole = _mm256_floor_ps(a.v), a - whole; }
 inline VF scale_by_power_of_two(VF p, VF whole) {
   __m256i e = _mm256_slli_epi32(_mm256_cvtps_epi32(whole.v), 23);
   return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p.v), e));
@@ -43,6 +44,7 @@ inline VF reciprocal(VF a) {  // one Newton step: relative error below 2e-7
 inline MF operator>=(VF a, VF b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GE_OQ)}; }
 inline MF operator<(VF a, VF b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_LT_OQ)}; }
 inline MF operator&(MF a, MF b) { return {_mm256_and_ps(a.m, b.m)}; }
+inline MF operator|(MF a, MF b) { return {_mm256_or_ps(a.m, b.m)}; }
 inline MF and_not(MF a, MF b) { return {_mm256_andnot_ps(b.m, a.m)}; }  // a and not b
 inline uint32_t bits(MF a) { return _mm256_movemask_ps(a.m); }
 inline bool any(MF a) { return !_mm256_testz_ps(a.m, a.m); }
@@ -84,7 +86,7 @@ inline VD fma(VD a, VD b, VD c) { return _mm256_fmadd_pd(a.v, b.v, c.v); }
 inline VD fnma(VD a, VD b, VD c) { return _mm256_fnmadd_pd(a.v, b.v, c.v); }
 inline VD min(VD a, VD b) { return _mm256_min_pd(a.v, b.v); }
 inline VD max(VD a, VD b) { return _mm256_max_pd(a.v, b.v); }
-inline VD floor(VD a) { return _mm256_floor_pd(a.v); }
+inline VD fraction(VD a, VD &whole) { return whole = _mm256_floor_pd(a.v), a - whole; }
 inline VD scale_by_power_of_two(VD p, VD whole) {
   __m256i e = _mm256_slli_epi64(_mm256_cvtepi32_epi64(_mm256_cvtpd_epi32(whole.v)), 52);
   return _mm256_castsi256_pd(_mm256_add_epi64(_mm256_castpd_si256(p.v), e));
@@ -93,6 +95,7 @@ inline VD reciprocal(VD a) { return _mm256_div_pd(_mm256_set1_pd(1.0), a.v); }
 inline MD operator>=(VD a, VD b) { return {_mm256_cmp_pd(a.v, b.v, _CMP_GE_OQ)}; }
 inline MD operator<(VD a, VD b) { return {_mm256_cmp_pd(a.v, b.v, _CMP_LT_OQ)}; }
 inline MD operator&(MD a, MD b) { return {_mm256_and_pd(a.m, b.m)}; }
+inline MD operator|(MD a, MD b) { return {_mm256_or_pd(a.m, b.m)}; }
 inline MD and_not(MD a, MD b) { return {_mm256_andnot_pd(b.m, a.m)}; }
 inline uint32_t bits(MD a) { return _mm256_movemask_pd(a.m); }
 inline bool any(MD a) { return !_mm256_testz_pd(a.m, a.m); }

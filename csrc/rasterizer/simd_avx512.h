@@ -31,7 +31,7 @@ inline VF fma(VF a, VF b, VF c) { return _mm512_fmadd_ps(a.v, b.v, c.v); }
 inline VF fnma(VF a, VF b, VF c) { return _mm512_fnmadd_ps(a.v, b.v, c.v); }
 inline VF min(VF a, VF b) { return _mm512_min_ps(a.v, b.v); }
 inline VF max(VF a, VF b) { return _mm512_max_ps(a.v, b.v); }
-inline VF floor(VF a) { return _mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF); }
+inline VF fraction(VF a, VF &whole) { return whole = a, _mm512_reduce_ps(a.v, _MM_FROUND_TO_NEG_INF); }  // scalef floors
 inline VF scale_by_power_of_two(VF p, VF whole) { return _mm512_scalef_ps(p.v, whole.v); }
 inline VF reciprocal(VF a) {  // one Newton step: relative error below 2e-7
   __m512 r = _mm512_rcp14_ps(a.v);
@@ -40,6 +40,7 @@ inline VF reciprocal(VF a) {  // one Newton step: relative error below 2e-7
 inline MF operator>=(VF a, VF b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
 inline MF operator<(VF a, VF b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LT_OQ)}; }
 inline MF operator&(MF a, MF b) { return {static_cast<__mmask16>(a.m & b.m)}; }
+inline MF operator|(MF a, MF b) { return {static_cast<__mmask16>(a.m | b.m)}; }
 inline MF and_not(MF a, MF b) { return {static_cast<__mmask16>(a.m & ~b.m)}; }  // a and not b
 inline uint32_t bits(MF a) { return a.m; }
 inline bool any(MF a) { return a.m != 0; }
@@ -85,12 +86,13 @@ inline VD fma(VD a, VD b, VD c) { return _mm512_fmadd_pd(a.v, b.v, c.v); }
 inline VD fnma(VD a, VD b, VD c) { return _mm512_fnmadd_pd(a.v, b.v, c.v); }
 inline VD min(VD a, VD b) { return _mm512_min_pd(a.v, b.v); }
 inline VD max(VD a, VD b) { return _mm512_max_pd(a.v, b.v); }
-inline VD floor(VD a) { return _mm512_roundscale_pd(a.v, _MM_FROUND_TO_NEG_INF); }
+inline VD fraction(VD a, VD &whole) { return whole = a, _mm512_reduce_pd(a.v, _MM_FROUND_TO_NEG_INF); }
 inline VD scale_by_power_of_two(VD p, VD whole) { return _mm512_scalef_pd(p.v, whole.v); }
 inline VD reciprocal(VD a) { return _mm512_div_pd(_mm512_set1_pd(1.0), a.v); }
 inline MD operator>=(VD a, VD b) { return {_mm512_cmp_pd_mask(a.v, b.v, _CMP_GE_OQ)}; }
 inline MD operator<(VD a, VD b) { return {_mm512_cmp_pd_mask(a.v, b.v, _CMP_LT_OQ)}; }
 inline MD operator&(MD a, MD b) { return {static_cast<__mmask8>(a.m & b.m)}; }
+inline MD operator|(MD a, MD b) { return {static_cast<__mmask8>(a.m | b.m)}; }
 inline MD and_not(MD a, MD b) { return {static_cast<__mmask8>(a.m & ~b.m)}; }
 inline uint32_t bits(MD a) { return a.m; }
 inline bool any(MD a) { return a.m != 0; }

@@ -57,6 +57,10 @@ Mask<T> operator&(Mask<T> a, Mask<T> b) {
   return {a.m & b.m};
 }
 template <class T>
+Mask<T> operator|(Mask<T> a, Mask<T> b) {
+  return {a.m | b.m};
+}
+template <class T>
 Mask<T> and_not(Mask<T> a, Mask<T> b) {
   return {a.m & ~b.m};
 }
@@ -79,11 +83,12 @@ Mask<T> mask_from_bits(uint32_t b) {
   return r;
 }
 template <class T>
-Vec<T> floor(Vec<T> a) {  // for |a| below 2^31; other lanes are arbitrary
+Vec<T> fraction(Vec<T> a, Vec<T> &whole) {  // for |a| below 2^31; other lanes are arbitrary
   Vec<T> clamped = max(min(a, Vec<T>(T(1e9))), Vec<T>(T(-1e9)));
   typename Lanes<T>::Int i = __builtin_convertvector(clamped.v, typename Lanes<T>::Int);
   typename Lanes<T>::Real r = __builtin_convertvector(i, typename Lanes<T>::Real);
-  return r > a.v ? r - 1 : r;
+  whole = r > a.v ? r - 1 : r;
+  return a - whole;
 }
 template <class T>
 Vec<T> scale_by_power_of_two(Vec<T> p, Vec<T> whole) {

@@ -50,32 +50,61 @@ PERCEPTION_HD void sh_basis_vjp(int degree, T x, T y, T z, const T *w, T *g) {
   g[2] += k10 * x * y + 8 * k11 * y * z + k12 * (6 * zz - 3 * xx - 3 * yy) + 8 * k13 * x * z + k14 * (xx - yy);
 }
 
+// The basis with every value three times, as the coefficients of red, green and blue stand.
+template <int DEGREE, class T>
+PERCEPTION_HD void spread_basis(const T *b, T *spread) {
+  constexpr int n = (DEGREE + 1) * (DEGREE + 1);
+  for (int k = 0; k < n; ++k)
+    for (int c = 0; c < 3; ++c) spread[3 * k + c] = b[k];
+}
+
+template <int DEGREE, class T>
+PERCEPTION_HD void sh_color_of(const T *v, const T *coefficients, T *rgb) {
+  T b[kMaxShCoefficients];
+  const T n2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2], r = n2 > T(0) ? T(1) / std::sqrt(n2) : T(0);
+  sh_basis(DEGREE, v[0] * r, v[1] * r, v[2] * r, b);
+  for (int c = 0; c < 3; ++c) {
+    T value = T(0.5);
+    for (int k = 0; k < (DEGREE + 1) * (DEGREE + 1); ++k) value += b[k] * coefficients[3 * k + c];
+    rgb[c] = value > T(0) ? value : T(0);
+  }
+}
+
+template <int DEGREE, class T>
+PERCEPTION_HD void sh_color_vjp_of(const T *v, const T *coefficients, const T *g_rgb, T *g_coefficients, T *gv) {
+  constexpr int n = (DEGREE + 1) * (DEGREE + 1);
+  T b[kMaxShCoefficients], w[kMaxShCoefficients], spread[3 * n], repeated[3 * n], products[3 * n], g[3];
+  const T n2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2], r = n2 > T(0) ? T(1) / std::sqrt(n2) : T(0);
+  const T x = v[0] * r, y = v[1] * r, z = v[2] * r;
+  sh_basis(DEGREE, x, y, z, b);
+  spread_basis<DEGREE>(b, spread);
+  for (int k = 0; k < n; ++k)
+    for (int c = 0; c < 3; ++c) repeated[3 * k + c] = g_rgb[c];
+  for (int j = 0; j < 3 * n; ++j) products[j] = coefficients[j] * repeated[j];
+  if (g_coefficients)
+    for (int j = 0; j < 3 * n; ++j) g_coefficients[j] += spread[j] * repeated[j];
+  for (int k = 0; k < n; ++k) w[k] = products[3 * k] + products[3 * k + 1] + products[3 * k + 2];
+  sh_basis_vjp(DEGREE, x, y, z, w, g);
+  const T along = g[0] * x + g[1] * y + g[2] * z;
+  gv[0] = (g[0] - x * along) * r, gv[1] = (g[1] - y * along) * r, gv[2] = (g[2] - z * along) * r;
+}
+
 // v: vector from the camera to the Gaussian. coefficients [(degree + 1)², 3].
 template <class T>
 PERCEPTION_HD void sh_color(int degree, const T *v, const T *coefficients, T *rgb) {
-  T b[kMaxShCoefficients];
-  const T n2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2], r = n2 > T(0) ? T(1) / std::sqrt(n2) : T(0);
-  sh_basis(degree, v[0] * r, v[1] * r, v[2] * r, b);
-  for (int c = 0; c < 3; ++c) rgb[c] = T(0.5);
-  for (int k = 0; k < (degree + 1) * (degree + 1); ++k)
-    for (int c = 0; c < 3; ++c) rgb[c] += b[k] * coefficients[3 * k + c];
-  for (int c = 0; c < 3; ++c) rgb[c] = rgb[c] > T(0) ? rgb[c] : T(0);
+  degree == 0   ? sh_color_of<0>(v, coefficients, rgb)
+  : degree == 1 ? sh_color_of<1>(v, coefficients, rgb)
+  : degree == 2 ? sh_color_of<2>(v, coefficients, rgb)
+                : sh_color_of<3>(v, coefficients, rgb);
 }
 
-// g_coefficients is added to; gv is written. g_rgb must be zero already where the colour was clamped.
+// g_coefficients is added to (null: not wanted); gv is written. g_rgb must be zero already where the colour was clamped.
 template <class T>
 PERCEPTION_HD void sh_color_vjp(int degree, const T *v, const T *coefficients, const T *g_rgb, T *g_coefficients, T *gv) {
-  T b[kMaxShCoefficients], w[kMaxShCoefficients], g[3];
-  const T n2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2], r = n2 > T(0) ? T(1) / std::sqrt(n2) : T(0);
-  const T x = v[0] * r, y = v[1] * r, z = v[2] * r;
-  sh_basis(degree, x, y, z, b);
-  for (int k = 0; k < (degree + 1) * (degree + 1); ++k) {
-    w[k] = 0;
-    for (int c = 0; c < 3; ++c) w[k] += coefficients[3 * k + c] * g_rgb[c], g_coefficients[3 * k + c] += b[k] * g_rgb[c];
-  }
-  sh_basis_vjp(degree, x, y, z, w, g);
-  const T along = g[0] * x + g[1] * y + g[2] * z;
-  gv[0] = (g[0] - x * along) * r, gv[1] = (g[1] - y * along) * r, gv[2] = (g[2] - z * along) * r;
+  degree == 0   ? sh_color_vjp_of<0>(v, coefficients, g_rgb, g_coefficients, gv)
+  : degree == 1 ? sh_color_vjp_of<1>(v, coefficients, g_rgb, g_coefficients, gv)
+  : degree == 2 ? sh_color_vjp_of<2>(v, coefficients, g_rgb, g_coefficients, gv)
+                : sh_color_vjp_of<3>(v, coefficients, g_rgb, g_coefficients, gv);
 }
 
 }  // namespace perception

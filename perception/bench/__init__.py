@@ -12,11 +12,16 @@ BENCHES = (
     "scannetpp",
     "clouds",
     "smoothing",
+    "calibrate",
     "queries",
+    "sam",
     "map",
     "switches",
     "scaling",
     "ablation",
     "export",
+    "instances",
+    "collisions",
+    "clustering",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""

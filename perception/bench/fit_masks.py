@@ -1,26 +1,31 @@
-"""Fits the built-in segmentation's weights: `python -m perception.bench.fit_masks SCENE… [--depth]`.
+"""Fits the built-in segmentation's weights: `python -m perception.bench.fit_masks SCENE… [--surface]`.
 
-Pairs of regions are met while merging photos; each says whether both lie mostly on the same truth instance.
-A logistic regression over them gives the log odds that `perception.masks.regions` merges by. With --depth the
-scene's depth is used, disturbed as depth rendered from Gaussians is: blurred, waving, with holes.
+Pairs of regions are met while merging photos, or with --surface pairs of patches of the whole scene's surface; each
+says whether both lie mostly on the same truth instance. A logistic regression over them gives the log odds that
+`perception.masks.regions` and `perception.masks.scene` merge by. Depth for --surface is found by stereo as in a map;
+where it starts from is the scene's depth, spoilt as that of a half-trained map is.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
+import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from perception.bench.masks import read_image, views_with_truth
-from perception.masks import regions
-from perception.masks.cues import DepthCues, PhotoCues, depth_cues, photo_cues
-from perception.masks.region_graph import DEPTH_FEATURES, PHOTO_FEATURES, RegionGraph
+from perception.masks import regions, scene
+from perception.masks.cues import photo_cues
+from perception.masks.region_graph import RegionGraph, agglomerate
+from perception.types import View
 
-_COLOUR_FEATURES = (1, 2, 3, 4, 7)
 _PURE = 0.7  # share of a region that one instance must cover for the region to teach anything
+_ROUNDS = 2  # the first regions, then every level that merging them goes through
 
 
 @dataclass
@@ -34,103 +39,144 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Example:
-    """One photo, ready to be merged. truth: [h, w] instance ids."""
+    """A graph ready to be merged. covered: [R, I] how much of each region lies on each instance; smallest: see
+    `agglomerate`."""
 
-    first: np.ndarray
-    look: PhotoCues
-    surface: DepthCues | None
-    truth: np.ndarray
+    graph: Any
+    covered: np.ndarray
+    smallest: float
 
 
-def disturbed(depth: np.ndarray, seed: int) -> np.ndarray:
-    """depth [h, w] in any unit, as a map of Gaussians would render it: float32, 0 = none."""
+def photo_example(photo: np.ndarray, truth: np.ndarray) -> Example:
+    """photo: [h, w, 3] uint8; truth: [h, w] instance ids."""
+    look = photo_cues(photo)
+    first = regions.first_regions(look)
+    return Example(RegionGraph(first, look), _covered([first], [truth]), regions.SMALLEST * truth.size)
+
+
+def surface_example(folder: Path) -> Example:
+    """The whole of a truth scene: photos, cameras, masks_gt/ and depth/ of equal stems."""
+    sights, truths = [], []
+    posed = posed_views(folder)
+    for seed, (view, truth) in enumerate(views_with_truth(folder)):
+        depth = read_image(folder / "depth" / f"{view.photo.stem}.png")
+        sight = scene.make_sight(posed[view.name], read_image(view.photo), spoilt(depth, seed))
+        if sight is not None:
+            sights.append(sight)
+            truths.append(_shrunk(truth, sight.depth.shape))
+    scene.measure(sights)
+    surface = scene.fuse(sights)
+    graph = scene.surface_graph(sights, surface)
+    voxels = [surface.voxel_of(sight.points(sight.cues()[1])) for sight in sights]
+    patches = [np.where(voxel >= 0, graph.patch[voxel], -1) for voxel in voxels]
+    return Example(graph, _covered(patches, truths), scene.SMALLEST)
+
+
+def spoilt(depth: np.ndarray, seed: int) -> np.ndarray:
+    """depth [h, w] in any unit as a half-trained map renders it: float32, waving by a few per cent, 0 = none."""
     import cv2
 
     rng = np.random.default_rng(seed)
-    noise = [cv2.GaussianBlur(rng.normal(size=depth.shape).astype(np.float32), (0, 0), s) for s in (3, 25)]
-    rendered = cv2.GaussianBlur(depth.astype(np.float32), (0, 0), 1.2)
-    rendered *= 1 + 0.004 * sum(part / part.std() for part in noise)
+    noise = [cv2.GaussianBlur(rng.normal(size=depth.shape).astype(np.float32), (0, 0), s) for s in (5, 40)]
+    rendered = cv2.GaussianBlur(depth.astype(np.float32), (0, 0), 2.0)
+    rendered *= 1 + 0.04 * sum(part / part.std() for part in noise)
     rendered[(depth == 0) | (rng.random(depth.shape) < 0.01)] = 0
     return rendered
 
 
-def example(scene: Path, photo: Path, truth: np.ndarray, with_depth: bool, seed: int) -> Example:
-    """Reads a photo of a truth scene; its depth is `depth/STEM.png`, its camera in transforms.json."""
-    look, surface = photo_cues(read_image(photo)), None
-    if with_depth:
-        depth = read_image(scene / "depth" / f"{photo.stem}.png")
-        surface = depth_cues(disturbed(depth, seed), _intrinsics(scene))
-    return Example(regions.first_regions(look, surface), look, surface, truth)
+def posed_views(folder: Path) -> dict[str, View]:
+    """The views of a scene's transforms.json by photo name."""
+    about = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
+    K = np.array([[about["fl_x"], 0, about["cx"]], [0, about["fl_y"], about["cy"]], [0, 0, 1]])
+    views = {}
+    for frame in about["frames"]:
+        photo = folder / frame["file_path"]
+        world_from_camera = np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        size = int(about["w"]), int(about["h"])
+        views[photo.name] = View(photo.name, photo, K, *size, np.linalg.inv(world_from_camera))
+    return views
 
 
 def collect(item: Example, weights: np.ndarray | None, pairs: Pairs) -> None:
     """Adds the pairs met while merging with `weights`; without, those of the first regions."""
-    ids, truth = np.unique(item.truth, return_inverse=True)
-    count = int(item.first.max()) + 1
-    covered = np.zeros((count, len(ids)))
-    np.add.at(covered, (item.first.ravel(), truth.ravel()), 1.0)
+    graph, covered = copy.deepcopy(item.graph), item.covered.copy()
 
-    def teach(graph: RegionGraph, a: int, others: list[int]) -> None:
+    def teach(graph: Any, a: int, others: list[int]) -> None:
         for b, features in zip(others, graph.features(a, others), strict=True):
             one, two = covered[a], covered[b]
-            if min(one.max() / one.sum(), two.max() / two.sum()) >= _PURE:
+            total_one, total_two = one.sum(), two.sum()
+            if min(total_one, total_two) > 0 and min(one.max() / total_one, two.max() / total_two) >= _PURE:
                 pairs.features.append(features)
                 pairs.same.append(bool(one.argmax() == two.argmax()))
-                pairs.weights.append(float(np.sqrt(min(one.sum(), two.sum()))))
+                pairs.weights.append(float(np.sqrt(min(graph.size(a), graph.size(b)))))
 
-    def watch(graph: RegionGraph, a: int, b: int) -> None:
+    def watch(graph: Any, a: int, b: int) -> None:
         teach(graph, a, [b, *(c for c in list(graph.borders[a])[:6] if c != b)])
         covered[a] = covered[b] = covered[a] + covered[b]
 
-    if weights is None:
-        graph = RegionGraph(item.first, item.look, item.surface)
-        for a, links in enumerate(graph.borders):
-            if later := [b for b in links if b > a]:
-                teach(graph, a, later)
-    else:
-        regions.merge_regions(item.first, item.look, item.surface, weights, 0.0, watch)
+    if weights is not None:
+        agglomerate(graph, weights, 0.0, item.smallest, watch)
+        return
+    for a, links in enumerate(graph.borders):
+        if later := [b for b in links if b > a]:
+            teach(graph, a, later)
 
 
-def fit(pairs: Pairs, without: tuple[int, ...] = ()) -> np.ndarray:
-    """[F] log odds per unit of each feature; those `without` get none."""
+def fit(pairs: Pairs) -> np.ndarray:
+    """[F] log odds per unit of each feature."""
     from sklearn.linear_model import LogisticRegression
 
     features = np.array(pairs.features)
-    features[:, list(without)] = 0
+    spread = features.std(axis=0)
+    spread[spread < 1e-9] = 1  # the constant
     weights = np.array(pairs.weights) / np.mean(pairs.weights)
-    model = LogisticRegression(C=1.0, fit_intercept=False, max_iter=2000)
-    return model.fit(features, pairs.same, sample_weight=weights).coef_[0]
+    model = LogisticRegression(C=1.0, fit_intercept=False, max_iter=3000)
+    return np.asarray(model.fit(features / spread, pairs.same, sample_weight=weights).coef_[0] / spread)
 
 
-def _intrinsics(scene: Path) -> np.ndarray:
-    import json
-
-    camera = json.loads((scene / "transforms.json").read_text())
-    return np.array([[camera["fl_x"], 0, camera["cx"]], [0, camera["fl_y"], camera["cy"]], [0, 0, 1]])
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Prints the weights, to be pasted into perception/masks/regions.py."""
-    parser = argparse.ArgumentParser(prog="python -m perception.bench.fit_masks")
-    parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
-    parser.add_argument("--depth", action="store_true", help="fit the weights used when depth is known")
-    parser.add_argument("--every", type=int, default=8, help="take every n-th photo")
-    options = parser.parse_args(arguments)
-    examples = []
-    for scene in options.scenes:
-        for seed, (view, truth) in enumerate(list(views_with_truth(scene))[:: options.every]):
-            examples.append(example(scene, view.photo, truth, options.depth, seed))
+def learn(examples: list[Example]) -> tuple[np.ndarray, Pairs]:
+    """The weights, and the pairs they were fitted to."""
     pairs, weights = Pairs(), None
-    for _ in range(2):  # the first regions, then every level that merging them goes through
+    for _ in range(_ROUNDS):
         for item in examples:
             collect(item, weights, pairs)
         weights = fit(pairs)
-    assert weights is not None and len(weights) == (DEPTH_FEATURES if options.depth else PHOTO_FEATURES)
+    assert weights is not None
+    return weights, pairs
+
+
+def _covered(images: list[np.ndarray], truths: list[np.ndarray]) -> np.ndarray:
+    """[R, I] pixels of region r (−1 = none) on instance i."""
+    counts = np.zeros((1 + max(int(i.max()) for i in images), 1 + max(int(t.max()) for t in truths)))
+    for image, truth in zip(images, truths, strict=True):
+        inside = image >= 0
+        np.add.at(counts, (image[inside], truth[inside]), 1.0)
+    return counts
+
+
+def _shrunk(ids: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    import cv2
+
+    return cv2.resize(ids.astype(np.int32), shape[::-1], interpolation=cv2.INTER_NEAREST)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Prints the weights, to be pasted into perception/masks/regions.py or scene.py."""
+    parser = argparse.ArgumentParser(prog="python -m perception.bench.fit_masks")
+    parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
+    parser.add_argument("--surface", action="store_true", help="fit the weights of the surface's patches")
+    parser.add_argument("--every", type=int, default=8, help="take every n-th photo (without --surface)")
+    options = parser.parse_args(arguments)
+    examples = []
+    for folder in options.scenes:
+        if options.surface:
+            examples.append(surface_example(folder))
+        else:
+            views = list(views_with_truth(folder))[:: options.every]
+            examples += [photo_example(read_image(view.photo), truth) for view, truth in views]
+    weights, pairs = learn(examples)
     print(f"{len(pairs.same)} pairs, {np.mean(pairs.same):.3f} of one object")
     print(np.array2string(weights, precision=2, separator=", ", suppress_small=True))
-    if options.depth:
-        shape_alone = fit(pairs, without=_COLOUR_FEATURES)
-        print("shape alone:", np.array2string(shape_alone, precision=2, separator=", ", suppress_small=True))
     return 0
 
 

@@ -16,7 +16,7 @@ from perception.bench.prompts import ABSENT, accuracy, chance
 from perception.bench.truth import TruthScene, read_truth, truth_view_scores
 from perception.instances.crops import choose_views
 from perception.instances.describe import describe_instances
-from perception.language.base import Encoder, make_encoder
+from perception.language.base import Encoder, make_encoder, reading_of
 from perception.language.description import InstanceDescription
 from perception.language.ranking import PRESENT, Ranker
 
@@ -30,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--encoder", default="conse")
     parser.add_argument("--background", default="plain", choices=["plain", "dim", "blur", "fill"])
     parser.add_argument("--views", type=int, default=5)
-    parser.add_argument("--levels", type=int, default=3)
+    parser.add_argument("--levels", type=int, default=0, help="crops a view; 0: as suits the encoder")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(argv)
     reports = [measure_scene(folder, options) for folder in options.scenes]
@@ -53,7 +53,12 @@ def measure_scene(folder: str, options: argparse.Namespace) -> dict[str, Any]:
     names = [frame["file_path"] for frame in scene.frames]
     before = time.perf_counter()
     descriptions = describe_instances(
-        encoder, choices, scene.load, names, levels=options.levels, background=options.background
+        encoder,
+        choices,
+        scene.load,
+        names,
+        levels=options.levels or reading_of(encoder).zooms,
+        background=options.background,
     )
     seconds = time.perf_counter() - before
     report = {"scene": scene.about["name"], "encoder": encoder.identity, "instances": len(descriptions)}

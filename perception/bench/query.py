@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -92,6 +92,29 @@ def load_times(path: Path, turns: int) -> dict[str, float]:
         gmap.get(0)
         pointing.append(time.perf_counter() - start)
     return {"load_map_ms": _ms(np.median(opening)), "load_map_and_points_ms": _ms(np.median(pointing))}
+
+
+def place_times(path: Path, turns: int) -> dict[str, float]:
+    """Milliseconds, median over instances, of questions about places, each at or around another instance."""
+    from perception.query import axis_box, load_map
+
+    gmap = load_map(path)
+    hits = gmap.find()[:: max(1, len(gmap.instances) // (8 * turns))]
+    questions: dict[str, Callable[[Any], Any]] = {
+        "nearest": lambda hit: gmap.nearest(hit.centroid, 3),
+        "instance_at": lambda hit: gmap.instance_at(hit.centroid),
+        "in_box": lambda hit: gmap.in_box(axis_box(hit.centroid - 1.5, hit.centroid + 1.5)),
+        "describe": lambda hit: gmap.describe(hit.instance_id),
+    }
+    found = {}
+    for name, ask in questions.items():
+        times = []
+        for hit in hits:
+            start = time.perf_counter()
+            ask(hit)
+            times.append(time.perf_counter() - start)
+        found[f"{name}_ms"] = _ms(np.median(times))
+    return found
 
 
 def warm(path: Path, names: Sequence[str], queries: int) -> tuple[dict[str, Any], dict[str, Best]]:
@@ -196,12 +219,15 @@ def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         path = folder / f"{size}.gsmap"
         write_synthetic_map(path, names, encoder, gaussians=size)
         row = {**load_times(path, options.turns), **cold_start(path, names[0], 0, options.rounds)}
+        row |= place_times(path, options.turns)
         report["maps"][size] = row
-        _say(f"{size:>9} Gaussians: load_map {row['load_map_ms']} ms, with points {row['load_map_and_points_ms']} ms; ")
+        _say(f"{size:>9} Gaussians: load_map {row['load_map_ms']} ms, with points {row['load_map_and_points_ms']} ms")
         _say(
             f"{'':>9} process to first answer {row['first_answer_s']} s wall, {row['first_answer_cpu_s']} s processor "
             f"({row['until_map_open_cpu_s']} s until the map was open), peak {row['peak_mib']} MiB"
         )
+        places = ", ".join(f"{name} {row[f'{name}_ms']}" for name in ("nearest", "instance_at", "in_box", "describe"))
+        _say(f"{'':>9} places, ms: {places}")
     report["warm"], answers = warm(path, names, options.queries)
     for kind in ("new_prompt", "repeated_prompt"):
         _say(f"one thread, {kind.replace('_', ' ')}: {_told(report['warm'][kind])}")

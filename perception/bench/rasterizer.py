@@ -1,94 +1,76 @@
-"""Speed against error of the rasterizer: `python -m perception.bench.rasterizer [scene.npz] [--json FILE]`.
+"""Speed against error of the rasterizer: `perception bench rasterizer [SCENE.npz ...] [-o FOLDER]`.
 
-Times forward + backward to the 3D parameters, every case once a round (interleaved, so that a busy machine is
-equally unkind to all), and reports the error to the float64 build. A pair is one Gaussian contributing to one
-pixel; its nanoseconds are CPU time, the steadier figure on a shared machine.
+Times forward + backward to the 3D parameters on every SIMD level this processor has, every case once a round
+(interleaved, so that a busy machine is equally unkind to all). A pair is one Gaussian contributing to one pixel. Its
+nanoseconds are CPU time of all threads: of the median round, and of the least disturbed one.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import platform
+import ctypes
 import statistics
-import sys
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from perception.bench.splats import SPLAT_KEYS, load_scene, synthetic_scene
+from perception.bench.sweep_cli import Column, finish, save_plot, table
 from perception.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-SPLAT_KEYS = ("means", "quats", "scales", "opacities", "colors", "features")
+STAGES = ("project", "sort", "bin", "blend", "blend_backward", "reduce")
+COLUMNS: tuple[Column, ...] = (
+    ("ms", "median_ms", ".1f"),
+    ("IQR", "iqr_ms", ".1f"),
+    ("fwd", "forward_ms", ".1f"),
+    ("CPU ms", "cpu_ms", ".1f"),
+    ("ns/pair", "ns_per_pair", ".2f"),
+    ("least", "least_ns_per_pair", ".2f"),
+    ("p99.9", "error_p999", ".1e"),
+    ("mean", "error_mean", ".1e"),
+    ("max", "error_max", ".1e"),
+    ("grad", "gradient_error", ".1e"),
+    ("peak MiB", "peak_mib", ".0f"),
+    *((stage.replace("blend_backward", "back"), f"share_{stage}", ".0%") for stage in STAGES),
+)
+HEADS = ("scene", "simd", "dtype", "channels", "threads")
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is timed: `rich` adds features and their variance to RGB."""
+
+    simd: str
+    dtype: str
+    rich: bool
+    threads: int
 
 
 @dataclass
-class Case:
-    """One line of the table; times in milliseconds of wall clock, cpu_ms (the least) summed over threads."""
+class Turn:
+    """One forward and backward pass."""
 
-    simd: str
-    threads: int
-    channels: str
-    median_ms: float
-    min_ms: float
-    spread_ms: float
-    forward_ms: float
-    cpu_ms: float
-    ns_per_pair: float
-    error_p999: float
-    error_mean: float
-    gradient_error: float
+    forward: float  # seconds of wall clock
+    total: float
+    cpu: float  # of all threads
+    stages: dict[str, float]
 
 
-def synthetic_scene(n: int = 50_000, width: int = 640, height: int = 480) -> dict[str, Any]:
-    """A cloud of small Gaussians in front of one camera, float32."""
-    import torch
-
-    g = torch.Generator().manual_seed(0)
-    means = (torch.rand((n, 3), generator=g) - 0.5) * torch.tensor([8.0, 6.0, 6.0]) + torch.tensor([0.0, 0.0, 5.0])
-    return {
-        "means": means,
-        "quats": torch.randn((n, 4), generator=g),
-        "scales": torch.exp(torch.randn((n, 3), generator=g) * 0.5 - 4.0),
-        "opacities": torch.rand(n, generator=g) * 0.9 + 0.05,
-        "colors": torch.rand((n, 3), generator=g),
-        "features": torch.randn((n, 8), generator=g),
-        "viewmats": torch.eye(4)[None],
-        "Ks": torch.tensor([[[500.0, 0, width / 2], [0, 500.0, height / 2], [0, 0, 1]]]),
-        "width": width,
-        "height": height,
-    }
-
-
-def load_scene(path: Path) -> dict[str, Any]:
-    """A splats .npz: means, quats, scales, opacities, colors, features, viewmat, K, width, height."""
-    import numpy as np
-    import torch
-
-    try:
-        data = np.load(path)
-        scene: dict[str, Any] = {k: torch.from_numpy(data[k].astype(np.float32)) for k in SPLAT_KEYS}
-        scene["viewmats"], scene["Ks"] = (torch.from_numpy(data[k].astype(np.float32))[None] for k in ("viewmat", "K"))
-        scene["width"], scene["height"] = int(data["width"]), int(data["height"])
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(
-            f"{path}: not a splats file ({error}); expected an .npz with {', '.join(SPLAT_KEYS)}"
-        ) from None
-    return scene
-
-
-def _render(scene: dict[str, Any], rich: bool, **options: Any) -> tuple[Any, list[Tensor], list[Tensor]]:
+def _render(scene: dict[str, Any], rich: bool, dtype: Any, **options: Any) -> tuple[Any, list[Tensor], list[Tensor]]:
+    """The result, its images, and the leaves that take gradients."""
     from perception.gaussians.rasterize import rasterize
 
-    inputs = {**scene, "features": scene["features"] if rich else None}
-    leaves = [inputs[k].detach().clone().requires_grad_() for k in SPLAT_KEYS if inputs[k] is not None]
-    inputs.update(zip([k for k in SPLAT_KEYS if inputs[k] is not None], leaves, strict=True))
-    out = rasterize(**inputs, depth=rich, variance=rich, **options)
+    inputs = {k: v.to(dtype) if hasattr(v, "dtype") else v for k, v in scene.items()}
+    names = [k for k in SPLAT_KEYS if rich or k != "features"]
+    inputs |= {k: inputs[k].detach().requires_grad_() for k in names} | ({} if rich else {"features": None})
+    out = rasterize(**inputs, depth=False, variance=rich, **options)
     images = [out.colors, out.features, out.feature_variance] if rich else [out.colors]
-    return out, images, leaves  # type: ignore[return-value]
+    return out, images, [inputs[k] for k in names]  # type: ignore[return-value]
 
 
 def _cotangents(images: list[Tensor]) -> list[Tensor]:
@@ -99,106 +81,144 @@ def _cotangents(images: list[Tensor]) -> list[Tensor]:
     return [(torch.rand(t.shape, generator=g, dtype=torch.float64) * 2 - 1).to(t.dtype) for t in images]
 
 
-def _once(scene: dict[str, Any], rich: bool, **options: Any) -> tuple[float, float, float]:
-    """Seconds of forward, forward + backward, and CPU time."""
+def _turn(scene: dict[str, Any], case: Case, cotangents: list[Tensor]) -> Turn:
     import torch
 
-    cpu = time.process_time()
-    start = time.perf_counter()
-    _, images, leaves = _render(scene, rich, **options)
-    middle, cpu_middle = time.perf_counter(), time.process_time()
-    cotangents = _cotangents(images)
-    again, cpu_again = time.perf_counter(), time.process_time()
+    cpu, start = time.process_time(), time.perf_counter()
+    out, images, leaves = _render(scene, case.rich, getattr(torch, case.dtype), simd=case.simd, threads=case.threads)
+    middle = time.perf_counter()
     torch.autograd.grad(images, leaves, cotangents)
-    end, cpu_end = time.perf_counter(), time.process_time()
-    return middle - start, middle - start + end - again, cpu_middle - cpu + cpu_end - cpu_again
+    end = time.perf_counter()
+    return Turn(middle - start, end - start, time.process_time() - cpu, out.stats.seconds)
 
 
-def _errors(scene: dict[str, Any], rich: bool, **options: Any) -> tuple[float, float, float]:
-    """p99.9 and mean absolute error of the images, and the relative L2 error of the gradients, to float64."""
+def _errors(scene: dict[str, Any], case: Case) -> dict[str, float]:
+    """Absolute error of the images, and relative L2 error of the gradients, to the float64 build of the same level."""
     import torch
 
     def run(dtype: Any) -> tuple[Tensor, Tensor]:
-        cast = {k: v.to(dtype) if isinstance(v, torch.Tensor) else v for k, v in scene.items()}
-        _, images, leaves = _render(cast, rich, **options)
+        _, images, leaves = _render(scene, case.rich, dtype, simd=case.simd)
         grads = torch.autograd.grad(images, leaves, _cotangents(images))
-        return torch.cat([t.detach().double().flatten() for t in images]), torch.cat(
-            [g.double().flatten() for g in grads]
-        )
+        flat = [torch.cat([t.detach().double().flatten() for t in tensors]) for tensors in (images, grads)]
+        return flat[0], flat[1]
 
-    (image, grad), (exact, exact_grad) = run(torch.float32), run(torch.float64)
+    (image, grad), (exact, exact_grad) = run(getattr(torch, case.dtype)), run(torch.float64)
     error = (image - exact).abs()
     p999 = float(error.kthvalue(max(1, int(0.999 * error.numel()))).values)
-    return p999, float(error.mean()), float((grad - exact_grad).norm() / exact_grad.norm())
+    relative = float((grad - exact_grad).norm() / exact_grad.norm())
+    figures = {"error_p999": p999, "error_mean": float(error.mean()), "error_max": float(error.max())}
+    return figures | {"gradient_error": relative}
 
 
-def measure(scene: dict[str, Any], rounds: int = 9, threads: tuple[int, ...] = (1, 2)) -> dict[str, Any]:
-    """All levels × threads × {RGB, RGB + features + variance}, interleaved; a JSON-able report."""
+def _peak_mib(scene: dict[str, Any], case: Case) -> float | None:
+    """MiB a first forward and backward pass add to this process, images and gradients included; None off Linux."""
     import torch
 
+    from perception import _core
+
+    _core.rasterizer_release_memory()  # type: ignore[attr-defined]
+    try:
+        ctypes.CDLL(None).malloc_trim(0)  # what was freed before must not hide what is taken now
+        Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
+        before = _status("VmRSS")
+        _, images, leaves = _render(scene, case.rich, getattr(torch, case.dtype), simd=case.simd, threads=case.threads)
+        torch.autograd.grad(images, leaves, [torch.ones_like(t) for t in images])
+        return (_status("VmHWM") - before) / 1024
+    except (OSError, AttributeError):
+        return None
+
+
+def _status(name: str) -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith(name)).split()[1])
+
+
+def cases(threads: Sequence[int], dtypes: Sequence[str]) -> list[Case]:
+    """Every SIMD level × precision × {RGB, rich} × number of threads."""
     from perception.gaussians.rasterize import simd_levels
 
-    keys = [(s, t, rich) for s in simd_levels() for t in threads for rich in (False, True)]
-    times: dict[Any, list[tuple[float, float, float]]] = {k: [] for k in keys}
-    for i in range(rounds + 1):  # the first round warms up
-        for key in keys:
-            seconds = _once(scene, key[2], simd=key[0], threads=key[1])
+    return [Case(s, d, rich, t) for d in dtypes for rich in (False, True) for s in simd_levels() for t in threads]
+
+
+def measure(name: str, scene: dict[str, Any], chosen: Sequence[Case], rounds: int) -> list[dict[str, Any]]:
+    """One row a case; the first round warms up and does not count."""
+    import torch
+
+    turns: dict[Case, list[Turn]] = {case: [] for case in chosen}
+    cotangents = {}
+    for case in chosen:
+        key = case.dtype, case.rich
+        if key not in cotangents:
+            cotangents[key] = _cotangents(_render(scene, case.rich, getattr(torch, case.dtype))[1])
+    for i in range(rounds + 1):
+        for case in chosen:
+            turn = _turn(scene, case, cotangents[case.dtype, case.rich])
             if i:
-                times[key].append(seconds)
-    pairs = max(1, _render(scene, False)[0].stats.contributing_pairs)
-    cases = []
-    for simd, n, rich in keys:
-        total = [t[1] * 1e3 for t in times[simd, n, rich]]
-        cpu = min(t[2] for t in times[simd, n, rich]) * 1e3
-        cases.append(
-            Case(
-                simd, n, f"RGB+{scene['features'].shape[1]}+var" if rich else "RGB",
-                statistics.median(total), min(total), max(total) - min(total),
-                statistics.median(t[0] * 1e3 for t in times[simd, n, rich]), cpu, cpu * 1e6 / pairs,
-                *_errors(scene, rich, simd=simd),
-            )
-        )  # fmt: skip
+                turns[case].append(turn)
+    return [_row(name, scene, case, turns[case]) for case in chosen]
+
+
+def _row(name: str, scene: dict[str, Any], case: Case, turns: list[Turn]) -> dict[str, Any]:
+    import torch
+
+    stats = _render(scene, case.rich, getattr(torch, case.dtype), simd=case.simd)[0].stats
+    pairs = max(1, stats.contributing_pairs)
+    total, cpu = sorted(1e3 * t.total for t in turns), [t.cpu for t in turns]
+    quarter = max(1, len(total) // 4)
+    seconds = {stage: statistics.median(t.stages[stage] for t in turns) for stage in STAGES}
+    whole = max(sum(seconds.values()), 1e-12)
     return {
-        "gaussians": scene["means"].shape[0], "width": scene["width"], "height": scene["height"],
-        "pairs": pairs,
-        "rounds": rounds, "machine": platform.processor() or platform.machine(), "torch": torch.__version__,
-        "cases": [asdict(c) for c in cases],
+        "scene": name, "simd": case.simd, "dtype": case.dtype, "threads": case.threads,
+        "channels": f"RGB+{scene['features'].shape[1]}+var" if case.rich else "RGB",
+        "gaussians": len(scene["means"]), "width": scene["width"], "height": scene["height"],
+        "evaluated_pairs": stats.evaluated_pairs, "contributing_pairs": stats.contributing_pairs,
+        "median_ms": statistics.median(total), "least_ms": total[0], "iqr_ms": total[-quarter] - total[quarter - 1],
+        "forward_ms": 1e3 * statistics.median(t.forward for t in turns), "cpu_ms": 1e3 * statistics.median(cpu),
+        "ns_per_pair": 1e9 * statistics.median(cpu) / pairs, "least_ns_per_pair": 1e9 * min(cpu) / pairs,
+        "peak_mib": _peak_mib(scene, case), **_errors(scene, case),
+        **{f"share_{stage}": seconds[stage] / whole for stage in STAGES},
     }  # fmt: skip
 
 
-def table(report: dict[str, Any]) -> str:
-    """The report as text."""
-    size = f"{report['width']}×{report['height']}"
-    head = f"{report['gaussians']} Gaussians, {size}, {report['pairs'] / 1e6:.2f} M pairs"
-    names = f"{'simd':9}{'thr':>4}{'channels':>12}{'median':>9}{'min':>8}{'spread':>8}{'fwd':>7}{'cpu':>8}"
-    lines = [head, f"{names}{'ns/pair':>9}{'p99.9':>10}{'mean':>10}{'grad':>10}"]
-    for c in report["cases"]:
-        lines.append(
-            f"{c['simd']:9}{c['threads']:4}{c['channels']:>12}{c['median_ms']:9.1f}{c['min_ms']:8.1f}{c['spread_ms']:8.1f}"
-            f"{c['forward_ms']:7.1f}{c['cpu_ms']:8.1f}{c['ns_per_pair']:9.2f}{c['error_p999']:10.1e}{c['error_mean']:10.1e}"
-            f"{c['gradient_error']:10.1e}"
-        )
-    return "\n".join(lines)
+def _draw(rows: list[dict[str, Any]]) -> Any:
+    def draw(figure: Any) -> None:
+        axis = figure.subplots()
+        labels = [" ".join(str(row[head]) for head in HEADS) for row in rows]
+        left = [0.0] * len(rows)
+        for stage in STAGES:
+            widths = [row["ns_per_pair"] * row[f"share_{stage}"] for row in rows]
+            axis.barh(labels, widths, left=left, label=stage.replace("_", " "))
+            left = [a + b for a, b in zip(left, widths, strict=True)]
+        axis.invert_yaxis()
+        axis.set_xlabel("CPU nanoseconds per contributing pair, forward + backward")
+        axis.legend()
+
+    return draw
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Command line; prints the table and writes the JSON where asked."""
-    parser = argparse.ArgumentParser(prog="perception.bench.rasterizer", description=__doc__)
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Prints the table; JSON and a plot go to the output folder."""
+    parser = argparse.ArgumentParser(prog="perception bench rasterizer", description=__doc__)
     parser.add_argument("scenes", nargs="*", type=Path, help="splats .npz files; a synthetic scene when absent")
-    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("-o", "--output", type=Path, default=Path("bench-rasterizer"), help="folder for figures")
+    parser.add_argument("--rounds", type=int, default=7, help="counted rounds, at least 1 (default 7)")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--json", type=Path)
-    args = parser.parse_args(argv)
-    reports = {}
-    for path in args.scenes or [None]:
+    parser.add_argument("--dtypes", nargs="+", default=["float32", "float64"], choices=("float32", "float64"))
+    options = parser.parse_args(arguments)
+    if options.rounds < 1 or min(options.threads) < 1:
+        raise InputError(f"bench rasterizer: found {options.rounds} rounds and threads {options.threads}, expected ≥ 1")
+    rows: list[dict[str, Any]] = []
+    for path in options.scenes or [None]:
         scene = load_scene(path) if path else synthetic_scene()
-        name = path.stem if path else "synthetic"
-        reports[name] = measure(scene, args.rounds, tuple(args.threads))
-        sys.stdout.write(f"{name}: {table(reports[name])}\n")
-    if args.json:
-        args.json.write_text(json.dumps(reports, indent=1))
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+        rows += measure(
+            path.stem if path else "synthetic", scene, cases(options.threads, options.dtypes), options.rounds
+        )
+    options.output.mkdir(parents=True, exist_ok=True)
+    heads = {row["scene"]: row for row in rows}.values()
+    text = "\n".join(
+        f"{row['scene']}: {row['gaussians']} Gaussians, {row['width']}×{row['height']}, "
+        f"{row['contributing_pairs'] / 1e6:.2f} M pairs contribute of {row['evaluated_pairs'] / 1e6:.2f} M evaluated"
+        for row in heads
+    )
+    finish("rasterizer", options, {"rows": rows}, f"{text}\n{table(rows, COLUMNS, HEADS)}")
+    save_plot(options.output / "rasterizer.png", _draw(rows), (9, 1 + 0.28 * len(rows)))

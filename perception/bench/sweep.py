@@ -20,9 +20,10 @@ import numpy as np
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
+from perception.types import View
 
 _CODE = ("gaussians", "instances", "export", "evaluate", "config.py", "_core*")
-TRUTH_CLOUD = "gt_points.ply"
+TRUTH_CLOUD, TRUTH_MASKS = "gt_points.ply", "masks_gt"
 
 
 @dataclass(frozen=True)
@@ -134,6 +135,7 @@ def run_variant(scene: SweepScene, variant: Variant, config: MapConfig) -> dict[
     from perception.gaussians.train import Trainer
     from perception.pipeline.instances import find_instances
     from perception.pipeline.mapping import initial_gaussians, score_views
+    from perception.pipeline.photos import split_views
     from perception.pipeline.record import PeakMemory, Stages
     from perception.progress import Progress
 
@@ -170,14 +172,18 @@ def run_variant(scene: SweepScene, variant: Variant, config: MapConfig) -> dict[
             "curve": record.curve,
             "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         }
-        return row | _instance_scores(scene, trainer.gaussians, found)
+        held_views = split_views(scene.scene().views, scene.held_out_every)[1]
+        return row | _instance_scores(scene, trainer.gaussians, found, held_views)
     finally:
         torch.set_num_threads(before)
 
 
-def _instance_scores(scene: SweepScene, gaussians: Any, found: Any) -> dict[str, Any]:
-    """AP of the exported truth cloud (protocol scannet, class-agnostic); {} without truth or without instances."""
+def _instance_scores(scene: SweepScene, gaussians: Any, found: Any, held: Sequence[View]) -> dict[str, Any]:
+    """AP of the exported truth cloud (protocol scannet, class-agnostic), and mIoU of the instances rendered in the
+    held-out views against the truth's masks; {} without truth or without instances.
+    """
     from perception.evaluate.instances import evaluate
+    from perception.evaluate.rendered import rendered_miou
     from perception.export.labels import export_labels
     from perception.io.cloud import read_cloud
 
@@ -189,6 +195,8 @@ def _instance_scores(scene: SweepScene, gaussians: Any, found: Any) -> dict[str,
     confidence = {entry["id"]: entry["score"] for entry in found.instances}
     result = evaluate(labels, confidence, cloud.labels["instance_id"])
     figures = {key: result[key] for key in ("ap", "ap50", "ap25")}
+    if held and (scene.root / TRUTH_MASKS).is_dir():
+        figures["miou"] = rendered_miou(gaussians, found.ids, held, scene.root / TRUTH_MASKS)
     return figures | {"instances": found.report["count"], "noise_share": found.report["noise_share"]}
 
 

@@ -26,6 +26,7 @@ FIGURES: tuple[Column, ...] = (
     ("AP", "ap", ".3f"),
     ("AP50", "ap50", ".3f"),
     ("AP25", "ap25", ".3f"),
+    ("mIoU", "miou", ".3f"),
 )
 COSTS: tuple[Column, ...] = (
     ("minutes", "minutes", ".2f"),

@@ -38,6 +38,15 @@ SWITCHES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("growth by gradient", "twice the threshold", ("densify.grad_threshold=4e-4",)),
     ("random background", "off", ("train.random_background=false",)),
     ("variance loss", "off", ("losses.variance_weight=0",)),
+    ("rates cool down", "off", ("train.cooldown=0",)),
+    (
+        "rates of means, scales, colours",
+        "as Kerbl et al.",
+        ("train.lr_means=1.6e-4", "train.lr_means_final=1.6e-6", "train.lr_scales=5e-3", "train.lr_colors=2.5e-3"),
+    ),
+    ("holes are filled", "off", ("densify.fill_every=0",)),
+    ("exchange rate", "off: no early end", ("train.exchange_db=-1000",)),
+    ("exchange rate", "0.1 dB", ("train.exchange_db=0.1",)),
 )
 
 
@@ -48,7 +57,7 @@ def variants(masks: str | None) -> list[Variant]:
 
 def with_differences(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Adds what each row costs and gains against the first."""
-    keys = ("minutes", "cpu_minutes", "psnr", "ssim", "ap")
+    keys = ("minutes", "cpu_minutes", "psnr", "ssim", "ap", "miou")
     return [row | {f"{key}_more": difference(row, rows[0], key) for key in keys} for row in rows]
 
 
@@ -64,6 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ("dB", "psnr_more", "+.2f"),
         ("SSIM", "ssim_more", "+.4f"),
         ("AP", "ap_more", "+.3f"),
+        ("mIoU", "miou_more", "+.3f"),
     )
     text = f"{scenes[0].name}, as measured\n{table(rows, (*FIGURES, *COSTS))}"
     text += f"\n\n{scenes[0].name}, against the default\n{table(rows[1:], changes)}"

@@ -1,4 +1,4 @@
-"""Training losses and Adam beside plain torch and OpenCV, in ms: python -m perception.bench.training.
+"""Training in milliseconds: losses and Adam beside plain torch and OpenCV, and the whole iteration by its parts.
 
 Every ratio is taken within one run: contenders take turns; printed are the median over turns and its
 quartiles. Forward and backward are timed together, at the sizes of a photo and a map in training.
@@ -7,11 +7,15 @@ quartiles. Forward and backward are timed together, at the sizes of a photo and 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
+
+from perception.bench.iteration import default_scene, draw_iterations, iteration_table, measure_iterations
+from perception.bench.sweep_cli import Column, finish, save_plot, table
+from perception.errors import InputError
 
 Contenders = dict[str, Callable[[], Any]]
 
@@ -154,47 +158,59 @@ def adam_case(rows: int) -> Contenders:
     }
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """Prints the tables, or one JSON object with --json."""
-    parser = argparse.ArgumentParser(prog="python -m perception.bench.training", description=__doc__)
-    parser.add_argument("--height", type=int, default=480)
+COLUMNS: tuple[Column, ...] = (("ms", "median", ".2f"), ("q25", "q25", ".2f"), ("q75", "q75", ".2f"))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Prints the tables; JSON and a plot of the whole iteration go to the output folder."""
+    parser = argparse.ArgumentParser(prog="perception bench training", description=__doc__)
+    parser.add_argument(
+        "scene", nargs="?", type=Path, help="splats .npz for the whole iteration; synthetic when absent"
+    )
+    parser.add_argument("-o", "--output", type=Path, default=Path("bench-training"), help="folder for figures")
+    parser.add_argument("--height", type=int, default=480, help="of the losses' photo")
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--depth", type=int, default=8, help="feature channels")
     parser.add_argument("--labels", type=int, default=60)
-    parser.add_argument("--gaussians", type=int, default=54000)
-    parser.add_argument("--threads", type=int, default=0, help="0: all processors")
+    parser.add_argument("--gaussians", type=int, default=54000, help="rows of Adam's tensors")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="the losses run on the largest")
     parser.add_argument("--turns", type=int, default=11)
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args(argv)
+    options = parser.parse_args(arguments)
+    if options.turns < 1 or min(options.threads) < 1:
+        raise InputError(f"bench training: found {options.turns} turns, threads {options.threads}, expected at least 1")
 
     # Idle workers of torch's OpenMP pool spin and would take the processor from the contender after torch.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    scene = default_scene(options.scene)
+    operations = measure_operations(options)
+    iterations = measure_iterations(scene, tuple(options.threads), options.turns, options.labels)
+    size = f"{len(scene['means'])} Gaussians, {scene['width']}×{scene['height']}"
+    text = f"{table(operations, COLUMNS)}\n\nWhole iteration, ms: {size}\n{iteration_table(iterations)}"
+    options.output.mkdir(parents=True, exist_ok=True)
+    finish("training", options, {"operations": operations, "iterations": iterations}, text)
+    save_plot(options.output / "training.png", draw_iterations(iterations))
+
+
+def measure_operations(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """One row a contender: group, name, quartiles in ms."""
     import cv2
     import torch
 
     from perception import _core
 
     torch.manual_seed(0)
-    threads = args.threads or os.cpu_count() or 1
+    threads = max(options.threads)
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
     _core.training.set_threads(threads)  # type: ignore[attr-defined]
     cases = {
-        "photometric": photometric_case(args.height, args.width),
-        "instance": instance_case(args.height, args.width, args.depth, args.labels),
-        "variance": variance_case(args.height, args.width, args.depth),
-        "adam": adam_case(args.gaussians),
+        "photometric": photometric_case(options.height, options.width),
+        "instance": instance_case(options.height, options.width, options.depth, options.labels),
+        "variance": variance_case(options.height, options.width, options.depth),
+        "adam": adam_case(options.gaussians),
     }
-    results = {name: interleaved(case, args.turns) for name, case in cases.items()}
-    if args.json:
-        levels = _core.training.levels()  # type: ignore[attr-defined]
-        print(json.dumps({"arguments": vars(args), "threads": threads, "level": levels[-1], "ms": results}))
-        return
-    for case, rows in results.items():
-        print(f"{case} ({threads} threads)")
-        for name, ms in rows.items():
-            print(f"  {name:28}{ms['median']:9.2f} ms   [{ms['q25']:.2f}, {ms['q75']:.2f}]")
-
-
-if __name__ == "__main__":
-    main()
+    return [
+        {"group": group, "name": name, "threads": threads, **figures}
+        for group, case in cases.items()
+        for name, figures in interleaved(case, options.turns).items()
+    ]

@@ -11,6 +11,11 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from perception import __version__
+from perception.cli import asking, clouds, mapping, robot_inputs, scoring
+from perception.cli.parser import Parser
+from perception.errors import InputError
+
+_MODULES = (mapping, asking, clouds, scoring, robot_inputs)
 from perception.cli.parser import Parser
 from perception.errors import InputError
 

@@ -29,32 +29,30 @@ def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         return _set(args)
     if args.clear:
         raise InputError("label: --clear needs the ID whose name is taken away")
-    from perception.io.labels import read_instances
+    from perception.io.labels import given_names
 
-    named = {entry["id"]: entry["label"] for entry in read_instances(args.map) if entry.get("label")}
+    named = given_names(args.map)
     return {"labels": named}, "\n".join(f"{i:>5}  {name}" for i, name in named.items()) or "no instance has a name"
 
 
 def _set(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.labels import set_labels
+    from perception.io.labels import give_names
 
     if args.text is None and not args.clear:
         raise InputError("label: no NAME given; write one, or --clear to take it away")
-    set_labels(args.map, {args.id: args.text})
-    said = (
-        f"instance {args.id} is called “{args.text}” now" if args.text else f"instance {args.id} has no name any more"
-    )
-    return {"id": args.id, "label": args.text}, said
+    label = give_names(args.map, {args.id: args.text})[args.id]
+    said = f"instance {args.id} is called “{label}” now" if label else f"instance {args.id} has no name any more"
+    return {"id": args.id, "label": label}, said
 
 
 def _carry(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.instances.survival import carried_text, carry_labels
-    from perception.io.labels import set_labels
+    from perception.io.labels import give_names
     from perception.io.store import read_map
 
     if args.id is not None:
         raise InputError("label: --from carries all names over and takes no ID")
     carried = carry_labels(read_map(args.old), read_map(args.map))
     if carried.labels:
-        set_labels(args.map, dict(carried.labels))
+        give_names(args.map, dict(carried.labels))
     return {"labels": carried.labels, "dropped": [name for _, name in carried.dropped]}, carried_text(carried)

@@ -21,38 +21,24 @@ SPLIT_SHRINK = 1.6
 @dataclass
 class Statistics:
     """Sums since the last densification, all [N]: gradient norms of the 2D mean (in units of half the image's long
-    side), how often a Gaussian was seen, its largest radius as a share of the image's long side, and the photos' error
-    where it was seen."""
+    side), how often a Gaussian was seen, and its largest radius as a share of the image's long side."""
 
     gradient: torch.Tensor
     seen: torch.Tensor
     radius: torch.Tensor
-    error: torch.Tensor
 
     @staticmethod
     def zeros(count: int) -> Statistics:
-        return Statistics(*(torch.zeros(count) for _ in range(4)))
+        return Statistics(*(torch.zeros(count) for _ in range(3)))
 
-    def add(
-        self,
-        gradient_px: torch.Tensor,
-        radius_px: torch.Tensor,
-        visible: torch.Tensor,
-        long_side: int,
-        error: torch.Tensor | None = None,
-    ) -> None:
-        """One view's figures: gradient_px [N] per pixel, radius_px [N] pixels, visible [N] bool, error [N] or None."""
+    def add(self, gradient_px: torch.Tensor, radius_px: torch.Tensor, visible: torch.Tensor, long_side: int) -> None:
+        """One view's figures: gradient_px [N] per pixel, radius_px [N] pixels, visible [N] bool."""
         self.gradient += torch.where(visible, gradient_px * (0.5 * long_side), 0.0)
         self.seen += visible
         self.radius = torch.maximum(self.radius, torch.where(visible, radius_px / long_side, 0.0))
-        if error is not None:
-            self.error += torch.where(visible, error, 0.0)
 
     def mean_gradient(self) -> torch.Tensor:
         return self.gradient / self.seen.clamp(min=1)
-
-    def mean_error(self) -> torch.Tensor:
-        return self.error / self.seen.clamp(min=1)
 
 
 @dataclass(frozen=True)
@@ -85,10 +71,6 @@ def densify(
     room = max(0, allowed - int(needed.sum()))
     score = statistics.mean_gradient()
     wanted = needed & (score > config.grad_threshold)
-    if config.by_error:
-        error = statistics.mean_error()
-        wanted &= error > config.error_floor
-        score = score * error**config.error_power
     candidates = torch.nonzero(wanted).flatten()
     if len(candidates) > room:
         best = torch.argsort(score[candidates], descending=True, stable=True)[:room]
@@ -101,7 +83,7 @@ def densify(
     gaussians.opacity_logits[clone] = halved
     needed[split] = False
     generator = torch.Generator().manual_seed(seed)
-    born = _concatenate([_rows(gaussians, clone), *_halves(gaussians, split, generator)])
+    born = Gaussians.concatenate([gaussians.rows(clone), *_halves(gaussians, split, generator)])
     return Change(torch.nonzero(needed).flatten(), born)
 
 
@@ -124,20 +106,12 @@ def _halved_logit(logits: torch.Tensor) -> torch.Tensor:
     return torch.logit(opacities.clamp(1e-6, 1 - 1e-6))
 
 
-def _rows(gaussians: Gaussians, index: torch.Tensor) -> Gaussians:
-    return Gaussians(**{name: tensor[index].clone() for name, tensor in vars(gaussians).items()})
-
-
-def _concatenate(parts: list[Gaussians]) -> Gaussians:
-    return Gaussians(**{name: torch.cat([vars(part)[name] for part in parts]) for name in vars(parts[0])})
-
-
 def _halves(gaussians: Gaussians, index: torch.Tensor, generator: torch.Generator) -> list[Gaussians]:
     """Two children of each Gaussian in `index`, drawn from it and shrunk."""
     rotations = rotation_matrices(gaussians.quats[index])
     children = []
     for _ in range(2):
-        child = _rows(gaussians, index)
+        child = gaussians.rows(index)
         offset = torch.randn(len(index), 3, generator=generator) * child.scales
         child.means += torch.einsum("nij,nj->ni", rotations, offset)
         child.log_scales -= torch.log(torch.tensor(SPLIT_SHRINK))

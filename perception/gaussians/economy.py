@@ -79,19 +79,19 @@ class Economy:
     def harmonics_step(self, degree: int) -> tuple[int, str | None]:
         """The degree to go on with after a trial, and what was decided about the last raise, if anything.
 
-        The first trial raises nothing and tells what a trial gains by itself; a raise pays when its trial gains
-        `sh_min_gain_db` more than that.
+        The first trial is left to what the end of growth sets free (opacities no longer decay), the second raises
+        nothing and tells what a trial gains by itself; a raise pays when its trial gains `sh_min_gain_db` more.
         """
         train = self.config.train
         self.harmonics.append(self.scores[-1])
         told = None
-        if len(self.harmonics) > 2:
-            before = self.harmonics[1] - self.harmonics[0]
+        if len(self.harmonics) > 3:
+            before = self.harmonics[2] - self.harmonics[1]
             extra = self.harmonics[-1] - self.harmonics[-2] - before
             paid = extra >= train.sh_min_gain_db
             told = f"harmonics: degree {degree} gained {extra:+.2f} dB, {'kept' if paid else 'taken back'}"
             degree -= not paid
             self.settled = not paid or degree == train.sh_degree
-        if len(self.harmonics) > 1 and not self.settled:
+        if len(self.harmonics) > 2 and not self.settled:
             degree += 1
         return degree, told

@@ -30,6 +30,15 @@ class Gaussians:
     def __len__(self) -> int:
         return int(self.means.shape[0])
 
+    def rows(self, index: torch.Tensor) -> Gaussians:
+        """Copies of the rows `index` [M] int64 selects, in its order."""
+        return Gaussians(**{name: tensor[index].clone() for name, tensor in vars(self).items()})
+
+    @staticmethod
+    def concatenate(parts: list[Gaussians]) -> Gaussians:
+        """All rows of `parts`, in order."""
+        return Gaussians(**{name: torch.cat([vars(part)[name] for part in parts]) for name in vars(parts[0])})
+
     @property
     def scales(self) -> torch.Tensor:
         return self.log_scales.exp()

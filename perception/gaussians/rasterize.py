@@ -53,7 +53,11 @@ class Rasterization:
 
 @dataclass(frozen=True)
 class Settings:
-    """How to rasterize. simd: "auto", "avx512", "avx2" or "baseline"; threads: 0 for torch's number."""
+    """How to rasterize. simd: "auto", "avx512", "avx2" or "baseline"; threads: 0 for torch's number.
+
+    max_records: gradient records (one a Gaussian and 64 × 64-pixel tile, 4 (16 + D) bytes in float32) held at once by
+    the backward pass, which takes the picture in parts beyond that; 0: four a visible Gaussian, at least 2**20.
+    """
 
     width: int
     height: int
@@ -63,6 +67,7 @@ class Settings:
     depth: bool = True
     threads: int = 0
     simd: str = "auto"
+    max_records: int = 0
 
 
 _default_simd = "auto"
@@ -129,6 +134,7 @@ def _core_inputs(inputs: tuple[Tensor | None, ...], background: Tensor | None, s
         _threads(settings),
         settings.depth,
         settings.variance,
+        settings.max_records,
     )
 
 
@@ -149,7 +155,7 @@ def rasterize_forward(inputs: tuple[Tensor | None, ...], background: Tensor | No
     out = Forward(
         colors=new((*image, 3)),
         alphas=new(image),
-        depths=new(image) if settings.depth or dims else None,
+        depths=new(image) if settings.depth else None,
         features=None if features is None else new((*image, dims)),
         feature_variance=new((*image, dims)) if features is not None and settings.variance else None,
         visible=torch.zeros((count, n), dtype=torch.uint8),

@@ -18,12 +18,13 @@ import torch
 from perception.config import MapConfig
 from perception.gaussians.densify import Statistics, decay_opacities, densify, target_count
 from perception.gaussians.economy import TRIAL, Economy
+from perception.gaussians.holes import fill_holes
 from perception.gaussians.losses import instance_loss, photometric_loss, variance_loss
 from perception.gaussians.model import Gaussians
 from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.profile import Profile
 from perception.gaussians.rasterize import Rasterization, rasterize
-from perception.gaussians.views import TrainingView, cooling, depth_image, error_at, psnr, render_view, scene_extent
+from perception.gaussians.views import TrainingView, cooling, depth_image, psnr, render_view, scene_extent, visible_in
 
 __all__ = ["TrainRecord", "Trainer", "TrainingView", "depth_image", "psnr", "render_view", "scene_extent"]
 
@@ -175,6 +176,8 @@ class Trainer:
                 self._densify(progress)
             if self.progress >= self.economy.due and not self.economy.finished:
                 self._end_trial()
+        if self.progress >= 1.0:
+            self._prune_unseen()
         if self.iteration % (5 * every) == 0 or self.progress >= 1.0:
             self._note(progress)
         return losses
@@ -236,9 +239,8 @@ class Trainer:
 
     def _watch(self, view: TrainingView, out: Rasterization) -> None:
         assert out.stats.mean2d_grad is not None
-        visible, long_side = out.visible[0], max(view.photo.shape[:2])
-        error = error_at(self.gaussians.means, view, out.colors[0].detach()) if self.config.densify.by_error else None
-        self.statistics.add(out.stats.mean2d_grad[0], out.stats.radii[0], visible, long_side, error)
+        long_side = max(view.photo.shape[:2])
+        self.statistics.add(out.stats.mean2d_grad[0], out.stats.radii[0], out.visible[0], long_side)
 
     def _feature_losses(self, view: TrainingView, out: Any, figures: dict[str, float]) -> torch.Tensor:
         losses = self.config.losses
@@ -274,6 +276,30 @@ class Trainer:
             self.optimiser.keep(change.keep)
             self.optimiser.append(vars(change.born))
             self._sync()
+            turn = round((progress - config.densify.start) * config.train.iterations / config.densify.every)
+            if config.densify.fill_every and turn % config.densify.fill_every == 0:
+                self._fill(seed)
+            self.statistics = Statistics.zeros(len(self.gaussians))
+
+    def _fill(self, seed: int) -> None:
+        room = self.config.train.budget - len(self.gaussians)
+        if room > 0:
+            born, empty = fill_holes(self.gaussians, self.coarse or self.views, room, seed)
+            self.optimiser.append(vars(born))
+            self._sync()
+            if len(born):
+                self._decide(f"holes: {empty:.2%} of the pictures were empty, {len(born)} Gaussians placed there")
+
+    def _prune_unseen(self) -> None:
+        """Drops at the end what adds to no photo: no training view's picture changes by it."""
+        seen = torch.zeros(len(self.gaussians), dtype=torch.bool)
+        with self.profile("evaluation"):
+            for view in self.views:
+                seen |= visible_in(self.gaussians, view)
+        if not bool(seen.all()):
+            self._decide(f"pruned: {int((~seen).sum())} Gaussians that no photo sees")
+            self.optimiser.keep(torch.nonzero(seen).flatten())
+            self._sync()
             self.statistics = Statistics.zeros(len(self.gaussians))
 
     # ---------------------------------------------------------------- economy
@@ -287,9 +313,11 @@ class Trainer:
         if progress < self.config.densify.stop and economy.growing:
             if progress > self.config.train.coarse_until + 2 * TRIAL:
                 self._decide(economy.growth_pays(count, self._allowed(progress + TRIAL)))
-        elif not economy.settled:
-            if not economy.harmonics:
-                self._decide(f"growth: {count} of at most {self.config.train.budget} Gaussians")
+            return
+        if economy.growing:
+            economy.growing = False
+            self._decide(f"growth: {count} of at most {self.config.train.budget} Gaussians")
+        if not economy.settled:
             degree, told = economy.harmonics_step(self.gaussians.sh_degree)
             self._decide(told)
             if degree != self.gaussians.sh_degree:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.rasterize import rasterize
+from perception.gaussians.rasterize import Rasterization, rasterize
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,18 @@ def scene_extent(views: list[TrainingView]) -> float:
 @torch.no_grad()
 def render_view(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
     """The photo as the map sees it, [H, W, 3] float32 in [0, 1], black where nothing is."""
+    return _render(gaussians, view).colors[0].clamp(0, 1)
+
+
+@torch.no_grad()
+def visible_in(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
+    """[N] bool: adds to some pixel of the view."""
+    return _render(gaussians, view).visible[0]
+
+
+def _render(gaussians: Gaussians, view: TrainingView) -> Rasterization:
     height, width = view.photo.shape[:2]
-    out = rasterize(
+    return rasterize(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
@@ -57,7 +67,6 @@ def render_view(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
         sh_degree=gaussians.sh_degree,
         depth=False,
     )
-    return out.colors[0].clamp(0, 1)
 
 
 @torch.no_grad()
@@ -84,29 +93,6 @@ def psnr(image: torch.Tensor, photo: torch.Tensor) -> float:
     """Peak signal-to-noise ratio in dB of image [H, W, 3] in [0, 1] against photo uint8."""
     error = float((image.double() - photo.double() / 255).square().mean())
     return float("inf") if error == 0 else -10 * float(np.log10(error))
-
-
-ERROR_BLOCK = 8
-"""Pixels a side over which a photo's error is averaged before Gaussians read it."""
-
-
-@torch.no_grad()
-def error_at(means: torch.Tensor, view: TrainingView, image: torch.Tensor) -> torch.Tensor:
-    """Mean absolute error [N] of render `image` [H, W, 3] in the block of pixels where each of means [N, 3] lies.
-
-    The view's mean colour error is taken out, so that a photo's exposure does not count as detail that is missing.
-    Outside the picture the nearest block's error is read.
-    """
-    height, width = view.photo.shape[:2]
-    difference = image - view.photo / 255
-    difference = (difference - difference.mean(dim=(0, 1))).abs().mean(dim=2)
-    blocks = torch.nn.functional.avg_pool2d(difference[None, None], ERROR_BLOCK, ceil_mode=True)[0, 0]
-    pose = view.camera_from_world
-    p = torch.addmm(pose[:3, 3], means, pose[:3, :3].T)
-    depth = p[:, 2].clamp(min=1e-6)
-    column = (p[:, 0] / depth * view.K[0, 0] + view.K[0, 2]).clamp(0, width - 1).div(ERROR_BLOCK).long()
-    row = (p[:, 1] / depth * view.K[1, 1] + view.K[1, 2]).clamp(0, height - 1).div(ERROR_BLOCK).long()
-    return blocks[row, column]
 
 
 def cooling(progress: float, share: float) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.instances.votes import MaskVotes
+from perception.instances.votes import MaskVotes, Table
 
 CHUNK = 20_000
 NEIGHBOURS = 8
@@ -12,13 +12,9 @@ LEAST_AGREEMENT = 0.5
 MARGIN = 0.15
 
 
-def mask_shares(table: np.ndarray, votes: MaskVotes) -> np.ndarray:
-    """[K, M]: of what a view shows of instance k, the share that lies in each of its masks. table: as of `votes.table`."""
-    if table.shape[1] == 0:
-        return table
-    number = np.cumsum(np.diff(votes.view, prepend=-1) > 0) - 1
-    each = np.add.reduceat(table, votes.starts, axis=1)
-    return table / np.maximum(each[:, number], 1e-12)
+def mask_shares(table: Table) -> np.ndarray:
+    """[K, M]: of what a view's masks show of instance k, the share in each of them."""
+    return table.pixels / np.maximum(table.by_view[:, table.view], 1e-12)
 
 
 def affinities(votes: MaskVotes, shares: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -28,48 +24,58 @@ def affinities(votes: MaskVotes, shares: np.ndarray, rows: np.ndarray) -> tuple[
     return np.asarray(weights @ shares.T) / np.maximum(pixels, 1e-12)[:, None], pixels
 
 
+def memberships(ids: np.ndarray, votes: MaskVotes) -> np.ndarray:
+    """[N] float32 in [0, 1]: how well each Gaussian's masks agree with its instance (`affinities`); 0 for noise."""
+    count = int(ids.max(initial=-1)) + 1
+    shares = mask_shares(votes.table(ids, count))
+    found = np.zeros(len(ids), np.float32)
+    for begin in range(0, len(ids), CHUNK):
+        rows = begin + np.flatnonzero(ids[begin : begin + CHUNK] >= 0)
+        if len(rows):
+            found[rows] = affinities(votes, shares, rows)[0][np.arange(len(rows)), ids[rows]]
+    return np.clip(found, 0, 1)
+
+
 def settle(
     ids: np.ndarray, means: np.ndarray, opacities: np.ndarray, votes: MaskVotes, min_opacity: float
-) -> tuple[np.ndarray, np.ndarray]:
+) -> np.ndarray:
     """Takes up undecided Gaussians and moves misplaced ones, where masks and neighbours in space agree on it.
 
-    ids [N] int32 (−1 = none), means [N, 3], opacities [N]. An undecided Gaussian (too faint to vote, say) joins the instance of at
-    least half of its 8 nearest voters if its own masks agree with that one best, by at least half. A voter moves
-    to the instance of at least half of its neighbours if the masks prefer that one clearly. Others stay as they
-    are. Returns (ids [N] int32, agreement [N] float32 in [0, 1] of each Gaussian with its instance, 0 for noise).
+    ids [N] int32 (−1 = none), means [N, 3], opacities [N]; Gaussians of `min_opacity` and more are voters. An undecided
+    Gaussian (too faint to vote, say) joins the instance of at least half of its 8 nearest voters if its own masks
+    agree with that one as with no other, by at least half. A voter moves to the instance of at least half of its
+    neighbours if the masks prefer that one clearly. Others stay as they are. Returns ids [N] int32.
     """
     count = int(ids.max(initial=-1)) + 1
-    settled, agreement = ids.copy(), np.zeros(len(ids), np.float32)
+    settled = ids.astype(np.int32)
     voters = np.flatnonzero((ids >= 0) & (opacities >= min_opacity))
     if count == 0 or len(voters) < 2:
-        return settled, agreement
+        return settled
     from scipy.spatial import cKDTree
 
-    shares = mask_shares(votes.table(ids, count), votes)
+    shares = mask_shares(votes.table(ids, count))
     tree = cKDTree(means[voters])
     near = min(NEIGHBOURS + 1, len(voters))
-    for begin in range(0, len(ids), CHUNK):
-        rows = np.arange(begin, min(begin + CHUNK, len(ids)))
+    finite = np.flatnonzero(np.isfinite(means).all(axis=1))
+    for begin in range(0, len(finite), CHUNK):
+        rows = finite[begin : begin + CHUNK]
         affinity, pixels = affinities(votes, shares, rows)
         _, found = tree.query(means[rows], k=near, workers=-1)
         around = ids[voters[found]]
         around[voters[found] == rows[:, None]] = -1  # not its own neighbour
         popular, support = _mode(around)
-        at = np.arange(len(rows))
-        own = np.where(ids[rows] >= 0, affinity[at, ids[rows]], 0)
+        at, own = np.arange(len(rows)), ids[rows]
+        mine = np.where(own >= 0, affinity[at, own], 0)
         theirs = np.where(popular >= 0, affinity[at, popular], 0)
-        backed = (popular >= 0) & (2 * support >= near - 1) & (pixels > 0)
-        joins = backed & (ids[rows] < 0) & (theirs >= LEAST_AGREEMENT) & (theirs >= affinity.max(axis=1) - MARGIN)
-        moves = backed & (ids[rows] >= 0) & (theirs >= own + MARGIN) & (theirs >= LEAST_AGREEMENT)
-        change = joins | moves
-        settled[rows[change]] = popular[change]
-        agreement[rows] = np.where(change, theirs, own)
-    agreement[settled < 0] = 0
-    return settled, agreement
+        backed = (2 * support >= near - 1) & (pixels > 0) & (theirs >= LEAST_AGREEMENT)
+        joins = backed & (own < 0) & (theirs >= affinity.max(axis=1) - MARGIN)
+        moves = backed & (own >= 0) & (theirs >= mine + MARGIN)
+        settled[rows] = np.where(joins | moves, popular, own)
+    return settled
 
 
 def _mode(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Most frequent non-negative value of each row [R, k] (ties: the nearer first), and how often it occurs; −1, 0 if none."""
+    """Most frequent id ≥ 0 of each row [R, k] (ties: the nearer) and how often it occurs; −1 and 0 where none is."""
     equal = (values[:, :, None] == values[:, None, :]) & (values[:, :, None] >= 0)
     counts = equal.sum(axis=2)
     first = counts.argmax(axis=1)

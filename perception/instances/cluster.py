@@ -43,14 +43,14 @@ def cluster_gaussians(
     solid = np.flatnonzero((opacities >= config.min_opacity) & np.isfinite(features).all(axis=1))
     if len(solid) < config.min_cluster_size:
         return Clusters(ids, membership)
-    found, strength = _hdbscan(features[solid], config, seed)
+    found, strength = cluster_features(features[solid], config, seed)
     found = split_disconnected(means[solid], scales[solid], found, config.min_cluster_size)
     ids[solid] = by_falling_size(found)
     membership[solid] = np.where(ids[solid] >= 0, strength, 0)
     return Clusters(ids, membership)
 
 
-def _hdbscan(features: np.ndarray, config: InstanceConfig, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def cluster_features(features: np.ndarray, config: InstanceConfig, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Labels and membership strengths; above `max_clustered` rows the rest joins by its nearest clustered row."""
     import hdbscan
 

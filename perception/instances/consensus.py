@@ -13,7 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from perception.instances.votes import Table
+
 GLIMPSE = 0.1  # of its best view: what shows less of a segment is no evidence about it
+ONE_SIDED = 0.5  # of a common view's weight, where it labels one of the two only
 PRIOR = 0.5  # views that the features' own evidence weighs as much as
 SUPPORT = 0.6  # IoU with a mask from which on a photo singles a node out
 
@@ -47,13 +50,12 @@ class MergeTree:
 class _Merger:
     """The state of the agglomeration. Tables lie mask-major, so that the few masks a segment is in are whole rows."""
 
-    def __init__(
-        self, table: np.ndarray, view: np.ndarray, prototypes: np.ndarray, sizes: np.ndarray, near: np.ndarray
-    ):
-        count = len(table)
-        self.view = np.unique(view, return_inverse=True)[1].reshape(-1)
-        self.views = int(self.view.max(initial=-1)) + 1
-        self.table = np.ascontiguousarray(table.T, np.float32)
+    def __init__(self, table: Table, prototypes: np.ndarray, sizes: np.ndarray, near: np.ndarray):
+        count, self.views = table.void.shape
+        self.view = table.view
+        self.table = np.ascontiguousarray(table.pixels.T, np.float32)
+        self.void = np.ascontiguousarray(table.void.T, np.float32)
+        self.blank = np.zeros_like(self.void)
         self.share = np.zeros_like(self.table)
         self.seen = np.zeros((self.views, count), np.float32)
         self.prototypes, self.sizes = prototypes.astype(np.float64), sizes.astype(np.float64)
@@ -64,24 +66,32 @@ class _Merger:
         self.affinity = np.stack([self._row(segment) for segment in range(count)]) if count else np.zeros((0, 0))
 
     def _normalise(self, i: int) -> None:
-        """The segment's unit direction over the masks of each view, and how much of it each view shows."""
-        column = self.table[:, i]
-        total = np.bincount(self.view, column, self.views)
+        """The segment's unit direction over the masks of each view, how much of it each view shows, and the share of
+        that which no mask covers."""
+        column, void = self.table[:, i], self.void[:, i]
+        total = np.bincount(self.view, column, self.views) + void
         length = np.sqrt(np.bincount(self.view, column**2, self.views))
         self.share[:, i] = column / np.maximum(length[self.view], 1e-12)
         self.seen[:, i] = total / max(float(total.max(initial=0)), 1e-12)
+        self.blank[:, i] = void / np.maximum(total, 1e-12)
 
     def _row(self, i: int) -> np.ndarray:
-        """Affinity [S] of segment i to all: mean cosine over common views, weighted by how much they show."""
+        """Affinity [S] of segment i to all: mean over common views, weighted by how much they show, of the cosine
+        between what is labelled of both. A view that labels one and not the other speaks against them, half as loud."""
         masks = np.flatnonzero(self.share[:, i] > 0)
-        products = self.share[masks] * self.share[masks, i][:, None]
-        views, first = np.unique(self.view[masks], return_index=True)
-        same = np.add.reduceat(products, first, axis=0) if len(masks) else products
-        weight = np.minimum(self.seen[views], self.seen[views, i][:, None])
-        weight = np.where(weight > GLIMPSE, weight, 0)
+        same = np.zeros_like(self.seen)
+        if len(masks):
+            views, first = np.unique(self.view[masks], return_index=True)
+            same[views] = np.add.reduceat(self.share[masks] * self.share[masks, i][:, None], first, axis=0)
+        common = np.minimum(self.seen, self.seen[:, i][:, None])
+        common = np.where(common > GLIMPSE, common, 0)
+        mine, theirs = 1 - self.blank[:, i][:, None], 1 - self.blank
+        both, one = mine * theirs, mine + theirs - 2 * mine * theirs
+        agreed = (common * both * same).sum(axis=0)
+        weight = (common * (both + ONE_SIDED * one)).sum(axis=0)
         distance = ((self.prototypes - self.prototypes[i]) ** 2).sum(axis=1)
         prior = np.clip(1 - distance, 0, 1) * self.near[i]
-        row = ((weight * same).sum(axis=0) + PRIOR * prior) / (weight.sum(axis=0) + PRIOR)
+        row = (agreed + PRIOR * prior) / (weight + PRIOR)
         row[~self.alive] = -1
         row[i] = -1
         return row
@@ -92,9 +102,10 @@ class _Merger:
         self.prototypes[i] = (self.prototypes[i] * self.sizes[i] + self.prototypes[j] * self.sizes[j]) / whole
         self.sizes[i] = whole
         self.table[:, i] += self.table[:, j]
+        self.void[:, i] += self.void[:, j]
         self.near[i] |= self.near[j]
         self.near[:, i] |= self.near[:, j]
-        self.share[:, j] = 0
+        self.share[:, j] = self.seen[:, j] = 0
         self.alive[j] = False
         self._normalise(i)
         self.affinity[j] = self.affinity[:, j] = -1
@@ -102,21 +113,16 @@ class _Merger:
 
 
 def merge_tree(
-    table: np.ndarray,
-    view: np.ndarray,
-    prototypes: np.ndarray,
-    sizes: np.ndarray,
-    near: np.ndarray,
-    lowest: float = 0.05,
+    table: Table, prototypes: np.ndarray, sizes: np.ndarray, near: np.ndarray, lowest: float = 0.05
 ) -> MergeTree:
     """Merges the most agreeing pair until none agrees by `lowest`.
 
-    table [S, M] pixels of each mask that each segment fills, view [M] the photo of each mask, prototypes [S, D] mean
-    features (in units of the loss's margin), sizes [S] Gaussians, near [S, S] bool. Features decide only where
-    photos do not: for neighbours, with the weight of half a view.
+    table: of the S segments. prototypes [S, D] mean features (a distance of 1 is the loss's margin), sizes [S]
+    Gaussians, near [S, S] bool. Features decide only where photos do not: for neighbours, with half a view's weight.
     """
-    state = _Merger(table, view, prototypes, sizes, near)
-    node = np.arange(len(table))
+    state = _Merger(table, prototypes, sizes, near)
+    count = len(sizes)
+    node = np.arange(count)
     best = state.affinity.max(axis=1, initial=-1)
     children, affinity = [], []
     while len(best) and (top := int(best.argmax())) >= 0 and best[top] >= lowest:
@@ -125,54 +131,65 @@ def merge_tree(
         affinity.append(float(best[top]))
         children.append((node[i], node[j]))
         state.join(i, j)
-        node[i] = len(table) + len(children) - 1
+        node[i] = count + len(children) - 1
         best = state.affinity.max(axis=1)
-    return MergeTree(len(table), np.array(children, np.int64).reshape(-1, 2), np.array(affinity))
+    return MergeTree(count, np.array(children, np.int64).reshape(-1, 2), np.array(affinity))
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Of each node: pixels it fills under masks, pixels · IoU with the best mask of each view summed over views
-    (agreement = matched / pixels), views that show it, and views in which a mask singles it out."""
+    """Of each group: pixels under masks; matched: the sum over them of the IoU between the group and the pixel's mask;
+    views that show it; fit [·, V]: IoU with the best mask of each view, 0 where the view shows too little of it."""
 
     pixels: np.ndarray
     matched: np.ndarray
     views: np.ndarray
-    support: np.ndarray
+    fit: np.ndarray
+
+    @property
+    def support(self) -> np.ndarray:
+        """[·] views in which one mask singles it out."""
+        return np.asarray((self.fit >= SUPPORT).sum(axis=1))
 
     @property
     def agreement(self) -> np.ndarray:
-        """[·] in [0, 1]: mean IoU with the best mask, weighted by pixels; 0 where no mask covers it."""
+        """[·] in [0, 1]: mean over its pixels of the IoU with the pixel's mask; 0 where no mask covers it."""
         return self.matched / np.maximum(self.pixels, 1e-12)
 
 
-def evidence(rows: np.ndarray, view: np.ndarray, area: np.ndarray, smallest: float = 8.0) -> Evidence:
-    """Of each row of a table [R, M]; a view shows what fills at least `smallest` pixels of its masks."""
-    if rows.shape[1] == 0:
-        none = np.zeros(len(rows))
-        return Evidence(none, none, none.astype(np.int64), none.astype(np.int64))
-    starts = np.flatnonzero(np.diff(view, prepend=-1) > 0)
-    rows = rows.astype(np.float64)
-    each = np.add.reduceat(rows, starts, axis=1)
-    number = np.cumsum(np.diff(view, prepend=-1) > 0) - 1
-    iou = np.maximum.reduceat(rows / np.maximum(each[:, number] + area - rows, 1e-12), starts, axis=1)
+def evidence(table: Table, smallest: float = 8.0) -> Evidence:
+    """Of each row of a table; a view shows what fills at least `smallest` pixels of its masks.
+
+    A pixel scores the IoU of its own mask, not of the best one: a small thing on a large one is not carried along by
+    the match of the large one, and views outvote each other pixel by pixel. What no mask covers is part of a group's
+    extent, so a mask that ends at a thing's border speaks for that border even where the thing itself is unlabelled.
+    """
+    if table.pixels.shape[1] == 0:
+        none = np.zeros(len(table.pixels))
+        return Evidence(none, none, none.astype(np.int64), none.reshape(-1, 1)[:, :0])
+    starts = np.flatnonzero(np.diff(table.view, prepend=-1) > 0)
+    rows = table.pixels.astype(np.float64)
+    each = table.by_view.astype(np.float64)
+    extent = (each + table.void)[:, table.view]
+    iou = rows / np.maximum(extent + table.area - rows, 1e-12)
     shown = each >= smallest
+    best = np.maximum.reduceat(iou, starts, axis=1)
     return Evidence(
         each.sum(axis=1),
-        (each * iou).sum(axis=1),
+        (rows * iou).sum(axis=1),
         shown.sum(axis=1),
-        (shown & (iou >= SUPPORT)).sum(axis=1),
+        np.where(shown, best, 0),
     )
 
 
-def node_evidence(tree: MergeTree, table: np.ndarray, view: np.ndarray, area: np.ndarray) -> Evidence:
-    """Evidence of all nodes of a tree over the leaves' table [S, M]."""
-    whole = [evidence(table, view, area)]
-    rows = dict(enumerate(table))
+def node_evidence(tree: MergeTree, table: Table) -> Evidence:
+    """Evidence of all nodes of a tree over the leaves' table."""
+    whole = [evidence(table)]
+    rows = {leaf: table.row(leaf) for leaf in range(tree.leaves)}
     for number, (a, b) in enumerate(tree.children.tolist()):
-        rows[tree.leaves + number] = rows.pop(a) + rows.pop(b)
-        whole.append(evidence(rows[tree.leaves + number][None], view, area))
-    names = ("pixels", "matched", "views", "support")
+        joined = rows[tree.leaves + number] = rows.pop(a) + rows.pop(b)
+        whole.append(evidence(joined))
+    names = ("pixels", "matched", "views", "fit")
     return Evidence(*(np.concatenate([getattr(part, name) for part in whole]) for name in names))
 
 
@@ -194,14 +211,16 @@ def best_cut(tree: MergeTree, matched: np.ndarray) -> list[int]:
 
 
 def parts_of(tree: MergeTree, node: int, found: Evidence, largest: float = 0.8, least_views: int = 2) -> list[int]:
-    """Parts of an instance: the highest nodes below it that masks single out in `least_views` photos or more.
+    """Parts of an instance: the highest nodes below it that masks single out in `least_views` photos or more, and fit
+    better there than any fits the whole.
 
     A part fills at most `largest` of the whole's pixels: it is not the whole once more.
     """
     parts, stack = [], tree.kids(node)
     while stack:
         at = stack.pop()
-        if found.support[at] >= least_views and found.pixels[at] <= largest * found.pixels[node]:
+        single = (found.fit[at] >= SUPPORT) & (found.fit[at] > found.fit[node])
+        if single.sum() >= least_views and found.pixels[at] <= largest * found.pixels[node]:
             parts.append(at)
         else:
             stack += tree.kids(at)

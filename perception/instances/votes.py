@@ -1,7 +1,7 @@
 """What the 2D masks say of every Gaussian: how much of it each mask of each photo shows.
 
-The weight of Gaussian n in mask m is Σ_{p ∈ m} w_n(p), w_n(p) = its alpha times the transmittance before it: the very weight
-with which its colour enters the picture. Rendering is linear in features, so these sums are the gradient of the
+The weight of Gaussian n in mask m is Σ_{p ∈ m} w_n(p), w_n(p) = its alpha times the transmittance before it: the very
+weight with which its colour enters the picture. Rendering is linear in features, so these sums are the gradient of the
 rendered mask indicator with respect to features, and one backward pass yields 16 masks for all Gaussians.
 """
 
@@ -23,24 +23,53 @@ FAINTEST = 0.02  # pixels; less than that is no evidence and only fills the matr
 
 
 @dataclass(frozen=True)
+class Table:
+    """Pixels [R, M] of each mask and [R, V] of each view's void that R groups fill; view and area as of the votes."""
+
+    pixels: np.ndarray
+    void: np.ndarray
+    view: np.ndarray
+    area: np.ndarray
+
+    def __add__(self, other: Table) -> Table:
+        return Table(self.pixels + other.pixels, self.void + other.void, self.view, self.area)
+
+    def row(self, group: int) -> Table:
+        """One group's, still with its first axis."""
+        return Table(self.pixels[group : group + 1], self.void[group : group + 1], self.view, self.area)
+
+    @property
+    def by_view(self) -> np.ndarray:
+        """[R, V] pixels under masks."""
+        if self.pixels.shape[1] == 0:
+            return np.zeros((len(self.pixels), 0), np.float32)
+        return np.add.reduceat(self.pixels, np.flatnonzero(np.diff(self.view, prepend=-1) > 0), axis=1)
+
+
+@dataclass(frozen=True)
 class MaskVotes:
-    """weights [N, M] float32 sparse, in pixels; per mask: view [M] int64 ascending, area [M] float64 pixels."""
+    """Evidence of V views that have M masks in all; weights are sparse, float32, in pixels.
+
+    weights [N, M]: of each Gaussian in each mask. void [N, V]: where the view has no mask. view [M] int64: 0 … V − 1
+    ascending. area [M] float64: pixels of each mask.
+    """
 
     weights: sparse.csr_matrix
+    void: sparse.csr_matrix
     view: np.ndarray
     area: np.ndarray
 
     @property
     def starts(self) -> np.ndarray:
-        """First mask of each view that has any, for `np.add.reduceat`."""
+        """[V] the first mask of each view, for `np.add.reduceat`."""
         return np.flatnonzero(np.diff(self.view, prepend=-1) > 0)
 
-    def table(self, ids: np.ndarray, count: int) -> np.ndarray:
-        """[count, M] float32: the pixels of each mask that the Gaussians of each id (−1 = none) fill."""
+    def table(self, ids: np.ndarray, count: int) -> Table:
+        """What the Gaussians of each id 0 … count − 1 (−1 = none) fill of each mask and of each view's void."""
         rows = np.flatnonzero(ids >= 0)
         ones = np.ones(len(rows), np.float32)
         gather = sparse.csr_matrix((ones, (ids[rows], rows)), shape=(count, len(ids)))
-        return (gather @ self.weights).toarray()
+        return Table((gather @ self.weights).toarray(), (gather @ self.void).toarray(), self.view, self.area)
 
 
 def mask_votes(
@@ -55,27 +84,35 @@ def mask_votes(
     half_resolution: masks are smooth enough for every other pixel, at a quarter of the time; areas are then in
     pixels of that size too.
     """
-    parts, owner, areas = [], [], []
+    parts: list[sparse.csr_matrix] = []
+    voids: list[sparse.csr_matrix] = []
+    owner: list[np.ndarray] = []
+    areas: list[np.ndarray] = []
     for index, view in enumerate(views):
-        if view.labels is not None and bool((view.labels > 0).any()):
-            shown = view.halved() if half_resolution and min(view.photo.shape[:2]) > 1 else view
+        shown = view.halved() if half_resolution and min(view.photo.shape[:2]) > 1 else view
+        if shown.labels is not None and bool((shown.labels > 0).any()):
             weights, area = _of_view(gaussians, shown)
-            parts.append(weights)
-            areas.append(area)
-            owner.append(np.full(len(area), index, np.int64))
+            parts.append(weights[:, 1:])
+            voids.append(weights[:, :1])
+            areas.append(area[1:])
+            owner.append(np.full(len(area) - 1, len(owner), np.int64))
         if progress is not None:
             progress(index + 1, len(views))
     if not parts:
-        return MaskVotes(sparse.csr_matrix((len(gaussians), 0), dtype=np.float32), np.zeros(0, np.int64), np.zeros(0))
-    return MaskVotes(sparse.hstack(parts, format="csr"), np.concatenate(owner), np.concatenate(areas))
+        none = sparse.csr_matrix((len(gaussians), 0), dtype=np.float32)
+        return MaskVotes(none, none, np.zeros(0, np.int64), np.zeros(0))
+    weights, void = (sparse.hstack(blocks, format="csr") for blocks in (parts, voids))
+    return MaskVotes(weights, void, np.concatenate(owner), np.concatenate(areas))
 
 
 @torch.no_grad()
 def _of_view(gaussians: Gaussians, view: TrainingView) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """Weights [N, 1 + masks] and areas; the first column is what no mask covers."""
     assert view.labels is not None  # told by the caller
     height, width = view.photo.shape[:2]
-    names, dense, counts = torch.unique(view.labels, return_inverse=True, return_counts=True)
-    masks = torch.nonzero(names > 0)[:, 0].tolist()
+    names, dense = np.unique(np.append(view.labels.numpy(), 0), return_inverse=True)
+    labels = torch.from_numpy(dense.reshape(-1)[:-1].reshape(height, width))
+    masks = range(len(names))
     inputs = (
         gaussians.means,
         gaussians.quats,
@@ -93,10 +130,10 @@ def _of_view(gaussians: Gaussians, view: TrainingView) -> tuple[sparse.csr_matri
         block = masks[first : first + BLOCK]
         inside = torch.zeros(1, height, width, BLOCK)
         for channel, mask in enumerate(block):
-            inside[0, ..., channel] = dense == mask
+            inside[0, ..., channel] = labels == mask
         wanted = tuple(name == 5 for name in range(7))  # the gradient of features, and no other
         gradients, _ = rasterize_backward(inputs, None, settings, forward, (None, None, None, inside, None), wanted)
         assert gradients[5] is not None  # wanted
         weights = gradients[5][:, : len(block)].numpy()
         columns.append(sparse.csr_matrix(np.where(weights > FAINTEST, weights, 0)))
-    return sparse.hstack(columns, format="csr"), counts[masks].numpy().astype(np.float64)
+    return sparse.hstack(columns, format="csr"), np.bincount(dense.reshape(-1)[:-1], minlength=len(names)).astype(float)

@@ -41,6 +41,51 @@ def read_camera(path: Path) -> Lens:
     return Lens(model, (float(fx), float(fy), float(cx), float(cy), *distortion), width, height)
 
 
+def write_camera(path: Path, name: str, model: str, size: tuple[int, int], values: np.ndarray) -> None:
+    """A ROS camera_info YAML of a camera of (width, height) pixels.
+
+    model "pinhole": values fx fy cx cy k1 k2 p1 p2 k3 (plumb_bob); "fisheye": fx fy cx cy k1 k2 k3 k4 (equidistant);
+    the principal point in OpenCV's and ROS' convention, the centre of the first pixel being (0, 0). The rectified
+    camera is the camera itself.
+    """
+    fx, fy, cx, cy = (float(v) for v in values[:4])
+    kind = "equidistant" if model == "fisheye" else "plumb_bob"
+    _write(path, name, size, kind, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], [float(v) for v in values[4:]])
+
+
+def write_camera_info(path: Path, message: Any, rectified: bool = False) -> None:
+    """A ROS CameraInfo message (ROS 1 or 2) as a camera file; rectified images are seen by its projection matrix."""
+
+    def field(name: str) -> list[float]:
+        values = getattr(message, name.lower(), None)
+        return [float(v) for v in (getattr(message, name.upper()) if values is None else values)]
+
+    K, distortion, kind = field("k"), field("d"), str(message.distortion_model) or "plumb_bob"
+    if rectified:
+        P = field("p")
+        K, distortion, kind = [*P[0:3], *P[4:7], *P[8:11]], [0.0] * 5, "plumb_bob"
+    size = (int(message.width), int(message.height))
+    _write(path, path.stem, size, kind, K, distortion or [0.0] * 5)
+
+
+def _write(path: Path, name: str, size: tuple[int, int], kind: str, K: list[float], distortion: list[float]) -> None:
+    import yaml
+
+    from perception.io.atomic import replacing
+
+    blocks = {
+        "camera_matrix": (3, 3, K),
+        "distortion_coefficients": (1, len(distortion), distortion),
+        "rectification_matrix": (3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
+        "projection_matrix": (3, 4, [*K[0:3], 0.0, *K[3:6], 0.0, *K[6:9], 0.0]),
+    }
+    data: dict[str, Any] = {"image_width": int(size[0]), "image_height": int(size[1]), "camera_name": name}
+    data["distortion_model"] = kind
+    data |= {key: {"rows": r, "cols": c, "data": numbers} for key, (r, c, numbers) in blocks.items()}
+    with replacing(path) as file:
+        file.write(yaml.safe_dump(data, sort_keys=False, default_flow_style=None).encode())
+
+
 def _colmap_distortion(name: str, k: list[float]) -> tuple[str, list[float]]:
     if name == "equidistant":
         return "OPENCV_FISHEYE", k

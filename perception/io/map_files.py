@@ -25,6 +25,7 @@ FORMAT_VERSION = 1
 MOST_ARCHIVE = 4 << 30
 """Bytes an .npz of a map may unpack to; a damaged or hostile one must not fill the memory."""
 _ARRAYS = {"features": 2, "instance_ids": 1, "membership": 1}
+ARCHIVES = ("cameras", "language", "index", "parts")
 _TRIES = 5
 _DAMAGE = (
     ValueError,
@@ -78,7 +79,7 @@ class MapFiles:
         try:
             self._rows = map_ply(self.path / "gaussians.ply", "vertex")
             self._arrays = {name: self._map_array(name, sides) for name, sides in _ARRAYS.items()}
-            self._archives = {name: _bytes(self.path / f"{name}.npz") for name in ("cameras", "language", "index")}
+            self._archives = {name: _bytes(self.path / f"{name}.npz") for name in ARCHIVES}
         except OSError as error:
             raise InputError(
                 f"{self.path}: the map is damaged ({error}); build it again with `perception map`"
@@ -122,6 +123,11 @@ class MapFiles:
     def language(self) -> dict[str, np.ndarray]:
         """What the encoder knows of each instance; {} in a map without."""
         return self._once("language", lambda: self._unpack("language"))
+
+    @property
+    def parts(self) -> dict[str, np.ndarray]:
+        """Which part of its instance each Gaussian is (see io.store); {} in a map without parts."""
+        return self._once("parts", lambda: self._unpack("parts"))
 
     def instance_index(self) -> InstanceIndex:
         """The points of each instance; made from the Gaussians for maps that were written before it was stored."""

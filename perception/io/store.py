@@ -2,9 +2,12 @@
 
 map.json        format_version, frame, metric, counts, config, seed, versions, times, quality, run record
 gaussians.ply   the standard 3DGS properties, readable by other viewers
-instances.json  per instance: id, label, score, num_gaussians, centroid, obb, aabb, views
+instances.json  per instance: id, label, score, num_gaussians, centroid, obb, aabb, views, and maybe parts: a list of
+                entries with the same keys and `parent`, the id of the whole. Ids of parts follow those of the wholes.
 features.npy    [N, D] float32      instance_ids.npy  [N] int32 (−1 = none)   membership.npy [N] float32
 language.npz    what the encoder knows of each instance, with its identity (absent without an encoder)
+parts.npz       ids [N] int32: the part each Gaussian belongs to (−1 = none; absent without parts). With an encoder also
+                language_*: as language.npz, one row a part in ascending id
 cameras.npz     the views: names, K, sizes, camera_from_world, which were held out
 index.npz       the points of each instance side by side (see instance_index), for questions
 map.json also lists size and SHA-256 of the other files (`files`) and its own (`sha256`); see checksums.
@@ -48,7 +51,7 @@ class GaussianMap:
 
     means [N, 3], quats [N, 4], log_scales [N, 3], opacity_logits [N], sh [N, K, 3], features [N, D],
     instance_ids [N] int32, membership [N]; instances: the list of instances.json; info: map.json;
-    cameras and language: named arrays (may be empty).
+    cameras, language and parts: named arrays (may be empty).
     """
 
     means: np.ndarray
@@ -63,6 +66,7 @@ class GaussianMap:
     info: dict[str, Any] = field(default_factory=dict)
     cameras: dict[str, np.ndarray] = field(default_factory=dict)
     language: dict[str, np.ndarray] = field(default_factory=dict)
+    parts: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.means)
@@ -97,6 +101,8 @@ def write_map(path: Path, gmap: GaussianMap) -> None:
         np.savez(folder / "index.npz", **gmap.instance_index().to_arrays())  # type: ignore[arg-type]
         if gmap.language:
             np.savez_compressed(folder / "language.npz", **gmap.language)  # type: ignore[arg-type]
+        if gmap.parts:
+            np.savez_compressed(folder / "parts.npz", **gmap.parts)  # type: ignore[arg-type]
         _dump(folder / EDITABLE, {"instances": gmap.instances})
         _dump(folder / FACTS, _with_checksums(info, folder))
 
@@ -123,6 +129,7 @@ def gaussian_map(files: MapFiles) -> GaussianMap:
             info=files.info,
             cameras=files.cameras,
             language=files.language,
+            parts=files.parts,
         )
     except (KeyError, ValueError) as error:
         if isinstance(error, InputError):

@@ -153,7 +153,8 @@ def _lens(file: Path, values: dict[str, Any], photo: Path | None) -> Lens:
     fx, fy = _focals(values, what, width, height)
     cx, cy = _number(values, "cx", what), _number(values, "cy", what)
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-    k1, k2, k3, k4, p1, p2 = (_number(values, key, what) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+    k1, k2, k3, k4, k5, k6, p1, p2 = (_number(values, key, what) or 0.0 for key in names)
     model = str(values.get("camera_model") or "OPENCV").upper()
     name: str
     extra: tuple[float, ...]
@@ -161,8 +162,8 @@ def _lens(file: Path, values: dict[str, Any], photo: Path | None) -> Lens:
         name, extra = "OPENCV_FISHEYE", (k1, k2, k3, k4)
     elif model not in _PERSPECTIVE:
         raise InputError(f"{what}: camera_model '{model}' is not supported; expected one of {_PERSPECTIVE + _FISHEYE}")
-    elif k3 or k4:
-        name, extra = "FULL_OPENCV", (k1, k2, p1, p2, k3, k4, 0.0, 0.0)
+    elif k3 or k4 or k5 or k6:
+        name, extra = "FULL_OPENCV", (k1, k2, p1, p2, k3, k4, k5, k6)
     elif any((k1, k2, p1, p2)) and "PINHOLE" not in model:
         name, extra = "OPENCV", (k1, k2, p1, p2)
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -11,15 +12,46 @@ from perception.errors import InputError
 from perception.language.onnx import Device
 
 
+@dataclass(frozen=True)
+class Part:
+    """A stretch of an embedding's numbers that is compared on its own.
+
+    stop: where it ends (it begins where the last one ended). weight: its share of the relevancy. references: [R, d]
+    unit rows of many common words in this part, the ruler for how specific a text is; None without one.
+    """
+
+    stop: int
+    weight: float = 1.0
+    references: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How an encoder's similarities are to be read.
+
+    parts: of its embeddings; none: the whole is one. margin: spreads above the map's probes from which an answer is
+    believed. canonical: phrases that fit anything, which a prompt must beat; none where sentences do not describe
+    pictures in general. zooms: crops a view that it does best with (the paper's 3 for what reads context well).
+    """
+
+    parts: tuple[Part, ...] = ()
+    margin: float = 0.0
+    zooms: int = 3
+    canonical: tuple[str, ...] = ()
+
+
+def reading_of(encoder: Encoder) -> Reading:
+    """The encoder's own `reading` where it has one, else the plain one."""
+    known = getattr(encoder, "reading", None)
+    return known if isinstance(known, Reading) else Reading()
+
+
 class Encoder(Protocol):
     """Images and texts in one space, where the dot product of two unit rows says how well they fit.
 
     identity: model, version and preprocessing; a map stores it and refuses embeddings of another.
-    dim: length of an embedding.
-    references: [R, D] unit embeddings of many common words, the ruler for how specific a text is; None
-    without one. templates: sentences with one {} that a prompt is put into; their embeddings are averaged.
-    margin: spreads above the map's probes from which an answer is believed. canonical: phrases that fit anything, which
-    a prompt must beat; none where sentences do not describe pictures in general.
+    dim: length of an embedding. templates: sentences with one {} that a prompt is put into; their embeddings are
+    averaged. An encoder may have a `reading` too, see `reading_of`.
     """
 
     @property
@@ -30,15 +62,6 @@ class Encoder(Protocol):
 
     @property
     def templates(self) -> tuple[str, ...]: ...
-
-    @property
-    def margin(self) -> float: ...
-
-    @property
-    def canonical(self) -> tuple[str, ...]: ...
-
-    @property
-    def references(self) -> np.ndarray | None: ...
 
     def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """RGB uint8 [H, W, 3] pictures of any size → float32 [n, dim], unit rows."""

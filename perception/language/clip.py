@@ -16,7 +16,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.model_store import known_names, resolve
-from perception.language.base import check_images, check_texts, unit_rows
+from perception.language.base import Reading, check_images, check_texts, unit_rows
 from perception.language.onnx import Device, dtype_of, fingerprint, open_session, shape_of, signature
 from perception.language.preprocess import Preprocess, family_of, find_preprocess
 from perception.language.tokenizer import Tokenizer, find_tokenizer
@@ -34,10 +34,8 @@ class ClipEncoder:
     first used.
     """
 
-    references: np.ndarray | None = None
     # Untried on real weights: none can be had here. The probes of the map and LERF's phrases are all there is.
-    margin: float = 0.0
-    canonical: tuple[str, ...] = ("object", "things", "stuff", "texture")
+    reading = Reading(canonical=("object", "things", "stuff", "texture"))
     templates: tuple[str, ...] = ("an image of {}", "a photo of a {}", "{}")
 
     def __init__(self, image: Path, text: Path, device: Device = "auto") -> None:

@@ -2,7 +2,8 @@
 
 The relevancy of instance i for a prompt t is judged against the map's other instances: with ē the mean
 embedding of the map, x_ti = cos(t, e_i − β ē) / σ_t takes away what all instances share, and σ_t, the spread
-of cos(t, ·) over the encoder's reference words, makes specific and vague prompts comparable. Whether the
+of cos(t, ·) over the encoder's reference words, makes specific and vague prompts comparable; where an encoder's
+embedding has parts, x is their weighted sum. Whether the
 best is good enough is told by probes: LERF's canonical phrases (object, things, stuff, texture) and a list
 of things that a scene seldom holds. Their best relevancies in this very map, under this very encoder, are
 the distribution of "not here", and
@@ -25,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.errors import InputError
-from perception.language.base import Encoder, check_texts, unit_rows
+from perception.language.base import Encoder, Part, check_texts, reading_of, unit_rows
 from perception.language.colors import color_match, color_words, without_color_words
 from perception.language.description import InstanceDescription
 from perception.language.shape_words import HINTS, KINDS, shape_kind
@@ -34,7 +35,7 @@ PRESENT = 0.8  # default least score of a hit; the probes are harder than the us
 QUANTILE, NORMAL_QUANTILE = 0.8, 0.8416  # Φ(.8416) = .8
 BETA = 0.5  # share of the map's mean embedding that is taken away
 SHAPE_WEIGHT = 6.0  # spreads between no and a full match of shape, for kinds that geometry alone decides
-SHAPE_HINT = 3.0  # the same for kinds that are only likelier with a shape: not every box is closed
+SHAPE_HINT = 2.0  # what a full match adds for kinds that shape only makes likelier: not every box is closed
 TEMPERATURE = 10.0  # LERF's
 COLOR_WEIGHT = 0.1  # relevancy between no and a full colour match
 LABEL_MARGIN = 2.0  # a label means the prompt from 2 + Φ⁻¹(score) spreads above what probes mean to it
@@ -49,6 +50,16 @@ class Answer:
     text: str
     hits: list[tuple[int, float]]
     present: bool
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A part of the embeddings made ready: where it lies, its weight, the instances' unit rows [I, d], its ruler."""
+
+    place: slice
+    weight: float
+    rows: np.ndarray
+    references: np.ndarray | None
 
 
 class Ranker:
@@ -75,15 +86,15 @@ class Ranker:
             raise InputError(
                 f"embeddings have {rows.shape[1]} dimensions, those of encoder '{encoder.identity}' {encoder.dim}"
             )
-        mean = rows[self.seen].mean(axis=0) if self.seen.any() else np.zeros(encoder.dim, np.float32)
-        self._rows = unit_rows(rows - BETA * mean) if self.seen.sum() > 1 else rows
+        self._reading = reading_of(encoder)
         self._plain = rows
-        self._canonical = self._encode(encoder.canonical)
+        self._parts = self._compared(rows)
+        self._canonical = self._encode(self._reading.canonical)
         self._palettes = np.array([d.palette for d in descriptions])
         self._names = [_words(label) for label in labels or [None] * len(descriptions)]
         self._named = np.flatnonzero([name != "" for name in self._names])
         texts = self._encode(probes())
-        self._usual_spread = float(self._spreads(texts).mean())
+        self._usual_spreads = [float(self._spreads(texts, part).mean()) for part in self._parts]
         self._null = self._best_of_absent(texts)
         self._label_rows = self._encode([self._names[i] for i in self._named])
         self._label_null = _middle_and_spread(self._label_rows @ texts.T)
@@ -96,7 +107,7 @@ class Ranker:
         """Score every instance for one prompt; see the module's docstring."""
         text = check_texts([prompt])[0]
         least = PRESENT if min_score is None else min_score
-        if not len(self._rows):
+        if not len(self._plain):
             return Answer(text, [], False)
         scores = self._scores(text)
         hits = [(int(i), float(scores[i])) for i in np.argsort(-scores, kind="stable")]
@@ -109,7 +120,7 @@ class Ranker:
         if colors:
             relevancy = relevancy + COLOR_WEIGHT * (color_match(self._palettes, colors) - 0.5)
         middle, spread = self._null
-        z = (relevancy - middle) / spread - self._encoder.margin + self._shape_bonus(text)
+        z = (relevancy - middle) / spread - self._reading.margin + self._shape_bonus(text)
         scores = np.array([_phi(x) for x in z])
         if len(self._canonical):
             scores = np.minimum(scores, 2 * PRESENT * self._against_canonical(row))
@@ -126,8 +137,8 @@ class Ranker:
         kind = shape_kind(text)
         if kind is None or self.shapes is None:
             return 0.0
-        weight = SHAPE_HINT if kind in HINTS else SHAPE_WEIGHT
-        return weight * (self.shapes[:, KINDS.index(kind)] - 0.5)
+        match = self.shapes[:, KINDS.index(kind)]
+        return SHAPE_HINT * match if kind in HINTS else SHAPE_WEIGHT * (match - 0.5)
 
     def _against_canonical(self, row: np.ndarray) -> np.ndarray:
         """LERF's relevancy [I]: how likely the prompt [1, D] is beside the canonical phrase that fits best."""
@@ -151,14 +162,29 @@ class Ranker:
         return self._relevancy(self._encode(texts))
 
     def _relevancy(self, texts: np.ndarray) -> np.ndarray:
-        """x [T, I] of text embeddings [T, D] in units of a usual prompt's spread."""
-        return (texts @ self._rows.T) * (self._usual_spread / self._spreads(texts))[:, None]
+        """x [T, I] of text embeddings [T, D] in units of a usual prompt's spread, summed over the parts."""
+        x = np.zeros((len(texts), len(self._plain)))
+        for part, usual in zip(self._parts, self._usual_spreads, strict=True):
+            fits = unit_rows(texts[:, part.place]) @ part.rows.T
+            x += part.weight * fits * (usual / self._spreads(texts, part))[:, None]
+        return x
 
-    def _spreads(self, texts: np.ndarray) -> np.ndarray:
-        references = self._encoder.references
-        if references is None:
+    def _compared(self, rows: np.ndarray) -> list[_Part]:
+        """The parts of the instances' embeddings [I, D], each less its share of the map's mean and of length 1."""
+        seen, start, parts = rows[self.seen], 0, []
+        for part in self._reading.parts or (Part(self._encoder.dim),):
+            place = slice(start, part.stop)
+            own = rows[:, place]
+            if len(seen) > 1:
+                own = own - BETA * unit_rows(seen[:, place]).mean(axis=0) * np.linalg.norm(own, axis=1, keepdims=True)
+            parts.append(_Part(place, part.weight, unit_rows(own), part.references))
+            start = part.stop
+        return parts
+
+    def _spreads(self, texts: np.ndarray, part: _Part) -> np.ndarray:
+        if part.references is None:
             return np.ones(len(texts))
-        return np.maximum((texts @ references.T).std(axis=1), 1e-3)
+        return np.maximum((unit_rows(texts[:, part.place]) @ part.references.T).std(axis=1), 1e-3)
 
     def _encode(self, texts: Sequence[str]) -> np.ndarray:
         """Mean over the encoder's templates, unit rows [T, D]."""

@@ -1,21 +1,25 @@
-"""The segmentation that needs no weights: `builtin`, from the photo alone or with depth from the map."""
+"""The segmentation that needs no weights: `builtin`, from the photo alone, or from all photos and their geometry."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from perception.masks.regions import refine_with_geometry, segment_photo
+from perception.masks.regions import segment_photo
+from perception.masks.scene import SceneSegmentation
 from perception.types import View
 
-VERSION = 3  # raised whenever the label images change, so that cached ones are made anew
+VERSION = 5  # raised whenever the label images change, so that cached ones are made anew
 
 
 class BuiltinSegmentation:
-    """Regions that look like one object: even colour and texture, and on one surface once depth is known."""
+    """Regions that look like one object; once the map can say how far things are, whole objects in all photos."""
 
     def __init__(self) -> None:
         self.name = "builtin"
         self.identity = f"builtin {VERSION}"
+        self._scene: SceneSegmentation | None = None
 
     def check(self, views: list[View]) -> list[str]:
         """Nothing can be wrong up front."""
@@ -25,11 +29,17 @@ class BuiltinSegmentation:
         """photo: [h, w, 3] uint8 RGB. Returns [h, w] int32, 0 = unlabelled."""
         return segment_photo(photo)
 
-    def label_image_with_geometry(self, view: View, photo: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """depth: [h, w] z-depth rendered for this view, 0 = none (expected depth divided by alpha)."""
-        return refine_with_geometry(photo, depth, _intrinsics_at(view, photo.shape[1], photo.shape[0]))
+    def survey(
+        self,
+        views: list[View],
+        load_photo: Callable[[View], np.ndarray],
+        load_depth: Callable[[View], np.ndarray],
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Segments the surface that all photos show together; load_depth gives [h, w] z-depths, 0 = none."""
+        self._scene = SceneSegmentation.of(views, load_photo, load_depth, progress)
 
-
-def _intrinsics_at(view: View, width: int, height: int) -> np.ndarray:
-    """K [3, 3] of the view at another size of its picture, by the true ratio per axis."""
-    return np.diag([width / view.width, height / view.height, 1.0]) @ view.K
+    def label_image_with_geometry(self, view: View, photo: np.ndarray) -> np.ndarray:
+        """As label_image, after `survey`: ids agree between photos. A photo without depth is judged alone."""
+        labels = None if self._scene is None else self._scene.label_image(view, photo)
+        return segment_photo(photo) if labels is None else labels

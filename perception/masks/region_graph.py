@@ -1,43 +1,40 @@
 """A graph of image regions that knows how alike neighbours are, and merges them best first.
 
 Everything a decision needs is a sum over pixels or over border pixels, so a merged region's evidence is the
-sum of its parts' and never goes stale. The convexity of patches follows Stein et al. 2014; the decision is a
-logistic regression over the evidence, met again at every level of merging (Nunez-Iglesias et al. 2013).
+sum of its parts' and never goes stale; the decision is a logistic regression over it, met again at every level of
+merging (Nunez-Iglesias et al. 2013).
 """
 
 from __future__ import annotations
 
 import heapq
 from collections.abc import Callable
+from typing import Any, Protocol
 
 import numpy as np
 
-from perception.masks.cues import COLOUR_WORDS, DepthCues, PhotoCues
+from perception.masks.cues import COLOUR_WORDS, PhotoCues
 
 PHOTO_FEATURES = 8
-DEPTH_FEATURES = PHOTO_FEATURES + 9
-_STEP = 0.012  # of the depth: what counts as a step between surfaces
-_STEP_CAP = 0.06
 _THIN = 1.5  # pixels of area a pixel of border: a ribbon 3 px wide
 
 # Columns of the sums over pixels, and over border pixels.
-_AREA, _LAB, _TEXTURE, _NORMAL, _POINT, _WORDS = 0, slice(1, 4), 4, slice(5, 8), slice(8, 11), slice(11, None)
-_LENGTH, _EDGE, _STEPS, _BROKEN, _CONCAVE, _CONVEX = range(6)
+_AREA, _LAB, _TEXTURE, _WORDS = 0, slice(1, 4), 4, slice(5, None)
+_LENGTH, _EDGE = range(2)
 
 
 class RegionGraph:
     """sums: [R, C] over each region's pixels; borders: region -> neighbour -> [B] sums over their border."""
 
-    def __init__(self, regions: np.ndarray, photo: PhotoCues, depth: DepthCues | None = None) -> None:
+    def __init__(self, regions: np.ndarray, photo: PhotoCues) -> None:
         """regions: [h, w] int, ids 0..R−1 all in use."""
-        self.has_depth = depth is not None
         self.pixels = regions.size
-        self.sums = _region_sums(regions, photo, depth)
-        self.borders = _border_sums(regions, photo, depth, len(self.sums))
+        self.sums = _region_sums(regions, photo)
+        self.borders = _border_sums(regions, photo, len(self.sums))
         self.perimeters = np.array([sum(row[_LENGTH] for row in links.values()) for links in self.borders])
 
     def features(self, a: int, others: list[int]) -> np.ndarray:
-        """Evidence that `a` and each of `others` are one object: [M, F], F = 8, or 17 with depth."""
+        """Evidence that `a` and each of `others` are one object: [M, PHOTO_FEATURES]."""
         border = np.stack([self.borders[a][b] for b in others])
         length = border[:, _LENGTH]
         one, two = self.sums[a], self.sums[others]
@@ -54,10 +51,11 @@ class RegionGraph:
             length / np.minimum(self.perimeters[a], self.perimeters[others]),
             np.minimum(mean_a[_TEXTURE], mean_b[:, _TEXTURE]),
         ]
-        if self.has_depth:
-            columns += [border[:, i] / length for i in (_STEPS, _BROKEN, _CONCAVE, _CONVEX)]
-            columns += _surface_features(mean_a, mean_b)
         return np.stack(columns, axis=1)
+
+    def size(self, a: int) -> float:
+        """Pixels: the larger of two lives on."""
+        return float(self.sums[a, _AREA])
 
     def negligible(self, a: int, smallest: float) -> bool:
         """Under `smallest` pixels, or so thin that it is but the blur of a border."""
@@ -76,23 +74,46 @@ class RegionGraph:
         self.borders[b] = {}
 
 
-Watcher = Callable[[RegionGraph, int, int], None]
+class MergingGraph(Protocol):
+    """What `agglomerate` asks of a graph of regions of a photo or of patches of a surface."""
+
+    sums: np.ndarray
+    borders: list[dict[int, np.ndarray]]
+
+    def features(self, a: int, others: list[int]) -> np.ndarray:
+        """[M, F] evidence that `a` and each of `others` are one object."""
+        ...
+
+    def size(self, a: int) -> float:
+        """The larger of two lives on."""
+        ...
+
+    def negligible(self, a: int, smallest: float) -> bool:
+        """Too small to stand alone."""
+        ...
+
+    def merge(self, a: int, b: int) -> None:
+        """b becomes part of a."""
+        ...
+
+
+Watcher = Callable[[Any, int, int], None]
 
 
 def agglomerate(
-    graph: RegionGraph, weights: np.ndarray, threshold: float, smallest: float, watch: Watcher | None = None
+    graph: MergingGraph, weights: np.ndarray, threshold: float, smallest: float, watch: Watcher | None = None
 ) -> np.ndarray:
     """Merges the likeliest pair until none scores `threshold` (log odds); what is negligible always merges.
 
-    weights: [F], or [W, F] of which the lowest log odds count. smallest: see RegionGraph.negligible. watch is
-    called before every merge. Returns [R] the region that each one ended in.
+    weights: [F]. smallest: see `negligible`. watch(graph, a, b) is called before every merge.
+    Returns [R] the region that each one ended in.
     """
     parent = np.arange(len(graph.sums))
     version = np.zeros(len(parent), np.int64)
     queue: list[tuple[float, int, int, int, int]] = []
 
     def offer(a: int, others: list[int]) -> None:
-        scores = (graph.features(a, others) @ np.atleast_2d(weights).T).min(axis=1)
+        scores = graph.features(a, others) @ weights
         for b, score in zip(others, scores.tolist(), strict=True):
             if score >= threshold or graph.negligible(a, smallest) or graph.negligible(b, smallest):
                 heapq.heappush(queue, (-score, a, b, int(version[a]), int(version[b])))
@@ -106,7 +127,7 @@ def agglomerate(
             continue
         if watch is not None:
             watch(graph, a, b)
-        if graph.sums[a, _AREA] < graph.sums[b, _AREA]:
+        if graph.size(a) < graph.size(b):
             a, b = b, a
         graph.merge(a, b)
         parent[b] = a
@@ -118,45 +139,23 @@ def agglomerate(
     return parent
 
 
-def _surface_features(mean_a: np.ndarray, mean_b: np.ndarray) -> list[np.ndarray]:
-    """How two patches, each taken as a plane through its mean point, lie to each other."""
-    normal_a = mean_a[_NORMAL] / (np.linalg.norm(mean_a[_NORMAL]) + 1e-9)
-    normal_b = mean_b[:, _NORMAL] / (np.linalg.norm(mean_b[:, _NORMAL], axis=1, keepdims=True) + 1e-9)
-    chord = mean_b[:, _POINT] - mean_a[_POINT]
-    depth = np.minimum(mean_a[_POINT][2], mean_b[:, _POINT][:, 2])
-    turn = np.minimum(1 - normal_b @ normal_a, 1.0)
-    offset = np.maximum(np.abs(chord @ normal_a), np.abs((chord * normal_b).sum(axis=1))) / depth
-    bend = ((normal_b - normal_a) * chord).sum(axis=1) / (np.linalg.norm(chord, axis=1) + 1e-9)
-    same_plane = np.exp(-offset / 0.01 - turn / 0.05)
-    return [turn, 5 * np.minimum(offset, 0.2), np.maximum(-bend, 0), np.maximum(bend, 0), same_plane]
-
-
-def _region_sums(regions: np.ndarray, photo: PhotoCues, depth: DepthCues | None) -> np.ndarray:
+def _region_sums(regions: np.ndarray, photo: PhotoCues) -> np.ndarray:
     flat, count = regions.ravel(), int(regions.max()) + 1
     maps = [np.ones(regions.shape), *np.moveaxis(photo.lab, -1, 0), photo.texture]
-    for vectors in (None, None) if depth is None else (depth.normals, depth.points):
-        maps += [np.zeros(regions.shape)] * 3 if vectors is None else list(np.moveaxis(vectors, -1, 0))
     sums = [np.bincount(flat, weights=values.ravel(), minlength=count) for values in maps]
     words = np.bincount(flat * COLOUR_WORDS + photo.word.ravel(), minlength=count * COLOUR_WORDS)
     return np.concatenate([np.stack(sums, axis=1), words.reshape(count, COLOUR_WORDS)], axis=1)
 
 
-def _border_sums(
-    regions: np.ndarray, photo: PhotoCues, depth: DepthCues | None, count: int
-) -> list[dict[int, np.ndarray]]:
+def _border_sums(regions: np.ndarray, photo: PhotoCues, count: int) -> list[dict[int, np.ndarray]]:
     keys, rows = [], []
     for axis in (0, 1):
-        first, second = _neighbours(regions, axis)
+        first, second = neighbours(regions, axis)
         cut = first != second
         low, high = np.minimum(first, second)[cut], np.maximum(first, second)[cut]
         keys.append(low.astype(np.int64) * count + high)
-        edge = np.maximum(*_neighbours(photo.edge, axis))[cut]
-        columns = [np.ones(len(edge)), edge]
-        if depth is not None:
-            step, bend = (_neighbours(maps[axis], axis)[0][cut] for maps in (depth.step, depth.bend))
-            columns += [np.minimum(step, _STEP_CAP) / _STEP_CAP, (step > _STEP).astype(float)]
-            columns += [np.clip(-bend, 0, 1), np.clip(bend, 0, 1)]
-        rows.append(np.stack(columns, axis=1))
+        edge = np.maximum(*neighbours(photo.edge, axis))[cut]
+        rows.append(np.stack([np.ones(len(edge)), edge], axis=1))
     unique, index = np.unique(np.concatenate(keys), return_inverse=True)
     values = np.concatenate(rows)
     sums = np.stack([np.bincount(index, weights=column) for column in values.T], axis=1)
@@ -167,6 +166,6 @@ def _border_sums(
     return borders
 
 
-def _neighbours(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+def neighbours(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Each pixel and its right (axis 0) or lower (axis 1) neighbour."""
     return (image[:, :-1], image[:, 1:]) if axis == 0 else (image[:-1], image[1:])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -33,10 +34,20 @@ class MaskSource(Protocol):
 
 @runtime_checkable
 class GeometryMaskSource(MaskSource, Protocol):
-    """A source that does better once the map can say how far away each pixel is."""
+    """A source that does better once the map can say about how far away each pixel is."""
 
-    def label_image_with_geometry(self, view: View, photo: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """depth: [h, w] z-depth of the view, 0 = none. Returns [h, w] int32, 0 = unlabelled."""
+    def survey(
+        self,
+        views: list[View],
+        load_photo: Callable[[View], np.ndarray],
+        load_depth: Callable[[View], np.ndarray],
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Looks at all photos together, once; load_depth: view -> [h, w] z-depth, 0 = none."""
+        ...
+
+    def label_image_with_geometry(self, view: View, photo: np.ndarray) -> np.ndarray:
+        """As label_image, for one of the views surveyed."""
         ...
 
 

@@ -40,13 +40,19 @@ def compute_masks(
     """
     warnings = source.check(views)
     start, skipped, empty, counts = perf_counter(), 0, [], []
+    seen: GeometryMaskSource | None = None
+    if load_depth is not None and isinstance(source, GeometryMaskSource):
+        seen = source
+        if any(stored_key(label_file(folder, view)) != _key(view, source, depth_key) for view in views):
+            seen.survey(views, load_photo, load_depth, progress)
     for done, view in enumerate(views, start=1):
         key, file = _key(view, source, depth_key), label_file(folder, view)
         if stored_key(file) == key:
             labels = load_labels(folder, view)
             skipped += 1
         else:
-            labels = _label_image(source, view, load_photo(view), load_depth)
+            photo = load_photo(view)
+            labels = source.label_image(view, photo) if seen is None else seen.label_image_with_geometry(view, photo)
             write_labels(file, labels, key)
         counts.append(len(np.setdiff1d(labels, [0])))
         if not labels.any():
@@ -68,14 +74,6 @@ def compute_masks(
         "empty": empty,
         "warnings": warnings,
     }
-
-
-def _label_image(
-    source: MaskSource, view: View, photo: np.ndarray, load_depth: Callable[[View], np.ndarray] | None
-) -> np.ndarray:
-    if load_depth is not None and isinstance(source, GeometryMaskSource):
-        return source.label_image_with_geometry(view, photo, load_depth(view))
-    return source.label_image(view, photo)
 
 
 def label_file(folder: Path, view: View) -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,22 +12,24 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians
 from perception.gaussians.train import TrainingView
-from perception.instances.cluster import cluster_gaussians
-from perception.instances.confidence import Agreement, scores
+from perception.instances.group import Grouping, group
 from perception.instances.silhouettes import Silhouettes, render_silhouettes
+from perception.instances.votes import mask_votes
 from perception.progress import Progress
 from perception.types import Scene
 
 
 @dataclass
 class FoundInstances:
-    """ids [N] int32 (−1 = none), membership [N] float32, instances.json's list, language arrays, facts."""
+    """ids [N] int32 (−1 = none), membership [N] float32, instances.json's list, language arrays, facts, and the
+    arrays of parts.npz (see io.store)."""
 
     ids: np.ndarray
     membership: np.ndarray
     instances: list[dict[str, Any]]
     language: dict[str, np.ndarray] = field(default_factory=dict)
     report: dict[str, Any] = field(default_factory=dict)
+    parts: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def find_instances(
@@ -41,35 +43,79 @@ def find_instances(
         empty = np.full(len(means), -1, np.int32)
         return FoundInstances(empty, np.zeros(len(means), np.float32), [], {}, {"warnings": ["no photo has masks"]})
 
-    progress.log(f"clustering {len(means)} Gaussians")
-    clusters = cluster_gaussians(
-        means,
-        gaussians.scales.detach().numpy(),
-        opacities,
-        gaussians.features.detach().numpy(),
-        config.instances,
-        config.seed,
-    )
-    agreement = Agreement(clusters.count)
-    seen: list[Silhouettes] = []
-    for done, view in enumerate(views, start=1):
-        height, width = view.photo.shape[:2]
-        found = render_silhouettes(gaussians, clusters.ids, view.camera_from_world, view.K, width, height)
-        agreement.add(found, None if view.labels is None else view.labels.numpy())
-        seen.append(found)
-        progress.update("silhouettes", done, len(views))
-    confidence = scores(clusters.ids, clusters.membership, opacities, agreement)
-    instances = [
-        _describe(i, means, opacities, clusters.ids, float(confidence[i]), int(agreement.views[i]))
-        for i in range(clusters.count)
-    ]
-    language = _embed(clusters.ids, seen, views, config, progress) if clusters.count else {}
+    progress.log(f"grouping {len(means)} Gaussians")
+    grouped = group_gaussians(gaussians, views, config, progress)
+    seen = _silhouettes(gaussians, grouped.ids, views, "silhouettes", progress) if grouped.count else []
+    instances = _entries(grouped, means, opacities, seen)
+    language = _embed(grouped.ids, seen, views, config, progress) if grouped.count else {}
     report = {
-        "count": clusters.count,
-        "noise_share": float(np.mean(clusters.ids < 0)),
+        "count": grouped.count,
+        "parts": len(grouped.parents),
+        "noise_share": float(np.mean(grouped.ids < 0)),
         "encoder": str(language["encoder"]) if language else None,
     }
-    return FoundInstances(clusters.ids, clusters.membership, instances, language, report)
+    parts = _parts(gaussians, grouped, views, config, progress) if grouped.parents else {}
+    return FoundInstances(grouped.ids, grouped.membership, instances, language, report, parts)
+
+
+def group_gaussians(gaussians: Gaussians, views: list[TrainingView], config: MapConfig, progress: Progress) -> Grouping:
+    """The votes of all masks, and the instances they and the features make."""
+    votes = mask_votes(
+        gaussians,
+        views,
+        half_resolution=config.losses.half_resolution,
+        progress=lambda done, of: progress.update("mask votes", done, of),
+    )
+    return group(
+        gaussians.means.detach().numpy(),
+        gaussians.scales.detach().numpy(),
+        gaussians.opacities.detach().numpy(),
+        gaussians.features.detach().numpy(),
+        votes,
+        config.instances,
+        margin=config.losses.margin,
+        seed=config.seed,
+    )
+
+
+def _silhouettes(
+    gaussians: Gaussians, ids: np.ndarray, views: list[TrainingView], what: str, progress: Progress
+) -> list[Silhouettes]:
+    seen = []
+    for done, view in enumerate(views, start=1):
+        height, width = view.photo.shape[:2]
+        seen.append(render_silhouettes(gaussians, ids, view.camera_from_world, view.K, width, height))
+        progress.update(what, done, len(views))
+    return seen
+
+
+def _entries(
+    grouped: Grouping, means: np.ndarray, opacities: np.ndarray, seen: list[Silhouettes]
+) -> list[dict[str, Any]]:
+    """instances.json's list, the parts of each instance inside its entry."""
+    views = np.sum([view.pixels > 0 for view in seen], axis=0) if seen else np.zeros(grouped.count)
+    entries = [
+        _describe(i, means, opacities, grouped.ids, float(grouped.scores[i]), int(views[i]))
+        for i in range(grouped.count)
+    ]
+    for number, parent in enumerate(grouped.parents):
+        score, shown = grouped.part_scores[number], grouped.part_views[number]
+        part = _describe(grouped.count + number, means, opacities, grouped.part_ids, score, shown)
+        entries[parent].setdefault("parts", []).append({**part, "parent": parent})
+    return entries
+
+
+def _parts(
+    gaussians: Gaussians, grouped: Grouping, views: list[TrainingView], config: MapConfig, progress: Progress
+) -> dict[str, np.ndarray]:
+    """The arrays of parts.npz: whose part each Gaussian is and, with an encoder, what the parts look like."""
+    local = np.where(grouped.part_ids >= 0, grouped.part_ids - grouped.count, -1).astype(np.int32)
+    language: dict[str, np.ndarray] = {}
+    if config.language.encoder != "none":
+        seen = _silhouettes(gaussians, local, views, "silhouettes of parts", progress)
+        thrifty = replace(config, language=replace(config.language, views=min(2, config.language.views), zooms=1))
+        language = _embed(local, seen, views, thrifty, progress)
+    return {"ids": grouped.part_ids, **{f"language_{name}": array for name, array in language.items()}}
 
 
 BOX_TRIM = 0.01
@@ -102,6 +148,7 @@ def _embed(
     from perception.instances.crops import choose_views, view_scores
     from perception.instances.describe import describe_instances
     from perception.language import make_encoder
+    from perception.language.base import reading_of
     from perception.language.description import to_arrays
 
     spec = config.language.encoder
@@ -124,8 +171,9 @@ def _embed(
         chosen,
         lambda index: (views[index].photo.numpy(), seen[index].ids),
         [view.name for view in views],
-        levels=config.language.zooms,
+        levels=config.language.zooms or reading_of(encoder).zooms,
         expansion=config.language.expansion,
+        background=config.language.background,  # type: ignore[arg-type]  # config.check knows them all
         progress=lambda done, of: progress.update("language", done, of),
     )
     return to_arrays(descriptions, encoder.identity)

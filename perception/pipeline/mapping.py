@@ -302,6 +302,7 @@ def _assemble(
         info=record,
         cameras=cameras,
         language=found.language,
+        parts=found.parts,
     )
 
 

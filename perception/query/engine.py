@@ -57,13 +57,13 @@ class QueryEngine:
         queue_size: int = 64,
         timeout: float = 10.0,
         watch: float | None = 1.0,
-        encoders: Callable[[str], Encoder | None] = make_encoder,
+        encoders: Callable[[str], Encoder | None] | None = None,
     ) -> None:
         for name, value, least in (("workers", workers, 1), ("queue_size", queue_size, 1), ("timeout", timeout, 1e-3)):
             if not value >= least:
                 raise InputError(f"engine: {name} is {value}, expected at least {least}")
         self.path, self.timeout = Path(path), timeout
-        self._encoders = _Shared(encoders)
+        self._encoders = _Shared(encoders or make_encoder)
         self._signature = map_signature(self.path)
         self._map = self._open()
         self._figures = Figures()

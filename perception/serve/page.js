@@ -66,7 +66,7 @@ function card(hit, source) {
     ["box", numbers(hit.obb.extent, unit)], ["points", hit.num_points], ["id", hit.instance_id]];
   for (const [name, value] of rows) { element("dt", name, facts); element("dd", value, facts); }
   for (const format of ["ply", "npz"]) {
-    const link = element("a", `points.${format} `, body);
+    const link = element("a", `points.${format}`, body);
     link.href = "#";
     link.onclick = (event) => { event.preventDefault(); download(hit, source, format); };
   }

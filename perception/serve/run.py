@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from perception.errors import InputError, missing_extra
-from perception.language.base import Encoder, make_encoder
+from perception.language.base import Encoder
 from perception.query.engine import QueryEngine
 from perception.serve.settings import ServeSettings
 
@@ -21,7 +21,7 @@ def serve(
     path: Path,
     settings: ServeSettings,
     say: Callable[[str], None] | None = None,
-    encoders: Callable[[str], Encoder | None] = make_encoder,
+    encoders: Callable[[str], Encoder | None] | None = None,
 ) -> None:
     """Serves the map at `path` until SIGINT or SIGTERM, finishing what is being answered.
 

@@ -1,0 +1,73 @@
+"""sensor_msgs/Image and CompressedImage as pictures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from perception.errors import InputError
+
+# Encoding -> (channels of the message, OpenCV's conversion to BGR or None). Bayer names differ: ROS names the first
+# row's first two pixels, OpenCV the second row's second and third.
+_EIGHT_BIT: dict[str, tuple[int, int | None]] = {
+    "rgb8": (3, cv2.COLOR_RGB2BGR),
+    "bgr8": (3, None),
+    "8UC3": (3, None),
+    "rgba8": (4, cv2.COLOR_RGBA2BGR),
+    "bgra8": (4, cv2.COLOR_BGRA2BGR),
+    "8UC4": (4, cv2.COLOR_BGRA2BGR),
+    "mono8": (1, cv2.COLOR_GRAY2BGR),
+    "8UC1": (1, cv2.COLOR_GRAY2BGR),
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2BGR),
+    "yuv422": (2, cv2.COLOR_YUV2BGR_UYVY),
+    "uyvy": (2, cv2.COLOR_YUV2BGR_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2BGR_YUY2),
+    "yuyv": (2, cv2.COLOR_YUV2BGR_YUY2),
+}
+
+
+def decode_image(message: Any, where: str) -> np.ndarray:
+    """An Image or CompressedImage as [H, W, 3] uint8 BGR. InputError naming `where` for what is no 8-bit picture."""
+    if hasattr(message, "encoding"):
+        return _raw(message, where)
+    picture = cv2.imdecode(np.frombuffer(bytes(message.data) or b"\0", np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise InputError(f"{where}: a compressed image of format '{message.format}' cannot be decoded (jpeg, png can)")
+    return np.asarray(picture)
+
+
+def _raw(message: Any, where: str) -> np.ndarray:
+    encoding = str(message.encoding)
+    if encoding not in _EIGHT_BIT:
+        raise InputError(
+            f"{where}: images are encoded as '{encoding}'; expected one of {', '.join(_EIGHT_BIT)} "
+            "(a depth image? give another --topic)"
+        )
+    channels, conversion = _EIGHT_BIT[encoding]
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    if min(height, width) < 1 or step < width * channels or data.size < step * height:
+        raise InputError(
+            f"{where}: an image of {width}x{height} ({encoding}, rows of {step} bytes) holds {data.size} bytes"
+        )
+    rows = data[: step * height].reshape(height, step)[:, : width * channels]
+    picture = np.ascontiguousarray(rows).reshape((height, width) if channels == 1 else (height, width, channels))
+    return picture if conversion is None else np.asarray(cv2.cvtColor(picture, conversion))
+
+
+def encoded(message: Any, picture: np.ndarray) -> tuple[str, bytes]:
+    """(suffix, bytes) of a file with the picture: a compressed message as it came, else PNG."""
+    if not hasattr(message, "encoding"):
+        data = bytes(message.data)
+        if data[:2] == b"\xff\xd8":
+            return ".jpg", data
+        if data[:4] == b"\x89PNG":
+            return ".png", data
+    done, buffer = cv2.imencode(".png", picture)
+    assert done  # an 8-bit picture can always be written
+    return ".png", buffer.tobytes()

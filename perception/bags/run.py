@@ -1,0 +1,198 @@
+"""`perception frames`: sharp, well-spaced photos of a bag with the camera's intrinsics and, where there, its poses."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.bags.choose import Chooser
+from perception.bags.decode import decode_image, encoded
+from perception.bags.poses import FIXED_FRAMES, Poses, read_poses
+from perception.bags.read import CAMERA_INFO, IMAGES, Bag, open_bag, stamp_of
+from perception.errors import InputError
+from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
+from perception.io.atomic import atomic_directory
+from perception.io.camera_file import read_camera, write_camera_info
+from perception.types import Lens
+
+
+@dataclass(frozen=True)
+class FrameOptions:
+    """topic: of the images (None: the bag's only one). camera_info: its topic (None: beside the images').
+
+    camera: a camera file used instead of camera_info. poses: use tf and odometry where there. fixed_frame: the world
+    (None: map, odom, world, or the root of the tree). odometry: topic (None: all). max_frames, spacing: see Chooser.
+    """
+
+    topic: str | None = None
+    camera_info: str | None = None
+    camera: Path | None = None
+    poses: bool = True
+    fixed_frame: str | None = None
+    odometry: str | None = None
+    max_frames: int = 200
+    spacing: float = 0.08
+
+
+def run_frames(
+    source: Path, output: Path, options: FrameOptions | None = None, tell: Callable[[str], None] | None = None
+) -> tuple[dict[str, Any], str]:
+    """Writes `output`/images, camera.yaml and, with poses, transforms.json: (JSON-able result, text).
+
+    The mapper takes `output` where there are poses, else `output`/images with --camera `output`/camera.yaml.
+    """
+    options, tell = options or FrameOptions(), tell or (lambda line: None)
+    if output.exists() and any(output.iterdir()):
+        raise InputError(f"{output}: is not empty; choose another -o or remove it first")
+    if options.max_frames < 2 or not options.spacing > 0:
+        raise InputError(f"--max-frames {options.max_frames}, --spacing {options.spacing}: expected 2 or more, above 0")
+    with open_bag(source) as bag:
+        topic = _image_topic(bag, options.topic)
+        info = None if options.camera is not None else _camera_info(bag, topic, options.camera_info)
+        chooser = Chooser(options.spacing)
+        size = None
+        for _, _, message in bag.messages([topic]):
+            picture = decode_image(message, f"{source}: {topic}")
+            size = size or (picture.shape[1], picture.shape[0])
+            chooser.show(picture)
+        if size is None:
+            raise InputError(f"{source}: {topic} holds no images")
+        chosen = chooser.chosen(options.max_frames)
+        tell(f"{topic}: {len(chosen)} of {len(chooser.motion)} images chosen")
+        poses = read_poses(bag, options.odometry) if options.poses else Poses()
+        with atomic_directory(output) as aside:
+            lens = _write_camera(aside / "camera.yaml", options.camera, info, topic, size, source)
+            stamps, frame = _write_images(bag, topic, chosen, aside / "images")
+            placed = _place(poses, stamps, frame, options.fixed_frame)
+            if placed.known:
+                _write_transforms(aside / "transforms.json", placed, lens)
+    facts = {
+        "output": str(output),
+        "topic": topic,
+        "images": len(chooser.motion),
+        "chosen": len(stamps),
+        "with_pose": len(placed.known),
+        "fixed_frame": placed.fixed if placed.known else None,
+        "camera_frame": placed.frame,
+        "size": list(size),
+        "camera_model": lens.model,
+    }
+    return facts, _text(facts)
+
+
+@dataclass
+class Placed:
+    """Poses of written images: known[name] = camera_from_world, in order; fixed, frame: the world's and camera's."""
+
+    known: dict[str, np.ndarray]
+    stamps: dict[str, int]
+    fixed: str | None
+    frame: str
+
+
+def _image_topic(bag: Bag, wanted: str | None) -> str:
+    topics = bag.of_type(*IMAGES)
+    if wanted is not None:
+        if wanted not in topics:
+            raise InputError(f"{bag.path}: has no image topic '{wanted}'; found {', '.join(topics) or 'none'}")
+        return wanted
+    if not topics:
+        raise InputError(f"{bag.path}: holds no images; its topics are {', '.join(sorted(bag.topics)) or 'none'}")
+    if len(topics) > 1:
+        raise InputError(f"{bag.path}: holds several image topics, choose one with --topic: {', '.join(topics)}")
+    return topics[0]
+
+
+def _camera_info(bag: Bag, topic: str, wanted: str | None) -> Any:
+    """The first CameraInfo of the camera that took `topic`."""
+    topics = bag.of_type(CAMERA_INFO)
+    base = topic.removesuffix("/compressed").rpartition("/")[0]
+    beside = f"{base}/camera_info"
+    name = wanted or (beside if beside in topics else topics[0] if len(topics) == 1 else beside)
+    if name not in topics:
+        raise InputError(
+            f"{bag.path}: has no camera_info '{name}' (found {', '.join(topics) or 'none'}); give its topic with "
+            "--camera-info, or a camera file with --camera (perception calibrate makes one)"
+        )
+    for _, _, message in bag.messages([name]):
+        return message
+    raise InputError(f"{bag.path}: {name} holds no message; give a camera file with --camera")
+
+
+def _write_camera(path: Path, camera: Path | None, info: Any, topic: str, size: tuple[int, int], source: Path) -> Lens:
+    if camera is not None:
+        path.write_bytes(Path(camera).read_bytes() if Path(camera).is_file() else b"")
+        lens = read_camera(camera)
+    else:
+        write_camera_info(path, info, rectified="rect" in topic.rpartition("/")[2].partition("_")[2])
+        lens = read_camera(path)
+    if (lens.width, lens.height) != size:
+        raise InputError(
+            f"{source}: images of {topic} are {size[0]}x{size[1]} pixels, the camera {lens.width}x{lens.height}; give "
+            "the camera_info of these images"
+        )
+    return lens
+
+
+def _write_images(bag: Bag, topic: str, chosen: list[int], folder: Path) -> tuple[dict[str, int], str]:
+    """Writes the chosen images; returns their times in ns by name, in order, and the camera's frame."""
+    folder.mkdir()
+    wanted, stamps, frame = set(chosen), {}, ""
+    for number, (_, recorded, message) in enumerate(bag.messages([topic])):
+        if number not in wanted:
+            continue
+        suffix, data = encoded(message, decode_image(message, f"{bag.path}: {topic}"))
+        name = f"{number:06d}{suffix}"
+        (folder / name).write_bytes(data)
+        stamps[name] = stamp_of(message) or recorded
+        frame = str(message.header.frame_id)
+    return stamps, frame
+
+
+def _place(poses: Poses, stamps: dict[str, int], frame: str, fixed: str | None) -> Placed:
+    """Poses in the first world of FIXED_FRAMES (or the tree's root) that knows four images in five, else the most."""
+    best = Placed({}, stamps, fixed, frame)
+    for name in [fixed] if fixed else [*FIXED_FRAMES, poses.root(frame)]:
+        found = {image: poses.camera_from_world(name, frame, time) for image, time in stamps.items()}
+        known = {image: pose for image, pose in found.items() if pose is not None}
+        if len(known) > len(best.known):
+            best = Placed(known, stamps, name, frame)
+        if len(known) >= 0.8 * len(stamps):
+            break
+    return best
+
+
+def _write_transforms(path: Path, placed: Placed, lens: Lens) -> None:
+    """nerfstudio's form: frames with a pose only, OpenGL camera axes, pixel centres at +0.5."""
+    frames = [
+        {
+            "file_path": f"images/{name}",
+            "transform_matrix": (inverse_se3(placed.known[name]) @ OPENCV_FROM_OPENGL).tolist(),
+            "stamp_ns": placed.stamps[name],
+        }
+        for name in placed.known
+    ]
+    fx, fy, cx, cy, *extra = lens.params
+    data: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if lens.model == "OPENCV_FISHEYE" else "OPENCV"}
+    data |= {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": lens.width, "h": lens.height}
+    order = {
+        "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+        "OPENCV": ("k1", "k2", "p1", "p2"),
+        "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    }.get(lens.model, ())
+    data |= dict(zip(order, extra, strict=True))
+    path.write_text(json.dumps({**data, "world_frame": placed.fixed, "frames": frames}, indent=1), encoding="utf-8")
+
+
+def _text(facts: dict[str, Any]) -> str:
+    folder = facts["output"]
+    line = f"{folder}: {facts['chosen']} of {facts['images']} images of {facts['topic']}, {facts['camera_model']}"
+    if facts["with_pose"]:
+        line += f"; {facts['with_pose']} with a pose in '{facts['fixed_frame']}'"
+        return f"{line}\nnext: perception map {folder} -o MAP"
+    return f"{line}; no poses\nnext: perception map {folder}/images --camera {folder}/camera.yaml -o MAP"

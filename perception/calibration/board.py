@@ -1,0 +1,107 @@
+"""Calibration boards and their corners in pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+
+from perception.errors import InputError
+
+MIN_CORNERS = 8
+"""Corners without which a picture says too little: a pose alone takes three."""
+
+
+@dataclass(frozen=True)
+class Detection:
+    """One picture of the board. name: of the picture; board_points [N, 3] float32 in the board's frame (its unit,
+    z = 0); pixels [N, 2] float32, OpenCV's way: the centre of the first pixel is (0, 0)."""
+
+    name: str
+    board_points: np.ndarray
+    pixels: np.ndarray
+
+
+@dataclass(frozen=True)
+class Board:
+    """A printed board. kind: "charuco" or "checkerboard"; squares: (columns, rows) of squares, not of corners;
+    square, marker: side lengths in metres (or any unit); dictionary: of the markers, as OpenCV names it."""
+
+    kind: str
+    squares: tuple[int, int]
+    square: float
+    marker: float = 0.0
+    dictionary: str = "5X5_100"
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("charuco", "checkerboard"):
+            raise InputError(f"--board is '{self.kind}'; expected charuco or checkerboard")
+        if min(self.squares) < 3 or not self.square > 0:
+            raise InputError(f"board of {self.squares[0]}x{self.squares[1]} squares of {self.square}: too small")
+        if self.kind == "charuco" and not 0 < self.marker < self.square:
+            raise InputError(
+                f"--marker is {self.marker}; expected a length above 0 and under the square's {self.square}"
+            )
+        if self.kind == "charuco" and not hasattr(cv2.aruco, f"DICT_{self.dictionary}"):
+            raise InputError(
+                f"--dictionary '{self.dictionary}' is not known; expected one of OpenCV's, such as 5X5_100"
+            )
+
+    def __str__(self) -> str:
+        markers = f", markers {self.dictionary}" if self.kind == "charuco" else ""
+        return f"{self.kind} of {self.squares[0]}x{self.squares[1]} squares{markers}"
+
+    def detect(self, name: str, picture: np.ndarray) -> Detection | None:
+        """The corners of the board in a grey picture [H, W] uint8; None with fewer than MIN_CORNERS."""
+        found = self._charuco(picture) if self.kind == "charuco" else self._checkerboard(picture)
+        if found is None or len(found[0]) < MIN_CORNERS or _on_a_line(found[0]):
+            return None
+        return Detection(name, found[0].astype(np.float32), found[1].astype(np.float32))
+
+    def texture(self, pixels_per_square: int = 60, margin: int = 30) -> np.ndarray:
+        """The board as a picture [H, W] uint8, its top left square starting `margin` pixels from the corner."""
+        columns, rows = self.squares
+        if self.kind == "charuco":
+            size = (columns * pixels_per_square + 2 * margin, rows * pixels_per_square + 2 * margin)
+            return np.asarray(self._charuco_board().generateImage(size, None, margin))
+        cells = (np.add.outer(np.arange(rows), np.arange(columns)) % 2 * 255).astype(np.uint8)
+        grid = np.kron(cells, np.ones((pixels_per_square, pixels_per_square), np.uint8))
+        return np.pad(grid, margin, constant_values=255)
+
+    def _charuco_board(self, legacy: bool = False) -> Any:
+        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
+        board = cv2.aruco.CharucoBoard(self.squares, self.square, self.marker, words)
+        board.setLegacyPattern(legacy)
+        return board
+
+    @cached_property
+    def _detectors(self) -> list[tuple[Any, np.ndarray]]:
+        """Today's pattern, then that of boards printed with OpenCV before 4.6, which differs for even rows."""
+        boards = [self._charuco_board(legacy) for legacy in (False, True)]
+        return [(cv2.aruco.CharucoDetector(board), np.asarray(board.getChessboardCorners())) for board in boards]
+
+    def _charuco(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        best = None
+        for detector, corners in self._detectors:
+            pixels, ids, _, _ = detector.detectBoard(picture)
+            if ids is not None and (best is None or len(ids) > len(best[0])):
+                best = corners[np.ravel(ids)], np.reshape(pixels, (-1, 2))
+            if best is not None and len(best[0]) >= MIN_CORNERS:
+                break
+        return best
+
+    def _checkerboard(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        columns, rows = self.squares[0] - 1, self.squares[1] - 1
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
+        seen, pixels = cv2.findChessboardCornersSB(picture, (columns, rows), flags=flags)
+        if not seen:
+            return None
+        grid = np.stack([*np.meshgrid(np.arange(columns), np.arange(rows)), np.zeros((rows, columns))], axis=-1)
+        return grid.reshape(-1, 3) * self.square, np.reshape(pixels, (-1, 2))
+
+
+def _on_a_line(points: np.ndarray) -> bool:
+    return int(np.linalg.matrix_rank((points - points.mean(axis=0))[:, :2], tol=1e-6)) < 2

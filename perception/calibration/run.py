@@ -1,0 +1,145 @@
+"""`perception calibrate`: pictures of a board in, a camera file and its proof out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from perception.calibration.board import Board, Detection
+from perception.calibration.judge import check_count, check_solution, coverage, distinct_views, tilt_spread
+from perception.calibration.pictures import draw_coverage, draw_detection, read_pictures
+from perception.calibration.solve import NAMES, Solution, solve
+from perception.errors import InputError
+from perception.io.atomic import atomic_directory, atomic_file
+from perception.io.camera_file import write_camera
+
+MODELS = ("auto", "pinhole", "fisheye")
+MAX_VIEWS = 60
+"""Views that are solved for; more of them change nothing but the time."""
+
+
+def run_calibration(
+    source: Path,
+    output: Path,
+    board: Board,
+    model: str = "auto",
+    pictures: Path | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> tuple[dict[str, Any], str]:
+    """Calibrates a camera from a folder of photos or a video of a board: (JSON-able result, table).
+
+    Writes `output` (ROS camera_info YAML), beside it a .json with every figure, and into `pictures` the detections
+    and the coverage. Photos are turned upright as their EXIF data says, as the mapper does. InputError when the
+    board is not seen, in too few or too similar views.
+    """
+    if model not in MODELS:
+        raise InputError(f"--model is '{model}'; expected one of {', '.join(MODELS)}")
+    tell = tell or (lambda line: None)
+    found, size, looked_at = _detect(source, board)
+    tell(f"{board} seen in {len(found)} of {looked_at} pictures")
+    views = distinct_views(found, size[0])
+    check_count(views, len(found), looked_at, str(board), str(source))
+    views = [views[i] for i in np.linspace(0, len(views) - 1, min(len(views), MAX_VIEWS)).round().astype(int)]
+    solution = best_model(views, size, model)
+    notes = check_solution(solution, str(source))
+    result = _facts(solution, looked_at, len(found), board, notes)
+    if pictures is not None:
+        _write_pictures(pictures, source, solution)
+        result["pictures"] = str(pictures)
+    write_camera(output, output.stem, solution.model, solution.size, solution.values)
+    with atomic_file(output.with_suffix(".json")) as aside:
+        aside.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    result["camera"] = str(output)
+    return result, _table(result)
+
+
+def best_model(views: list[Detection], size: tuple[int, int], model: str = "auto") -> Solution:
+    """The solution under a model; "auto": of both, the one with less error, pinhole where they are within 5 %."""
+    if model != "auto":
+        return solve(model, views, size)
+    solved = []
+    for name in ("pinhole", "fisheye"):
+        try:
+            solved.append(solve(name, views, size))
+        except (InputError, cv2.error, np.linalg.LinAlgError):
+            continue  # a model that cannot explain the views at all
+    if not solved:
+        raise InputError("neither a pinhole nor a fisheye camera explains the boards found; is the board flat?")
+    if len(solved) == 2 and solved[1].rms > 0.95 * solved[0].rms:
+        return solved[0]
+    return solved[-1]
+
+
+def _detect(source: Path, board: Board) -> tuple[list[Detection], tuple[int, int], int]:
+    found: list[Detection] = []
+    size, looked_at = None, 0
+    for name, picture in read_pictures(source):
+        looked_at += 1
+        here = (picture.shape[1], picture.shape[0])
+        if size is None:
+            size = here
+        elif here != size:
+            raise InputError(
+                f"{source}: {name} is {here[0]}x{here[1]} pixels, the pictures before it {size[0]}x{size[1]}; a "
+                "calibration is for one camera at one size"
+            )
+        seen = board.detect(name, picture)
+        if seen is not None:
+            found.append(seen)
+    if size is None:
+        raise InputError(f"{source}: holds no pictures")
+    return found, size, looked_at
+
+
+def _facts(solution: Solution, looked_at: int, found: int, board: Board, notes: list[str]) -> dict[str, Any]:
+    names = NAMES[solution.model]
+    rows = zip(names, solution.values, solution.sigmas, solution.free, strict=True)
+    return {
+        "model": solution.model,
+        "distortion_model": "equidistant" if solution.model == "fisheye" else "plumb_bob",
+        "size": list(solution.size),
+        "board": str(board),
+        "parameters": {n: {"value": float(v), "sigma": float(s)} for n, v, s, free in rows if free},
+        "pixel_convention": "ROS and OpenCV: the centre of the first pixel is (0, 0)",
+        "reprojection_error_px": solution.rms * float(np.sqrt(2)),
+        "views": {v.name: float(e) for v, e in zip(solution.views, solution.view_errors, strict=True)},
+        "pictures_looked_at": looked_at,
+        "pictures_with_board": found,
+        "coverage": coverage(solution),
+        "tilt_spread_degrees": tilt_spread(solution),
+        "warnings": notes,
+    }
+
+
+def _write_pictures(folder: Path, source: Path, solution: Solution) -> None:
+    wanted = {view.name: (view, residuals) for view, residuals in zip(solution.views, solution.residuals, strict=True)}
+    with atomic_directory(folder) as aside:
+        for name, picture in read_pictures(source):
+            if name in wanted:
+                cv2.imwrite(str(aside / f"{Path(name).stem}.png"), draw_detection(picture, *wanted[name]))
+        cv2.imwrite(str(aside / "coverage.png"), draw_coverage(solution))
+
+
+def _table(result: dict[str, Any]) -> str:
+    lines = [f"{result['model']} ({result['distortion_model']}), {result['size'][0]}x{result['size'][1]} pixels"]
+    lines.append(f"{'':6}{'value':>14}{'+- sigma':>12}")
+    for name, row in result["parameters"].items():
+        lines.append(f"{name:6}{row['value']:>14.5f}{row['sigma']:>12.5f}")
+    worst = max(result["views"], key=result["views"].get)
+    lines.append(
+        f"reprojection error {result['reprojection_error_px']:.3f} px over {len(result['views'])} views "
+        f"(worst {worst}: {result['views'][worst]:.3f} px); {result['pictures_with_board']} of "
+        f"{result['pictures_looked_at']} pictures show the board"
+    )
+    lines.append(
+        f"corners cover {result['coverage']:.0%} of the picture, tilts differ by "
+        f"{result['tilt_spread_degrees']:.0f} deg"
+    )
+    lines += [f"warning: {note}" for note in result["warnings"]]
+    lines.append(f"written to {result['camera']}")
+    return "\n".join(lines)

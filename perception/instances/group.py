@@ -1,0 +1,160 @@
+"""Gaussians and masks to instances, their parts, and how sure each is: the stages in order, nothing of files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perception.config import InstanceConfig
+from perception.instances.assign import memberships, settle
+from perception.instances.cluster import by_falling_size, cluster_gaussians
+from perception.instances.confidence import calibrated, raw_scores
+from perception.instances.consensus import (
+    Evidence,
+    MergeTree,
+    best_cut,
+    evidence,
+    merge_tree,
+    node_evidence,
+    parts_of,
+)
+from perception.instances.segments import over_segment, touching
+from perception.instances.votes import MaskVotes
+
+PER_SEGMENT = 16  # Gaussians; fewer make segments that photos say little about
+LEAST = 4  # Gaussians; below that an instance is a speck even if masks single it out
+
+
+@dataclass(frozen=True)
+class Grouping:
+    """ids [N] int32 (−1 = none), 0 … K − 1 by falling size; membership [N] float32 in [0, 1], 0 for noise;
+    raw [K] uncalibrated and scores [K] calibrated in [0, 1]; found: evidence of the K instances.
+
+    part_ids [N] int32 (−1 = none): K, K + 1, …; parents: instance of each part, part_scores and part_views alike.
+    """
+
+    ids: np.ndarray
+    membership: np.ndarray
+    raw: np.ndarray
+    scores: np.ndarray
+    found: Evidence
+    part_ids: np.ndarray
+    parents: list[int] = field(default_factory=list)
+    part_scores: list[float] = field(default_factory=list)
+    part_views: list[int] = field(default_factory=list)
+
+    @property
+    def count(self) -> int:
+        return len(self.scores)
+
+
+def group(
+    means: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    features: np.ndarray,
+    votes: MaskVotes,
+    config: InstanceConfig,
+    *,
+    margin: float = 1.0,
+    seed: int = 0,
+) -> Grouping:
+    """Instances of N Gaussians: means [N, 3], scales [N, 3], opacities [N], features [N, D] float32.
+
+    margin: the loss's γ, the squared distance it keeps between features of different objects.
+    """
+    features = np.where(np.isfinite(features), features, 0) / np.sqrt(margin)
+    if config.method == "hdbscan":
+        ids = cluster_gaussians(means, scales, opacities, features, config, seed).ids
+        parts = np.full(len(ids), -1, np.int64)
+        parents = np.zeros(0, np.int64)
+    else:
+        ids, parts, parents = _by_consensus(means, opacities, features, votes, config, seed)
+    ids = settle(ids, means, opacities, votes, config.min_opacity)
+    ids = _without_specks(ids, votes, config)
+    ids = settle(ids, means, opacities, votes, config.min_opacity)
+    return _judged(ids, parts, parents, votes)
+
+
+def _by_consensus(
+    means: np.ndarray,
+    opacities: np.ndarray,
+    features: np.ndarray,
+    votes: MaskVotes,
+    config: InstanceConfig,
+    seed: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """ids [N] int32, parts [N] int64 (−1 = none, both) and the instance of each part."""
+    ids, parts = np.full(len(means), -1, np.int32), np.full(len(means), -1, np.int64)
+    solid = np.flatnonzero((opacities >= config.min_opacity) & np.isfinite(means).all(axis=1))
+    if len(solid) == 0:
+        return ids, parts, np.zeros(0, np.int64)
+    wanted = int(np.clip(len(solid) // PER_SEGMENT, min(32, len(solid)), config.max_segments))
+    segments = over_segment(means[solid], features[solid], wanted, seed)
+    count = int(segments.max()) + 1
+    everywhere = np.full(len(means), -1, np.int64)
+    everywhere[solid] = segments
+    table = votes.table(everywhere, count)
+    sizes = np.bincount(segments, minlength=count)
+    sums = [np.bincount(segments, column, minlength=count) for column in features[solid].T]
+    near = touching(means[solid], segments, count)
+    tree = merge_tree(table, np.stack(sums, axis=1) / sizes[:, None], sizes, near)
+    found = node_evidence(tree, table)
+    instance, part, parents = _cut(tree, found)
+    ids[solid], parts[solid] = instance[segments], part[segments]
+    return ids, parts, parents
+
+
+def _cut(tree: MergeTree, found: Evidence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Instance and part (−1 = none) of each leaf, and the instance of each part."""
+    instance, part = np.full(tree.leaves, -1, np.int32), np.full(tree.leaves, -1, np.int64)
+    parents: list[int] = []
+    for number, node in enumerate(best_cut(tree, found.matched)):
+        instance[tree.under(node)] = number
+        for piece in parts_of(tree, node, found):
+            part[tree.under(piece)] = len(parents)
+            parents.append(number)
+    return instance, part, np.array(parents, np.int64)
+
+
+def _without_specks(ids: np.ndarray, votes: MaskVotes, config: InstanceConfig) -> np.ndarray:
+    """ids with −1 for groups under `min_cluster_size` that fewer than two photos single out, and for those that none
+    does and that have under a quarter of the median group's Gaussians: what is left over between things."""
+    count = int(ids.max(initial=-1)) + 1
+    if count == 0:
+        return ids
+    sizes = np.bincount(ids[ids >= 0], minlength=count)
+    support = evidence(votes.table(ids, count)).support
+    kept = (sizes >= config.min_cluster_size) | ((sizes >= LEAST) & (support >= 2))
+    kept &= (support > 0) | (sizes >= 0.25 * np.median(sizes[sizes > 0]))
+    return np.where((ids >= 0) & np.append(kept, False)[ids], ids, -1)
+
+
+def _judged(ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: MaskVotes) -> Grouping:
+    """Orders the instances by size and scores them and their parts."""
+    before = ids
+    ids = by_falling_size(before)
+    rename = np.full(max(int(before.max(initial=-1)) + 2, int(parents.max(initial=-1)) + 2), -1)
+    rename[before] = ids  # of groups without members −1; the last entry stands for −1
+    membership = memberships(ids, votes)
+    found = evidence(votes.table(ids, int(ids.max(initial=-1)) + 1))
+    raw = raw_scores(ids, membership, found)
+    part_ids, owners, scores, views = _judged_parts(ids, parts, rename[:-1][parents], votes)
+    return Grouping(ids, membership, raw, calibrated(raw), found, part_ids, owners, scores, views)
+
+
+def _judged_parts(
+    ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: MaskVotes
+) -> tuple[np.ndarray, list[int], list[float], list[int]]:
+    """Part ids that follow the instances', and of each part its instance, score (agreement with masks) and views."""
+    whole = np.append(parents, -1)[parts]
+    inside = np.where((parts >= 0) & (whole == ids) & (ids >= 0), parts, -1)
+    left = np.flatnonzero(np.bincount(inside[inside >= 0], minlength=len(parents)) >= LEAST)
+    rename = np.full(len(parents) + 1, -1)
+    rename[left] = np.arange(len(left))
+    number = rename[inside]
+    found = evidence(votes.table(number, len(left)))
+    first = int(ids.max(initial=-1)) + 1
+    part_ids = np.where(number >= 0, number + first, -1).astype(np.int32)
+    return part_ids, parents[left].tolist(), np.clip(found.agreement, 0, 1).tolist(), found.views.tolist()

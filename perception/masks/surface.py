@@ -1,0 +1,114 @@
+"""The surface that all depth images show together: small cubes (voxels) with a place, a normal and a colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perception.masks.cues import DepthCues, PhotoCues
+
+_FOOTPRINTS = 4.0  # side of a voxel in pixels at the median depth: above the noise of depth
+_MOST = 400_000  # voxels; a larger scene takes larger ones
+_LEAST_PIXELS = 3  # that must fall into a voxel over all photos for it to be more than a stray
+_OFFSET = 1 << 20  # makes voxel indices positive; 2^21 of them a side
+
+
+@dataclass(frozen=True)
+class Surface:
+    """V voxels of side `size`. keys [V] int64 ascending; pixels [V] that fell into each, over all photos;
+    points, normals, lab [V, 3] float32 means in the world frame (Lab on the 8-bit scale)."""
+
+    size: float
+    keys: np.ndarray
+    pixels: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    lab: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def voxel_of(self, points: np.ndarray) -> np.ndarray:
+        """[...] int32 voxel that holds each of points [..., 3], −1 where there is none."""
+        keys = voxel_keys(points.reshape(-1, 3), self.size)
+        place = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        return np.where(self.keys[place] == keys, place, -1).astype(np.int32).reshape(points.shape[:-1])
+
+
+@dataclass
+class SurfaceBuilder:
+    """Sums up one photo after the other; memory grows with the surface, not with the photos."""
+
+    size: float
+    _keys: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    _sums: np.ndarray = field(default_factory=lambda: np.zeros((0, 10)))
+
+    def add(self, photo: PhotoCues, depth: DepthCues, known: np.ndarray, world_from_camera: np.ndarray) -> None:
+        """known: [h, w] bool, the pixels whose depth is to be believed. world_from_camera: [4, 4]."""
+        points = to_world(depth.points[known], world_from_camera)
+        normals = depth.normals[known] @ world_from_camera[:3, :3].T
+        keys, index = np.unique(voxel_keys(points, self.size), return_inverse=True)
+        values = np.concatenate([np.ones((len(points), 1)), points, normals, photo.lab[known]], axis=1)
+        sums = np.stack([np.bincount(index, weights=column, minlength=len(keys)) for column in values.T], axis=1)
+        self._merge(keys, sums)
+
+    def _merge(self, keys: np.ndarray, sums: np.ndarray) -> None:
+        every, index = np.unique(np.concatenate([self._keys, keys]), return_inverse=True)
+        total = np.zeros((len(every), sums.shape[1]))
+        total[index[: len(self._keys)]] = self._sums
+        total[index[len(self._keys) :]] += sums
+        self._keys, self._sums = every, total
+        if len(every) > 2 * _MOST:
+            self._coarsen()
+
+    def _coarsen(self) -> None:
+        """Doubles the voxels' side: eight become one."""
+        self.size *= 2
+        old, self._keys = parted(self._keys) // 2, np.zeros(0, np.int64)
+        keys, index = np.unique(joined(old), return_inverse=True)
+        sums = np.stack([np.bincount(index, weights=column, minlength=len(keys)) for column in self._sums.T], axis=1)
+        self._sums = np.zeros((0, sums.shape[1]))
+        self._merge(keys, sums)
+
+    def build(self) -> Surface:
+        """What was seen, without strays."""
+        rows = self._sums[:, 0] >= _LEAST_PIXELS
+        sums = self._sums[rows]
+        count = np.maximum(sums[:, :1], 1)
+        normals = sums[:, 4:7] / np.maximum(np.linalg.norm(sums[:, 4:7], axis=1, keepdims=True), 1e-9)
+        return Surface(
+            self.size,
+            self._keys[rows],
+            sums[:, 0],
+            (sums[:, 1:4] / count).astype(np.float32),
+            normals.astype(np.float32),
+            (sums[:, 7:10] / count).astype(np.float32),
+        )
+
+
+def voxel_side(footprints: np.ndarray) -> float:
+    """The side to begin with, from footprints [P] of pixels (depth / focal length, the scene's unit)."""
+    return _FOOTPRINTS * float(np.median(footprints))
+
+
+def to_world(points: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
+    """points [..., 3] of a camera's frame in the world's, float64."""
+    return points.astype(np.float64) @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+
+
+def voxel_keys(points: np.ndarray, size: float) -> np.ndarray:
+    """[P] int64, equal for points [P, 3] in one voxel."""
+    return joined(np.floor(points / size).astype(np.int64))
+
+
+def joined(index: np.ndarray) -> np.ndarray:
+    """Three voxel indices [P, 3] as one number [P]."""
+    i = np.clip(index + _OFFSET, 0, 2 * _OFFSET - 1)
+    return (i[:, 0] << 42) | (i[:, 1] << 21) | i[:, 2]
+
+
+def parted(keys: np.ndarray) -> np.ndarray:
+    """The three voxel indices [P, 3] of each key: the inverse of `joined`."""
+    mask = (1 << 21) - 1
+    return np.stack([(keys >> 42) & mask, (keys >> 21) & mask, keys & mask], axis=1) - _OFFSET

@@ -1,0 +1,236 @@
+"""A graph of patches of the scene's surface, with the evidence of all photos for and against their being one object.
+
+Everything a decision needs is a sum over pixels, border pixels or voxels, so a merged patch's evidence is the sum of
+its parts' and never goes stale. The convexity of patches follows Stein et al. 2014.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from perception import _core
+from perception.masks.cues import COLOUR_WORDS, DepthCues, PhotoCues
+from perception.masks.region_graph import neighbours
+from perception.masks.surface import Surface
+
+FEATURES = 24
+NEIGHBOURS = 8
+_STEP = 0.012  # of the depth: what counts as a step between surfaces
+_STEP_CAP = 0.06
+_TURN, _OFFSET = 0.02, 0.025  # of one plane: 1 − cosine of the normals; distance, in units of the depth
+_ALIKE = 0.5  # share of their colours that parts of one plane have in common when they do not touch
+_SHARP = 12.0  # border gradient that counts as an edge
+
+# Columns of the sums over a patch's pixels and voxels, and over border pixels of two patches.
+_AREA, _LAB, _TEXTURE, _DEPTH = 0, slice(1, 4), 4, 5
+_VOXELS, _NORMAL, _POINT, _SQUARES, _WORDS = 6, slice(7, 10), slice(10, 13), slice(13, 19), slice(19, None)
+_LENGTH, _EDGE, _SHARPS, _STEPS, _BROKEN, _CONCAVE, _CONVEX, _CONTACT = range(8)
+_UPPER = np.triu_indices(3)
+
+
+def voxel_edges(surface: Surface) -> np.ndarray:
+    """[E, 2] int32, a < b: each voxel and its nearest neighbours, no farther than three voxels."""
+    from scipy.spatial import cKDTree
+
+    k = min(NEIGHBOURS + 1, len(surface))
+    distance, near = cKDTree(surface.points).query(surface.points, k=k, distance_upper_bound=3 * surface.size)
+    a = np.repeat(np.arange(len(surface)), k)[np.isfinite(distance).ravel()]
+    b = near.ravel()[np.isfinite(distance).ravel()]
+    low, high = np.minimum(a, b)[a != b].astype(np.int64), np.maximum(a, b)[a != b]
+    unique = np.unique(low * len(surface) + high)
+    return np.stack([unique // len(surface), unique % len(surface)], axis=1).astype(np.int32)
+
+
+def patches(surface: Surface, edges: np.ndarray, scale: float = 4.0, smallest: int = 12) -> np.ndarray:
+    """[V] int32 patch of each voxel, even in colour and normal (Felzenszwalb & Huttenlocher 2004)."""
+    a, b = edges[:, 0], edges[:, 1]
+    colour = (surface.lab[a] - surface.lab[b]) / np.array([14.0, 7.0, 7.0], np.float32)
+    turn = (surface.normals[a] - surface.normals[b]) / 0.25
+    weights = np.sqrt((colour**2).sum(axis=1) + (turn**2).sum(axis=1)).astype(np.float32)
+    labels = np.empty(len(surface), np.int32)
+    _core.felzenszwalb(edges, np.ascontiguousarray(weights), scale, smallest, labels)
+    return labels
+
+
+class SurfaceGraph:
+    """sums: [R, C] over each patch; borders: patch -> neighbour -> [B]. Neighbours touch in space."""
+
+    def __init__(self, surface: Surface, patch: np.ndarray, edges: np.ndarray) -> None:
+        """patch: [V] int, ids 0..R−1 all in use; edges: [E, 2] voxels that touch."""
+        count = int(patch.max()) + 1
+        self.surface, self.patch, self.count = surface, patch, count
+        self.unit = surface.size**2
+        self._scale = surface.size
+        local = (surface.points - surface.points.mean(axis=0)).astype(np.float64)
+        squares = np.stack([local[:, i] * local[:, j] for i, j in zip(*_UPPER, strict=True)], axis=1)
+        maps = [np.ones((len(patch), 1)), surface.normals, local, squares]
+        self.sums = np.zeros((count, _WORDS.start + COLOUR_WORDS))
+        self.sums[:, _VOXELS : _WORDS.start] = _sum_by(patch, np.concatenate(maps, axis=1), count)
+        ends = patch[edges]
+        ends = np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1).astype(np.int64)
+        self._keys, contact = np.unique(ends[:, 0] * count + ends[:, 1], return_counts=True)
+        self._border = np.zeros((len(self._keys), _CONTACT + 1))
+        self._border[:, _CONTACT] = contact
+        self.borders: list[dict[int, np.ndarray]] = []
+
+    def add(self, regions: np.ndarray, photo: PhotoCues, depth: DepthCues) -> None:
+        """Takes in what one photo says. regions: [h, w] patch seen in each pixel, −1 = none."""
+        inside = regions >= 0
+        flat = regions[inside]
+        z = depth.points[..., 2]
+        maps = [np.ones(len(flat)), *photo.lab[inside].T, photo.texture[inside], z[inside]]
+        self.sums[:, :_VOXELS] += _sum_by(flat, np.stack(maps, axis=1), self.count)
+        words = flat.astype(np.int64) * COLOUR_WORDS + photo.word[inside]
+        words = np.bincount(words, minlength=self.count * COLOUR_WORDS)
+        self.sums[:, _WORDS] += words.reshape(self.count, COLOUR_WORDS)
+        for axis in (0, 1):
+            first, second = neighbours(regions, axis)
+            cut = (first != second) & (first >= 0) & (second >= 0)
+            low, high = np.minimum(first, second)[cut].astype(np.int64), np.maximum(first, second)[cut]
+            keys = low * self.count + high
+            place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+            edge = np.maximum(*neighbours(photo.edge, axis))[cut]
+            step, bend = (neighbours(maps[axis], axis)[0][cut] for maps in (depth.step, depth.bend))
+            columns = [np.ones(len(edge)), edge, edge > _SHARP, np.minimum(step, _STEP_CAP) / _STEP_CAP, step > _STEP]
+            columns += [np.clip(-bend, 0, 1), np.clip(bend, 0, 1)]
+            touching = self._keys[place] == keys
+            values = np.stack(columns, axis=1)[touching]
+            self._border[:, :_CONTACT] += _sum_by(place[touching], values, len(self._keys))
+
+    def link(self) -> None:
+        """Makes the borders, once all photos are in."""
+        self.borders = [{} for _ in range(self.count)]
+        for key, row in zip(self._keys.tolist(), self._border, strict=True):
+            if row[_LENGTH] > 0:
+                a, b = divmod(key, self.count)
+                self.borders[a][b] = self.borders[b][a] = row
+        self.contacts = np.array([sum(row[_CONTACT] for row in links.values()) for links in self.borders])
+
+    def size(self, patch: int) -> float:
+        """For choosing which of two survives."""
+        return float(self.sums[patch, _VOXELS])
+
+    def features(self, a: int, others: list[int]) -> np.ndarray:
+        """Evidence that `a` and each of `others` are one object: [M, FEATURES]."""
+        border = np.stack([self.borders[a][b] for b in others])
+        length = border[:, _LENGTH]
+        one, two = self.sums[a], self.sums[others]
+        look_a, look_b = one / max(one[_AREA], 1), two / np.maximum(two[:, _AREA], 1)[:, None]
+        shape_a, shape_b = one / one[_VOXELS], two / two[:, _VOXELS, None]
+        depth = (one[_DEPTH] + two[:, _DEPTH]) / np.maximum(one[_AREA] + two[:, _AREA], 1)
+        depth = np.maximum(depth, 1e-9)
+        colour = (look_b[:, _LAB] - look_a[_LAB]) ** 2 @ np.array([0.5, 2.0, 2.0])
+        smaller, larger = (f(one[_VOXELS], two[:, _VOXELS]) * self.unit / depth**2 for f in (np.minimum, np.maximum))
+        turn, offset, concave, convex, same_plane = _surface_features(shape_a, shape_b, depth)
+        thick = np.stack([_thickness(shape_a[None])[0].repeat(len(others)), _thickness(shape_b)])
+        flat = np.exp(-thick / (0.01 * depth))
+        flat_of_larger = np.where(one[_VOXELS] > two[:, _VOXELS], flat[0], flat[1])
+        sharp, broken = border[:, _SHARPS] / length, border[:, _BROKEN] / length
+        crease = border[:, _CONCAVE] / length
+        grand = np.log(larger) + 2
+        return np.stack(
+            [
+                np.ones(len(others)),
+                np.log1p(border[:, _EDGE] / length),
+                sharp,
+                np.log1p(np.sqrt(colour)),
+                1 - np.minimum(look_a[_WORDS], look_b[:, _WORDS]).sum(axis=1),
+                np.abs(look_a[_TEXTURE] - look_b[:, _TEXTURE]),
+                np.minimum(look_a[_TEXTURE], look_b[:, _TEXTURE]),
+                np.log(smaller) + 6,
+                grand,
+                border[:, _CONTACT] / np.minimum(self.contacts[a], self.contacts[others]),
+                np.log(border[:, _CONTACT] * self._scale / depth) + 2,
+                border[:, _STEPS] / length,
+                broken,
+                crease,
+                border[:, _CONVEX] / length,
+                turn,
+                offset,
+                concave,
+                convex,
+                same_plane,
+                crease * flat_of_larger,
+                concave * flat_of_larger,
+                same_plane * sharp,
+                flat_of_larger * (1 - same_plane),
+            ],
+            axis=1,
+        )
+
+    def depth(self, a: int) -> float:
+        """Mean depth at which the photos show it."""
+        return float(self.sums[a, _DEPTH] / max(self.sums[a, _AREA], 1))
+
+    def share(self, a: int) -> float:
+        """Area in squared distances that it was photographed from."""
+        return float(self.sums[a, _VOXELS] * self.unit / max(self.depth(a), 1e-9) ** 2)
+
+    def flatness(self, a: int) -> float:
+        """Standard deviation across its own plane, in units of its depth."""
+        return float(_thickness(self.sums[a][None] / self.sums[a, _VOXELS])[0] / max(self.depth(a), 1e-9))
+
+    def one_plane(self, a: int, b: int) -> bool:
+        """Whether both are parts of one plane: they lie in it, and touch without an edge (a picture lies in the plane
+        of its wall), or do not touch but have the same colours."""
+        shape_a, shape_b = (self.sums[i] / self.sums[i, _VOXELS] for i in (a, b))
+        normal_a, normal_b = _direction(shape_a), _direction(shape_b)
+        chord = shape_b[_POINT] - shape_a[_POINT]
+        offset = max(abs(float(chord @ normal)) for normal in (normal_a, normal_b))
+        if 1 - abs(float(normal_a @ normal_b)) > _TURN or offset > _OFFSET * (self.depth(a) + self.depth(b)) / 2:
+            return False
+        border = self.borders[a].get(b)
+        if border is not None:
+            return bool(border[_SHARPS] < 0.5 * border[_LENGTH])
+        words = (self.sums[i, _WORDS] / max(self.sums[i, _AREA], 1) for i in (a, b))
+        return bool(np.minimum(*words).sum() > _ALIKE)
+
+    def negligible(self, a: int, smallest: float) -> bool:
+        """Smaller than `smallest`, in shares of the squared distance it was photographed from."""
+        return self.share(a) < smallest
+
+    def merge(self, a: int, b: int) -> None:
+        """b becomes part of a."""
+        self.contacts[a] += self.contacts[b] - 2 * self.borders[a].pop(b)[_CONTACT]
+        self.sums[a] += self.sums[b]
+        for other, row in self.borders[b].items():
+            if other != a:
+                del self.borders[other][b]
+                total = self.borders[a][other] + row if other in self.borders[a] else row
+                self.borders[a][other] = self.borders[other][a] = total
+        self.borders[b] = {}
+
+
+def _surface_features(shape_a: np.ndarray, shape_b: np.ndarray, depth: np.ndarray) -> list[np.ndarray]:
+    """How two patches, each taken as a plane through its mean point, lie to each other."""
+    normal_a = shape_a[_NORMAL] / (np.linalg.norm(shape_a[_NORMAL]) + 1e-9)
+    normal_b = shape_b[:, _NORMAL] / (np.linalg.norm(shape_b[:, _NORMAL], axis=1, keepdims=True) + 1e-9)
+    chord = shape_b[:, _POINT] - shape_a[_POINT]
+    turn = np.minimum(1 - normal_b @ normal_a, 1.0)
+    offset = np.maximum(np.abs(chord @ normal_a), np.abs((chord * normal_b).sum(axis=1))) / depth
+    bend = ((normal_b - normal_a) * chord).sum(axis=1) / (np.linalg.norm(chord, axis=1) + 1e-9)
+    same_plane = np.exp(-offset / 0.01 - turn / 0.05)
+    return [turn, 5 * np.minimum(offset, 0.2), np.maximum(-bend, 0), np.maximum(bend, 0), same_plane]
+
+
+def _direction(shape: np.ndarray) -> np.ndarray:
+    """[3] the normal of the plane through a patch, of either sign, from its mean point and squares [C]."""
+    return np.asarray(np.linalg.eigh(_covariance(shape[None])[0])[1][:, 0])
+
+
+def _covariance(shape: np.ndarray) -> np.ndarray:
+    """[M, 3, 3] of the voxels of each patch, from mean points and squares [M, C]."""
+    full = np.zeros((len(shape), 3, 3))
+    full[:, _UPPER[0], _UPPER[1]] = full[:, _UPPER[1], _UPPER[0]] = shape[:, _SQUARES]
+    mean = shape[:, _POINT]
+    return full - mean[:, :, None] * mean[:, None, :]
+
+
+def _thickness(shape: np.ndarray) -> np.ndarray:
+    """[M] standard deviation of each patch across its own plane."""
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(_covariance(shape))[:, 0], 0))
+
+
+def _sum_by(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """[count, C] sums of the rows of `values` [P, C] by `index` [P]."""
+    return np.stack([np.bincount(index, weights=column, minlength=count) for column in values.T], axis=1)

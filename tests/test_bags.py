@@ -1,0 +1,315 @@
+"""Bags of all three kinds, written here, through `perception frames` into what the mapper reads."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from perception.bags import FrameOptions, run_frames
+from perception.bags.choose import Chooser
+from perception.bags.decode import decode_image
+from perception.bags.poses import Poses
+from perception.cli import main
+from perception.config import load_config
+from perception.errors import InputError
+from perception.geometry import inverse_se3
+from perception.io.camera_file import read_camera
+from perception.io.transforms import read_frames
+from perception.pipeline.mapping import build_map
+
+pytest.importorskip("rosbags")
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+DATA = os.environ.get("PERCEPTION_DATA")
+K = np.array([[80.0, 0, 63.0], [0, 82.0, 47.0], [0, 0, 1]])
+D = [-0.1, 0.02, 0.001, -0.002, 0.003]
+
+
+class Recorder:
+    """Writes messages of one ROS generation; kind: "ros1", "sqlite" or "mcap"."""
+
+    def __init__(self, path: Path, kind: str) -> None:
+        self.ros1 = kind == "ros1"
+        self.store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
+        if self.ros1:  # which its store leaves out
+            entries = "geometry_msgs/TransformStamped[] transforms\n"
+            self.store.register(get_types_from_msg(entries, "tf2_msgs/msg/TFMessage"))
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        self.writer = Writer1(path) if self.ros1 else Writer2(path, version=9, storage_plugin=plugin)
+        self.writer.open()
+        self.topics: dict = {}
+        self.sequence = 0
+
+    def close(self) -> None:
+        self.writer.close()
+
+    def type(self, name: str):
+        return self.store.types[name]
+
+    def header(self, time: int, frame: str):
+        stamp = self.type("builtin_interfaces/msg/Time")(time // 10**9, time % 10**9)
+        extra = {"seq": 0} if self.ros1 else {}
+        return self.type("std_msgs/msg/Header")(stamp=stamp, frame_id=frame, **extra)
+
+    def write(self, topic: str, kind: str, time: int, message) -> None:
+        if topic not in self.topics:
+            self.topics[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
+        serialize = self.store.serialize_ros1 if self.ros1 else self.store.serialize_cdr
+        self.writer.write(self.topics[topic], time, serialize(message, kind))
+
+    def image(self, topic: str, time: int, picture: np.ndarray, frame: str = "cam", encoding: str = "bgr8") -> None:
+        kind = "sensor_msgs/msg/Image"
+        height, width = picture.shape[:2]
+        data = picture.reshape(-1)
+        step = data.size // height
+        image = self.type(kind)(self.header(time, frame), height, width, encoding, 0, step, data)
+        self.write(topic, kind, time, image)
+
+    def jpeg(self, topic: str, time: int, data: bytes, frame: str = "cam") -> None:
+        kind = "sensor_msgs/msg/CompressedImage"
+        message = self.type(kind)(self.header(time, frame), "jpeg", np.frombuffer(data, np.uint8))
+        self.write(topic, kind, time, message)
+
+    def info(self, topic: str, time: int, size: tuple[int, int], K: np.ndarray, D: list, model: str = "plumb_bob"):
+        kind = "sensor_msgs/msg/CameraInfo"
+        roi = self.type("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
+        names = ("D", "K", "R", "P") if self.ros1 else ("d", "k", "r", "p")
+        P = np.hstack([K * 0.9, np.zeros((3, 1))])
+        values = [np.array(v, np.float64).ravel() for v in (D, K, np.eye(3), P)]
+        fields = dict(zip(names, values, strict=True))
+        header = self.header(time, "cam")
+        common = {"height": size[1], "width": size[0], "distortion_model": model, "binning_x": 0, "binning_y": 0}
+        self.write(topic, kind, time, self.type(kind)(header=header, roi=roi, **common, **fields))
+
+    def transform(self, topic: str, time: int, parent: str, child: str, matrix: np.ndarray) -> None:
+        x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat()
+        vector = self.type("geometry_msgs/msg/Vector3")(*map(float, matrix[:3, 3]))
+        quaternion = self.type("geometry_msgs/msg/Quaternion")(x, y, z, w)
+        transform = self.type("geometry_msgs/msg/Transform")(vector, quaternion)
+        entry = self.type("geometry_msgs/msg/TransformStamped")(self.header(time, parent), child, transform)
+        self.write(topic, "tf2_msgs/msg/TFMessage", time, self.type("tf2_msgs/msg/TFMessage")([entry]))
+
+    def odometry(self, topic: str, time: int, matrix: np.ndarray) -> None:
+        x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat()
+        g = {
+            name: self.type(f"geometry_msgs/msg/{name}") for name in ("Point", "Quaternion", "Pose", "Twist", "Vector3")
+        }
+        pose = g["Pose"](g["Point"](*map(float, matrix[:3, 3])), g["Quaternion"](x, y, z, w))
+        none = g["Vector3"](0.0, 0.0, 0.0)
+        with_pose = self.type("geometry_msgs/msg/PoseWithCovariance")(pose, np.zeros(36))
+        with_twist = self.type("geometry_msgs/msg/TwistWithCovariance")(g["Twist"](none, none), np.zeros(36))
+        kind = "nav_msgs/msg/Odometry"
+        self.write(topic, kind, time, self.type(kind)(self.header(time, "odom"), "base", with_pose, with_twist))
+
+
+def pose(angle: float, shift: float) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_euler("zyx", [angle, 0.3 * angle, -0.2]).as_matrix()
+    matrix[:3, 3] = [shift, -shift / 2, 0.4]
+    return matrix
+
+
+def photo(number: int, blur: float = 0.0) -> np.ndarray:
+    """A textured wall, seen 16 pixels farther to the right with each number."""
+    wall = np.random.default_rng(0).integers(0, 255, (24, 200), np.uint8)
+    wall = cv2.GaussianBlur(cv2.resize(wall, (1600, 192), interpolation=cv2.INTER_CUBIC), (0, 0), 1.5)
+    part = wall[:96, 16 * number : 16 * number + 128]
+    part = cv2.GaussianBlur(part, (0, 0), blur) if blur else part
+    return np.ascontiguousarray(np.repeat(part[..., None], 3, axis=2))
+
+
+BASE_FROM_CAM = pose(0.7, 0.1)
+TIMES = [10**9 * 5 + 200_000_000 * i for i in range(12)]
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
+def test_images_camera_and_poses_come_through(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / ("drive.bag" if kind == "ros1" else "drive")
+    bag = Recorder(path, kind)
+    bag.transform("/tf_static", TIMES[0], "base", "cam", BASE_FROM_CAM)
+    bag.info("/front/camera_info", TIMES[0], (128, 96), K, D)
+    for i, time in enumerate(TIMES):
+        bag.transform("/tf", time - 50_000_000, "odom", "base", pose(0.1 * i, 0.2 * i))  # before and after, not at
+        bag.image("/front/image_raw", time, photo(i))
+        bag.transform("/tf", time + 50_000_000, "odom", "base", pose(0.1 * i + 0.02, 0.2 * i + 0.04))
+    bag.transform("/tf", TIMES[0], "map", "odom", np.eye(4))
+    bag.transform("/tf", TIMES[-1] + 10**9, "map", "odom", np.eye(4))
+    bag.close()
+    source = next(path.glob("*.mcap")) if kind == "mcap" else path  # a lone .mcap too
+
+    facts, text = run_frames(source, tmp_path / "out")
+    assert facts["images"] == 12 and 4 <= facts["chosen"] <= 12
+    lens = read_camera(tmp_path / "out" / "camera.yaml")
+    np.testing.assert_allclose(lens.params, [80, 82, 63.5, 47.5, *D[:4], D[4], 0, 0, 0])
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    # map is known at both ends only, too far apart to interpolate, so odom is the world.
+    assert frames["world_frame"] == "odom" and facts["with_pose"] == facts["chosen"]
+    for name, camera_from_world, _ in read_frames(tmp_path / "out" / "transforms.json"):
+        number = int(Path(name).stem)
+        base = inverse_se3(camera_from_world) @ inverse_se3(BASE_FROM_CAM)
+        want = pose(0.1 * number + 0.01, 0.2 * number + 0.02)  # halfway between the samples around it
+        np.testing.assert_allclose(base, want, atol=2e-4)
+        written = cv2.imread(str(tmp_path / "out" / name))
+        np.testing.assert_array_equal(written, photo(number))  # raw images are kept exactly
+    assert "perception map" in text
+
+
+def test_poses_are_those_recorded(tmp_path: Path) -> None:
+    bag = Recorder(tmp_path / "drive", "mcap")
+    bag.info("/camera_info", TIMES[0], (128, 96), K, [-0.02, 0.01, 0.0, 0.0], "equidistant")
+    bag.transform("/tf_static", TIMES[0], "base", "cam", BASE_FROM_CAM)
+    for i, time in enumerate(TIMES):
+        bag.jpeg("/compressed", time, cv2.imencode(".jpg", photo(i))[1].tobytes())
+        bag.odometry("/odom", time, pose(0.1 * i, 0.2 * i))
+    bag.close()
+    facts, _ = run_frames(tmp_path / "drive", tmp_path / "out")
+    assert facts["with_pose"] == facts["chosen"] > 3 and facts["fixed_frame"] == "odom"
+    for name, camera_from_world, lens in read_frames(tmp_path / "out" / "transforms.json"):
+        number = int(Path(name).stem)
+        want = inverse_se3(pose(0.1 * number, 0.2 * number) @ BASE_FROM_CAM)
+        np.testing.assert_allclose(camera_from_world, want, atol=1e-9)
+        assert lens.model == "OPENCV_FISHEYE" and lens == read_camera(tmp_path / "out" / "camera.yaml")
+        kept = (tmp_path / "out" / name).read_bytes()
+        assert kept == cv2.imencode(".jpg", photo(number))[1].tobytes()  # compressed images are not touched
+    plain, text = run_frames(tmp_path / "drive", tmp_path / "plain", FrameOptions(poses=False))
+    assert plain["with_pose"] == 0 and "--camera" in text and not (tmp_path / "plain" / "transforms.json").exists()
+
+
+def test_interpolation_and_gaps() -> None:
+    poses = Poses()
+    poses.add("world", "base", 0, pose(0.0, 0.0))
+    poses.add("world", "base", 400_000_000, pose(0.0, 1.0))
+    poses.add("world", "base", 2_000_000_000, pose(0.0, 2.0))
+    poses.add("elsewhere", "base", 0, pose(1.0, 9.0))  # a second parent is not believed
+    poses.add("base", "cam", 0, np.eye(4), static=True)
+    quarter = inverse_se3(poses.camera_from_world("world", "/cam", 100_000_000))
+    np.testing.assert_allclose(quarter[:3, 3], [0.25, -0.125, 0.4])
+    assert poses.camera_from_world("world", "cam", 1_000_000_000) is None  # 1.6 s without a sample
+    assert poses.camera_from_world("world", "cam", 2_100_000_000) is None  # after the last
+    assert poses.camera_from_world("nowhere", "cam", 0) is None
+    assert poses.root("cam") == "world"
+
+
+def test_sharp_and_spaced() -> None:
+    chooser = Chooser(spacing=0.4)
+    still = [photo(0)] * 5
+    moving = [photo(i, blur=2.0 if i % 2 else 0.0) for i in range(1, 13)]
+    for picture in still + moving:
+        chooser.show(picture)
+    chosen = chooser.chosen(100)
+    assert sum(number < 5 for number in chosen) <= 1  # standing still is one view
+    moved = [number - 4 for number in chosen if number >= 5]
+    assert all(number % 2 == 0 for number in moved) and len(moved) >= 3  # the sharp ones
+    assert len(chooser.chosen(3)) <= 3
+    assert Chooser().chosen(10) == []
+
+
+@pytest.mark.parametrize(
+    ("encoding", "channels", "conversion"),
+    [("rgb8", 3, cv2.COLOR_BGR2RGB), ("bgra8", 4, cv2.COLOR_BGR2BGRA), ("mono8", 1, cv2.COLOR_BGR2GRAY)],
+)
+def test_encodings_with_padded_rows(encoding: str, channels: int, conversion: int) -> None:
+    picture = np.random.default_rng(1).integers(0, 255, (6, 5, 3), np.uint8)
+    raw = cv2.cvtColor(picture, conversion).reshape(6, 5 * channels)
+    padded = np.hstack([raw, np.zeros((6, 3), np.uint8)])
+    step = 5 * channels + 3
+    message = SimpleNamespace(encoding=encoding, height=6, width=5, step=step, data=padded.tobytes())
+    want = picture if channels > 1 else np.repeat(raw[..., None], 3, axis=2)
+    np.testing.assert_array_equal(decode_image(message, "x"), want)
+    message.data = padded.tobytes()[:-4]
+    with pytest.raises(InputError, match="holds"):
+        decode_image(message, "x")
+
+
+@pytest.mark.parametrize("encoding", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
+def test_bayer_mosaics_give_the_colour_back(encoding: str) -> None:
+    color = np.array([40, 120, 220], np.uint8)  # BGR
+    cells = dict(zip("bgr", color.tolist(), strict=True))
+    pattern = encoding[6:10]
+    mosaic = np.empty((16, 16), np.uint8)
+    for place, letter in enumerate(pattern):
+        mosaic[place // 2 :: 2, place % 2 :: 2] = cells[letter]
+    message = SimpleNamespace(encoding=encoding, height=16, width=16, step=16, data=mosaic.tobytes())
+    np.testing.assert_allclose(decode_image(message, "x")[4:12, 4:12].reshape(-1, 3).mean(axis=0), color, atol=1)
+
+
+def test_bad_bags_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def told(source: Path, *more: str) -> str:
+        assert main(["frames", str(source), "-o", str(tmp_path / "out"), *more]) == 2
+        line = capsys.readouterr().err.strip()
+        assert "\n" not in line and not (tmp_path / "out").exists()
+        return line
+
+    bag = Recorder(tmp_path / "bare", "mcap")
+    for i, time in enumerate(TIMES[:3]):
+        bag.image("/image", time, photo(i))
+    bag.close()
+    assert "has no camera_info" in told(tmp_path / "bare") and "--camera" in told(tmp_path / "bare")
+    assert "no image topic '/left'" in told(tmp_path / "bare", "--topic", "/left")
+
+    bag = Recorder(tmp_path / "odd", "sqlite")
+    bag.info("/camera_info", TIMES[0], (128, 96), K, D)
+    bag.image("/image", TIMES[0], photo(0)[..., 0], encoding="32FC1")
+    bag.close()
+    assert "encoded as '32FC1'" in told(tmp_path / "odd")
+
+    bag = Recorder(tmp_path / "two.bag", "ros1")
+    for topic in ("/left/image", "/right/image"):
+        bag.image(topic, TIMES[0], photo(0))
+    bag.info("/left/camera_info", TIMES[0], (64, 48), K, D)
+    bag.close()
+    assert "several image topics" in told(tmp_path / "two.bag")
+    assert "128x96 pixels, the camera 64x48" in told(tmp_path / "two.bag", "--topic", "/left/image")
+
+    bag = Recorder(tmp_path / "silent", "mcap")
+    bag.info("/camera_info", TIMES[0], (64, 48), K, D)
+    bag.close()
+    assert "holds no images" in told(tmp_path / "silent")
+    (tmp_path / "no.bag").write_bytes(b"not a bag at all")
+    (tmp_path / "no.mcap").write_bytes(b"nor this")
+    for name in ("no.bag", "no.mcap"):
+        assert "is no bag" in told(tmp_path / name)
+    assert "no such bag" in told(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    assert "is no bag" in told(tmp_path / "empty")
+
+
+@pytest.mark.skipif(not DATA, reason="PERCEPTION_DATA is not set")
+def test_a_bag_of_the_fox_becomes_a_scene_for_the_mapper(tmp_path: Path) -> None:
+    fox = Path(str(DATA)) / "fox_480"
+    data = json.loads((fox / "transforms.json").read_text())
+    frames = {name: (pose, lens) for name, pose, lens in read_frames(fox / "transforms.json") if (fox / name).is_file()}
+    bag = Recorder(tmp_path / "fox", "mcap")
+    first = next(iter(frames.values()))[1]
+    fx, fy, cx, cy = first.params[:4]
+    K = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
+    bag.info(
+        "/camera_info", TIMES[0], (first.width, first.height), K, [data[k] for k in ("k1", "k2", "p1", "p2")] + [0]
+    )
+    names = sorted(frames)[:12]
+    for i, name in enumerate(names):
+        time = TIMES[0] + 10**8 * i
+        bag.jpeg("/image/compressed", time, (fox / name).read_bytes())
+        bag.transform("/tf", time, "map", "cam", inverse_se3(frames[name][0]))
+    bag.close()
+    facts, _ = run_frames(tmp_path / "fox", tmp_path / "out", FrameOptions(camera_info="/camera_info", spacing=0.02))
+    assert facts["with_pose"] == facts["chosen"] >= 7
+    for name, camera_from_world, lens in read_frames(tmp_path / "out" / "transforms.json"):
+        want, known = frames[names[int(Path(name).stem)]]
+        np.testing.assert_allclose(camera_from_world, want, atol=1e-6)
+        assert lens.model == known.model
+        np.testing.assert_allclose(lens.params, known.params, atol=1e-6)
+
+    quick = ["train.iterations=40", "train.budget=3000", "photos.max_side=120", "language.encoder=none"]
+    gmap = build_map(tmp_path / "out", tmp_path / "fox.gsmap", load_config(None, quick))
+    assert len(gmap.cameras["names"]) == facts["chosen"] and gmap.info["quality"]["psnr"] > 12

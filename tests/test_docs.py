@@ -1,0 +1,77 @@
+"""Every command in the documentation: all are parsed, and those that end by themselves are run on a small scene."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+
+from perception.cli import build_parser, main
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "launch/README.md", ROOT / "calib/README.md"]
+
+# Run elsewhere: servers by their own tests, calibration on rendered boards, bags on written ones, models on built ones.
+ELSEWHERE = {"demo", "serve", "node", "view", "launch", "bench", "calibrate", "frames", "models"}
+
+
+def documented() -> list[tuple[str, str]]:
+    """(page, command) of every line of code that starts with `perception`, and of inline code with a known command."""
+    found: dict[tuple[str, str], None] = {}
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        lines = re.findall(r"^(?: {4}|\$ )?(perception [a-z].*)$", text, re.M)
+        inline = re.findall(r"`(perception [a-z][^`]*)`", text)
+        for command in [*lines, *inline]:
+            for part in re.split(r" && | \| ", re.sub(r"\s+#.*", "", command)):
+                if part.startswith("perception ") and "…" not in part and "..." not in part:
+                    found[(page.name, part.strip())] = None
+    return list(found)
+
+
+def arguments(command: str) -> list[str]:
+    """The words after `perception`; a bare name of a subcommand is completed, as in running text."""
+    words = ["0" if word == "ID" else word for word in shlex.split(command)[1:]]
+    return [*words, "--help"] if len(words) == 1 else words
+
+
+@pytest.mark.parametrize(("page", "command"), documented(), ids=lambda value: str(value)[:60])
+def test_documented_commands_are_understood(page: str, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        build_parser().parse_args(arguments(command))
+    except SystemExit as done:  # --help
+        assert done.code == 0
+
+
+def runnable() -> list[str]:
+    """The complete commands of the README's walkthrough, in its order."""
+    commands = [command for page, command in documented() if page == "README.md" and " kitchen.gsmap" in command]
+    return [command for command in dict.fromkeys(commands) if shlex.split(command)[1] not in ELSEWHERE]
+
+
+def test_the_walkthrough_runs(small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From photos to answers exactly as the README has it, on a small scene with short training."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(small_scene / "truth" / "gt_points.ply", tmp_path / "scan.ply")
+    commands = runnable()
+    assert any(command.startswith("perception map PHOTOS") for command in commands)
+    # The map's own arguments are kept; what is added makes it small, and gives it masks and poses.
+    small = f"--masks labels:{small_scene / 'labels'} --iterations 60 --budget 2000 --set instances.min_cluster_size=8"
+    for command in commands:
+        words = arguments(command)
+        if words[0] == "map":
+            words = [str(small_scene / "transforms.json") if word == "PHOTOS" else word for word in words]
+            words += shlex.split(small)
+        if words[0] == "label":  # the id of an instance that this map has
+            words[2] = str(_first_id(tmp_path / "kitchen.gsmap"))
+        assert main(words) == 0, command
+    assert (tmp_path / "labelled.ply").is_file()
+
+
+def _first_id(path: Path) -> int:
+    from perception.query import load_map
+
+    return int(load_map(path).instances[0]["id"])

@@ -1,0 +1,119 @@
+"""The exchange rate decides as arithmetic says; cooling, and stops in a real run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perception.cli import _resume, main
+from perception.config import MapConfig, load_config
+from perception.gaussians.economy import COST_EXPONENT, Economy
+from perception.gaussians.views import cooling
+from perception.io.cloud import read_cloud, write_cloud
+from perception.pipeline.mapping import build_map
+from perception.pipeline.summary import shares, speed
+from perception.types import PointCloud
+
+
+def economy(rate: float, scores: list[float]) -> Economy:
+    config = MapConfig()
+    return Economy(replace(config, train=replace(config.train, exchange_db=rate)), scores=scores)
+
+
+def test_a_plateau_is_where_ten_percent_more_time_gains_less_than_asked() -> None:
+    # At progress .8 the last two trials (.1) were 12.5 % more time; .05 dB in them are .04 dB per 10 %.
+    scores = [20.0, 25.0, 25.02, 25.05]
+    assert economy(0.039, scores).plateau(0.8) is None
+    told = economy(0.041, scores).plateau(0.8)
+    assert told is not None and "0.040 dB" in told
+    assert economy(9.0, scores[:2]).plateau(0.8) is None  # too early to tell
+    assert economy(0.0, [25.0, 26.0, 25.5, 25.9]).plateau(0.8) is None  # at no price, not even a loss ends it
+    assert economy(0.001, [25.0, 26.0, 25.5, 25.9]).plateau(0.8) is not None  # a dip that recovers is no gain
+
+
+def test_growth_ends_where_all_that_was_gained_would_not_pay_for_it() -> None:
+    scores = [20.0, 22.0, 22.2]  # two trials gained 2.2, 1.1 each
+    tenths = (2**COST_EXPONENT - 1) / 0.1
+    assert economy(1.1 / tenths * 0.99, scores).growth_pays(1000, 2000) is None
+    ended = economy(1.1 / tenths * 1.01, scores)
+    assert "1000 Gaussians" in str(ended.growth_pays(1000, 2000)) and not ended.growing
+    assert economy(100.0, scores).growth_pays(2000, 2000) is None  # nothing to pay for
+
+
+def test_a_harmonic_is_kept_when_its_trial_gains_more_than_one_without() -> None:
+    held = economy(0.0, [])
+    degrees = []
+    for score in (18.0, 20.0, 20.1, 20.4, 20.45):  # base trial +.1; degree 1 +.3: kept; degree 2 +.05: taken back
+        held.scores.append(score)
+        degree, _ = held.harmonics_step(degrees[-1] if degrees else 0)
+        degrees.append(degree)
+    assert degrees == [0, 0, 1, 2, 1] and held.settled
+
+
+def test_rates_cool_down_over_the_last_share_only() -> None:
+    values = [cooling(p, 0.2) for p in np.linspace(0, 1, 101)]
+    assert values[:81] == [1.0] * 81 and np.all(np.diff(values[80:]) < 0) and values[-1] == pytest.approx(0.05)
+    assert cooling(1.0, 0.0) == 1.0
+
+
+SMALL = ["train.budget=3000", "densify.every=20", "language.encoder=none", "photos.holdout=6"]
+
+
+def test_a_run_stops_at_the_quality_that_was_asked(small_scene: Path, tmp_path: Path) -> None:
+    source, labels = small_scene / "transforms.json", f"masks=labels:{small_scene / 'labels'}"
+    pairs = [*SMALL, labels, "train.iterations=400"]
+    whole = build_map(source, tmp_path / "whole.gsmap", load_config(None, [*pairs, "train.exchange_db=-99"]))
+    asked = max(point["psnr"] for point in whole.info["training"]["curve"][:-2]) - 1.5
+    early = build_map(source, tmp_path / "early.gsmap", load_config(None, [*pairs, f"train.stop_psnr={asked}"]))
+    training = early.info["training"]
+    assert training["iterations"] < whole.info["training"]["iterations"] == 400
+    assert any(text.startswith("stop: held-out PSNR") for text in training["decisions"])
+    assert early.info["quality"]["psnr"] >= asked - 0.2 and len(early.instances) > 3
+
+
+def test_growth_and_training_end_where_they_do_not_pay(small_scene: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(small_scene, scene)
+    cloud = read_cloud(scene / "truth" / "gt_points.ply")
+    write_cloud(scene / "truth" / "gt_points.ply", PointCloud(cloud.points[::100], cloud.colors[::100]))
+    labels = f"masks=labels:{scene / 'labels'}"
+    pairs = [*SMALL, labels, "train.iterations=300", "train.budget=8000", "train.sh_degree=0"]
+    found = {}
+    for rate in (-99, 50):
+        config = load_config(None, [*pairs, f"train.exchange_db={rate}"])
+        found[rate] = build_map(scene / "transforms.json", tmp_path / f"{rate}.gsmap", config)
+    decisions = found[50].info["training"]["decisions"]
+    assert any(text.startswith("growth: ended") for text in decisions)
+    assert any(text.startswith("stop: 10 %") for text in decisions)
+    assert len(found[50]) < 0.7 * len(found[-99])
+    assert found[50].info["training"]["iterations"] < 300 == found[-99].info["training"]["iterations"]
+
+
+def test_nothing_held_out_works_on_training_views(small_scene: Path, tmp_path: Path) -> None:
+    pairs = [*SMALL[:-1], "photos.holdout=0", f"masks=labels:{small_scene / 'labels'}", "train.iterations=200"]
+    pairs.append("train.sh_degree=0")
+    gmap = build_map(
+        small_scene / "transforms.json", tmp_path / "m.gsmap", load_config(None, [*pairs, "train.exchange_db=50"])
+    )
+    assert gmap.info["training"]["iterations"] < 200 and gmap.info["quality"] == {"views": {}}
+
+
+def test_the_record_accounts_for_the_time(
+    small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "m.gsmap"
+    settings = [*SMALL, "train.iterations=60", f"masks=labels:{small_scene / 'labels'}"]
+    words = ["map", str(small_scene / "transforms.json"), "-o", str(out), *(f"--set={pair}" for pair in settings)]
+    assert main([*words, "--profile"]) == 0
+    assert "rasterizer backward" in capsys.readouterr().out
+    training = json.loads((out / "map.json").read_text())["training"]
+    assert sum(shares(training).values()) == pytest.approx(1, abs=1e-2) and training["pairs"] > 60 * 128 * 96
+    assert speed(training)["pairs_per_second"] == pytest.approx(training["pairs"] / training["seconds"], abs=1)
+    assert main(["info", str(out)]) == 0
+    assert "M pairs/s" in capsys.readouterr().out
+    assert _resume([*words]).endswith("--resume") and _resume(["query", "m", "a b"]) == "perception query m 'a b'"

@@ -1,0 +1,178 @@
+"""Grouping against scenes whose instances are known exactly, the hard cases among them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from sklearn.metrics import adjusted_rand_score
+
+pytest.importorskip("perception._core")
+from perception.bench.blob_scenes import BlobScene, make_scene, orbit, random_scene, with_errors
+from perception.config import InstanceConfig
+from perception.gaussians.rasterize import rasterize
+from perception.instances.group import Grouping, group
+from perception.instances.votes import mask_votes
+
+
+def run(scene: BlobScene, **changes: object) -> Grouping:
+    g = scene.gaussians
+    votes = mask_votes(g, scene.views)
+    arrays = (t.numpy() for t in (g.means, g.scales, g.opacities, g.features))
+    return group(*arrays, votes, InstanceConfig(**changes))  # type: ignore[arg-type]
+
+
+def agrees(found: Grouping, truth: np.ndarray, share: float = 0.9) -> bool:
+    known = found.ids >= 0
+    return bool(known.mean() >= share and adjusted_rand_score(truth[known], found.ids[known]) > 0.97)
+
+
+def row(count: int, gap: float = 0.8) -> np.ndarray:
+    return np.stack([gap * (np.arange(count) - (count - 1) / 2), np.zeros(count), np.zeros(count)], axis=1)
+
+
+CODES = np.random.default_rng(0).normal(0, 0.5, (400, 32))
+CAMERAS = orbit(8, 3.0, 1.5, np.zeros(3))
+
+
+def test_votes_are_the_weights_with_which_gaussians_enter_the_picture() -> None:
+    scene = make_scene(row(3), CODES[:3, :8], CAMERAS[:2])
+    g, view = scene.gaussians, scene.views[0]
+    votes = mask_votes(g, [view], half_resolution=False)
+    names = np.unique(view.labels[view.labels > 0])
+    for n in (0, 200, 449):  # render one Gaussian white among the others and add up the mask's pixels
+        white = torch.zeros(len(g), 1)
+        white[n] = 1
+        height, width = view.labels.shape
+        out = rasterize(
+            g.means, g.quats, g.scales, g.opacities, g.base_colors, view.camera_from_world[None], view.K[None],
+            width, height, features=white,
+        )  # fmt: skip
+        picture = out.features[0, ..., 0].numpy()
+        expected = np.array([picture[view.labels.numpy() == name].sum() for name in names])
+        found = votes.weights[n].toarray()[0]
+        assert np.abs(np.where(expected > 0.02, expected, 0) - found).max() < 1e-3
+        assert votes.void[n].sum() == pytest.approx(picture[view.labels.numpy() == 0].sum(), abs=0.03)
+    assert votes.area.tolist() == [int((view.labels == name).sum()) for name in names]
+
+
+@pytest.mark.parametrize("dim", [1, 8, 32])
+@pytest.mark.parametrize("method", ["consensus", "hdbscan"])
+def test_balls_are_found_in_any_width(dim: int, method: str) -> None:
+    codes = np.arange(5.0)[:, None] + 0 * CODES[:5, :dim] if dim == 1 else CODES[:5, :dim]
+    scene = make_scene(row(5), codes, CAMERAS)
+    found = run(scene, method=method)
+    assert found.count == 5 and agrees(found, scene.truth)
+    assert (found.scores > 0).all() and (found.scores <= 1).all() and found.membership.max() <= 1
+
+
+def test_one_object() -> None:
+    scene = make_scene(row(1), CODES[:1, :8], CAMERAS)
+    found = run(scene)
+    assert found.count == 1 and (found.ids == 0).mean() > 0.9
+
+
+def test_no_masks_at_all_leaves_features_and_places_to_decide() -> None:
+    scene = make_scene(row(3), CODES[:3, :8], CAMERAS)
+    blank = [replace(v, labels=None) for v in scene.views]
+    found = run(replace(scene, views=blank))
+    assert found.count >= 3 and not found.found.pixels.any() and np.isfinite(found.scores).all()
+
+
+def test_masks_in_one_photo_only() -> None:
+    scene = make_scene(row(4), CODES[:4, :8], CAMERAS)
+    views = [v if i == 2 else replace(v, labels=torch.zeros_like(v.labels)) for i, v in enumerate(scene.views)]
+    found = run(replace(scene, views=views))
+    known = found.ids >= 0
+    assert adjusted_rand_score(scene.truth[known], found.ids[known]) > 0.9
+
+
+def test_300_instances() -> None:
+    grid = np.stack(np.meshgrid(np.arange(20), np.arange(15)), axis=-1).reshape(-1, 2) * 0.8
+    centres = np.concatenate([grid - grid.mean(axis=0), np.zeros((300, 1))], axis=1)
+    cameras = orbit(6, 7.0, 9.0, np.zeros(3))
+    scene = make_scene(centres, CODES[:300, :8], cameras, each=40, size=(200, 150), focal=140)
+    found = run(scene)
+    assert 290 <= found.count <= 310 and agrees(found, scene.truth)
+
+
+def test_two_identical_objects_side_by_side() -> None:
+    codes = np.repeat(CODES[:1, :8], 2, axis=0)
+    scene = make_scene(row(2, gap=0.62), codes, CAMERAS)
+    found = run(scene)
+    assert found.count == 2 and agrees(found, scene.truth)
+
+
+def test_all_features_equal_leaves_the_masks_to_decide() -> None:
+    scene = make_scene(row(4), np.zeros((4, 8)), CAMERAS, feature_noise=0.0)
+    assert agrees(run(scene), scene.truth)
+
+
+def test_equal_features_that_share_no_photo_do_not_collide() -> None:
+    far = np.array([[-20.0, 0, 0], [20.0, 0, 0]])
+    cameras = orbit(6, 3.0, 1.5, far[0]) + orbit(6, 3.0, 1.5, far[1])
+    scene = make_scene(far, np.repeat(CODES[:1, :8], 2, axis=0), cameras)
+    found = run(scene)
+    assert found.count == 2 and agrees(found, scene.truth)
+
+
+def test_an_instance_of_12_gaussians_is_kept_when_photos_single_it_out() -> None:
+    scene = make_scene(row(3), CODES[:3, :8], CAMERAS, each=[300, 300, 12])
+    found = run(scene)
+    assert found.count == 3 and agrees(found, scene.truth)
+
+
+def test_an_object_cut_by_every_border() -> None:
+    scene = make_scene(row(1), CODES[:1, :8], orbit(6, 0.55, 0.1, np.zeros(3)), radius=0.5, each=600)
+    found = run(scene)
+    assert found.count == 1
+
+
+def test_errors_of_the_segmenter_are_outvoted() -> None:
+    scene = random_scene(5, count=12)
+    spoiled = with_errors(scene, np.random.default_rng(1))
+    found = run(spoiled)
+    assert agrees(found, scene.truth, 0.8)
+
+
+def test_parts_that_photos_single_out_are_kept_below_their_whole() -> None:
+    """Two halves, in one mask in 6 of 8 photos and in two masks in the rest: one instance with two parts."""
+    halves = np.array([[-0.25, 0, 0], [0.25, 0, 0], [2.0, 0, 0]])
+    cameras = orbit(8, 2.0, 3.0, np.zeros(3))  # from above: neither half hides the other
+    scene = make_scene(halves, np.array([[0.0] * 8, [0.3] * 8, [-1.0] * 8]), cameras, each=400)
+    views = []
+    for number, view in enumerate(scene.views):
+        labels = view.labels.clone()
+        if number < 6:
+            pair = [int(n) for n in _names(scene, view)[:2] if n > 0]
+            if len(pair) == 2:
+                labels[labels == pair[1]] = pair[0]
+        views.append(replace(view, labels=labels))
+    found = run(replace(scene, views=views))
+    whole = found.ids[scene.truth == 0]
+    owner = int(np.bincount(whole[whole >= 0]).argmax())
+    assert (found.ids[scene.truth == 1] == owner).mean() > 0.9 and found.count == 2
+    assert found.parents == [owner, owner]
+    inside = found.part_ids >= 0
+    assert adjusted_rand_score(scene.truth[inside], found.part_ids[inside]) > 0.9
+    assert set(np.unique(found.part_ids[inside])) == {2, 3}
+
+
+def _names(scene: BlobScene, view: object) -> list[int]:
+    """The label of each ball in a view (0 = unseen), by the ball whose Gaussians project into the mask."""
+    points = scene.gaussians.means.numpy()
+    pose, K = view.camera_from_world.numpy(), view.K.numpy()  # type: ignore[attr-defined]
+    camera = points @ pose[:3, :3].T + pose[:3, 3]
+    pixel = (camera[:, :2] / camera[:, 2:] * K[0, 0] + K[:2, 2]).astype(int)
+    labels = view.labels.numpy()  # type: ignore[attr-defined]
+    pixel = np.clip(pixel, 0, [labels.shape[1] - 1, labels.shape[0] - 1])
+    seen = labels[pixel[:, 1], pixel[:, 0]]
+    return [int(np.bincount(seen[scene.truth == k]).argmax()) for k in range(3)]
+
+
+def test_the_same_input_gives_the_same_groups() -> None:
+    scene = with_errors(random_scene(7, count=8, views=10), np.random.default_rng(2))
+    first, second = run(scene), run(scene)
+    assert np.array_equal(first.ids, second.ids) and np.array_equal(first.raw, second.raw)
