@@ -115,7 +115,7 @@ def _as_ros_hashes() -> Iterator[None]:
     The flags enter the hash of every type that holds one. CycloneDDS has no switch for it, so while types are hashed
     its name for that header is one that drops the flags; tests hold the hashes against those rclpy announces.
     """
-    builder = importlib.import_module("cyclonedds.idl._xt_builder")
+    builder: Any = importlib.import_module("cyclonedds.idl._xt_builder")
     names = builder.xt
 
     class WithoutFlags:
