@@ -76,7 +76,7 @@ class DensifyConfig:
 class LossConfig:
     """Instance losses of OpenSplat3D; variants as its authors' tool computes them are selectable.
 
-    Masks that need the map's own depth (the built-in ones) are made at progress `geometry_start`.
+    Masks that begin from the map's own depth (the built-in ones) are made at progress `geometry_start`.
     From progress `start` on, every `every`-th iteration renders features too, at half the resolution if so set:
     features with their variance cost 2.5 times what colour does, and labels are smooth where photos are not.
     """

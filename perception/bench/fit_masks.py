@@ -25,6 +25,8 @@ from perception.masks.region_graph import RegionGraph, agglomerate
 from perception.types import View
 
 _PURE = 0.7  # share of a region that one instance must cover for the region to teach anything
+_PRIOR = 0.03  # C of the regression: few scenes must not decide much
+_HEAVIEST = 4.0  # times the mean weight: one wall must not outweigh a table full of things
 _ROUNDS = 2  # the first regions, then every level that merging them goes through
 
 
@@ -123,15 +125,18 @@ def collect(item: Example, weights: np.ndarray | None, pairs: Pairs) -> None:
 
 
 def fit(pairs: Pairs) -> np.ndarray:
-    """[F] log odds per unit of each feature."""
+    """[F] log odds per unit of each feature, of which the first is the constant 1."""
     from sklearn.linear_model import LogisticRegression
 
     features = np.array(pairs.features)
-    spread = features.std(axis=0)
-    spread[spread < 1e-9] = 1  # the constant
-    weights = np.array(pairs.weights) / np.mean(pairs.weights)
-    model = LogisticRegression(C=1.0, fit_intercept=False, max_iter=3000)
-    return np.asarray(model.fit(features / spread, pairs.same, sample_weight=weights).coef_[0] / spread)
+    mean, spread = features.mean(axis=0), features.std(axis=0) + 1e-9
+    mean[0], spread[0] = 0, 1
+    weights = np.minimum(np.array(pairs.weights) / np.mean(pairs.weights), _HEAVIEST)
+    model = LogisticRegression(C=_PRIOR, max_iter=3000)
+    model.fit((features - mean) / spread, pairs.same, sample_weight=weights)
+    found = np.asarray(model.coef_[0] / spread)
+    found[0] += model.intercept_[0] - found[1:] @ mean[1:]
+    return found
 
 
 def learn(examples: list[Example]) -> tuple[np.ndarray, Pairs]:

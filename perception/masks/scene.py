@@ -19,8 +19,9 @@ from perception.masks.surface import Surface, SurfaceBuilder, to_world, voxel_si
 from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.types import View
 
-# Log odds that two patches are one object, fitted by `python -m perception.bench.fit_masks --surface` on two rendered
-# scenes, in the order of SurfaceGraph.features; they are all that was learned.
+# Log odds that two patches are one object, in the order of SurfaceGraph.features; they are all that was learned: the
+# regression of `python -m perception.bench.fit_masks --surface`, on three rendered scenes, begun from the depth of
+# half-trained maps. Fitted on two of the scenes they part the third about as well.
 WEIGHTS = np.array(
     [5.99, -1.07, -0.89, 0.23, -3.48, -0.75, 0.42, -0.24, -0.47, 0.69, 0.16, 1.57,
      -2.46, -0.1, 0.53, -2.85, 0.71, -0.39, 3.08, 0.26, 0.18, -2.49, 0.43, 0.35]
