@@ -11,11 +11,6 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from perception import __version__
-from perception.cli import asking, clouds, mapping, robot_inputs, scoring
-from perception.cli.parser import Parser
-from perception.errors import InputError
-
-_MODULES = (mapping, asking, clouds, scoring, robot_inputs)
 from perception.cli.parser import Parser
 from perception.errors import InputError
 
@@ -29,6 +24,7 @@ _MODULES = (
     "node",
     "viewing",
     "models",
+    "robot_inputs",
 )
 """Files of this package that add subcommands, in the order of --help."""
 

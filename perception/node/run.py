@@ -52,9 +52,14 @@ def serve_node(
 
 
 def _engine(path: str | Path, config: NodeConfig, encoders: Callable[[str], Encoder | None] | None) -> QueryEngine:
-    more: dict[str, Any] = {} if encoders is None else {"encoders": encoders}
-    sizes = {"workers": config.workers, "queue_size": config.queue_size}
-    return QueryEngine(path, timeout=config.timeout, watch=config.watch, **sizes, **more)
+    return QueryEngine(
+        path,
+        workers=config.workers,
+        queue_size=config.queue_size,
+        timeout=config.timeout,
+        watch=config.watch,
+        encoders=encoders,
+    )
 
 
 @contextlib.contextmanager
