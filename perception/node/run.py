@@ -52,14 +52,13 @@ def serve_node(
 
 
 def _engine(path: str | Path, config: NodeConfig, encoders: Callable[[str], Encoder | None] | None) -> QueryEngine:
-    more: dict[str, Any] = {} if encoders is None else {"encoders": encoders}
     return QueryEngine(
         path,
         workers=config.workers,
         queue_size=config.queue_size,
         timeout=config.timeout,
         watch=config.watch,
-        **more,
+        encoders=encoders,
     )
 
 
