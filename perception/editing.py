@@ -250,7 +250,7 @@ class Editor:
             raise InputError(
                 f"{self.path}: was changed by another program since it was opened; open it again and repeat"
             )
-        write_map(self.path, self.current())
+        write_map(self.path, self.current(), keep_report=True)
         self._signature = _signature(self.path)
         self._saved = self._now
 

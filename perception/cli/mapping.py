@@ -35,6 +35,7 @@ def _add_map(commands: Any) -> None:
     p.add_argument("--seed", metavar="S")
     p.add_argument("--device", help="auto, cpu or cuda")
     p.add_argument("--labels-from", type=Path, metavar="OLD.gsmap", help="carry over the names given to its instances")
+    p.add_argument("--rrd", type=Path, metavar="OUT.rrd", help="record the run for the Rerun viewer")
     p.add_argument("--profile", action="store_true", help="print where the time went")
     p.add_argument("--resume", action="store_true", help="go on with an interrupted run")
 
@@ -58,11 +59,17 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     given = [f"{key}={getattr(args, name)}" for name, key in _SHORTCUTS.items() if getattr(args, name) is not None]
     config = load_config(args.config, args.pairs + given, args.preset)
-    from perception.pipeline.mapping import build_map
+    from perception.pipeline.run import run_map
     from perception.progress import Progress
 
-    gmap = build_map(
-        args.input, args.output, config, resume=args.resume, progress=Progress(), labels_from=args.labels_from
+    gmap = run_map(
+        args.input,
+        args.output,
+        config,
+        resume=args.resume,
+        progress=Progress(),
+        labels_from=args.labels_from,
+        rrd=args.rrd,
     )
     from perception.pipeline.summary import map_facts, profile_text
 

@@ -9,14 +9,15 @@ from typing import Any
 
 from perception.errors import InputError
 
+REPORT = "report.html"
 FACTS = "map.json"
 EDITABLE = "instances.json"
 """People write labels into this file by hand, so a change there is told, not refused."""
 
 
 def file_facts(folder: Path) -> dict[str, dict[str, Any]]:
-    """{name: {"bytes", "sha256"}} of every file in `folder` but map.json, which cannot hold its own."""
-    files = sorted(file for file in folder.iterdir() if file.is_file() and file.name != FACTS)
+    """{name: {"bytes", "sha256"}} of every file in `folder` but map.json, which cannot hold its own, and the report."""
+    files = sorted(file for file in folder.iterdir() if file.is_file() and file.name not in (FACTS, REPORT))
     return {file.name: {"bytes": file.stat().st_size, "sha256": sha256(file)} for file in files}
 
 
@@ -72,7 +73,7 @@ def verify(folder: Path, info: dict[str, Any]) -> dict[str, str]:
     if "sha256" in info and seal(info)["sha256"] != info["sha256"]:
         raise InputError(f"{folder / FACTS}: its own checksum differs; it was edited or is damaged")
     states = {FACTS: "ok" if "sha256" in info else "no checksum"}
-    for file in sorted(file for file in folder.iterdir() if file.is_file() and file.name != FACTS):
+    for file in sorted(file for file in folder.iterdir() if file.is_file() and file.name not in (FACTS, REPORT)):
         if file.name not in known:
             states[file.name] = "no checksum"
         elif file.name == EDITABLE:

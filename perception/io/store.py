@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory, atomic_file
-from perception.io.checksums import EDITABLE, FACTS, file_facts, seal, verify
+from perception.io.checksums import EDITABLE, FACTS, REPORT, file_facts, seal, verify
 from perception.io.instance_index import InstanceIndex, build_index
 from perception.io.map_files import FORMAT_VERSION, MapFiles, map_signature, read_info
 from perception.io.map_lock import writing
@@ -33,6 +34,7 @@ from perception.io.ply import write_ply
 
 __all__ = [
     "FORMAT_VERSION",
+    "REPORT",
     "GaussianMap",
     "gaussian_map",
     "map_signature",
@@ -84,8 +86,10 @@ class GaussianMap:
         return build_index(self.means, self.instance_ids)
 
 
-def write_map(path: Path, gmap: GaussianMap) -> None:
+def write_map(path: Path, gmap: GaussianMap, keep_report: bool = False) -> None:
     """Writes the whole map aside and swaps it in: a reader sees the old map or the new one, never half of one.
+
+    keep_report: the report of the map that is replaced stays, for corrections by hand.
 
     InputError when another writer is at this map, or the place cannot be written to.
     """
@@ -104,6 +108,8 @@ def write_map(path: Path, gmap: GaussianMap) -> None:
         if gmap.parts:
             np.savez_compressed(folder / "parts.npz", **gmap.parts)  # type: ignore[arg-type]
         _dump(folder / EDITABLE, {"instances": gmap.instances})
+        if keep_report and (path / REPORT).is_file():
+            shutil.copy2(path / REPORT, folder / REPORT)
         _dump(folder / FACTS, _with_checksums(info, folder))
 
 

@@ -50,12 +50,14 @@ def build_map(
     resume: bool = False,
     progress: Progress | None = None,
     labels_from: Path | None = None,
+    on_note: Callable[[Trainer], None] | None = None,
 ) -> GaussianMap:
     """Builds a map from photos, a COLMAP workspace or a transforms.json, and writes it to `output`.
 
     Raises InputError for bad input. What was done is kept in `work_folder(output)` until the map is written; with
     `resume` a run goes on from there. Names given to the instances of the map `labels_from` are carried over to those
-    that fill the same place. A run refused before it trained leaves nothing behind.
+    that fill the same place. A run refused before it trained leaves nothing behind. `on_note` sees the trainer each
+    time a point of its curve is noted.
     """
     if config.device == "cuda":
         raise InputError("--device cuda: this build has no CUDA rasterizer; use --device cpu or auto")
@@ -64,7 +66,7 @@ def build_map(
     work = _prepare(source, output, resume)
     with writing(output):
         try:
-            return _build(source, output, work, config, progress or Progress(quiet=True), labelled)
+            return _build(source, output, work, config, progress or Progress(quiet=True), labelled, on_note)
         except OSError as error:
             if error.errno != errno.ENOSPC:
                 raise
@@ -76,7 +78,13 @@ def build_map(
 
 
 def _build(
-    source: Path, output: Path, work: Path, config: MapConfig, progress: Progress, labelled: GaussianMap | None
+    source: Path,
+    output: Path,
+    work: Path,
+    config: MapConfig,
+    progress: Progress,
+    labelled: GaussianMap | None,
+    on_note: Callable[[Trainer], None] | None,
 ) -> GaussianMap:
     stages = Stages()
     started = time.monotonic()
@@ -91,7 +99,7 @@ def _build(
         views = _photos(training, config, progress)
         held = _photos(held_out, config, progress)
     trainer = Trainer(initial_gaussians(scene, config), views, config, held)
-    session = _Session(trainer, work, fingerprint(source, config), config, progress)
+    session = _Session(trainer, work, fingerprint(source, config), config, progress, on_note)
     depth = None
     if isinstance(source_of_masks, GeometryMaskSource):  # its masks wait for the map's own geometry
         with stages("train"):
@@ -200,9 +208,17 @@ def _photos(views: list[View], config: MapConfig, progress: Progress) -> list[Tr
 class _Session:
     """Training in legs, each ending in a checkpoint; takes up where an interrupted run left off."""
 
-    def __init__(self, trainer: Trainer, work: Path, mark: str, config: MapConfig, progress: Progress):
+    def __init__(
+        self,
+        trainer: Trainer,
+        work: Path,
+        mark: str,
+        config: MapConfig,
+        progress: Progress,
+        on_note: Callable[[Trainer], None] | None,
+    ):
         self.trainer, self.mark, self.path = trainer, mark, work / CHECKPOINT
-        self.watch = _Watch(self.path, mark, config, progress)
+        self.watch = _Watch(self.path, mark, config, progress, on_note)
         state = load_checkpoint(self.path, mark)
         if state is not None:
             trainer.load(state)
@@ -230,8 +246,16 @@ def initial_gaussians(scene: Scene, config: MapConfig) -> Gaussians:
 class _Watch:
     """Called after every step: draws progress now and then, keeps a checkpoint now and then."""
 
-    def __init__(self, path: Path, mark: str, config: MapConfig, progress: Progress):
-        self.path, self.mark, self.config, self.progress = path, mark, config, progress
+    def __init__(
+        self,
+        path: Path,
+        mark: str,
+        config: MapConfig,
+        progress: Progress,
+        on_note: Callable[[Trainer], None] | None,
+    ):
+        self.path, self.mark, self.config, self.progress, self.on_note = path, mark, config, progress, on_note
+        self.noted = 0
         self.saved = self.drawn = time.monotonic()
         self.loss: float | None = None
         self.first: tuple[float, int] | None = None
@@ -243,6 +267,9 @@ class _Watch:
         if now - self.drawn > 0.5 or trainer.progress >= 1:
             self.drawn = now
             self._draw(trainer, now)
+        if self.on_note is not None and len(trainer.record.curve) > self.noted:
+            self.noted = len(trainer.record.curve)
+            self.on_note(trainer)
         if now - self.saved > self.config.train.checkpoint_seconds:
             save_checkpoint(self.path, trainer.state(), self.mark)
             self.saved = time.monotonic()
