@@ -102,7 +102,7 @@ def measure_map(scene: Path, map_path: Path) -> dict[str, dict[str, float]]:
     names, truth = np.unique(cloud.labels["instance_id"], return_inverse=True)
     together = np.zeros((len(names), len(names)), bool)
     for file in sorted((scene / "masks_gt").glob("*.png")):
-        seen = np.isin(names, np.unique(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)))
+        seen = np.isin(names, np.unique(np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED))))
         together |= seen[:, None] & seen[None]
     solid = gmap.opacities >= InstanceConfig().min_opacity
     features = np.where(solid, 0, -1)

@@ -102,8 +102,8 @@ def calibrate(scenes: int) -> dict[str, Any]:
         )
         scene = with_errors(made, rng, RATES[seed % len(RATES)])
         g = scene.gaussians
-        arrays = (tensor.numpy() for tensor in (g.means, g.scales, g.opacities, g.features))
-        found = group(*arrays, mask_votes(g, scene.views), InstanceConfig())
+        means, scales, opacities, features = (t.numpy() for t in (g.means, g.scales, g.opacities, g.features))
+        found = group(means, scales, opacities, features, mask_votes(g, scene.views), InstanceConfig())
         raw += found.raw.tolist()
         right += (_best_iou(found.ids, scene.truth, found.count) > 0.5).tolist()
     fit = IsotonicRegression(y_min=0, y_max=1, out_of_bounds="clip").fit(raw, np.array(right, float))
