@@ -241,7 +241,7 @@ def test_box_floor_and_wall_are_one_segment_each_in_all_photos(tmp_path):
 
 
 def test_photos_without_depth_are_judged_alone(tmp_path):
-    views = [view for view, *_ in world()[:2]]
+    views = [world()[0][0]]
     photo = world()[0][1]
     compute_masks(
         views,
@@ -277,9 +277,9 @@ def test_normals_and_creases_of_known_surfaces():
     pose = camera_from_world(np.array(EYES[2]))
     depth, ids, points = cast(pose)
     cues = depth_cues(depth, K)
-    far = np.minimum(np.abs(points - LOW), np.abs(points - HIGH)).min(axis=-1) > 0.12
+    far = np.maximum(LOW - points, points - HIGH).max(axis=-1) > 0.1  # from the box
     floor = cues.normals[(ids == 1) & far & (points[..., 1] < WALL - 0.3)] @ pose[:3, :3]
-    np.testing.assert_allclose(floor.mean(axis=0), [0, 0, 1], atol=0.02)
+    np.testing.assert_allclose(np.median(floor, axis=0), [0, 0, 1], atol=0.02)
     column = 5
     crease = int(np.argmax(ids[:, column] == 1))  # where the wall meets the floor, concave
     assert cues.bend[1, crease, column] < -0.5 and abs(cues.bend[1, crease + 20, column]) < 0.05
