@@ -51,7 +51,7 @@ def cluster_gaussians(
 
 
 def cluster_features(features: np.ndarray, config: InstanceConfig, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Labels and membership strengths; above `max_clustered` rows the rest joins by its nearest clustered row."""
+    """Labels and membership strengths of rows [N, D]; above `max_clustered` of them a sample speaks for the rest."""
     import hdbscan
 
     # Equal rows make zero distances, which HDBSCAN turns into infinite densities: all features equal = one cluster.
@@ -63,7 +63,7 @@ def cluster_features(features: np.ndarray, config: InstanceConfig, seed: int = 0
     share = len(chosen) / len(features)
     model = hdbscan.HDBSCAN(
         min_cluster_size=max(2, round(config.min_cluster_size * share)),
-        min_samples=max(1, round(config.min_samples * share)),
+        min_samples=config.min_samples,
         core_dist_n_jobs=1,
         approx_min_span_tree=False,
         allow_single_cluster=False,
@@ -71,12 +71,32 @@ def cluster_features(features: np.ndarray, config: InstanceConfig, seed: int = 0
     labels, strengths = model.labels_, model.probabilities_
     if labels.max(initial=-1) < 0:  # one blob without structure: one object
         labels, strengths = np.zeros(len(chosen), np.int64), np.ones(len(chosen))
-    if len(chosen) == len(features):
-        return labels, strengths.astype(np.float32)
+    if len(chosen) < len(features):
+        labels, strengths = _spread(features, chosen, labels, strengths, config.min_samples)
+    return labels, strengths.astype(np.float32)
+
+
+def _spread(
+    features: np.ndarray, chosen: np.ndarray, labels: np.ndarray, strengths: np.ndarray, samples: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Labels of all rows [N, D] from those of the rows `chosen` [S], by HDBSCAN's own rule of membership.
+
+    A row is of a cluster if it lies as densely as the cluster's loosest member: its core distance (to the
+    `samples`-th nearest sampled row) is no larger. It joins the cluster of its nearest member, else it is noise.
+    """
     from scipy.spatial import cKDTree
 
-    _, nearest = cKDTree(features[chosen]).query(features, workers=-1)
-    return labels[nearest], strengths[nearest].astype(np.float32)
+    sampled = np.zeros(len(features), bool)
+    sampled[chosen] = True
+    distance, nearest = cKDTree(features[chosen]).query(features, k=samples + 1, workers=-1)
+    core = np.where(sampled, distance[:, samples], distance[:, samples - 1])  # a sampled row finds itself first
+    limit = np.zeros(labels.max() + 1)
+    member = labels >= 0
+    np.maximum.at(limit, labels[member], core[chosen[member]])
+    first = (labels[nearest] >= 0).argmax(axis=1)
+    source = nearest[np.arange(len(features)), first]
+    joins = (labels[source] >= 0) & (core <= limit[labels[source]])
+    return np.where(joins, labels[source], -1), np.where(joins, strengths[source], 0)
 
 
 def split_disconnected(means: np.ndarray, scales: np.ndarray, ids: np.ndarray, smallest: int) -> np.ndarray:
