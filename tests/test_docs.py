@@ -27,7 +27,7 @@ def documented() -> list[tuple[str, str]]:
         inline = re.findall(r"`(perception [a-z][^`]*)`", text)
         for command in [*lines, *inline]:
             for part in re.split(r" && | \| ", re.sub(r"\s+#.*", "", command)):
-                if part.startswith("perception ") and "…" not in part and "..." not in part:
+                if part.startswith("perception ") and not re.search(r"…|\.\.\.|\[--", part):
                     found[(page.name, part.strip())] = None
     return list(found)
 

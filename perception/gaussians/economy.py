@@ -14,6 +14,8 @@ from perception.config import MapConfig
 
 TRIAL = 0.05
 """Length of a trial, as a share of the whole course."""
+CEILING = 45.0
+"""dB beyond which nothing is gained: errors of 1.4 grey levels of 255, less than a photo's own noise."""
 COST_EXPONENT = 0.6
 """An iteration's time grows like the number of Gaussians to this power (`perception bench scaling`)."""
 
@@ -45,10 +47,10 @@ class Economy:
         vars(self).update(values)
 
     def gain(self) -> float | None:
-        """dB that the best PSNR gained over the last two trials; None before there are three."""
+        """dB that the best PSNR gained over the last two trials, up to CEILING; None before there are three."""
         if len(self.scores) < 3:
             return None
-        return max(self.scores) - max(self.scores[:-2])
+        return min(max(self.scores), CEILING) - min(max(self.scores[:-2]), CEILING)
 
     def growth_pays(self, gaussians: int, next_count: int) -> str | None:
         """None while growth pays; else why it ends.
