@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 from perception.bench.masks import main, score_photo
+from perception.errors import InputError
+from perception.masks import make_source
 from perception.masks.cues import photo_cues
 from perception.masks.region_graph import RegionGraph
 from perception.masks.regions import segment_photo
+from perception.masks.source import GeometryMaskSource
 
 
 def disc_and_box(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -88,3 +91,15 @@ def test_merging_keeps_the_evidence_exact():
         if others:
             expected = fresh.features(i, list(fresh.borders[i]))
             np.testing.assert_allclose(graph.features(int(a), others), expected, atol=1e-9)
+
+
+def test_the_first_round_alone_judges_each_photo_by_itself() -> None:
+    """`builtin:photos` never asks for geometry, and labels a photo as the default does before there is any."""
+    first, both = make_source("builtin:photos"), make_source("builtin")
+    assert not isinstance(first, GeometryMaskSource) and isinstance(both, GeometryMaskSource)
+    assert first.identity != both.identity
+    photo = np.zeros((60, 80, 3), np.uint8)
+    photo[:, 40:] = 200
+    np.testing.assert_array_equal(first.label_image(None, photo), both.label_image(None, photo))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="builtin:photos"):
+        make_source("builtin:other")

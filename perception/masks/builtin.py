@@ -13,13 +13,12 @@ from perception.types import View
 VERSION = 5  # raised whenever the label images change, so that cached ones are made anew
 
 
-class BuiltinSegmentation:
-    """Regions that look like one object; once the map can say how far things are, whole objects in all photos."""
+class PhotoSegmentation:
+    """Regions that look like one object, each photo by itself: what the second round is measured against."""
 
     def __init__(self) -> None:
-        self.name = "builtin"
-        self.identity = f"builtin {VERSION}"
-        self._scene: SceneSegmentation | None = None
+        self.name = "builtin:photos"
+        self.identity = f"builtin photos {VERSION}"
 
     def check(self, views: list[View]) -> list[str]:
         """Nothing can be wrong up front."""
@@ -28,6 +27,15 @@ class BuiltinSegmentation:
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
         """photo: [h, w, 3] uint8 RGB. Returns [h, w] int32, 0 = unlabelled."""
         return segment_photo(photo)
+
+
+class BuiltinSegmentation(PhotoSegmentation):
+    """Once the map can say how far things are: whole objects in all photos together."""
+
+    def __init__(self) -> None:
+        self.name = "builtin"
+        self.identity = f"builtin {VERSION}"
+        self._scene: SceneSegmentation | None = None
 
     def survey(
         self,

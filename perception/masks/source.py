@@ -52,21 +52,22 @@ class GeometryMaskSource(MaskSource, Protocol):
 
 
 def make_source(spec: str, *, cache_dir: Path | None = None) -> MaskSource:
-    """`auto`, `builtin`, `labels:DIR`, or `sam:PATH` (folder, encoder file, or `ENCODER,DECODER`).
+    """`auto`, `builtin`, `builtin:photos`, `labels:DIR`, or `sam:PATH` (folder, encoder file, or `ENCODER,DECODER`).
 
     `auto` takes the SAM named by the environment variable PERCEPTION_SAM or by `masks.sam` in the user's
     configuration (`perception/config.toml` under XDG_CONFIG_HOME), or made the default by `perception models add
     --default`; else the built-in segmentation.
+    `builtin:photos` stops at the built-in segmentation's first round: every photo by itself, no geometry.
     cache_dir: where a source may keep derived files; no source needs it today.
     """
     kind, _, argument = spec.partition(":")
     if kind == "auto" and not argument:
         configured = configured_sam()
         kind, argument = ("builtin", "") if configured is None else ("sam", configured)
-    if kind == "builtin" and not argument:
-        from perception.masks.builtin import BuiltinSegmentation
+    if kind == "builtin" and argument in ("", "photos"):
+        from perception.masks.builtin import BuiltinSegmentation, PhotoSegmentation
 
-        return BuiltinSegmentation()
+        return PhotoSegmentation() if argument else BuiltinSegmentation()
     if kind == "labels" and argument:
         from perception.masks.labels import LabelFolder
 
@@ -75,7 +76,7 @@ def make_source(spec: str, *, cache_dir: Path | None = None) -> MaskSource:
         from perception.masks.sam import SamSource
 
         return SamSource(argument)
-    raise InputError(f"--masks {spec}: expected auto, builtin, sam:PATH or labels:DIR")
+    raise InputError(f"--masks {spec}: expected auto, builtin, builtin:photos, sam:PATH or labels:DIR")
 
 
 def configured_sam() -> str | None:
