@@ -16,6 +16,7 @@ from perception.io.photos import load_photo, scaled_K
 from perception.io.scene_cache import view_from_json
 from perception.io.store import GaussianMap
 from perception.pictures import features_to_rgb, instance_palette, montage, outline, overlay
+from perception.pipeline.coverage import weak_coverage
 from perception.pipeline.rendering import as_gaussians
 from perception.query import LoadedMap
 from perception.report import InstanceRow, QueryRow, ReportData, ViewRow, write_report
@@ -45,7 +46,7 @@ def write_map_report(
         instances=[_instance_row(opened, i, album, names) for i, names in enumerate(_names(opened))],
         metric=opened.metric,
         queries=[_query_row(opened, text, album, (expected or {}).get(text)) for text in queries],
-        warnings=[*info["scene"].get("warnings", []), *info["masks"].get("warnings", [])],
+        warnings=_warnings(info, gaussians, list(album.views.values())),
         settings=_flat(info["config"]),
         rerun=f"perception map {info['source']} -o {opened.path} --seed {info['seed']}",
     )
@@ -53,6 +54,18 @@ def write_map_report(
         return write_report(path, data)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def _warnings(info: dict[str, Any], gaussians: Gaussians, views: list[View]) -> list[str]:
+    """What went wrong or is thin, the worst first."""
+    scored = info["quality"].get("views", {})
+    mean = info["quality"].get("psnr")
+    bad = [f"{name} ({figures['psnr']:.1f} dB)" for name, figures in scored.items() if mean - figures["psnr"] > 6]
+    told = [*info["scene"].get("warnings", []), *info["masks"].get("warnings", [])]
+    if bad:
+        told.append(f"held-out views far below the mean of {mean:.1f} dB: {', '.join(bad)}")
+    weak = weak_coverage(gaussians, views)
+    return told if weak is None else [*told, weak]
 
 
 class _Album:
