@@ -121,10 +121,19 @@ class Editor:
         arrays["instance_ids"] = now.ids[kept]
         arrays["membership"] = np.where(now.ids[kept] >= 0, self.original.membership[kept], 0).astype(np.float32)
         language = to_arrays(now.descriptions, self._encoder) if self._encoder else {}
-        parts = {name: array[kept] if name == "ids" else array for name, array in self.original.parts.items()}
         return dataclasses.replace(
-            self.original, **arrays, instances=list(now.instances), language=language, parts=parts
+            self.original, **arrays, instances=list(now.instances), language=language, parts=self._parts_now()
         )
+
+    def _parts_now(self) -> dict[str, np.ndarray]:
+        """parts.npz's arrays: the parts of instances that were merged, split or removed went with them."""
+        parts = self.original.parts
+        if "ids" not in parts:
+            return parts
+        known = [part["id"] for entry in self._now.instances for part in entry.get("parts", [])]
+        alive = np.isin(np.unique(parts["ids"][parts["ids"] >= 0]), known)
+        ids = np.where(np.isin(parts["ids"], known), parts["ids"], -1)[self._now.kept].astype(np.int32)
+        return _described({**parts, "ids": ids}, alive)
 
     # ------------------------------------------------------------------ editing
 
@@ -171,21 +180,19 @@ class Editor:
     def split(self, instance: int) -> list[int]:
         """Cuts an instance into its parts; returns their ids. Raises InputError when it has none.
 
-        Its features are clustered again, alone and finer: what the whole map's cut had put into one.
+        Along the map's hierarchy where the instance has parts there; else its features are clustered again, alone
+        and finer.
         """
-        from perception.instances.cluster import cluster_gaussians
-
         place = self._place(instance)
         rows = np.flatnonzero((self.ids == instance) & self.kept)
         gmap = self.original
-        finer = dataclasses.replace(InstanceConfig(), min_cluster_size=max(8, len(rows) // 20), min_samples=8)
-        found = cluster_gaussians(gmap.means[rows], gmap.scales[rows], gmap.opacities[rows], gmap.features[rows], finer)
-        if found.count < 2:
+        found = self._parts_of(self.instances[place], rows)
+        if found.max(initial=-1) < 1:
             raise InputError(f"instance {instance}: its Gaussians are all alike, there is nothing to split")
         first = self._next_id()
         ids = self.ids.copy()
-        ids[rows] = _nearest_filled(gmap.means[rows], found.ids) + first
-        news = list(range(first, first + found.count))
+        ids[rows] = _nearest_filled(gmap.means[rows], found) + first
+        news = list(range(first, first + int(found.max()) + 1))
         entry = self.instances[place]
         parts = [{**self._entry(new, ids, None, entry["score"]), "views": entry.get("views", 0)} for new in news]
         self._replace(f"split {instance} into {len(parts)}", [place], ids, parts, lambda descriptions: descriptions[0])
@@ -256,8 +263,23 @@ class Editor:
 
     # ------------------------------------------------------------------ helpers
 
+    def _parts_of(self, entry: dict[str, Any], rows: np.ndarray) -> np.ndarray:
+        """[R] number of the part of each of an instance's Gaussians, 0 ... and −1 = none."""
+        from perception.instances.cluster import cluster_gaussians
+
+        gmap = self.original
+        if entry.get("parts") and "ids" in gmap.parts:
+            own = gmap.parts["ids"][rows]
+            known = np.unique(own[np.isin(own, [part["id"] for part in entry["parts"]])])
+            return np.where(np.isin(own, known), np.searchsorted(known, own), -1)
+        finer = dataclasses.replace(InstanceConfig(), min_cluster_size=max(8, len(rows) // 20), min_samples=8)
+        return cluster_gaussians(
+            gmap.means[rows], gmap.scales[rows], gmap.opacities[rows], gmap.features[rows], finer
+        ).ids
+
     def _next_id(self) -> int:
-        return 1 + max((entry["id"] for state in (*self._past, *self._future) for entry in state.instances), default=-1)
+        entries = [entry for state in (*self._past, *self._future) for entry in state.instances]
+        return 1 + max((e["id"] for entry in entries for e in (entry, *entry.get("parts", []))), default=-1)
 
     def _entry(self, instance: int, ids: np.ndarray, label: str | None, score: float) -> dict[str, Any]:
         rows = (ids == instance) & self.kept
@@ -326,6 +348,17 @@ def _joined(descriptions: list[InstanceDescription]) -> InstanceDescription:
         [name for d in descriptions for name in d.views],
         [box for d in descriptions for box in d.boxes],
     )
+
+
+def _described(parts: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, np.ndarray]:
+    """parts.npz's arrays with the language rows of parts that are alive [P] bool, in ascending id."""
+    prefix = "language_"
+    language = {name[len(prefix) :]: array for name, array in parts.items() if name.startswith(prefix)}
+    if not language or alive.all():
+        return parts
+    descriptions, encoder = from_arrays(language)
+    left = [description for description, lives in zip(descriptions, alive, strict=True) if lives]
+    return {"ids": parts["ids"], **{prefix + name: a for name, a in to_arrays(left, encoder).items()}}
 
 
 def _signature(path: Path) -> tuple[int, int, int]:

@@ -150,3 +150,72 @@ def test_isolated_keeps_a_uniform_grid() -> None:
     grid = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), -1).reshape(-1, 3)
     assert not isolated(grid).any()
     assert np.flatnonzero(isolated(np.concatenate([grid, [[100.0, 0, 0]]]))).tolist() == [len(grid)]
+
+
+def with_parts(path: Path) -> Path:
+    """Instance 0 gets two parts, of 25 and of 30 of its 60 Gaussians, described by axes 3 and 4."""
+    gmap = read_map(path)
+    ids = np.full(len(gmap), -1, np.int32)
+    ids[:25], ids[25:55] = 3, 4
+    entry = gmap.instances[0]
+    entry["parts"] = [{**entry, "id": i, "num_gaussians": n, "parent": 0} for i, n in ((3, 25), (4, 30))]
+    said = [
+        InstanceDescription(e, e[None], np.zeros((PALETTE, 4), np.float32), ["a.jpg"], [(0, 0, 1, 1)])
+        for e in np.eye(8, dtype=np.float32)[3:5]
+    ]
+    gmap.parts = {"ids": ids, **{f"language_{name}": a for name, a in to_arrays(said, "test").items()}}
+    write_map(path, gmap)
+    return path
+
+
+def test_a_split_follows_the_hierarchy(path: Path) -> None:
+    editor = Editor(with_parts(path))
+    first, second = editor.split(0)
+    assert first >= 5  # ids of parts are taken
+    before = editor.original.parts["ids"]
+    assert set(editor.ids[before == 3]) == {first} and set(editor.ids[before == 4]) == {second}
+    assert np.isin(editor.ids[55:60], [first, second]).all()  # those of no part go with their neighbours
+    editor.save()
+    assert (read_map(path).parts["ids"] == -1).all()  # the parts are instances of their own now
+
+
+def test_parts_survive_what_happens_to_others(path: Path) -> None:
+    editor = Editor(with_parts(path))
+    editor.remove(2)
+    editor.delete_floaters()
+    editor.save()
+    saved = read_map(path)
+    assert len(saved.parts["ids"]) == len(saved) == editor.kept.sum()
+    np.testing.assert_array_equal(saved.parts["ids"], editor.original.parts["ids"][editor.kept])
+    np.testing.assert_array_equal(saved.parts["language_embeddings"], np.eye(8)[3:5])
+    editor.merge([0, 1])
+    editor.save()
+    assert (read_map(path).parts["ids"] == -1).all() and len(read_map(path).parts["language_embeddings"]) == 0
+
+
+def test_parts_are_asked_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from perception.query import PartsMap, load_map
+    from perception.query.hit import Hit
+
+    opened = load_map(with_parts(path))
+    parts = PartsMap(opened)
+    assert [(hit.instance_id, len(hit.points), hit.parent) for hit in parts.of(0)] == [(4, 30, 0), (3, 25, 0)]
+    assert parts.of(1) == []
+    np.testing.assert_array_equal(parts.of(0)[1].points, opened.gmap.means[:25])
+
+    class Ranked:
+        """Part number 1 fits "handle" best."""
+
+        def rank(self, text: str, min_score: float | None) -> object:
+            hits = [(1, 0.9), (0, 0.2)] if text == "handle" else []
+            return type("Answer", (), {"hits": hits, "present": bool(hits)})
+
+    wholes: dict[str, list[Hit]] = {"mug": [opened.hit(0)], "table": [opened.hit(1)]}
+    monkeypatch.setattr(opened, "query", lambda text, top_k: wholes.get(text, []))
+    monkeypatch.setattr(type(parts._asked), "ranker", property(lambda self: Ranked()))
+    assert [hit.instance_id for hit in parts.query("the handle of the mug")] == [4, 3]
+    assert parts.query("handle of a table") == [] and parts.query("handle of the boat") == []
+    assert [hit.parent for hit in parts.query("handle", top_k=1)] == [0]
+    assert parts.query("spout") == []
+    with pytest.raises(InputError, match="empty"):
+        parts.query(" ")

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from perception.query.frames import Frame
     from perception.query.hit import Description, Hit, Neighbor
     from perception.query.opened import LoadedMap, load_map
+    from perception.query.parts import PartsMap
     from perception.query.regions import Prism, Region, axis_box
     from perception.query.requests import Reply, Request
     from perception.query.where import Where
@@ -26,6 +27,7 @@ _HOMES = {
     "Hit": "hit",
     "LoadedMap": "opened",
     "Neighbor": "hit",
+    "PartsMap": "parts",
     "Prism": "regions",
     "QueryEngine": "engine",
     "Region": "regions",
@@ -44,6 +46,7 @@ __all__ = [
     "Hit",
     "LoadedMap",
     "Neighbor",
+    "PartsMap",
     "Prism",
     "QueryEngine",
     "Region",

@@ -22,6 +22,7 @@ class Hit:
     score: in [0, 1]; of a prompt's answer how well it fits, else the instance's own confidence. views: the photos
     that show it best, best first. All of it in `frame`, whose unit is the metre when the map says so.
     distance: from the place asked about to the nearest of the points; None when no place was given.
+    parent: of a part, the id of the instance it belongs to.
     """
 
     instance_id: int
@@ -34,6 +35,7 @@ class Hit:
     covariance: np.ndarray = field(default_factory=lambda: _NO_SPREAD)
     frame: str = "map"
     distance: float | None = None
+    parent: int | None = None
 
     def transformed(self, a_from_b: np.ndarray, frame: str | None = None) -> Hit:
         """The same hit in frame a, given a_from_b [4, 4] (rigid or similarity) from the frame it is in now.
@@ -56,7 +58,7 @@ class Hit:
 
     def to_json(self) -> dict[str, Any]:
         """A hit of `perception query --json`."""
-        answer = {
+        answer: dict[str, Any] = {
             "instance_id": self.instance_id,
             "score": round(float(self.score), 4),
             "num_points": len(self.points),
@@ -66,6 +68,8 @@ class Hit:
             "views": list(self.views),
             "covariance": [[float(x) for x in row] for row in self.covariance],
         }
+        if self.parent is not None:
+            answer["parent"] = self.parent
         return answer if self.distance is None else {**answer, "distance": float(self.distance)}
 
 

@@ -1,0 +1,65 @@
+"""Questions about parts of things: "handle of the mug", or the parts of one instance."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+from perception.errors import InputError
+from perception.query.hit import Hit
+from perception.query.opened import LoadedMap
+
+_OF = re.compile(r"^(?:the\s+)?(?P<part>.+?)\s+of\s+(?:the\s+|a\s+|an\s+)?(?P<whole>.+)$", re.IGNORECASE)
+_WHOLES = 3
+"""Hits for the whole whose parts are looked at."""
+
+
+class PartsMap:
+    """The parts of a map's instances (see io.store), asked like instances. Made from an opened map, lazily cheap."""
+
+    def __init__(self, opened: LoadedMap):
+        self.opened = opened
+        gmap = opened.gmap
+        entries = [part for entry in gmap.instances for part in entry.get("parts", [])]
+        self.entries = sorted(entries, key=lambda part: int(part["id"]))
+        self._asked: LoadedMap | None = None
+        if self.entries and "ids" in gmap.parts:
+            prefix = "language_"
+            language = {name[len(prefix) :]: a for name, a in gmap.parts.items() if name.startswith(prefix)}
+            held = dataclasses.replace(
+                gmap, instances=self.entries, instance_ids=gmap.parts["ids"], language=language, parts={}
+            )
+            self._asked = LoadedMap(held, opened.path)
+
+    def of(self, instance: int) -> list[Hit]:
+        """The parts of instance id `instance`, largest first, scored by the mapper's confidence."""
+        self.opened.position(instance)  # raises for an unknown id
+        if self._asked is None:
+            return []
+        hits = [self._hit(n) for n, part in enumerate(self.entries) if part["parent"] == instance]
+        return sorted(hits, key=lambda hit: -len(hit.points))
+
+    def query(self, text: str, top_k: int = 3) -> list[Hit]:
+        """The parts that answer `text`, best first, each with the `parent` it belongs to.
+
+        "X of the Y" looks for X among the parts of what answers Y, and says what fits best there: that Y is present
+        is the evidence. Any other text is judged against all parts as a prompt is against instances; empty when not
+        present. Raises InputError as LoadedMap.query does.
+        """
+        if not text.strip():
+            raise InputError('query: the text is empty; ask for a part, such as "handle of the mug"')
+        if self._asked is None:
+            return []
+        asked = _OF.match(" ".join(text.split()))
+        if asked is None:
+            answer = self._asked.ranker.rank(text, None)
+            return [self._hit(n, score) for n, score in answer.hits[:top_k]] if answer.present else []
+        wholes = [hit.instance_id for hit in self.opened.query(asked["whole"], _WHOLES)]
+        ranked = self._asked.ranker.rank(asked["part"], 0.0).hits
+        inside = [(n, score) for n, score in ranked if self.entries[n]["parent"] in wholes]
+        inside.sort(key=lambda found: wholes.index(self.entries[found[0]]["parent"]))  # stable: best part of best whole
+        return [self._hit(n, score) for n, score in inside[:top_k]]
+
+    def _hit(self, position: int, score: float | None = None) -> Hit:
+        assert self._asked is not None
+        return dataclasses.replace(self._asked.hit(position, score), parent=int(self.entries[position]["parent"]))
