@@ -37,7 +37,7 @@ BETA = 0.5  # share of the map's mean embedding that is taken away
 SHAPE_WEIGHT = 6.0  # spreads between no and a full match of shape, for kinds that geometry alone decides
 SHAPE_HINT = 2.0  # what a full match adds for kinds that shape only makes likelier: not every box is closed
 TEMPERATURE = 10.0  # LERF's
-COLOR_WEIGHT = 0.1  # relevancy between no and a full colour match
+COLOR_WEIGHT = 2.0  # spreads between no and a full match of colour: enough to tell two things of one kind apart
 LABEL_MARGIN = 2.0  # a label means the prompt from 2 + Φ⁻¹(score) spreads above what probes mean to it
 
 
@@ -117,10 +117,10 @@ class Ranker:
         colors = color_words(text)
         row = self._encode([without_color_words(text)])
         relevancy = self._relevancy(row)[0]
-        if colors:
-            relevancy = relevancy + COLOR_WEIGHT * (color_match(self._palettes, colors) - 0.5)
         middle, spread = self._null
         z = (relevancy - middle) / spread - self._reading.margin + self._shape_bonus(text)
+        if colors:
+            z = z + COLOR_WEIGHT * (color_match(self._palettes, colors) - 0.5)
         scores = np.array([_phi(x) for x in z])
         if len(self._canonical):
             scores = np.minimum(scores, 2 * PRESENT * self._against_canonical(row))
