@@ -46,6 +46,7 @@ def server(command: list[str], folder: Path) -> Iterator[tuple[subprocess.Popen[
         text=True,
         env=environment,
         cwd=folder,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a suite run in the background ignores it
     )
     try:
         assert process.stderr is not None

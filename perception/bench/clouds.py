@@ -23,6 +23,8 @@ from typing import Any
 
 import numpy as np
 
+from perception.bench.children import child_options
+
 TREES = ("perception", "scipy", "open3d")
 LISTS = 12
 """Neighbours that smoothing asks for."""
@@ -143,7 +145,7 @@ def _status(key: str) -> float:
 
 def _in_child(task: str, tree: str, arguments: Sequence[str]) -> dict[str, Any]:
     command = [sys.executable, "-m", "perception.bench.clouds", *arguments, "--one", task, tree]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = subprocess.run(command, capture_output=True, text=True, check=True, **child_options())
     result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return result
 

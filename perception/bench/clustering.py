@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from perception.bench.children import child_options
+
 RUN = """
 import json, resource, sys, time
 import numpy as np
@@ -51,7 +53,7 @@ def measure(rows: int, most: int, folder: Path) -> tuple[dict[str, float], np.nd
     """One run in a process of its own: (seconds, CPU seconds, peak MiB), labels."""
     out = folder / f"{rows}_{most}.npy"
     command = [sys.executable, "-c", RUN, str(rows), str(most), str(out)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    done = subprocess.run(command, check=True, capture_output=True, text=True, **child_options())
     return json.loads(done.stdout), np.load(out)
 
 

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from perception.bench.children import child_options
 from perception.errors import InputError
 
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -82,7 +83,7 @@ def first_picture(path: Path, browser: str) -> tuple[float, float, float]:
         page.set_default_timeout(1000 * LIMIT)
         command = [sys.executable, "-m", "perception.cli", "view", str(path), "--port", str(port)]
         start = time.perf_counter()
-        viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **child_options())
         try:
             _wait_for(port, viewer)
             listening = time.perf_counter() - start
