@@ -108,7 +108,7 @@ class InstanceConfig:
     min_cluster_size: int = 32
     min_samples: int = 16
     min_opacity: float = 0.1
-    max_clustered: int = 80_000
+    max_clustered: int = 60_000
 
 
 @dataclass(frozen=True)
