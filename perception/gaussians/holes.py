@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import SH_C0, Gaussians
-from perception.gaussians.rasterize import rasterize
+from perception.gaussians.render import render
 from perception.gaussians.views import TrainingView
 
 BLOCK = 8
@@ -48,17 +48,7 @@ def fill_holes(gaussians: Gaussians, views: list[TrainingView], room: int, seed:
 def _blocks(gaussians: Gaussians, view: TrainingView) -> tuple[np.ndarray, np.ndarray]:
     """Mean opacity, and opacity-weighted depth (0 where nothing is), of each block [h, w]."""
     height, width = view.photo.shape[:2]
-    out = rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.base_colors,
-        view.camera_from_world[None],
-        view.K[None],
-        width,
-        height,
-    )
+    out = render(gaussians, view.camera_from_world, view.K, width, height)
     images = torch.stack([out.alphas[0], out.depths[0]])[None]
     alpha, depth = torch.nn.functional.avg_pool2d(images, BLOCK, ceil_mode=True)[0].numpy()
     return alpha, np.where(alpha > 0, depth / np.maximum(alpha, 1e-6), 0)

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.rasterize import Rasterization, rasterize
+from perception.gaussians.rasterize import Rasterization
+from perception.gaussians.render import render
 
 
 @dataclass(frozen=True)
@@ -54,19 +55,7 @@ def visible_in(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
 
 def _render(gaussians: Gaussians, view: TrainingView) -> Rasterization:
     height, width = view.photo.shape[:2]
-    return rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        view.camera_from_world[None],
-        view.K[None],
-        width,
-        height,
-        sh_degree=gaussians.sh_degree,
-        depth=False,
-    )
+    return render(gaussians, view.camera_from_world, view.K, width, height, harmonics=True, depth=False)
 
 
 @torch.no_grad()
@@ -74,17 +63,7 @@ def depth_image(
     gaussians: Gaussians, camera_from_world: torch.Tensor, K: torch.Tensor, width: int, height: int
 ) -> torch.Tensor:
     """Expected depth [H, W] along the optical axis where the map is more than half opaque, 0 elsewhere."""
-    out = rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.base_colors,
-        camera_from_world[None],
-        K[None],
-        width,
-        height,
-    )
+    out = render(gaussians, camera_from_world, K, width, height)
     alpha = out.alphas[0]
     return torch.where(alpha > 0.5, out.depths[0] / alpha.clamp(min=1e-6), torch.zeros_like(alpha))
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.rasterize import rasterize
+from perception.gaussians.render import render
 
 BLOCK = 16
 """Instances rendered in one pass: a feature width the kernel is specialised for."""
@@ -47,20 +47,7 @@ def render_silhouettes(
         inside = (owner >= first) & (owner < first + BLOCK)
         white = torch.zeros(len(gaussians), BLOCK)
         white[inside, owner[inside] - first] = 1.0
-        out = rasterize(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.scales,
-            gaussians.opacities,
-            gaussians.base_colors,
-            camera_from_world[None],
-            K[None],
-            width,
-            height,
-            features=white,
-            variance=False,
-            depth=False,
-        )
+        out = render(gaussians, camera_from_world, K, width, height, features=white, variance=False, depth=False)
         seen = out.visible[0]
         assert out.features is not None  # features were given
         value, index = out.features[0].max(dim=2)

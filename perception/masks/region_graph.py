@@ -65,13 +65,18 @@ class RegionGraph:
     def merge(self, a: int, b: int) -> None:
         """b becomes part of a."""
         self.perimeters[a] += self.perimeters[b] - 2 * self.borders[a].pop(b)[_LENGTH]
-        self.sums[a] += self.sums[b]
-        for other, row in self.borders[b].items():
-            if other != a:
-                del self.borders[other][b]
-                total = self.borders[a][other] + row if other in self.borders[a] else row
-                self.borders[a][other] = self.borders[other][a] = total
-        self.borders[b] = {}
+        join(self.sums, self.borders, a, b)
+
+
+def join(sums: np.ndarray, borders: list[dict[int, np.ndarray]], a: int, b: int) -> None:
+    """b's sums and borders are added to a's, in place; the border between the two is gone already from a's side."""
+    sums[a] += sums[b]
+    for other, row in borders[b].items():
+        if other != a:
+            del borders[other][b]
+            total = borders[a][other] + row if other in borders[a] else row
+            borders[a][other] = borders[other][a] = total
+    borders[b] = {}
 
 
 class MergingGraph(Protocol):

@@ -10,7 +10,7 @@ import numpy as np
 
 from perception import _core
 from perception.masks.cues import COLOUR_WORDS, DepthCues, PhotoCues
-from perception.masks.region_graph import neighbours
+from perception.masks.region_graph import join, neighbours
 from perception.masks.surface import Surface
 
 FEATURES = 24
@@ -192,13 +192,7 @@ class SurfaceGraph:
     def merge(self, a: int, b: int) -> None:
         """b becomes part of a."""
         self.contacts[a] += self.contacts[b] - 2 * self.borders[a].pop(b)[_CONTACT]
-        self.sums[a] += self.sums[b]
-        for other, row in self.borders[b].items():
-            if other != a:
-                del self.borders[other][b]
-                total = self.borders[a][other] + row if other in self.borders[a] else row
-                self.borders[a][other] = self.borders[other][a] = total
-        self.borders[b] = {}
+        join(self.sums, self.borders, a, b)
 
 
 def _surface_features(shape_a: np.ndarray, shape_b: np.ndarray, depth: np.ndarray) -> list[np.ndarray]:

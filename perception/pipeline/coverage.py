@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.rasterize import rasterize
+from perception.gaussians.render import render
 from perception.types import View
 
 ENOUGH = 3
@@ -27,14 +27,10 @@ def views_of_each(gaussians: Gaussians, views: list[View]) -> np.ndarray:
         scale = min(1.0, SIDE / max(view.width, view.height))
         width, height = max(1, round(view.width * scale)), max(1, round(view.height * scale))
         K = view.K * np.array([[width / view.width], [height / view.height], [1.0]])
-        out = rasterize(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.scales,
-            gaussians.opacities,
-            gaussians.base_colors,
-            torch.from_numpy(view.camera_from_world.astype(np.float32))[None],
-            torch.from_numpy(K.astype(np.float32))[None],
+        out = render(
+            gaussians,
+            torch.from_numpy(view.camera_from_world.astype(np.float32)),
+            torch.from_numpy(K.astype(np.float32)),
             width,
             height,
             depth=False,

@@ -11,7 +11,7 @@ import torch
 
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians
-from perception.gaussians.rasterize import rasterize
+from perception.gaussians.render import render
 from perception.gaussians.train import depth_image
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.store import GaussianMap, read_map
@@ -121,17 +121,13 @@ def _picture(kind: str, gaussians: Gaussians, gmap: GaussianMap, view: View) -> 
     if kind == "depth":
         depth = depth_image(gaussians, pose, K, view.width, view.height)
         return (depth * 1000).round().clamp(0, 65535).numpy().astype(np.uint16)
-    out = rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        pose[None],
-        K[None],
+    out = render(
+        gaussians,
+        pose,
+        K,
         view.width,
         view.height,
-        sh_degree=gaussians.sh_degree,
+        harmonics=True,
         features=gaussians.features if kind == "features" else None,
     )
     if kind == "rgb":

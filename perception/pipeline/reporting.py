@@ -10,6 +10,7 @@ import torch
 
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians
+from perception.gaussians.render import render
 from perception.gaussians.train import TrainingView, render_view
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.photos import load_photo, scaled_K
@@ -169,23 +170,9 @@ def _overview(gmap: GaussianMap, album: _Album) -> dict[str, np.ndarray]:
 
 def feature_picture(album: _Album, name: str, photo: np.ndarray) -> np.ndarray:
     """Rendered features of a view, coloured by their three main components."""
-    from perception.gaussians.rasterize import rasterize
-
     height, width = photo.shape[:2]
     pose, K = album._camera(name, width, height)
-    g = album.gaussians
-    out = rasterize(
-        g.means,
-        g.quats,
-        g.scales,
-        g.opacities,
-        g.base_colors,
-        pose[None],
-        K[None],
-        width,
-        height,
-        features=g.features,
-    )
+    out = render(album.gaussians, pose, K, width, height, features=album.gaussians.features)
     assert out.features is not None  # features were given
     return features_to_rgb(out.features[0].numpy())
 
