@@ -6,6 +6,7 @@ import contextlib
 import io
 import socket
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,14 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.viewer.panel import Panel
-from perception.viewer.picking import covariances
 from perception.viewer.session import Session
+from perception.viewer.splats import Splats
 
 FRUSTUM_PHOTO = 96
 """Pixels of the longer side of the photo drawn in a camera's frustum."""
+
+FIRST_LOOK = 1.0
+"""Seconds that a browser has for the coarse picture before the whole map follows."""
 
 
 class Viewer:
@@ -35,15 +39,10 @@ class Viewer:
         self._overlays: dict[str, list[Any]] = {"cameras": [], "boxes": [], "names": []}
         self._overlays_on = dict.fromkeys(self._overlays, False)
         self._frame_map()
-        gmap = self.session.editor.original
-        self._splats = self.server.scene.add_gaussian_splats(
-            "/map/splats",
-            centers=gmap.means * self.scale,
-            covariances=covariances(gmap) * self.scale**2,
-            rgbs=self.session.colors(),
-            opacities=self.session.opacities()[:, None],
-        )
+        self._splats = Splats(self.session.editor.original, self.scale)
         self.panel = Panel(self)
+        self.server.on_client_connect(self._welcome)
+        self.server.on_client_disconnect(self._splats.forget)
         self.server.scene.on_click()(lambda event: self._clicked(event, add=False))
         self.server.scene.on_click(modifier="shift")(lambda event: self._clicked(event, add=True))
 
@@ -69,16 +68,23 @@ class Viewer:
         camera.position = tuple(eye * self.scale)
         camera.look_at = tuple((eye + pose[2, :3] * max(float(depth), 1e-6)) * self.scale)
 
-    def redraw(self, client: Any = None) -> None:
-        """Colours and opacities anew, in one message; overlays that are on follow."""
+    def _welcome(self, client: Any) -> None:
+        """A new browser: the coarse picture, and the whole one when it has had time to draw that."""
+        self._show(client)
+        if self._splats.coarse:
+            time.sleep(FIRST_LOOK)
+            if client.client_id in self.server.get_clients():
+                self._show(client)
+
+    def _show(self, client: Any) -> None:
+        camera = self._camera_of(client) if self.session.mode == "depth" else None
+        self._splats.show(client, self.session.colors(camera), self.session.opacities())
+
+    def redraw(self) -> None:
+        """Colours and opacities anew in every browser, in one message each; overlays that are on follow."""
         with self._drawing:
-            camera = None if client is None or self.session.mode != "depth" else self._camera_of(client)
-            self._splats.set_gaussians(
-                self._splats.centers,
-                self._splats.covariances,
-                self.session.colors(camera),
-                self.session.opacities()[:, None],
-            )
+            for client in self.server.get_clients().values():
+                self._show(client)
             for kind, on in self._overlays_on.items():
                 if on and kind != "cameras":
                     self._draw(kind)
@@ -181,7 +187,7 @@ class Viewer:
         if edited:
             self.session.edited()
         self.panel.refresh()
-        self.redraw(client)
+        self.redraw()
 
 
 def start_viewer(path: Path, host: str = "127.0.0.1", port: int = 8090) -> Viewer:

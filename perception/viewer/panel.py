@@ -47,9 +47,9 @@ class Panel:
             boxes = [(kind, self.gui.add_checkbox(kind, False)) for kind in ("boxes", "names", "cameras")]
             clear = self.gui.add_button("Clear selection")
 
-        def choose(event: Any) -> None:
+        def choose(_: Any) -> None:
             self.session.mode = mode.value
-            self.viewer.redraw(event.client)
+            self.viewer.redraw()
 
         mode.on_update(choose)
         for kind, box in boxes:
@@ -123,7 +123,7 @@ class Panel:
         """Every word of the panel from the session's state."""
         session, editor = self.session, self.session.editor
         unit = "m" if editor.original.info.get("metric") else "map units"
-        self._facts.content = f"**{int(editor.kept.sum()):,} Gaussians · {len(editor.instances)} instances**"
+        self._facts.content = f"**{int(editor.kept.sum()):,} Gaussians · instances: {len(editor.instances)}**"
         self._refresh_answer()
         if not session.selected:
             self._words.content = "Click a thing; shift-click adds another."
