@@ -25,7 +25,7 @@ class Splats:
         self._lock = threading.Lock()
 
     def show(self, client: Any, colors: np.ndarray, opacities: np.ndarray) -> None:
-        """Draws in one browser, the first time the coarse picture only; colors [N, 3] uint8, opacities [N] in [0, 1]."""
+        """Draws in one browser, at first the coarse picture only; colors [N, 3] uint8, opacities [N] in [0, 1]."""
         with self._lock:
             handle = self._handles.get(client.client_id)
             if handle is None:
