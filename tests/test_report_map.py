@@ -48,7 +48,7 @@ def test_photos_that_are_not_in_the_map_are_named_by_reason() -> None:
 
 
 def plan(ceiling: bool) -> GaussianMap:
-    """Two balls on the ground (z up), ids 0 at x = 0 and 1 at x = 4, perhaps a ceiling; a camera at z = 2 looks at y."""
+    """Balls on the ground (z up), id 0 at x = 0 and 1 at x = 4, perhaps a ceiling; a camera at z = 2 looks along y."""
     rng = np.random.default_rng(0)
     count = 400
     places = [[0.0, 0, 0], [4.0, 0, 0]] + [[2.0, 0, 3]] * ceiling
@@ -80,14 +80,14 @@ def test_from_above_things_lie_where_they_are_and_the_ceiling_is_lifted_off(ceil
     picture = instances_from_above(plan(ceiling), side).astype(int)
     colors = instance_palette(np.arange(3)).astype(int)
     found = [np.argwhere(np.abs(picture - color).max(axis=2) < 12) for color in colors]
-    (row0, column0), (row1, column1) = (spots.mean(axis=0) for spots in found[:2])
+    (row0, column0), (row1, column1) = (spots.mean(axis=0).tolist() for spots in found[:2])
     assert abs(row0 - row1) < 3 and abs((row0 + row1) / 2 - side / 2) < 6
     assert column0 < column1  # x runs right, as it does for the camera
     pixels = (column1 - column0) / 4  # a unit's
     assert len(found[2]) == 0
     bar = np.flatnonzero(np.abs(picture[side - 16] - 70).max(axis=1) < 12)
     assert abs((bar[-1] - bar[0]) / pixels - 1) < 0.1  # the round length below a third of four and a bit
-    camera = picture[int(round((row0 + row1) / 2 + pixels)), int(round((column0 + column1) / 2))]
+    camera = picture[round((row0 + row1) / 2 + pixels), round((column0 + column1) / 2)]
     assert np.abs(camera - 70).max() < 12  # at y = -1: one unit towards the reader
 
 

@@ -25,14 +25,14 @@ def instances_from_above(gmap: GaussianMap, side: int = 480) -> np.ndarray:
     """
     poses = gmap.cameras["camera_from_world"].astype(np.float64)
     axes = _axes(poses)
-    means = gmap.means @ axes.T
+    turned = gmap.means @ axes.T
     eyes = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3]) @ axes.T
     solid = (gmap.opacities > SOLID) & (gmap.instance_ids >= 0)
-    below = solid & (means[:, 2] >= eyes[:, 2].min())
+    below = solid & (turned[:, 2] >= eyes[:, 2].min())
     rows = np.flatnonzero(below if below.any() else solid)
     if len(rows) == 0:
         return np.full((side, side, 3), 255, np.uint8)
-    low, high = np.percentile(means[rows], [2, 98], axis=0)
+    low, high = np.percentile(turned[rows], [2, 98], axis=0)
     width = 1.08 * max(float((high - low)[:2].max()), 1e-9)
     middle = (low + high) / 2
     pose = np.eye(4)
@@ -40,16 +40,13 @@ def instances_from_above(gmap: GaussianMap, side: int = 480) -> np.ndarray:
     pose[:3, 3] = -middle + [0, 0, FAR * width]
     focal = FAR * side
     K = np.array([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1]])
-    out = rasterize(
-        *(torch.from_numpy(np.ascontiguousarray(a[rows], np.float32)) for a in (gmap.means, gmap.quats, gmap.scales)),
-        torch.from_numpy(np.ascontiguousarray(gmap.opacities[rows], np.float32)),
-        torch.from_numpy(instance_palette(gmap.instance_ids[rows]).astype(np.float32) / 255),
-        torch.from_numpy(pose[None].astype(np.float32)),
-        torch.from_numpy(K[None].astype(np.float32)),
-        side,
-        side,
-        background=torch.ones(1, 3),
+    arrays = (gmap.means, gmap.quats, gmap.scales, gmap.opacities, instance_palette(gmap.instance_ids) / 255)
+    centres, quats, scales, opacities, colors = (
+        torch.from_numpy(np.ascontiguousarray(array[rows], np.float32)) for array in arrays
     )
+    viewmats, Ks = (torch.from_numpy(array[None].astype(np.float32)) for array in (pose, K))
+    white = torch.ones(1, 3)
+    out = rasterize(centres, quats, scales, opacities, colors, viewmats, Ks, side, side, background=white)
     picture = np.ascontiguousarray((out.colors[0].clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy())
     for eye in (eyes - middle)[:, :2] / width * side + side / 2:
         if (np.abs(eye) < 10 * side).all():
