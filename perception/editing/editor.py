@@ -74,7 +74,8 @@ class Editor:
     def __init__(self, path: Path):
         self.path = Path(path)
         self._lock = threading.RLock()
-        self._signature = map_signature(self.path)
+        # Taken before reading, so that a change in between is noticed; where nothing lies, read_map says it best.
+        self._signature = map_signature(self.path) if self.path.exists() else ()
         self.original = read_map(self.path)
         gmap = self.original
         descriptions, self._encoder = from_arrays(gmap.language) if gmap.language else ([], "")
@@ -274,6 +275,7 @@ class Editor:
         return self._now.what
 
     @property
+    @_step
     def outdated(self) -> bool:
         """Whether somebody else changed the map since it was opened or saved; InputError when it is gone."""
         return map_signature(self.path) != self._signature

@@ -71,7 +71,7 @@ def pick(
 def covariances(gmap: GaussianMap) -> np.ndarray:
     """[N, 3, 3] float32 second moments R S Sᵀ Rᵀ."""
     norms = np.linalg.norm(gmap.quats, axis=1, keepdims=True)
-    quats = np.where(norms > 0, gmap.quats / np.where(norms > 0, norms, 1), np.float32([1, 0, 0, 0]))
+    quats = np.where(norms > 0, gmap.quats / np.where(norms > 0, norms, 1), np.array([1, 0, 0, 0], np.float32))
     w, x, y, z = quats.astype(np.float32).T
     a, b, c = (gmap.scales.astype(np.float32) ** 2).T
     columns = (  # of the rotation, each times its axis' variance; written out, it is ten times as fast as matmul
