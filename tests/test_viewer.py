@@ -10,7 +10,9 @@ import pytest
 import torch
 from viewer_maps import free_port, small_map
 
+import perception
 from perception.errors import InputError
+from perception.io.store import write_map
 from perception.viewer.paint import HIGHLIGHT, MODES, highlight, paint
 from perception.viewer.picking import covariances, pick
 
@@ -96,3 +98,71 @@ def test_a_port_in_use_is_told(tmp_path: Path) -> None:
             start_viewer(tmp_path / "none.gsmap", port=busy.getsockname()[1])
     with pytest.raises(InputError, match="no map"):
         start_viewer(tmp_path / "none.gsmap", port=free_port())
+
+
+def test_without_a_display_the_address_is_printed_and_ctrl_c_ends(tmp_path: Path) -> None:
+    """As over SSH: no DISPLAY, no browser; the page answers, and Ctrl-C ends it without noise."""
+    pytest.importorskip("viser")
+    import os
+    import signal
+    import subprocess
+    import sys
+    from urllib.request import urlopen
+
+    write_map(tmp_path / "m.gsmap", small_map(100))
+    home = str(Path(perception.__file__).parents[1])
+    env = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    port = free_port()
+    command = [sys.executable, "-m", "perception.cli", "view", "m.gsmap", "--port", str(port)]
+    viewer = subprocess.Popen(
+        command, cwd=tmp_path, env=env | {"PYTHONPATH": home}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert viewer.stderr is not None
+        told = viewer.stderr.readline()
+        assert f"http://localhost:{port}" in told and f"ssh -L {port}:localhost:{port}" in told
+        with urlopen(f"http://127.0.0.1:{port}", timeout=30) as page:
+            assert page.status == 200
+        viewer.send_signal(signal.SIGINT)
+        out, err = viewer.communicate(timeout=60)
+    finally:
+        viewer.kill()
+    assert viewer.returncode == 0 and "Traceback" not in err and out.strip() == ""
+
+
+def test_what_arrives_first_covers_most() -> None:
+    """The coarse picture's Gaussians against the definition: opacity times the product of the two longest axes."""
+    from perception.viewer.splats import most_visible
+
+    gmap = small_map(500)
+    gmap.opacity_logits = np.random.default_rng(3).normal(size=500).astype(np.float32)
+    cover = [o * np.prod(sorted(s)[1:]) for o, s in zip(gmap.opacities, gmap.scales, strict=True)]
+    assert set(most_visible(gmap, 40)) == set(np.argsort(cover)[-40:])
+    np.testing.assert_array_equal(most_visible(gmap, 500), np.arange(500))
+
+
+def test_every_browser_gets_the_coarse_picture_then_the_whole_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    from types import SimpleNamespace
+
+    from perception.viewer import splats
+
+    monkeypatch.setattr(splats, "FIRST", 40)
+    sent: list[tuple[int, int]] = []
+
+    def client(number: int) -> SimpleNamespace:
+        def add(name: str, centers: np.ndarray, *rest: np.ndarray) -> SimpleNamespace:
+            sent.append((number, len(centers)))
+            assert {len(array) for array in rest} == {len(centers)}
+            return SimpleNamespace(set_gaussians=lambda centers, *rest: sent.append((number, len(centers))))
+
+        return SimpleNamespace(client_id=number, scene=SimpleNamespace(add_gaussian_splats=add))
+
+    gmap = small_map(100)
+    shown = splats.Splats(gmap, 2.0)
+    np.testing.assert_allclose(shown.centers, 2 * gmap.means, rtol=1e-6)
+    first, second = client(1), client(2)
+    for one in (first, second, first):
+        shown.show(one, np.zeros((100, 3), np.uint8), np.ones(100, np.float32))
+    shown.forget(first)
+    shown.show(client(1), np.zeros((100, 3), np.uint8), np.ones(100, np.float32))
+    assert sent == [(1, 40), (2, 40), (1, 100), (1, 40)]

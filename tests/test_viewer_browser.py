@@ -240,7 +240,7 @@ def test_parts_are_shown_found_and_split_along(path: Path, browser: Any, monkeyp
         page.set_default_timeout(120_000)
         page.goto(viewer.url)
         page.wait_for_selector("text=Gaussians · instances")
-        page.locator("input[type=checkbox]:visible").first.check()
+        page.get_by_label("parts of things").check()
         enter(page, "prompt", "stalk of the pear")
         page.wait_for_selector("text=1. part of instance 1")
         page.wait_for_selector("text=2 parts; Split takes it apart")
