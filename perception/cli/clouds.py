@@ -16,10 +16,17 @@ def register(commands: Any) -> None:
 
 
 def _add_export(commands: Any) -> None:
-    p = command(commands, "export", _export, "instances onto a point cloud or mesh, or onto the map's own points")
+    p = command(commands, "export", _export, "instances onto a point cloud or mesh, or the map itself for viewers")
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("--points", type=Path, metavar="CLOUD")
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.ply")
+    p.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        metavar="OUT",
+        help=".ply, .pcd, .npz, or .mcap (Foxglove), .rrd (Rerun): the map with its photos",
+    )
     p.add_argument("--smooth", action=argparse.BooleanOptionalAction, default=True)
     p.add_argument("--rule", choices=("nearest", "densest"), default="nearest", help="nearest mean is the paper's")
     p.add_argument(
@@ -36,7 +43,7 @@ def _add_export(commands: Any) -> None:
     p.add_argument("--split", type=Path, metavar="DIR", help="one cloud an instance")
     p.add_argument("--boxes", type=Path, metavar="OUT.json", help="3D boxes")
     p.add_argument("--scannet", type=Path, metavar="DIR", help="ScanNet submission layout")
-    p.add_argument("--mcap", type=Path, metavar="OUT.mcap", help="ROS 2 bag with cloud and detections")
+    p.add_argument("--mcap", type=Path, metavar="OUT.mcap", help="ROS 2 bag with cloud, detections and boxes")
 
 
 def _length(text: str) -> float | str:

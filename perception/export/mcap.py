@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,21 @@ from perception.boxes import instance_boxes
 from perception.errors import InputError, missing_extra
 from perception.io.atomic import replacing
 from perception.io.cdr import serialize, typestore
-from perception.io.ros_messages import DETECTIONS, POINT_CLOUD, Stamp, detection, header, packed_rgb, point_cloud2
+from perception.io.ros_messages import (
+    DETECTIONS,
+    MARKERS,
+    POINT_CLOUD,
+    Stamp,
+    box_markers,
+    detection,
+    header,
+    packed_rgb,
+    point_cloud2,
+)
 from perception.types import OrientedBox, PointCloud
+
+Timed = tuple[str, str, int, dict[str, Any]]
+"""A message: topic, type, time in nanoseconds, fields."""
 
 
 def write_mcap(
@@ -26,27 +39,39 @@ def write_mcap(
     frame: str = "map",
     stamp_ns: int = 0,
 ) -> None:
-    """One PointCloud2 on /perception/points (x y z rgb instance_id) and one Detection3DArray on
-    /perception/instances.
+    """One PointCloud2 on /perception/points (x y z rgb instance_id), one Detection3DArray on /perception/instances, and
+    the same boxes with their words as a MarkerArray, which viewers draw, on /perception/boxes.
 
-    Points keep their order; not a number stays so. stamp_ns: time of both messages in nanoseconds.
+    Points keep their order; not a number stays so. stamp_ns: time of the messages in nanoseconds.
     """
+    stamp = (stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000)
+    found = detections(cloud.points, labels, instances, frame, stamp)
+    boxes = {int(i): OrientedBox.from_json(facts["obb"]) for i, facts in instance_boxes(cloud.points, labels).items()}
+    words = [(box, instances.get(i, {}).get("label") or str(i)) for i, box in boxes.items()]
+    write_bag(
+        Path(path),
+        [
+            ("/perception/points", POINT_CLOUD, stamp_ns, labelled_cloud(cloud, labels, frame, stamp)),
+            ("/perception/instances", DETECTIONS, stamp_ns, found),
+            ("/perception/boxes", MARKERS, stamp_ns, box_markers(words, "instances", header(frame, stamp))),
+        ],
+    )
+
+
+def write_bag(path: Path, messages: Iterable[Timed]) -> None:
+    """An MCAP file of ROS 2 messages (topic, type, nanoseconds, fields); written aside, then put in place."""
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer
     except ImportError as error:
         raise missing_extra("rosbags", "ros") from error
-    path = Path(path)
-    stamp = (stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000)
-    messages = {
-        "/perception/points": (POINT_CLOUD, labelled_cloud(cloud, labels, frame, stamp)),
-        "/perception/instances": (DETECTIONS, detections(cloud.points, labels, instances, frame, stamp)),
-    }
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / "bag"
         with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-            for topic, (kind, message) in messages.items():
-                connection = writer.add_connection(topic, kind, typestore=typestore())
-                writer.write(connection, stamp_ns, serialize(kind, message))
+            topics: dict[str, Any] = {}
+            for topic, kind, time, message in messages:
+                if topic not in topics:
+                    topics[topic] = writer.add_connection(topic, kind, typestore=typestore())
+                writer.write(topics[topic], time, serialize(kind, message))
         written = list(bag.glob("*.mcap"))
         if len(written) != 1:
             raise InputError(f"{path}: rosbags wrote {len(written)} MCAP files, expected one; update rosbags")

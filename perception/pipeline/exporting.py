@@ -22,10 +22,15 @@ def export_map(
 ) -> tuple[dict[str, Any], str]:
     """Writes the labelled cloud, its sidecar JSON and what `outputs` asks for; returns facts and a table.
 
-    Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids.
+    Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids. An output of .mcap or
+    .rrd is the whole map for viewers: points, instances, boxes, cameras and photos.
     """
+    if output.suffix.lower() in (".mcap", ".rrd"):
+        return _for_viewers(map_path, output, points)
     if output.suffix.lower() not in (".ply", ".pcd", ".npz"):
-        raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected .ply, .pcd or .npz")
+        raise InputError(
+            f"{output}: unknown kind of cloud '{output.suffix}', expected .ply, .pcd, .npz, or for viewers .mcap, .rrd"
+        )
     gmap = read_map(map_path)
     cloud: PointCloud | Path = points if points is not None else surface_points(gmap)
     if points is None:  # every point is a Gaussian: nearest is itself
@@ -42,6 +47,24 @@ def export_map(
         options=options,
         outputs=outputs,
     )
+
+
+def _for_viewers(map_path: Path, output: Path, points: Path | None) -> tuple[dict[str, Any], str]:
+    from perception.pipeline.recording import write_recording
+    from perception.pipeline.replay import write_replay
+    from perception.pipeline.reporting import saved_views
+
+    if points is not None:
+        raise InputError(
+            f"{output}: such a file holds the map itself; leave --points out, or write the cloud with -o OUT.ply "
+            "and --mcap OUT.mcap beside it"
+        )
+    gmap = read_map(map_path)
+    views = saved_views(gmap)
+    write = write_replay if output.suffix.lower() == ".mcap" else write_recording
+    write(output, gmap, views)
+    facts = {"output": str(output), "views": len(views), "instances": len(gmap.instances)}
+    return facts, f"{output}: the map with {len(gmap.instances)} instances and {len(views)} cameras"
 
 
 def surface_points(gmap: GaussianMap) -> PointCloud:

@@ -55,7 +55,8 @@ class Viewer:
     def stop(self) -> None:
         """Closes the page and its port."""
         self._stopped.set()
-        self.server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):  # viser says goodbye there too
+            self.server.stop()
 
     # ------------------------------------------------------------------ drawing
 
