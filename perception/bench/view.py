@@ -133,7 +133,7 @@ class _Screencast:
     def __init__(self, page: Any):
         self._frames: list[dict[str, Any]] = []
         self._session = page.context.new_cdp_session(page)
-        self._session.on("Page.screencastFrame", self._frames.append)
+        self._session.on("Page.screencastFrame", lambda frame: self._frames.append(frame))
         self._session.send("Page.startScreencast", {"format": "png"})
 
     def taken(self) -> list[tuple[float, bytes]]:
