@@ -6,6 +6,9 @@ import sys
 import time
 from typing import Any
 
+LINE = "{desc}{percentage:3.0f}%{postfix}  {bar}"
+"""tqdm's line; the bar takes what room is left. Its own rate and rest are wrong for a run that was resumed."""
+
 
 class Progress:
     """Reports stages. `quiet` silences everything (library use)."""
@@ -17,6 +20,12 @@ class Progress:
         self._bar: Any = None
         self._last = 0.0
 
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()  # so that what is said next, as after Ctrl-C, begins on a line of its own
+
     def log(self, text: str) -> None:
         """One line, shown at once."""
         if self.quiet:
@@ -25,29 +34,29 @@ class Progress:
             self._bar.clear()
         print(text, file=self.stream, flush=True)
 
-    def update(self, stage: str, done: int, total: int, **figures: object) -> None:
+    def update(self, stage: str, done: int, total: int, *words: str) -> None:
         """Where a stage stands; elsewhere than on a terminal a line every ten seconds and at the end."""
         if self.quiet:
             return
         if self.terminal:
-            self._draw(stage, done, total, figures)
+            self._draw(stage, done, total, words)
             return
         now = time.monotonic()
         if done >= total or now - self._last >= 10:
             self._last = now
-            told = "  ".join(f"{name} {value}" for name, value in figures.items())
-            print(f"{stage}: {done}/{total}  {told}".rstrip(), file=self.stream, flush=True)
+            print("  ".join([f"{stage}: {done}/{total}", *words]), file=self.stream, flush=True)
 
-    def _draw(self, stage: str, done: int, total: int, figures: dict[str, object]) -> None:
+    def _draw(self, stage: str, done: int, total: int, words: tuple[str, ...]) -> None:
         from tqdm import tqdm
 
         if self._bar is None or self._bar.desc != f"{stage}: ":
             self.close()
-            self._bar = tqdm(total=total, desc=stage, file=self.stream, dynamic_ncols=True, leave=True)
+            self._bar = tqdm(total=total, desc=f"{stage}: ", file=self.stream, dynamic_ncols=True, bar_format=LINE)
         self._bar.total = total
-        self._bar.set_postfix(figures, refresh=False)
+        self._bar.set_postfix_str(", ".join(words or (f"{done}/{total}",)), refresh=False)
         self._bar.update(done - self._bar.n)
         if done >= total:
+            self._bar.refresh()
             self.close()
 
     def close(self) -> None:

@@ -62,15 +62,16 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.pipeline.run import run_map
     from perception.progress import Progress
 
-    gmap = run_map(
-        args.input,
-        args.output,
-        config,
-        resume=args.resume,
-        progress=Progress(),
-        labels_from=args.labels_from,
-        rrd=args.rrd,
-    )
+    with Progress() as progress:
+        gmap = run_map(
+            args.input,
+            args.output,
+            config,
+            resume=args.resume,
+            progress=progress,
+            labels_from=args.labels_from,
+            rrd=args.rrd,
+        )
     from perception.pipeline.summary import map_facts, profile_text
 
     facts = map_facts(args.output, gmap.info, len(gmap), len(gmap.instances))
@@ -123,5 +124,7 @@ def _add_demo(commands: Any) -> None:
 
 def _demo(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.pipeline.demo import run_demo
+    from perception.progress import Progress
 
-    return run_demo(args.output)
+    with Progress() as progress:
+        return run_demo(args.output, progress)

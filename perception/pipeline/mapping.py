@@ -283,12 +283,12 @@ class _Watch:
             "train",
             trainer.iteration,
             total,
-            loss=f"{self.loss:.4f}",
-            psnr=f"{curve[-1]['psnr']:.2f}" if curve else "-",
-            gaussians=len(trainer.gaussians),
-            it_s=f"{speed:.1f}",
-            left_s=round((total - trainer.iteration) / max(speed, 1e-6)),
-            MiB=round(peak_memory_mib()),
+            f"loss {self.loss:.3f}",
+            f"{curve[-1]['psnr']:.1f} dB" if curve else "- dB",
+            f"{len(trainer.gaussians) / 1000:.3g}k Gaussians",
+            f"{speed:.1f} it/s",
+            f"{round((total - trainer.iteration) / max(speed, 1e-6))} s left",
+            f"{round(peak_memory_mib())} MiB",
         )
 
 
