@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import os
@@ -21,12 +22,16 @@ _REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary sibling to write; on success it is synced and renamed to `path`, else removed."""
+    """Yield a temporary sibling to write; on success it is synced and renamed to `path`, else removed.
+
+    What killed writers of `path` left beside it goes too.
+    """
     path = Path(path)
     temporary = _sibling(path, "new")
     try:
         with _disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
+            recover(path)
             yield temporary
             _sync(temporary)
             temporary.replace(path)
@@ -80,10 +85,8 @@ def atomic_directory(path: Path) -> Iterator[Path]:
 def recover(path: Path) -> None:
     """Put `path` back when a writer died between its two renames, and delete leftovers of writers that are gone."""
     path = Path(path)
-    leftovers = sorted(path.parent.glob(f".{path.name}.*"), key=lambda item: item.stat().st_mtime)
-    for item in leftovers:
-        kind, writer = _parse(item, path)
-        if kind is None or _alive(writer):
+    for kind, writer, item in _leftovers(path):
+        if _alive(writer):
             continue
         if kind == "old" and not path.exists():
             item.rename(path)
@@ -91,6 +94,18 @@ def recover(path: Path) -> None:
             shutil.rmtree(item, ignore_errors=True)
         else:
             item.unlink(missing_ok=True)
+
+
+def _leftovers(path: Path) -> list[tuple[str, int, Path]]:
+    """(new or old, process that wrote it, where) of all temporary siblings of `path`, oldest first."""
+    found = []
+    with contextlib.suppress(FileNotFoundError), os.scandir(path.parent) as entries:
+        for entry in entries:
+            kind, writer = _parse(entry.name, path) if entry.name.startswith(f".{path.name}.") else (None, 0)
+            if kind is not None:
+                with contextlib.suppress(FileNotFoundError):  # a living writer has just renamed it
+                    found.append((entry.stat(follow_symlinks=False).st_mtime_ns, kind, writer, Path(entry.path)))
+    return [(kind, writer, item) for _, kind, writer, item in sorted(found)]
 
 
 def _swap(new: Path, path: Path, old: Path) -> None:
@@ -125,8 +140,8 @@ def _sibling(path: Path, kind: str) -> Path:
     return path.with_name(f".{path.name}.{kind}-{os.getpid()}-{uuid4().hex[:8]}")
 
 
-def _parse(item: Path, path: Path) -> tuple[str | None, int]:
-    parts = item.name[len(path.name) + 2 :].split("-")
+def _parse(name: str, path: Path) -> tuple[str | None, int]:
+    parts = name[len(path.name) + 2 :].split("-")
     if len(parts) == 3 and parts[0] in ("new", "old") and parts[1].isdigit():
         return parts[0], int(parts[1])
     return None, 0

@@ -27,7 +27,7 @@ MOST_ARCHIVE = 4 << 30
 _ARRAYS = {"features": 2, "instance_ids": 1, "membership": 1}
 ARCHIVES = ("cameras", "language", "index", "parts")
 _TRIES = 5
-_DAMAGE = (
+DAMAGE = (
     ValueError,
     KeyError,
     TypeError,
@@ -97,7 +97,7 @@ class MapFiles:
             array = np.load(file, mmap_mode="r", allow_pickle=False)
         except FileNotFoundError as error:
             raise InputError(f"{file}: is missing; the map is damaged, build it again or copy it anew") from error
-        except _DAMAGE as error:
+        except DAMAGE as error:
             raise InputError(f"{file}: cannot be read ({_short(error)}); the map is damaged, build it again") from error
         kind = "i" if name == "instance_ids" else "f"
         if array.ndim != sides or array.dtype.kind != kind:
@@ -183,7 +183,7 @@ class MapFiles:
                 return {key: arrays[key] for key in arrays.files}
         except InputError:
             raise
-        except _DAMAGE as error:
+        except DAMAGE as error:
             raise InputError(f"{file}: cannot be read ({_short(error)}); the map is damaged, build it again") from error
 
 

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from perception.errors import InputError
+from perception.io.atomic import recover
 
 try:
     import fcntl
@@ -27,6 +28,7 @@ def writing(path: Path) -> Iterator[None]:
 
     The lock is an advisory flock on the sibling `.NAME.lock`, so it ends with its process, however that ends; the file
     says who holds it and goes when the lock does. A thread may take a lock again that it holds. Readers need none.
+    What writers that were killed left beside the map is put back or deleted first.
     """
     path = Path(path).resolve()
     me = threading.get_ident()
@@ -39,6 +41,7 @@ def writing(path: Path) -> Iterator[None]:
     try:
         if depth == 0:
             descriptor = _take(path)
+            recover(path)
         yield
     finally:
         with _guard:

@@ -1,12 +1,13 @@
 """Processes to kill: forked from one that has everything imported, so that a hundred of them cost no imports.
 
-Forking is sound here because the parent runs no parallel region: torch's OpenMP pool and autograd's threads begin in the
-child, and OpenBLAS, the one library that starts threads when it is imported, stops them around a fork by itself. The
-harness checks it too: a fresh interpreter must end with the very map that a forked child ends with.
+Forking is sound here because the parent runs no parallel region: torch's OpenMP pool and autograd's threads begin in
+the child, and OpenBLAS, the one library that starts threads when it is imported, stops them around a fork by itself.
+The harness checks it too: a fresh interpreter must end with the very map that a forked child ends with.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import select
@@ -171,10 +172,8 @@ def _redirect(log: Path) -> None:
 
 
 def _set_group(child: int) -> None:
-    try:
+    with contextlib.suppress(ProcessLookupError, PermissionError):
         os.setpgid(child, child)  # here too: whoever comes first
-    except (ProcessLookupError, PermissionError):
-        pass
 
 
 def _wait_until(child: int, limit: float) -> tuple[bool, int]:

@@ -65,7 +65,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--writes", type=int, default=30, metavar="N", help="around changes to the file system")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--scene", type=Path, help="a small scene that lies ready (tests/conftest.py's)")
-    parser.add_argument("--sfm", action=argparse.BooleanOptionalAction, default=True, help="from photos alone, or with given poses")
+    parser.add_argument(
+        "--sfm", action=argparse.BooleanOptionalAction, default=True, help="from photos alone, or with given poses"
+    )
     parser.add_argument("--folder", type=Path, help="where to work; a temporary one by default")
     parser.add_argument("--json", type=Path, metavar="OUT.json")
     args = parser.parse_args()
@@ -78,7 +80,7 @@ def _warm() -> None:
     """Everything imported that the commands import, and nothing of it run."""
     import cv2  # noqa: F401
     import pycolmap  # noqa: F401
-    import scipy.sparse.csgraph  # noqa: F401
+    import scipy.sparse.csgraph
     import scipy.spatial  # noqa: F401
     import torch  # noqa: F401
 
@@ -102,7 +104,7 @@ def _cases(folder: Path, scene: Path | None, sfm: bool) -> dict[str, Case]:
     (first / "out").mkdir()
     _do(lambda: command("label", first / "m.gsmap", 0, "an older name"), folder)
     exporting = Exporting(gmap, scene / "truth" / "gt_points.ply", first / "out")
-    _do(lambda: exporting.work(first, 1), folder)
+    _do(lambda: exporting.export(first, "--no-smooth", "--color", "original"), folder)
     return {"mapping": mapping, "exporting": exporting, "editing": Editing(gmap, first / "m.gsmap")}
 
 
@@ -131,8 +133,11 @@ def _kill(case: Case, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     lengths, writes = _undisturbed(case, folder, case.name == "mapping" and args.kills >= 20)
     row: dict[str, Any] = {"what": case.name, "kills": 0, "survived": 0, "killed_again": 0, "lost": []}
     row |= {"run_seconds": float(np.mean(lengths)), "writes": len(writes[0]), "left": collections.Counter()}
-    for trial in range(args.kills + args.writes):
-        moment = _moment(rng, lengths[trial % case.variants], writes[trial % case.variants], trial < args.kills)
+    for trial in range(3 * (args.kills + args.writes)):  # a run may end before its kill
+        if row["kills"] == args.kills + args.writes:
+            break
+        uniform = row["kills"] < args.kills
+        moment = _moment(rng, lengths[trial % case.variants], writes[trial % case.variants], uniform)
         twice = rng.random() < RESUME_KILLED
         second = Moment(rng.uniform(0, lengths[trial % case.variants])) if twice else None
         place = folder / f"{case.name}-{trial}"
@@ -140,11 +145,10 @@ def _kill(case: Case, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
             _one(case, place, trial, moment, second, row)
         except AssertionError as error:
             row["lost"].append(f"{case.name} trial {trial} {moment}: {error}")
-        else:
-            row["survived"] += 1
+            row["survived"] -= 1
         shutil.rmtree(place, ignore_errors=True)
         if sys.stderr.isatty() or trial % 20 == 19:
-            print(f"{case.name}: {trial + 1} of {args.kills + args.writes}", file=sys.stderr, flush=True)
+            print(f"{case.name}: {row['kills']} kills, {len(row['lost'])} lost", file=sys.stderr, flush=True)
     return row
 
 
@@ -193,6 +197,7 @@ def _one(case: Case, place: Path, trial: int, moment: Moment, second: Moment | N
     end = children.run(lambda: case.work(place, trial), place, moment)
     assert end.killed or end.code == 0, end.said
     row["kills"] += end.killed
+    row["survived"] += end.killed
     row["left"][children.ask(lambda: case.after_kill(place, trial)) if end.killed else "ended before"] += 1
     if second is not None:
         end = children.run(lambda: case.again(place, trial), place, second)
