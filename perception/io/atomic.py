@@ -37,7 +37,8 @@ def atomic_file(path: Path) -> Iterator[Path]:
             temporary.replace(path)
             _sync(path.parent)
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # where nothing may be written there is nothing to remove
+            temporary.unlink()
 
 
 @contextmanager
@@ -73,7 +74,8 @@ def atomic_directory(path: Path) -> Iterator[Path]:
             path.parent.mkdir(parents=True, exist_ok=True)
             recover(path)
             temporary.mkdir()
-            yield temporary
+            with _told_of(path, temporary):
+                yield temporary
             for file in temporary.rglob("*"):
                 _sync(file)
             _sync(temporary)
@@ -169,11 +171,23 @@ def _sync(path: Path) -> None:
 
 
 @contextmanager
+def _told_of(path: Path, temporary: Path) -> Iterator[None]:
+    """What is said of a file inside the temporary folder names the folder that was asked for."""
+    try:
+        yield
+    except InputError as error:
+        if str(temporary) not in str(error):
+            raise
+        raise InputError(str(error).replace(str(temporary), str(path))) from error
+
+
+@contextmanager
 def _disk_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in _FULL:
+        short = error.errno is None and str(error).endswith(" written")  # all that numpy tells of a full disk
+        if error.errno in _FULL or short:
             raise InputError(f"{path}: the disk is full, nothing was written; free some space") from error
         if error.errno in _REFUSED:
             raise InputError(

@@ -17,7 +17,12 @@ EDITABLE = "instances.json"
 
 def file_facts(folder: Path) -> dict[str, dict[str, Any]]:
     """{name: {"bytes", "sha256"}} of every file in `folder` but map.json, which cannot hold its own, and the report."""
-    return {file.name: {"bytes": file.stat().st_size, "sha256": sha256(file)} for file in _files(folder)}
+    return {file.name: facts_of(file) for file in _files(folder)}
+
+
+def facts_of(file: Path) -> dict[str, Any]:
+    """{"bytes", "sha256"} of one file."""
+    return {"bytes": file.stat().st_size, "sha256": sha256(file)}
 
 
 def _files(folder: Path) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import threading
@@ -68,8 +69,9 @@ def _take(path: Path) -> int | None:
             if _lock(descriptor, path) and _same(descriptor, file):
                 break
             os.close(descriptor)  # its last holder removed the file between our open and our lock: once more
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        with contextlib.suppress(OSError):  # on a full disk the lock holds too, it only does not say whose it is
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         return descriptor
     except OSError as error:
         raise InputError(
@@ -96,7 +98,8 @@ def _lock(descriptor: int, path: Path) -> bool:
 def _drop(path: Path, descriptor: int | None) -> None:
     if descriptor is None:
         return
-    lock_file(path).unlink(missing_ok=True)  # while we hold it: no one else can have locked this very file
+    with contextlib.suppress(OSError):
+        lock_file(path).unlink()  # while we hold it: no one else can have locked this very file
     os.close(descriptor)
 
 

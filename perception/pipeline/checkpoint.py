@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import pickle
 from pathlib import Path
@@ -26,8 +27,10 @@ def save_checkpoint(path: Path, state: dict[str, Any], mark: str) -> None:
     """Writes `state` under the settings' fingerprint `mark`."""
     import torch
 
+    buffer = io.BytesIO()  # torch's own file writer ends the process where the disk is full
+    torch.save({"mark": mark, "state": state}, buffer)
     with atomic_file(path) as aside:
-        torch.save({"mark": mark, "state": state}, aside)
+        aside.write_bytes(buffer.getbuffer())
 
 
 def load_checkpoint(path: Path, mark: str) -> dict[str, Any] | None:
