@@ -20,7 +20,8 @@ import numpy as np
 from perception.boxes import oriented_box
 from perception.config import InstanceConfig
 from perception.errors import InputError
-from perception.io.store import GaussianMap, read_map, write_map
+from perception.io.map_lock import writing
+from perception.io.store import GaussianMap, map_signature, read_map, write_map
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
 
 FLOATER_SPREAD = 5.0
@@ -58,7 +59,7 @@ class Editor:
     def __init__(self, path: Path):
         self.path = Path(path)
         self._lock = threading.RLock()
-        self._signature = _signature(self.path)
+        self._signature = map_signature(self.path)
         self.original = read_map(self.path)
         gmap = self.original
         descriptions, self._encoder = from_arrays(gmap.language) if gmap.language else ([], "")
@@ -253,12 +254,13 @@ class Editor:
     @_step
     def save(self) -> None:
         """Writes the edited map in place of the old one; refuses when somebody else replaced it since it was opened."""
-        if _signature(self.path) != self._signature:
-            raise InputError(
-                f"{self.path}: was changed by another program since it was opened; open it again and repeat"
-            )
-        write_map(self.path, self.current(), keep_report=True)
-        self._signature = _signature(self.path)
+        with writing(self.path):  # nobody comes between the look and the write
+            if map_signature(self.path) != self._signature:
+                raise InputError(
+                    f"{self.path}: was changed by another program since it was opened; open it again and repeat"
+                )
+            write_map(self.path, self.current(), keep_report=True)
+            self._signature = map_signature(self.path)
         self._saved = self._now
 
     # ------------------------------------------------------------------ helpers
@@ -359,12 +361,3 @@ def _described(parts: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, np.
     descriptions, encoder = from_arrays(language)
     left = [description for description, lives in zip(descriptions, alive, strict=True) if lives]
     return {"ids": parts["ids"], **{prefix + name: a for name, a in to_arrays(left, encoder).items()}}
-
-
-def _signature(path: Path) -> tuple[int, int, int]:
-    """Changes whenever the map is replaced."""
-    try:
-        facts = (path / "map.json").stat()
-    except OSError:
-        return (0, 0, 0)
-    return (facts.st_ino, facts.st_mtime_ns, facts.st_size)

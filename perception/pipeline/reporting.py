@@ -184,6 +184,9 @@ def instances_from_above(gmap: GaussianMap, side: int = 480) -> np.ndarray:
     right = np.cross(down, [1.0, 0.2, 0.1])
     right /= np.linalg.norm(right)
     rows = np.flatnonzero((gmap.opacities > 0.3) & (gmap.instance_ids >= 0))
+    picture = np.full((side, side, 3), 255, np.uint8)
+    if len(rows) == 0:  # a map stopped early may be all faint
+        return picture
     points = gmap.means[rows].astype(np.float64)
     flat = np.stack([points @ right, points @ np.cross(down, right)], axis=1)
     low, high = np.percentile(flat, [2, 98], axis=0)
@@ -191,7 +194,6 @@ def instances_from_above(gmap: GaussianMap, side: int = 480) -> np.ndarray:
     inside = ((pixel >= 0) & (pixel < side)).all(axis=1)
     order = np.argsort(-(points @ down), kind="stable")  # lowest first, so that the highest is seen
     order = order[inside[order]]
-    picture = np.full((side, side, 3), 255, np.uint8)
     colors = instance_palette(gmap.instance_ids[rows[order]])
     for dx in (0, 1):
         for dy in (0, 1):
