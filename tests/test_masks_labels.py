@@ -78,6 +78,16 @@ def test_extra_label_image_is_a_warning(folder):
     assert len(warnings) == 1 and "b.png" in warnings[0]
 
 
+def test_label_images_of_photos_that_were_kept_out_are_no_surprise(folder, tmp_path_factory):
+    photos = tmp_path_factory.mktemp("photos")
+    for name in ("a.jpg", "b.jpg"):
+        (photos / name).touch()
+    cv2.imwrite(str(folder / "c.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    trained = View("a.jpg", photos / "a.jpg", np.eye(3), WIDTH, HEIGHT, np.eye(4))
+    warnings = make_source(f"labels:{folder}").check([trained])
+    assert len(warnings) == 1 and "c.png" in warnings[0] and "b.png" not in warnings[0]
+
+
 def test_wrong_size_tells_both_sizes(folder):
     cv2.imwrite(str(folder / "a.png"), np.zeros((HEIGHT, WIDTH + 1), np.uint8))
     with pytest.raises(InputError, match=f"{WIDTH + 1}×{HEIGHT} pixels, but its photo has {WIDTH}×{HEIGHT}"):

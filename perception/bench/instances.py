@@ -60,8 +60,8 @@ def write_pictures(map_path: Path, folder: Path) -> list[str]:
     from perception.instances.silhouettes import render_silhouettes
     from perception.io.store import read_map
     from perception.pictures import colorize_instances
+    from perception.pipeline.above import instances_from_above
     from perception.pipeline.rendering import as_gaussians, map_views
-    from perception.pipeline.reporting import instances_from_above
 
     gmap = read_map(map_path)
     gaussians = as_gaussians(gmap)

@@ -19,7 +19,7 @@ from perception.config import MapConfig
 from perception.gaussians.densify import Statistics, decay_opacities, densify, target_count
 from perception.gaussians.economy import TRIAL, Economy
 from perception.gaussians.holes import fill_holes
-from perception.gaussians.losses import instance_loss, photometric_loss, variance_loss
+from perception.gaussians.losses import instance_loss, photometric, photometric_loss, variance_loss
 from perception.gaussians.model import Gaussians
 from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.profile import Profile
@@ -359,13 +359,18 @@ class Trainer:
 
     # ------------------------------------------------------------------ figures
 
-    def score(self, limit: int | None = None) -> dict[str, float]:
-        """Mean PSNR over held-out views (training views if there are none), at most `limit` of them."""
+    def score(self, limit: int | None = None, with_ssim: bool = False) -> dict[str, float]:
+        """Mean PSNR (and SSIM as trained) over at most `limit` held-out views, training views if there are none."""
         views = self.held_out or self.views
         if limit is not None and len(views) > limit:
             views = [views[i] for i in np.linspace(0, len(views) - 1, limit).round().astype(int)]
+        figures = []
         with self.profile("evaluation"):
-            return {"psnr": float(np.mean([psnr(render_view(self.gaussians, view), view.photo) for view in views]))}
+            for view in views:
+                image = render_view(self.gaussians, view)
+                ssim = [photometric(image, view.photo, beta=1.0).ssim] if with_ssim else []
+                figures.append([psnr(image, view.photo), *ssim])
+        return dict(zip(("psnr", "ssim"), np.mean(figures, axis=0).tolist(), strict=False))
 
     @torch.no_grad()
     def depth(self, name: str) -> np.ndarray:
@@ -374,12 +379,14 @@ class Trainer:
         return depth_image(self.gaussians, view.camera_from_world, view.K, *view.photo.shape[1::-1]).numpy()
 
     def _note(self, progress: float) -> None:
+        figures = self.score(limit=6, with_ssim=True)
         self.record.curve.append(
             {
                 "iteration": self.iteration,
                 "seconds": round(self.elapsed, 2),
                 "gaussians": len(self.gaussians),
-                "psnr": round(self.score(limit=6)["psnr"], 3),
+                "psnr": round(figures["psnr"], 3),
+                "ssim": round(figures["ssim"], 4),
                 "progress": round(progress, 4),
             }
         )

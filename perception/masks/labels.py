@@ -43,7 +43,11 @@ class LabelFolder:
         for view in views:
             _check_header(self._files[view.name], *_photo_size(view))
         used = set(self._files.values())
-        extra = [str(file.relative_to(self.folder)) for file in _pngs(self.folder) if file not in used]
+        # Photos kept out of training, or that found no place, have label images with good reason.
+        folders = {view.photo.parent for view in views if view.photo.parent.is_dir()} - {self.folder}
+        photos = {file.stem for folder in folders for file in folder.iterdir()}
+        left = [file for file in _pngs(self.folder) if file not in used]
+        extra = [str(file.relative_to(self.folder)) for file in left if file.stem not in photos]
         if extra:
             return [f"labels:{self.folder}: {_some(extra)} belong to no photo of the map and are ignored"]
         return []

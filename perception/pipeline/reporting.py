@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
@@ -16,15 +18,16 @@ from perception.instances.silhouettes import render_silhouettes
 from perception.io.photos import load_photo, scaled_K
 from perception.io.scene_cache import view_from_json
 from perception.io.store import GaussianMap
-from perception.pictures import features_to_rgb, instance_palette, montage, outline, overlay
+from perception.pictures import features_to_rgb, montage, outline, overlay
+from perception.pipeline.above import instances_from_above
 from perception.pipeline.coverage import weak_coverage
 from perception.pipeline.rendering import as_gaussians
 from perception.query import LoadedMap
 from perception.report import InstanceRow, QueryRow, ReportData, ViewRow, write_report
 from perception.types import View
 
-SHOWN = 3
-"""Held-out views shown beside their photos."""
+SHOWN = ("worst", "middle", "best")
+"""Held-out views shown beside their photos, by PSNR."""
 
 
 def write_map_report(
@@ -41,6 +44,7 @@ def write_map_report(
         figures=_figures(gmap),
         seconds={name: value for name, value in info["seconds"].items() if name != "total"},
         psnr_curve=[(entry["iteration"], entry["psnr"]) for entry in curve],
+        ssim_curve=[(entry["iteration"], entry["ssim"]) for entry in curve if "ssim" in entry],
         gaussians_curve=[(entry["iteration"], entry["gaussians"]) for entry in curve],
         views=_view_rows(gmap, album),
         overview=_overview(gmap, album),
@@ -49,7 +53,7 @@ def write_map_report(
         queries=[_query_row(opened, text, album, (expected or {}).get(text)) for text in queries],
         warnings=_warnings(info, gaussians, list(album.views.values())),
         settings=_flat(info["config"]),
-        rerun=f"perception map {info['source']} -o {opened.path} --seed {info['seed']}",
+        rerun=rerun_command(info, opened.path or Path("MAP")),
     )
     try:
         return write_report(path, data)
@@ -57,16 +61,41 @@ def write_map_report(
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
+def rerun_command(info: dict[str, Any], path: Path) -> str:
+    """The command that makes the map again: its input, and every setting that is not the default."""
+    usual = _flat(MapConfig().to_json())
+    words = ["perception", "map", str(info["source"]), "-o", str(path), "--seed", str(info["seed"])]
+    for key, value in _flat(info["config"]).items():
+        if key == "seed" or (key in usual and usual[key] == value):
+            continue
+        text = "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+        words += ["--masks", text] if key == "masks" else ["--set", f"{key}={text}"]
+    return shlex.join(words)
+
+
 def _warnings(info: dict[str, Any], gaussians: Gaussians, views: list[View]) -> list[str]:
     """What went wrong or is thin, the worst first."""
     scored = info["quality"].get("views", {})
     mean = info["quality"].get("psnr")
     bad = [f"{name} ({figures['psnr']:.1f} dB)" for name, figures in scored.items() if mean - figures["psnr"] > 6]
-    told = [*info["scene"].get("warnings", []), *info["masks"].get("warnings", [])]
+    told = [*_left_out(info["scene"]), *info["scene"].get("warnings", []), *info["masks"].get("warnings", [])]
     if bad:
         told.append(f"held-out views far below the mean of {mean:.1f} dB: {', '.join(bad)}")
     weak = weak_coverage(gaussians, views)
     return told if weak is None else [*told, weak]
+
+
+def _left_out(scene: dict[str, Any], most: int = 12) -> list[str]:
+    """One line a reason: the photos that are not in the map."""
+    reasons: dict[str, list[str]] = {}
+    for entry in scene.get("left_out", []):
+        reasons.setdefault(entry["why"], []).append(entry["name"])
+    told = []
+    for why, names in reasons.items():
+        more = f" and {len(names) - most} more" if len(names) > most else ""
+        count = "1 photo" if len(names) == 1 else f"{len(names)} photos"
+        told.append(f"{count} not in the map, {why}: {', '.join(names[:most])}{more}")
+    return told
 
 
 class _Album:
@@ -144,13 +173,16 @@ def _figures(gmap: GaussianMap) -> dict[str, str]:
 
 def _view_rows(gmap: GaussianMap, album: _Album) -> list[ViewRow]:
     scored = gmap.info["quality"].get("views", {})
-    names = list(scored)
-    shown = {names[i] for i in np.linspace(0, len(names) - 1, min(SHOWN, len(names))).round().astype(int)}
+    shown: dict[str, str] = {}
+    by_psnr = sorted(scored, key=lambda name: float(scored[name]["psnr"]))
+    for rank, place in zip(SHOWN, (0, len(by_psnr) // 2, len(by_psnr) - 1), strict=True):
+        if by_psnr:
+            shown.setdefault(by_psnr[place], f"{rank} of {len(by_psnr)}" if len(by_psnr) > 1 else "")
     rows = []
-    for name in names:
+    for name, figures in scored.items():
         photo = album.photo(name) if name in shown else None
         render = album.render(name, photo) if photo is not None else None
-        rows.append(ViewRow(name, scored[name]["psnr"], scored[name]["ssim"], photo, render))
+        rows.append(ViewRow(name, figures["psnr"], figures["ssim"], photo, render, shown.get(name, "")))
     return rows
 
 
@@ -175,31 +207,6 @@ def feature_picture(album: _Album, name: str, photo: np.ndarray) -> np.ndarray:
     out = render(album.gaussians, pose, K, width, height, features=album.gaussians.features)
     assert out.features is not None  # features were given
     return features_to_rgb(out.features[0].numpy())
-
-
-def instances_from_above(gmap: GaussianMap, side: int = 480) -> np.ndarray:
-    """The opaque Gaussians' means seen along the mean of the cameras' downward axes, painted by instance."""
-    down = gmap.cameras["camera_from_world"][:, 1, :3].mean(axis=0)
-    down /= max(np.linalg.norm(down), 1e-9)
-    right = np.cross(down, [1.0, 0.2, 0.1])
-    right /= np.linalg.norm(right)
-    rows = np.flatnonzero((gmap.opacities > 0.3) & (gmap.instance_ids >= 0))
-    picture = np.full((side, side, 3), 255, np.uint8)
-    if len(rows) == 0:  # a map stopped early may be all faint
-        return picture
-    points = gmap.means[rows].astype(np.float64)
-    flat = np.stack([points @ right, points @ np.cross(down, right)], axis=1)
-    low, high = np.percentile(flat, [2, 98], axis=0)
-    pixel = ((flat - low) / max((high - low).max(), 1e-9) * (side - 1)).round().astype(int)
-    inside = ((pixel >= 0) & (pixel < side)).all(axis=1)
-    order = np.argsort(-(points @ down), kind="stable")  # lowest first, so that the highest is seen
-    order = order[inside[order]]
-    colors = instance_palette(gmap.instance_ids[rows[order]])
-    for dx in (0, 1):
-        for dy in (0, 1):
-            x, y = np.minimum(pixel[order, 0] + dx, side - 1), np.minimum(pixel[order, 1] + dy, side - 1)
-            picture[y, x] = colors
-    return picture
 
 
 def _best_crop(opened: LoadedMap, index: int, album: _Album, whole: bool) -> np.ndarray | None:

@@ -8,7 +8,7 @@ from html import escape
 
 import numpy as np
 
-WIDTH, HEIGHT, LEFT, BOTTOM = 440, 190, 52, 24
+WIDTH, HEIGHT, LEFT, BOTTOM = 320, 170, 40, 22
 
 
 def ticks(low: float, high: float, count: int = 4) -> list[float]:
@@ -17,8 +17,9 @@ def ticks(low: float, high: float, count: int = 4) -> list[float]:
         return [low]
     rough = (high - low) / count
     unit = 10 ** np.floor(np.log10(rough))
-    step = float(next(m * unit for m in (1, 2, 5, 10) if m * unit >= rough * 0.999))
-    return [float(x) for x in np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step]
+    step = float(min((m * unit for m in (1, 2, 5, 10)), key=lambda step: abs(np.log(step / rough))))
+    marks = np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step
+    return [float(x) for x in marks + 0.0]  # + 0.0: no "-0"
 
 
 def short(value: float) -> str:
@@ -58,13 +59,14 @@ def curve(points: Sequence[tuple[float, float]], label: str, unit: str = "") -> 
 
 
 def columns(values: Mapping[str, float], label: str, unit: str) -> str:
-    """One upright bar per name, the mean as a line; values that are not finite are left out."""
+    """One upright bar per name, written below where there is room, and the mean; what is not finite is left out."""
     kept = {name: value for name, value in values.items() if np.isfinite(value)}
     if not kept:
         return ""
     high = max(*kept.values(), 1e-9)
     top, base, right = 12, HEIGHT - BOTTOM, WIDTH - 12
     pitch = (right - LEFT) / len(kept)
+    stems = [name.rsplit("/", 1)[-1].rsplit(".", 1)[0] for name in kept]
     parts = []
     for y in ticks(0, high):
         py = base - y / high * (base - top)
@@ -75,11 +77,14 @@ def columns(values: Mapping[str, float], label: str, unit: str) -> str:
         parts.append(
             f'<rect class="bar" x="{LEFT + (i + 0.15) * pitch:.1f}" y="{base - tall:.1f}" '
             f'width="{0.7 * pitch:.1f}" height="{tall:.1f}" rx="2">'
-            f"<title>{escape(name)}: {value:.2f} {escape(unit)}</title></rect>"
+            f"<title>{escape(name)}: {value:.3g} {escape(unit)}</title></rect>"
         )
+        if 6 * max(map(len, stems)) <= pitch:
+            middle = LEFT + (i + 0.5) * pitch
+            parts.append(f'<text x="{middle:.1f}" y="{HEIGHT - 7}" text-anchor="middle">{escape(stems[i])}</text>')
     mean = base - float(np.mean(list(kept.values()))) / high * (base - top)
     parts.append(f'<line class="mean" x1="{LEFT}" x2="{right}" y1="{mean:.1f}" y2="{mean:.1f}"/>')
-    return _svg(WIDTH, HEIGHT, f"{label}, mean {np.mean(list(kept.values())):.2f} {unit}", parts)
+    return _svg(WIDTH, HEIGHT, f"{label}, mean {np.mean(list(kept.values())):.3g} {unit}", parts)
 
 
 def stages(seconds: Mapping[str, float]) -> str:

@@ -13,13 +13,14 @@ import numpy as np
 
 @dataclass(frozen=True)
 class ViewRow:
-    """A held-out view. photo, render: pictures of one size; psnr in dB, ssim in [0, 1]."""
+    """A held-out view. photo, render: pictures of one size; psnr in dB, ssim in [0, 1]; note: why it is shown."""
 
     name: str
     psnr: float | None = None
     ssim: float | None = None
     photo: np.ndarray | None = None
     render: np.ndarray | None = None
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -54,13 +55,11 @@ class QueryRow:
 class ReportData:
     """All of a report.
 
-    figures: name -> value as it should read, for the header ({"PSNR held-out": "28.4 dB"}). seconds: by
-    stage, in order.
-    psnr_curve: (iteration, dB); gaussians_curve: (iteration, count). views: held-out views; those with
-    pictures are
-    shown, all with a psnr appear in the bars. overview: title -> picture (instances from above, feature
-    colours).
-    metric: whether extents are metres. settings: name -> value. rerun: the command that makes this map again.
+    figures: name -> value as it should read, for the header ({"PSNR held-out": "28.4 dB"}). seconds: by stage, in
+    order. psnr_curve: (iteration, dB); ssim_curve: (iteration, SSIM as trained, zero-padded); gaussians_curve:
+    (iteration, count). views: held-out views; those with pictures are shown, worst first, all with figures appear in
+    the bars. overview: title -> picture (instances from above, feature colours). metric: whether extents are metres.
+    settings: name -> value. rerun: the command that makes this map again.
     """
 
     title: str
@@ -68,6 +67,7 @@ class ReportData:
     figures: Mapping[str, str] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
     psnr_curve: Sequence[tuple[float, float]] = ()
+    ssim_curve: Sequence[tuple[float, float]] = ()
     gaussians_curve: Sequence[tuple[float, float]] = ()
     views: Sequence[ViewRow] = ()
     overview: Mapping[str, np.ndarray] = field(default_factory=dict)

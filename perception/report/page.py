@@ -87,7 +87,7 @@ def _header(data: ReportData) -> str:
 
 def _views(data: ReportData, inline: Inline) -> str:
     rows: list[str] = []
-    for view in data.views:
+    for view in sorted(data.views, key=lambda view: view.psnr if view.psnr is not None else float("inf")):
         if view.photo is None or view.render is None or len(rows) == MOST_VIEWS:
             continue
         quality = [
@@ -96,7 +96,7 @@ def _views(data: ReportData, inline: Inline) -> str:
         ]
         cells = [
             (view.photo, f"photo {view.name}, not used for the map"),
-            (view.render, "render " + ", ".join(text for text in quality if text)),
+            (view.render, "render: " + ", ".join(text for text in [*quality, view.note] if text)),
         ]
         if view.photo.shape == view.render.shape:
             cells.append((error_map(view.photo, view.render), "error: black is none, bright is a quarter of the range"))
@@ -109,11 +109,14 @@ def _views(data: ReportData, inline: Inline) -> str:
 
 
 def _charts(data: ReportData) -> str:
-    per_view = {view.name: view.psnr for view in data.views if view.psnr is not None}
+    psnr = {view.name: view.psnr for view in data.views if view.psnr is not None}
+    ssim = {view.name: view.ssim for view in data.views if view.ssim is not None}
     charts = {
         "PSNR over iterations (dB)": curve(data.psnr_curve, "PSNR over iterations", "dB"),
+        "SSIM over iterations": curve(data.ssim_curve, "SSIM over iterations"),
         "Gaussians over iterations": curve(data.gaussians_curve, "Gaussians over iterations"),
-        "PSNR of each held-out view (dB), mean dashed": columns(per_view, "PSNR of each held-out view", "dB"),
+        "PSNR by view (dB; dashed: mean)": columns(psnr, "PSNR of each held-out view", "dB"),
+        "SSIM by view (dashed: mean)": columns(ssim, "SSIM of each held-out view", ""),
     }
     cards = "".join(f'<div class="card"><h3>{escape(k)}</h3>{svg}</div>' for k, svg in charts.items() if svg)
     return _section("How it was learnt", f'<div class="cards">{cards}</div>' if cards else "")
@@ -156,8 +159,8 @@ def _instances(data: ReportData, inline: Inline) -> str:
     if not data.instances:
         return ""
     size = "size (cm)" if data.metric else "size (map units)"
-    numbers = "".join(f'<th class="n">{title}</th>' for title in ("score", size, "Gaussians"))
-    head = f"<th></th><th>instance</th><th>name</th>{numbers}"
+    numbers = "".join(f'<th class="n">{title}</th>' for title in ("confidence", size, "Gaussians"))
+    head = f"<th></th><th>instance</th><th>name, or likeliest words</th>{numbers}"
     scale = 100.0 if data.metric else 1.0
     rows = "".join(_instance(row, inline, scale) for row in data.instances)
     table = f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
@@ -167,13 +170,20 @@ def _instances(data: ReportData, inline: Inline) -> str:
 def _instance(row: InstanceRow, inline: Inline, scale: float = 1.0) -> str:
     crop = inline(row.crop[..., :3], f"instance {row.id}") if row.crop is not None else ""
     name = f"<b>{escape(row.label)}</b>" if row.label else escape(", ".join(row.names))
-    size = " × ".join(f"{scale * side:.3g}" for side in row.extent) if row.extent is not None else ""
+    size = _size([scale * side for side in row.extent]) if row.extent is not None else ""
     score = f"{row.score:.2f}" if row.score is not None else ""
     count = f"{row.num_gaussians:,}" if row.num_gaussians is not None else ""
     return (
         f"<tr><td>{crop}</td><td>{_chip(row.id)}{row.id}</td><td>{name}</td>"
         f'<td class="n">{score}</td><td class="n">{size}</td><td class="n">{count}</td></tr>'
     )
+
+
+def _size(sides: Sequence[float]) -> str:
+    """Sides with as many decimals as give the longest three digits."""
+    longest = max(*sides, 1e-12)
+    decimals = int(np.clip(2 - np.floor(np.log10(longest)), 0, 6))
+    return " × ".join(f"{side:.{decimals}f}" for side in sides)
 
 
 def _settings(data: ReportData) -> str:

@@ -6,6 +6,7 @@ import contextlib
 import io
 import socket
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,16 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.viewer.panel import Panel
-from perception.viewer.picking import covariances
 from perception.viewer.session import Session
+from perception.viewer.splats import Splats
 
 FRUSTUM_PHOTO = 96
 """Pixels of the longer side of the photo drawn in a camera's frustum."""
+
+FIRST_LOOK = 1.0
+"""Seconds that a browser has for the coarse picture before the whole map follows."""
+WATCH = 1.0
+"""Seconds between looks at whether another program changed the map."""
 
 
 class Viewer:
@@ -31,24 +37,24 @@ class Viewer:
         with contextlib.redirect_stdout(io.StringIO()):  # viser greets on stdout, which belongs to --json
             self.server = viser.ViserServer(host=host, port=port, label=f"perception · {path.name}", verbose=False)
         self.url = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0', '::') else host}:{port}"
-        self._drawing = threading.Lock()
+        self._one = threading.RLock()  # what browsers ask for is done one after the other
         self._overlays: dict[str, list[Any]] = {"cameras": [], "boxes": [], "names": []}
         self._overlays_on = dict.fromkeys(self._overlays, False)
         self._frame_map()
-        gmap = self.session.editor.original
-        self._splats = self.server.scene.add_gaussian_splats(
-            "/map/splats",
-            centers=gmap.means * self.scale,
-            covariances=covariances(gmap) * self.scale**2,
-            rgbs=self.session.colors(),
-            opacities=self.session.opacities()[:, None],
-        )
+        self._drawn = self.session.editor.original
+        self._splats = Splats(self._drawn, self.scale)
         self.panel = Panel(self)
+        self._stopped = threading.Event()
+        self._problem = ""
+        self.server.on_client_connect(self._welcome)
+        self.server.on_client_disconnect(lambda client: self._splats.forget(client))
         self.server.scene.on_click()(lambda event: self._clicked(event, add=False))
         self.server.scene.on_click(modifier="shift")(lambda event: self._clicked(event, add=True))
+        threading.Thread(target=self._watch, daemon=True).start()
 
     def stop(self) -> None:
         """Closes the page and its port."""
+        self._stopped.set()
         self.server.stop()
 
     # ------------------------------------------------------------------ drawing
@@ -69,23 +75,40 @@ class Viewer:
         camera.position = tuple(eye * self.scale)
         camera.look_at = tuple((eye + pose[2, :3] * max(float(depth), 1e-6)) * self.scale)
 
-    def redraw(self, client: Any = None) -> None:
-        """Colours and opacities anew, in one message; overlays that are on follow."""
-        with self._drawing:
-            camera = None if client is None or self.session.mode != "depth" else self._camera_of(client)
-            self._splats.set_gaussians(
-                self._splats.centers,
-                self._splats.covariances,
-                self.session.colors(camera),
-                self.session.opacities()[:, None],
-            )
+    def _welcome(self, client: Any) -> None:
+        """A new browser: the coarse picture, and the whole one when it has had time to draw that."""
+        with self._one:
+            self._show(client)
+        if self._splats.coarse:
+            time.sleep(FIRST_LOOK)
+            with self._one:
+                self._show(client)
+
+    def _show(self, client: Any) -> None:
+        if client.client_id not in self.server.get_clients():
+            return  # it left in the meantime
+        camera = self._camera_of(client) if self.session.mode == "depth" else None
+        self._splats.show(client, self.session.colors(camera), self.session.opacities())
+
+    def redraw(self) -> None:
+        """Colours and opacities anew in every browser, in one message each; overlays that are on follow."""
+        with self._one:
+            clients = self.server.get_clients().values()
+            if self._drawn is not self.session.editor.original:
+                self._frame_map()
+                self._drawn = self.session.editor.original
+                self._splats = Splats(self._drawn, self.scale)
+                for client in clients:
+                    self._show(client)  # the coarse picture, which makes room for the whole one
+            for client in clients:
+                self._show(client)
             for kind, on in self._overlays_on.items():
                 if on and kind != "cameras":
                     self._draw(kind)
 
     def overlay(self, kind: str, on: bool) -> None:
         """Shows or hides "cameras", "boxes" or "names"."""
-        with self._drawing:
+        with self._one:
             self._overlays_on[kind] = on
             self._draw(kind)
 
@@ -98,7 +121,7 @@ class Viewer:
     def _visible_entries(self) -> list[dict[str, Any]]:
         session = self.session
         entries = [entry for entry in session.editor.instances if not entry.get("hidden")]
-        chosen = session.selected or [hit.instance_id for hit in session.hits]
+        chosen = session.lit()
         return [entry for entry in entries if not chosen or entry["id"] in chosen]
 
     def _boxes(self) -> list[Any]:
@@ -167,21 +190,49 @@ class Viewer:
         return pose
 
     def _clicked(self, event: Any, add: bool) -> None:
-        self.session.pick(np.array(event.ray_origin) / self.scale, np.array(event.ray_direction), add)
-        self.panel.refresh()
-        self.redraw()
+        origin, direction = np.array(event.ray_origin) / self.scale, np.array(event.ray_direction)
+        self.guarded(lambda: self.session.pick(origin, direction, add))
 
     def guarded(self, action: Callable[[], object], client: Any = None, edited: bool = False) -> None:
         """Runs what a control asks for; what is wrong is told in the page, and everything is drawn anew."""
-        try:
-            action()
-        except InputError as error:
-            self.panel.tell(client, str(error))
-            return
-        if edited:
-            self.session.edited()
-        self.panel.refresh()
-        self.redraw(client)
+        with self._one:
+            try:
+                action()
+            except InputError as error:
+                self.panel.tell(client, str(error))
+                return
+            if edited:
+                self.session.edited()
+            self.panel.refresh()
+            self.redraw()
+
+    def _watch(self) -> None:
+        """Follows a map that another program changes: at once, or when what is unsaved here has been dealt with."""
+        while not self._stopped.wait(WATCH):
+            try:
+                outdated, problem = self.session.editor.outdated, ""
+            except InputError as error:  # gone; between two renames for an instant only
+                outdated, problem = False, str(error)
+            if outdated:
+                problem = self._follow()
+            self.panel.offer_renewal(outdated and bool(problem))
+            if problem and problem != self._problem:
+                self.panel.tell(None, problem)
+            self._problem = problem
+
+    def _follow(self) -> str:
+        """Takes over the changed map; returns what is in the way, if something is."""
+        with self._one:
+            try:
+                if not self.session.editor.outdated:
+                    return ""  # saved from here in the meantime
+                self.session.reopen()
+            except InputError as error:
+                return str(error)
+            self.panel.tell(None, "the map was changed by another program; this is the new one")
+            self.panel.refresh()
+            self.redraw()
+        return ""
 
 
 def start_viewer(path: Path, host: str = "127.0.0.1", port: int = 8090) -> Viewer:

@@ -10,7 +10,7 @@ import numpy as np
 from perception.io.store import GaussianMap
 from perception.pictures import features_to_rgb, instance_palette
 
-MODES = ("photo", "instances", "features", "confidence", "depth")
+MODES = ("photo", "instances", "parts", "features", "confidence", "depth")
 HIGHLIGHT = np.array([255, 214, 10], np.uint8)
 _SH_CONSTANT = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
 
@@ -25,10 +25,11 @@ def paint(
 ) -> np.ndarray:
     """[N, 3] uint8 colours in a mode of MODES.
 
-    ids [N]: instance of each Gaussian, −1 = none (grey where instances are shown). scores: instance → confidence.
+    ids [N]: instance (or part) of each Gaussian, −1 = none (grey where instances are shown). scores: instance →
+    confidence.
     from_above: camera_from_world [4, 4] that depth is measured from.
     """
-    if mode == "instances":
+    if mode in ("instances", "parts"):
         return instance_palette(ids)
     if mode == "features":
         return features_to_rgb(gmap.features[None])[0]

@@ -31,6 +31,7 @@ class Panel:
     def _build_ask(self) -> None:
         with self.gui.add_form("Ask") as form:
             self._text = self.gui.add_text("prompt", "", hint='a thing, such as "red mug"; Enter asks')
+            self._parts = self.gui.add_checkbox("parts of things", False, hint='such as "handle of the mug"')
             button = self.gui.add_button("Search")
         button.on_click(lambda _: form.submit())
         form.on_submit(lambda event: self.viewer.guarded(lambda: self._ask(), event.client))
@@ -39,7 +40,7 @@ class Panel:
         self._hit_buttons: list[Any] = []
 
     def _ask(self) -> None:
-        self.session.ask(self._text.value)
+        self.session.ask(self._text.value, parts=self._parts.value)
 
     def _build_show(self) -> None:
         with self.gui.add_folder("Show"):
@@ -47,9 +48,9 @@ class Panel:
             boxes = [(kind, self.gui.add_checkbox(kind, False)) for kind in ("boxes", "names", "cameras")]
             clear = self.gui.add_button("Clear selection")
 
-        def choose(event: Any) -> None:
+        def choose(_: Any) -> None:
             self.session.mode = mode.value
-            self.viewer.redraw(event.client)
+            self.viewer.redraw()
 
         mode.on_update(choose)
         for kind, box in boxes:
@@ -66,6 +67,7 @@ class Panel:
         with self._selection:
             self._words = self.gui.add_markdown("")
             self._photo: Any = None
+            self._named: tuple[int, str | None] | None = None
             with self.gui.add_form(None) as form:
                 self._name = self.gui.add_text("name", "", hint="Enter renames")
                 rename = self.gui.add_button("Rename")
@@ -93,12 +95,18 @@ class Panel:
         row.on_click(lambda event: self.viewer.guarded(actions[row.value], event.client, edited=True))
 
     def _build_history(self) -> None:
-        editor = self.session.editor
+        session, editor = self.session, self.session.editor
         with self.gui.add_folder("Corrections"):
             self._actions("history", {"Undo": editor.undo, "Redo": editor.redo})
             self._actions("map", {"Show hidden": self._unhide, "Delete floaters": editor.delete_floaters})
             save = self.gui.add_button("Save into the map")
-            save.on_click(lambda event: self.viewer.guarded(editor.save, event.client))
+            save.on_click(lambda event: self.viewer.guarded(editor.save, event.client, edited=True))
+            self._renew = self.gui.add_button(
+                "Drop them, open the new map", visible=False, hint="another program replaced the map"
+            )
+            self._renew.on_click(
+                lambda event: self.viewer.guarded(lambda: session.reopen(discard=True), event.client, edited=True)
+            )
             self._history = self.gui.add_markdown("")
 
     def _unhide(self) -> None:
@@ -119,11 +127,15 @@ class Panel:
         for receiver in receivers:
             receiver.add_notification("perception", text, auto_close_seconds=8, color="orange")
 
+    def offer_renewal(self, offered: bool) -> None:
+        """Shows or hides the button that drops the corrections for a map that another program put there."""
+        self._renew.visible = offered
+
     def refresh(self) -> None:
         """Every word of the panel from the session's state."""
         session, editor = self.session, self.session.editor
         unit = "m" if editor.original.info.get("metric") else "map units"
-        self._facts.content = f"**{int(editor.kept.sum()):,} Gaussians · {len(editor.instances)} instances**"
+        self._facts.content = f"**{int(editor.kept.sum()):,} Gaussians · instances: {len(editor.instances)}**"
         self._refresh_answer()
         if not session.selected:
             self._words.content = "Click a thing; shift-click adds another."
@@ -138,8 +150,12 @@ class Panel:
             self._words.content = (
                 f"**{session.name(entry)}** (id {entry['id']})  \nconfidence {entry['score']:.2f} · "
                 f"{entry['num_gaussians']} Gaussians  \nbox {sides} {unit}"
+                + (f"  \n{len(entry['parts'])} parts; Split takes it apart" if entry.get("parts") else "")
             )
-            self._name.value = entry.get("label") or ""
+            named = (entry["id"], entry.get("label"))
+            if named != self._named:  # else somebody may be typing there
+                self._named = named
+                self._name.value = entry.get("label") or ""
             self._show_photo(session.crop(entry["id"]))
         last = editor.history[-3:]
         unsaved = "unsaved changes" if editor.dirty else "all saved"
@@ -160,11 +176,10 @@ class Panel:
         self._answer.content = f'"{session.question}": {len(session.hits)} found'
         with self._hits_folder:
             for rank, hit in enumerate(session.hits, start=1):
-                entry = session.editor.entry(hit.instance_id)
-                button = self.gui.add_button(f"{rank}. {session.name(entry)} · {hit.score:.2f}")
-                button.on_click(
-                    lambda event, i=hit.instance_id: self.viewer.guarded(lambda: session.select(i), event.client)
-                )
+                whole = session.editor.entry(hit.instance_id if hit.parent is None else hit.parent)
+                name = session.name(whole) if hit.parent is None else f"part of {session.name(whole)}"
+                button = self.gui.add_button(f"{rank}. {name} · {hit.score:.2f}")
+                button.on_click(lambda event, hit=hit: self.viewer.guarded(lambda: session.show_hit(hit), event.client))
                 self._hit_buttons.append(button)
 
     def _show_photo(self, picture: Any) -> None:

@@ -12,7 +12,7 @@ from perception.editing import Editor
 from perception.errors import InputError
 from perception.io.photos import load_photo
 from perception.io.scene_cache import view_from_json
-from perception.query import Hit, LoadedMap
+from perception.query import Hit, LoadedMap, PartsMap
 from perception.types import View
 from perception.viewer.paint import highlight, paint
 from perception.viewer.picking import pick
@@ -28,15 +28,17 @@ class Session:
         self.editor = Editor(path)
         self.mode = "photo"
         self.selected: list[int] = []
+        self.part: int | None = None
         self.question = ""
         self.hits: list[Hit] = []
         self._lock = threading.RLock()
         self._opened: tuple[int, LoadedMap] | None = None
         self._edits = 0
-        self.views: dict[str, View] = {}
-        for entry in self.editor.original.info.get("views", []):
-            view = view_from_json(entry)
-            self.views[view.name] = view
+        self.views = self._views()
+
+    def _views(self) -> dict[str, View]:
+        views = [view_from_json(entry) for entry in self.editor.original.info.get("views", [])]
+        return {view.name: view for view in views}
 
     # ------------------------------------------------------------------ asking
 
@@ -45,21 +47,33 @@ class Session:
             self._opened = (self._edits, LoadedMap(self.editor.current(), self.editor.path))
         return self._opened[1]
 
-    def ask(self, text: str, top_k: int = 5) -> list[Hit]:
-        """Ranked hits, which are then highlighted; empty when the text is not present. Hidden ones are left out."""
+    def ask(self, text: str, top_k: int = 5, parts: bool = False) -> list[Hit]:
+        """Ranked hits, which are then highlighted; empty when the text is not present. Hidden ones are left out.
+
+        parts: hits are parts of things, each with its `parent`, as "handle of the mug".
+        """
         with self._lock:
             hidden = {entry["id"] for entry in self.editor.instances if entry.get("hidden")}
-            found = self._loaded().query(text, top_k + len(hidden))
+            opened = self._loaded()
+            found = (PartsMap(opened) if parts else opened).query(text, top_k + len(hidden))
             self.question = " ".join(text.split())
-            self.hits = [hit for hit in found if hit.instance_id not in hidden][:top_k]
-            self.selected = [hit.instance_id for hit in self.hits[:1]]
+            self.hits = [hit for hit in found if _whole(hit) not in hidden][:top_k]
+            self.select(None)
+            for hit in self.hits[:1]:
+                self.show_hit(hit)
             return self.hits
+
+    def show_hit(self, hit: Hit) -> None:
+        """Selects what was found; of a part the thing it belongs to, with the part highlighted."""
+        self.select(_whole(hit))
+        self.part = hit.instance_id if hit.parent is not None else None
 
     # --------------------------------------------------------------- selecting
 
     def select(self, instance: int | None, add: bool = False) -> None:
         """Selects an instance, or takes it in and out of the selection; None selects nothing."""
         with self._lock:
+            self.part = None
             if instance is None:
                 self.selected = self.selected if add else []
             elif not add:
@@ -88,8 +102,17 @@ class Session:
         with self._lock:
             self._edits += 1
             known = {entry["id"] for entry in self.editor.instances}
+            parts = {part["id"] for entry in self.editor.instances for part in entry.get("parts", [])}
             self.selected = [instance for instance in self.selected if instance in known]
-            self.hits = [hit for hit in self.hits if hit.instance_id in known]
+            self.part = self.part if self.part in parts else None
+            self.hits = [hit for hit in self.hits if hit.instance_id in (known if hit.parent is None else parts)]
+
+    def reopen(self, discard: bool = False) -> None:
+        """Takes over the map that another program left there, with what is unsaved here (see Editor.reopen)."""
+        with self._lock:
+            self.editor.reopen(discard)
+            self.views = self._views()
+            self.edited()
 
     # ----------------------------------------------------------------- showing
 
@@ -101,8 +124,16 @@ class Session:
     def colors(self, camera_from_world: np.ndarray | None = None) -> np.ndarray:
         """[N, 3] uint8 in the present mode, the selection (or the hits) highlighted."""
         scores = {int(entry["id"]): float(entry["score"]) for entry in self.editor.instances}
-        colors = paint(self.editor.original, self.editor.ids, self.mode, scores, camera_from_world)
-        return highlight(colors, self.editor.ids, self.selected or [hit.instance_id for hit in self.hits])
+        ids, parts = self.editor.ids, self.editor.part_ids
+        shown = np.where(parts >= 0, parts, ids) if self.mode == "parts" else ids
+        colors = paint(self.editor.original, shown, self.mode, scores, camera_from_world)
+        if self.part is not None:
+            return highlight(colors, parts, [self.part])
+        return highlight(colors, ids, self.lit())
+
+    def lit(self) -> list[int]:
+        """The instances that stand out: the selected ones, else all that were found; empty when all are alike."""
+        return self.selected or [_whole(hit) for hit in self.hits]
 
     def opacities(self) -> np.ndarray:
         """[N] float32, 0 for what is not shown."""
@@ -127,6 +158,11 @@ class Session:
         except InputError:  # photos may have moved since the map was made; the map itself is whole
             return None
         return _cut(photo, gmap.language["view_boxes"][row])
+
+
+def _whole(hit: Hit) -> int:
+    """The instance that a hit is, or is a part of."""
+    return hit.instance_id if hit.parent is None else hit.parent
 
 
 def _cut(photo: np.ndarray, box: np.ndarray) -> np.ndarray:

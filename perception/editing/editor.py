@@ -2,7 +2,7 @@
 
 An `Editor` owns one opened map. Operations change memory only; `save` writes the whole map aside and swaps it in. It is
 safe to call from several threads: every operation is one step under a lock, so a caller that vanishes leaves either all
-of an edit or none of it.
+of an edit or none of it. When another program changed the map meanwhile, what was not saved is done again on its work.
 """
 
 from __future__ import annotations
@@ -19,18 +19,17 @@ import numpy as np
 
 from perception.boxes import oriented_box
 from perception.config import InstanceConfig
+from perception.editing.changes import NEIGHBORS, described, instances_named, isolated, joined, nearest_filled
 from perception.errors import InputError
 from perception.io.map_lock import writing
 from perception.io.store import GaussianMap, map_signature, read_map, write_map
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
 
-FLOATER_SPREAD = 5.0
-"""A Gaussian is a floater when its mean distance to its neighbours lies this many robust deviations (in logarithm)
-above the map's median: what statistical outlier removal (Rusu et al. 2008) cuts, without its Gaussian model."""
-NEIGHBORS = 8
 UNDO_DEPTH = 100
 
 F = TypeVar("F", bound=Callable[..., Any])
+Call = tuple[str, tuple[Any, ...], dict[str, Any], Any]
+"""An edit: method, arguments, named arguments, what it returned."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +41,7 @@ class _State:
     kept: np.ndarray
     instances: tuple[dict[str, Any], ...]
     descriptions: tuple[InstanceDescription, ...]
+    call: Call = ("", (), {}, None)
 
 
 def _step(method: F) -> F:
@@ -53,13 +53,29 @@ def _step(method: F) -> F:
     return locked  # type: ignore[return-value]
 
 
+def _edit(method: F) -> F:
+    """A step that is remembered, so that it can be done again."""
+
+    @_step
+    @wraps(method)
+    def remembered(self: Editor, *args: Any, **kwargs: Any) -> Any:
+        before = self._past[-1]
+        result = method(self, *args, **kwargs)
+        if self._past[-1] is not before:
+            self._past[-1] = dataclasses.replace(self._past[-1], call=(method.__name__, args, kwargs, result))
+        return result
+
+    return remembered  # type: ignore[return-value]
+
+
 class Editor:
     """A map and its history. Instances are named by their `id`, which never changes; merged ones get a new id."""
 
     def __init__(self, path: Path):
         self.path = Path(path)
         self._lock = threading.RLock()
-        self._signature = map_signature(self.path)
+        # Taken before reading, so that a change in between is noticed; where nothing lies, read_map says it best.
+        self._signature = map_signature(self.path) if self.path.exists() else ()
         self.original = read_map(self.path)
         gmap = self.original
         descriptions, self._encoder = from_arrays(gmap.language) if gmap.language else ([], "")
@@ -83,6 +99,13 @@ class Editor:
     def ids(self) -> np.ndarray:
         """[N] int32 instance of every Gaussian of the opened map, −1 = none."""
         return self._now.ids
+
+    @property
+    def part_ids(self) -> np.ndarray:
+        """[N] part of every Gaussian of the opened map, −1 = none; parts went with instances that were edited away."""
+        known = [part["id"] for entry in self.instances for part in entry.get("parts", [])]
+        ids = self.original.parts.get("ids")
+        return np.full(len(self.ids), -1) if ids is None else np.where(np.isin(ids, known), ids, -1)
 
     @property
     def kept(self) -> np.ndarray:
@@ -134,7 +157,7 @@ class Editor:
         known = [part["id"] for entry in self._now.instances for part in entry.get("parts", [])]
         alive = np.isin(np.unique(parts["ids"][parts["ids"] >= 0]), known)
         ids = np.where(np.isin(parts["ids"], known), parts["ids"], -1)[self._now.kept].astype(np.int32)
-        return _described({**parts, "ids": ids}, alive)
+        return described({**parts, "ids": ids}, alive)
 
     # ------------------------------------------------------------------ editing
 
@@ -149,18 +172,18 @@ class Editor:
         instances[place] = {**instances[place], **values}
         self._push(what, instances=tuple(instances))
 
-    @_step
+    @_edit
     def rename(self, instance: int, label: str | None) -> None:
         """Gives an instance a name of the user's; an empty one takes the name away."""
         label = " ".join(label.split()) if label else None
         self._change(f"named {instance} '{label}'" if label else f"took the name of {instance}", instance, label=label)
 
-    @_step
+    @_edit
     def hide(self, instance: int, hidden: bool = True) -> None:
         """Marks an instance as not to be shown (it stays in the map)."""
         self._change(f"{'hid' if hidden else 'showed'} {instance}", instance, hidden=hidden)
 
-    @_step
+    @_edit
     def merge(self, chosen: list[int]) -> int:
         """Makes one instance of several, with a new id; it keeps the first name among them. Returns the id."""
         chosen = sorted(set(chosen))
@@ -174,10 +197,10 @@ class Editor:
         label = next((entry["label"] for entry in entries if entry.get("label")), None)
         merged = self._entry(new, ids, label, float(weights @ [e["score"] for e in entries] / weights.sum()))
         merged["views"] = max(int(entry.get("views", 0)) for entry in entries)
-        self._replace(f"merged {', '.join(map(str, chosen))} into {new}", places, ids, [merged], _joined)
+        self._replace(f"merged {', '.join(map(str, chosen))} into {new}", places, ids, [merged], joined)
         return new
 
-    @_step
+    @_edit
     def split(self, instance: int) -> list[int]:
         """Cuts an instance into its parts; returns their ids. Raises InputError when it has none.
 
@@ -192,21 +215,21 @@ class Editor:
             raise InputError(f"instance {instance}: its Gaussians are all alike, there is nothing to split")
         first = self._next_id()
         ids = self.ids.copy()
-        ids[rows] = _nearest_filled(gmap.means[rows], found) + first
+        ids[rows] = nearest_filled(gmap.means[rows], found) + first
         news = list(range(first, first + int(found.max()) + 1))
         entry = self.instances[place]
         parts = [{**self._entry(new, ids, None, entry["score"]), "views": entry.get("views", 0)} for new in news]
         self._replace(f"split {instance} into {len(parts)}", [place], ids, parts, lambda descriptions: descriptions[0])
         return news
 
-    @_step
+    @_edit
     def remove(self, instance: int) -> None:
         """Takes an instance from the list; its Gaussians stay, as no instance."""
         place = self._place(instance)
         ids = np.where(self.ids == instance, -1, self.ids).astype(np.int32)
-        self._replace(f"removed {instance}", [place], ids, [], _joined)
+        self._replace(f"removed {instance}", [place], ids, [], joined)
 
-    @_step
+    @_edit
     def delete_floaters(self) -> int:
         """Deletes Gaussians that hang alone in space; returns how many. Instances left empty leave the list."""
         rows = np.flatnonzero(self.kept)
@@ -251,17 +274,55 @@ class Editor:
         self._past.append(self._future.pop())
         return self._now.what
 
+    @property
+    @_step
+    def outdated(self) -> bool:
+        """Whether somebody else changed the map since it was opened or saved; InputError when it is gone."""
+        return map_signature(self.path) != self._signature
+
     @_step
     def save(self) -> None:
-        """Writes the edited map in place of the old one; refuses when somebody else replaced it since it was opened."""
-        with writing(self.path):  # nobody comes between the look and the write
-            if map_signature(self.path) != self._signature:
-                raise InputError(
-                    f"{self.path}: was changed by another program since it was opened; open it again and repeat"
-                )
+        """Writes the edited map in place of the old one; one that somebody else changed is opened again first."""
+        with writing(self.path):
+            if self.outdated:
+                self.reopen()
             write_map(self.path, self.current(), keep_report=True)
             self._signature = map_signature(self.path)
         self._saved = self._now
+
+    @_step
+    def reopen(self, discard: bool = False) -> None:
+        """Opens the map as it now lies there and does again what was not saved (unless `discard`); history restarts.
+
+        Raises InputError, with nothing changed, when that has no meaning there: other Gaussians, other instances.
+        """
+        fresh = Editor(self.path)
+        if self.dirty and not discard:
+            for method, args, kwargs, result in self._unsaved(fresh):
+                if getattr(fresh, method)(*args, **kwargs) != result:
+                    raise self._no_fit()
+        for name in ("original", "_encoder", "_past", "_future", "_saved", "_signature"):
+            setattr(self, name, getattr(fresh, name))
+
+    def _unsaved(self, fresh: Editor) -> list[Call]:
+        """The edits since the last save, if what they touch is the same in `fresh`."""
+        place = next((n for n, state in enumerate(self._past) if state is self._saved), None)
+        kept, there = self._saved.kept, fresh.original
+        if place is None or not np.array_equal(self.original.means[kept], there.means):
+            raise self._no_fit()
+        calls = [state.call for state in self._past[place + 1 :]]
+        mine, theirs = ({entry["id"]: entry for entry in e} for e in (self._saved.instances, fresh.instances))
+        for instance in instances_named(calls):
+            same = np.array_equal(self._saved.ids[kept] == instance, there.instance_ids == instance)
+            if not same or mine.get(instance) != theirs.get(instance):
+                raise self._no_fit()
+        return calls
+
+    def _no_fit(self) -> InputError:
+        return InputError(
+            f"{self.path}: was changed by another program since it was opened, and the unsaved corrections do not fit "
+            "what lies there now; open it again and repeat them"
+        )
 
     # ------------------------------------------------------------------ helpers
 
@@ -316,48 +377,3 @@ class Editor:
         if said:
             descriptions[places[0] : places[0]] = [describe(said) for _ in news]
         self._push(what, ids=ids, instances=tuple(entries), descriptions=tuple(descriptions))
-
-
-def isolated(means: np.ndarray) -> np.ndarray:
-    """[N] bool: points [N, 3] whose mean distance to their NEIGHBORS nearest is far above the common one."""
-    from scipy.spatial import cKDTree
-
-    distance, _ = cKDTree(means).query(means, k=NEIGHBORS + 1, workers=-1)
-    level = np.log(np.maximum(distance[:, 1:].mean(axis=1), 1e-12))
-    middle = np.median(level)
-    spread = 1.4826 * np.median(np.abs(level - middle))  # the deviation a normal distribution would have
-    return np.asarray(level > middle + FLOATER_SPREAD * max(spread, 1e-3))
-
-
-def _nearest_filled(means: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    """ids [N] with −1 replaced by the id of the nearest point that has one."""
-    from scipy.spatial import cKDTree
-
-    known = ids >= 0
-    _, nearest = cKDTree(means[known]).query(means)
-    return np.asarray(np.where(known, ids, ids[known][nearest]))
-
-
-def _joined(descriptions: list[InstanceDescription]) -> InstanceDescription:
-    """What is known of several instances as one: all views, the mean embedding, the colours of the best seen."""
-    best = max(descriptions, key=lambda d: len(d.views))
-    total = np.sum([d.embedding * len(d.views) for d in descriptions], axis=0)
-    norm = float(np.linalg.norm(total))
-    return InstanceDescription(
-        (total / norm if norm > 0 else best.embedding).astype(np.float32),
-        np.concatenate([d.per_view for d in descriptions]),
-        best.palette,
-        [name for d in descriptions for name in d.views],
-        [box for d in descriptions for box in d.boxes],
-    )
-
-
-def _described(parts: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, np.ndarray]:
-    """parts.npz's arrays with the language rows of parts that are alive [P] bool, in ascending id."""
-    prefix = "language_"
-    language = {name[len(prefix) :]: array for name, array in parts.items() if name.startswith(prefix)}
-    if not language or alive.all():
-        return parts
-    descriptions, encoder = from_arrays(language)
-    left = [description for description, lives in zip(descriptions, alive, strict=True) if lives]
-    return {"ids": parts["ids"], **{prefix + name: a for name, a in to_arrays(left, encoder).items()}}
