@@ -223,7 +223,10 @@ def test_split_covers_the_labelled_points_in_order(tmp_path):
         part = read_cloud(path)
         np.testing.assert_array_equal(part.points, cloud.points[labels == int(path.stem)])
     assert read_cloud(paths[1]).faces.tolist() == [[0, 1, 2]]
-    with pytest.raises(InputError, match="not empty"):
+    (tmp_path / "parts" / "7.ply").touch()  # of an older split, which is replaced as a whole
+    assert write_split(tmp_path / "parts", cloud, labels) == paths == sorted((tmp_path / "parts").iterdir())
+    (tmp_path / "parts" / "notes.txt").touch()
+    with pytest.raises(InputError, match=r"holds notes\.txt"):
         write_split(tmp_path / "parts", cloud, labels)
 
 

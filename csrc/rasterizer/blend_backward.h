@@ -281,24 +281,35 @@ inline uint64_t box_tiles_before(const Splat<T> &s, int tiles_x, int tile) {
   return static_cast<uint64_t>(within(row, height)) * width + in_row;
 }
 
-// Writes the records of one 64x64 tile to their slots (one a splat and tile it touches): the geometry's moments, then
-// the feature gradient Σ w (g' + 2 v e).
+// Writes one splat's record to its slot: the geometry's moments, then the feature gradient Σ w (g' + 2 v e).
+template <class T, int NF, bool VAR, bool DEPTH>
+inline void store_record(const Worker<T> &w, int j, uint64_t slot, Scratch<T> &scratch) {
+  using Tile = BackwardTile<T, NF, VAR, DEPTH>;
+  const T *from = w.records.data() + static_cast<std::size_t>(j) * Tile::kRecord;
+  const T *e = w.features.data() + static_cast<std::size_t>(j) * Tile::kRow;
+  T *to = scratch.records.data() + slot * (kGeometry + NF);
+  for (int c = 0; c < kGeometry + NF; ++c) to[c] = from[c];
+  if constexpr (VAR)
+    for (int c = 0; c < NF; ++c) to[kGeometry + c] += 2 * e[c] * from[kGeometry + NF + c];
+  scratch.touched[slot] = 1;
+}
+
+// Writes the records of one 64x64 tile to their slots, one a splat and tile it touches. Slots lie far apart in memory:
+// each is asked for some splats before it is written.
 template <class T, int NF, bool VAR, bool DEPTH>
 void store_records(const Frame<T> &f, int index, const Worker<T> &w, Scratch<T> &scratch) {
-  using Tile = BackwardTile<T, NF, VAR, DEPTH>;
+  constexpr int kAhead = 8, kSize = kGeometry + NF;
   const int tx = index % f.tiles_x, ty = index / f.tiles_x;
-  for (int j = 0; j < w.n; ++j) {
-    if (!w.touched[j]) continue;
+  uint64_t slots[kAhead];
+  for (int j = 0; j < w.n + kAhead; ++j) {
+    uint64_t &slot = slots[j % kAhead];
+    if (j >= kAhead && w.touched[j - kAhead]) store_record<T, NF, VAR, DEPTH>(w, j - kAhead, slot, scratch);
+    if (j >= w.n || !w.touched[j]) continue;
     const Splat<T> &s = w.splats[j];
     const uint64_t place = static_cast<uint64_t>(ty - s.y0) * (s.x1 - s.x0 + 1) + (tx - s.x0);
-    const uint64_t slot = scratch.slots[w.source[j]] + place - box_tiles_before(s, f.tiles_x, scratch.first_tile);
-    const T *from = w.records.data() + static_cast<std::size_t>(j) * Tile::kRecord;
-    const T *e = w.features.data() + static_cast<std::size_t>(j) * Tile::kRow;
-    T *to = scratch.records.data() + slot * (kGeometry + NF);
-    for (int c = 0; c < kGeometry + NF; ++c) to[c] = from[c];
-    if constexpr (VAR)
-      for (int c = 0; c < NF; ++c) to[kGeometry + c] += 2 * e[c] * from[kGeometry + NF + c];
-    scratch.touched[slot] = 1;
+    slot = scratch.slots[w.source[j]] + place - box_tiles_before(s, f.tiles_x, scratch.first_tile);
+    const T *record = scratch.records.data() + slot * kSize;
+    __builtin_prefetch(record, 1), __builtin_prefetch(record + kSize - 1, 1), __builtin_prefetch(&scratch.touched[slot], 1);
   }
 }
 

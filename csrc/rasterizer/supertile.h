@@ -31,9 +31,14 @@ void load_supertile(const Inputs<T> &in, const Frame<T> &f, int tile, Slice slic
   std::memset(w.counts, 0, sizeof w.counts);
   alignas(64) uint32_t ids[16];
   uint16_t masks[16];
+  constexpr int kAhead = 16;  // places
   int kept = 0, pending = 0;
   for (int i = 0; i < n; ++i) {
-    if (i + 24 < n) __builtin_prefetch(&f.splats[list[i + 24]]);
+    if (i + 2 * kAhead < n) __builtin_prefetch(&f.splats[list[i + 2 * kAhead]]);
+    if (NF > 0 && i + kAhead < n) {  // its splat has arrived by now
+      const T *row = in.features + static_cast<int64_t>(f.splats[list[i + kAhead]].id) * in.dims + slice.begin;
+      __builtin_prefetch(row), __builtin_prefetch(row + slice.count - 1);
+    }
     const Splat<T> &s = f.splats[list[i]];
     const uint32_t mask = boxes_touched<T, 0>(s, s.x - x, s.y - y);
     if (!mask) continue;

@@ -23,5 +23,6 @@ BENCHES = (
     "instances",
     "collisions",
     "clustering",
+    "section",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""

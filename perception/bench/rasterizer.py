@@ -12,7 +12,7 @@ import ctypes
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,8 @@ COLUMNS: tuple[Column, ...] = (
     ("CPU ms", "cpu_ms", ".1f"),
     ("ns/pair", "ns_per_pair", ".2f"),
     ("least", "least_ns_per_pair", ".2f"),
+    ("x 1 thread", "times_one_thread", ".2f"),
+    ("x baseline", "times_baseline", ".1f"),
     ("p99.9", "error_p999", ".1e"),
     ("mean", "error_mean", ".1e"),
     ("max", "error_max", ".1e"),
@@ -155,7 +157,18 @@ def measure(name: str, scene: dict[str, Any], chosen: Sequence[Case], rounds: in
             turn = _turn(scene, case, cotangents[case.dtype, case.rich])
             if i:
                 turns[case].append(turn)
-    return [_row(name, scene, case, turns[case]) for case in chosen]
+    rows = [_row(name, scene, case, turns[case]) for case in chosen]
+    for case, row in zip(chosen, rows, strict=True):
+        row["times_one_thread"] = times_faster(turns, case, replace(case, threads=1))
+        row["times_baseline"] = times_faster(turns, case, replace(case, simd="baseline"))
+    return rows
+
+
+def times_faster(turns: dict[Case, list[Turn]], case: Case, other: Case) -> float | None:
+    """Median over the rounds of the other case's wall time by this one's; None where the other was not timed."""
+    if other not in turns:
+        return None
+    return statistics.median(b.total / a.total for a, b in zip(turns[case], turns[other], strict=True))
 
 
 def _row(name: str, scene: dict[str, Any], case: Case, turns: list[Turn]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from perception.bench.sweep import Variant, difference
 from perception.bench.sweep_cli import (
     COSTS,
     FIGURES,
+    Column,
     chosen,
     finish,
     prepare,
@@ -43,7 +44,13 @@ SWITCHES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("holes are filled", "off", ("densify.fill_every=0",)),
     ("exchange rate", "off: no early end", ("train.exchange_db=-1000",)),
     ("exchange rate", "0.1 dB", ("train.exchange_db=0.1",)),
+    (
+        "the scene decides",
+        "off: whole budget, degree 3, to the end",
+        ("densify.grad_threshold=0", "densify.opacity_decay=0", "train.sh_min_gain_db=-100", "train.exchange_db=-1000"),
+    ),
 )
+CHOSEN: tuple[Column, ...] = (("iterations", "iterations", "d"), ("SH", "sh_degree", "d"))
 
 
 def variants(masks: str | None) -> list[Variant]:
@@ -71,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ("AP", "ap_more", "+.3f"),
         ("mIoU", "miou_more", "+.3f"),
     )
-    text = f"{scenes[0].name}, as measured\n{table(rows, (*FIGURES, *COSTS))}"
+    text = f"{scenes[0].name}, as measured\n{table(rows, (*FIGURES, *COSTS, *CHOSEN))}"
     text += f"\n\n{scenes[0].name}, against the default\n{table(rows[1:], changes)}"
     _plot(options.output / "switches.png", scenes[0].name, rows[1:])
     finish("switches", options, {"scene": scenes[0].name, "rows": rows}, text)

@@ -11,7 +11,7 @@ import numpy as np
 
 from perception.boxes import instance_boxes
 from perception.errors import InputError
-from perception.io.atomic import replacing
+from perception.io.atomic import atomic_directory, replacing
 from perception.io.cloud import write_cloud
 from perception.types import PointCloud
 
@@ -42,32 +42,39 @@ def _color(i: int) -> tuple[int, ...]:
 
 
 def write_split(folder: str | Path, cloud: PointCloud, labels: np.ndarray, suffix: str = ".ply") -> list[Path]:
-    """One file for each instance, "<id><suffix>" in a new or empty folder, points in the cloud's order."""
+    """One file for each instance, "<id><suffix>", points in the cloud's order; the folder appears whole or not at all.
+
+    InputError when `folder` holds anything but an older split, which is replaced.
+    """
     folder = Path(folder)
-    _new_folder(folder)
-    written = []
-    for i in np.unique(labels[labels >= 0]).tolist():
-        rows = labels == i
-        part = PointCloud(
-            cloud.points[rows],
-            None if cloud.colors is None else cloud.colors[rows],
-            None if cloud.normals is None else cloud.normals[rows],
-            _faces_within(cloud.faces, rows),
-            {"instance_id": labels[rows]},
-        )
-        written.append(folder / f"{i}{suffix}")
-        write_cloud(written[-1], part)
-    return written
+    _check_folder(folder, suffix)
+    ids = np.unique(labels[labels >= 0]).tolist()
+    with atomic_directory(folder) as aside:
+        for i in ids:
+            write_cloud(aside / f"{i}{suffix}", _part(cloud, labels, i))
+    return [folder / f"{i}{suffix}" for i in ids]
 
 
-def _new_folder(folder: Path) -> None:
+def _part(cloud: PointCloud, labels: np.ndarray, i: int) -> PointCloud:
+    rows = labels == i
+    return PointCloud(
+        cloud.points[rows],
+        None if cloud.colors is None else cloud.colors[rows],
+        None if cloud.normals is None else cloud.normals[rows],
+        _faces_within(cloud.faces, rows),
+        {"instance_id": labels[rows]},
+    )
+
+
+def _check_folder(folder: Path, suffix: str) -> None:
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        occupied = any(folder.iterdir())
+        others = [file for file in folder.iterdir() if not (file.stem.isdigit() and file.suffix == suffix)]
+    except FileNotFoundError:
+        return
     except OSError as error:
         raise InputError(f"{folder}: cannot be made a folder ({error.strerror})") from error
-    if occupied:
-        raise InputError(f"{folder}: is not empty; give a new folder")
+    if others:
+        raise InputError(f"{folder}: holds {others[0].name}, which is no part of an older split; give a new folder")
 
 
 def _faces_within(faces: np.ndarray | None, rows: np.ndarray) -> np.ndarray | None:

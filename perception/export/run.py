@@ -67,8 +67,8 @@ def run_export(
     painted = source
     if outputs.color == "instance":
         painted = PointCloud(source.points, instance_colors(labels), source.normals, source.faces)
-    sidecar = write_export(out, painted, labels, instances, classes)
     _write_others(outputs, Path(out).stem, painted, labels, instances, classes)
+    sidecar = write_export(out, painted, labels, instances, classes)  # last: where the cloud lies, all lies
     result = {
         "points": len(labels),
         "labelled": int((labels >= 0).sum()),
@@ -141,7 +141,7 @@ def write_export(
             "label": known.get("label"),
             "num_points": n,
         }
-    write_cloud(path, labelled)
     with replacing(path.with_suffix(".json")) as file:
         file.write(json.dumps(sidecar, indent=1).encode())
+    write_cloud(path, labelled)
     return sidecar

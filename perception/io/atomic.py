@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import os
@@ -21,18 +22,23 @@ _REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary sibling to write; on success it is synced and renamed to `path`, else removed."""
+    """Yield a temporary sibling to write; on success it is synced and renamed to `path`, else removed.
+
+    What killed writers of `path` left beside it goes too.
+    """
     path = Path(path)
     temporary = _sibling(path, "new")
     try:
         with _disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
+            recover(path)
             yield temporary
             _sync(temporary)
             temporary.replace(path)
             _sync(path.parent)
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # where nothing may be written there is nothing to remove
+            temporary.unlink()
 
 
 @contextmanager
@@ -68,7 +74,8 @@ def atomic_directory(path: Path) -> Iterator[Path]:
             path.parent.mkdir(parents=True, exist_ok=True)
             recover(path)
             temporary.mkdir()
-            yield temporary
+            with _told_of(path, temporary):
+                yield temporary
             for file in temporary.rglob("*"):
                 _sync(file)
             _sync(temporary)
@@ -80,10 +87,8 @@ def atomic_directory(path: Path) -> Iterator[Path]:
 def recover(path: Path) -> None:
     """Put `path` back when a writer died between its two renames, and delete leftovers of writers that are gone."""
     path = Path(path)
-    leftovers = sorted(path.parent.glob(f".{path.name}.*"), key=lambda item: item.stat().st_mtime)
-    for item in leftovers:
-        kind, writer = _parse(item, path)
-        if kind is None or _alive(writer):
+    for kind, writer, item in _leftovers(path):
+        if _alive(writer):
             continue
         if kind == "old" and not path.exists():
             item.rename(path)
@@ -91,6 +96,18 @@ def recover(path: Path) -> None:
             shutil.rmtree(item, ignore_errors=True)
         else:
             item.unlink(missing_ok=True)
+
+
+def _leftovers(path: Path) -> list[tuple[str, int, Path]]:
+    """(new or old, process that wrote it, where) of all temporary siblings of `path`, oldest first."""
+    found = []
+    with contextlib.suppress(FileNotFoundError), os.scandir(path.parent) as entries:
+        for entry in entries:
+            kind, writer = _parse(entry.name, path) if entry.name.startswith(f".{path.name}.") else (None, 0)
+            if kind is not None:
+                with contextlib.suppress(FileNotFoundError):  # a living writer has just renamed it
+                    found.append((entry.stat(follow_symlinks=False).st_mtime_ns, kind, writer, Path(entry.path)))
+    return [(kind, writer, item) for _, kind, writer, item in sorted(found)]
 
 
 def _swap(new: Path, path: Path, old: Path) -> None:
@@ -125,8 +142,8 @@ def _sibling(path: Path, kind: str) -> Path:
     return path.with_name(f".{path.name}.{kind}-{os.getpid()}-{uuid4().hex[:8]}")
 
 
-def _parse(item: Path, path: Path) -> tuple[str | None, int]:
-    parts = item.name[len(path.name) + 2 :].split("-")
+def _parse(name: str, path: Path) -> tuple[str | None, int]:
+    parts = name[len(path.name) + 2 :].split("-")
     if len(parts) == 3 and parts[0] in ("new", "old") and parts[1].isdigit():
         return parts[0], int(parts[1])
     return None, 0
@@ -154,11 +171,23 @@ def _sync(path: Path) -> None:
 
 
 @contextmanager
+def _told_of(path: Path, temporary: Path) -> Iterator[None]:
+    """What is said of a file inside the temporary folder names the folder that was asked for."""
+    try:
+        yield
+    except InputError as error:
+        if str(temporary) not in str(error):
+            raise
+        raise InputError(str(error).replace(str(temporary), str(path))) from error
+
+
+@contextmanager
 def _disk_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in _FULL:
+        short = error.errno is None and str(error).endswith(" written")  # all that numpy tells of a full disk
+        if error.errno in _FULL or short:
             raise InputError(f"{path}: the disk is full, nothing was written; free some space") from error
         if error.errno in _REFUSED:
             raise InputError(

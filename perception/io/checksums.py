@@ -17,8 +17,18 @@ EDITABLE = "instances.json"
 
 def file_facts(folder: Path) -> dict[str, dict[str, Any]]:
     """{name: {"bytes", "sha256"}} of every file in `folder` but map.json, which cannot hold its own, and the report."""
-    files = sorted(file for file in folder.iterdir() if file.is_file() and file.name not in (FACTS, REPORT))
-    return {file.name: {"bytes": file.stat().st_size, "sha256": sha256(file)} for file in files}
+    return {file.name: facts_of(file) for file in _files(folder)}
+
+
+def facts_of(file: Path) -> dict[str, Any]:
+    """{"bytes", "sha256"} of one file."""
+    return {"bytes": file.stat().st_size, "sha256": sha256(file)}
+
+
+def _files(folder: Path) -> list[Path]:
+    """The map's own files but map.json and the report; what a killed writer left aside is hidden."""
+    files = (file for file in folder.iterdir() if file.is_file() and file.name not in (FACTS, REPORT))
+    return sorted(file for file in files if not file.name.startswith("."))
 
 
 def sha256(file: Path) -> str:
@@ -73,7 +83,7 @@ def verify(folder: Path, info: dict[str, Any]) -> dict[str, str]:
     if "sha256" in info and seal(info)["sha256"] != info["sha256"]:
         raise InputError(f"{folder / FACTS}: its own checksum differs; it was edited or is damaged")
     states = {FACTS: "ok" if "sha256" in info else "no checksum"}
-    for file in sorted(file for file in folder.iterdir() if file.is_file() and file.name not in (FACTS, REPORT)):
+    for file in _files(folder):
         if file.name not in known:
             states[file.name] = "no checksum"
         elif file.name == EDITABLE:

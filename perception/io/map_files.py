@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
@@ -17,6 +18,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io import instance_index
+from perception.io.atomic import recover
 from perception.io.checksums import EDITABLE, FACTS, check_file, check_sizes
 from perception.io.instance_index import InstanceIndex, build_index
 from perception.io.ply import map_ply
@@ -27,7 +29,7 @@ MOST_ARCHIVE = 4 << 30
 _ARRAYS = {"features": 2, "instance_ids": 1, "membership": 1}
 ARCHIVES = ("cameras", "language", "index", "parts")
 _TRIES = 5
-_DAMAGE = (
+DAMAGE = (
     ValueError,
     KeyError,
     TypeError,
@@ -59,6 +61,7 @@ class MapFiles:
         self.path = Path(path)
         self._lock = threading.Lock()
         self._made: dict[str, Any] = {}
+        _put_back(self.path)
         for left in reversed(range(_TRIES)):
             self._identity = _folder_identity(self.path)
             try:
@@ -97,7 +100,7 @@ class MapFiles:
             array = np.load(file, mmap_mode="r", allow_pickle=False)
         except FileNotFoundError as error:
             raise InputError(f"{file}: is missing; the map is damaged, build it again or copy it anew") from error
-        except _DAMAGE as error:
+        except DAMAGE as error:
             raise InputError(f"{file}: cannot be read ({_short(error)}); the map is damaged, build it again") from error
         kind = "i" if name == "instance_ids" else "f"
         if array.ndim != sides or array.dtype.kind != kind:
@@ -183,12 +186,13 @@ class MapFiles:
                 return {key: arrays[key] for key in arrays.files}
         except InputError:
             raise
-        except _DAMAGE as error:
+        except DAMAGE as error:
             raise InputError(f"{file}: cannot be read ({_short(error)}); the map is damaged, build it again") from error
 
 
 def read_info(path: Path) -> dict[str, Any]:
     """map.json alone; raises InputError when `path` is no map or of a version this program does not read."""
+    _put_back(Path(path))
     return _read_facts(Path(path))[0]
 
 
@@ -199,6 +203,14 @@ def map_signature(path: Path) -> Signature:
     except OSError as error:
         raise InputError(f"{path}: the map is gone ({error.strerror}); build it again or put it back") from error
     return tuple((stat.st_ino, stat.st_mtime_ns if n else 0, stat.st_size if n else 0) for n, stat in enumerate(stats))
+
+
+def _put_back(path: Path) -> None:
+    """Where two folders cannot be exchanged in one step, a writer killed between its two renames leaves the old map
+    aside; it is put back under its name."""
+    if not path.exists():
+        with contextlib.suppress(OSError):
+            recover(path)
 
 
 def _folder_identity(path: Path) -> tuple[int, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import threading
@@ -10,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from perception.errors import InputError
+from perception.io.atomic import recover
 
 try:
     import fcntl
@@ -27,6 +29,7 @@ def writing(path: Path) -> Iterator[None]:
 
     The lock is an advisory flock on the sibling `.NAME.lock`, so it ends with its process, however that ends; the file
     says who holds it and goes when the lock does. A thread may take a lock again that it holds. Readers need none.
+    What writers that were killed left beside the map is put back or deleted first.
     """
     path = Path(path).resolve()
     me = threading.get_ident()
@@ -39,6 +42,7 @@ def writing(path: Path) -> Iterator[None]:
     try:
         if depth == 0:
             descriptor = _take(path)
+            recover(path)
         yield
     finally:
         with _guard:
@@ -65,8 +69,9 @@ def _take(path: Path) -> int | None:
             if _lock(descriptor, path) and _same(descriptor, file):
                 break
             os.close(descriptor)  # its last holder removed the file between our open and our lock: once more
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        with contextlib.suppress(OSError):  # on a full disk the lock holds too, it only does not say whose it is
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         return descriptor
     except OSError as error:
         raise InputError(
@@ -93,7 +98,8 @@ def _lock(descriptor: int, path: Path) -> bool:
 def _drop(path: Path, descriptor: int | None) -> None:
     if descriptor is None:
         return
-    lock_file(path).unlink(missing_ok=True)  # while we hold it: no one else can have locked this very file
+    with contextlib.suppress(OSError):
+        lock_file(path).unlink()  # while we hold it: no one else can have locked this very file
     os.close(descriptor)
 
 

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from perception.errors import InputError
 from perception.io.atomic import atomic_directory
+from perception.io.map_files import DAMAGE
 from perception.types import Lens, Scene, View
 
 
@@ -22,14 +24,17 @@ def save_scene(folder: Path, scene: Scene) -> None:
 
 
 def load_saved_scene(folder: Path) -> Scene | None:
-    """The scene kept in `folder`; None when there is none."""
+    """The scene kept in `folder`; None when there is none. InputError when it is damaged."""
     if not (folder / "scene.json").is_file():
         return None
-    facts = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
-    with np.load(folder / "points.npz") as arrays:
-        points, colors = arrays["points"], arrays["colors"]
-    views = [view_from_json(entry) for entry in facts["views"]]
-    return Scene(views, points, colors, facts["metric"], facts["frame"], facts["report"])
+    try:
+        facts = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
+        with np.load(folder / "points.npz") as arrays:
+            points, colors = arrays["points"], arrays["colors"]
+        views = [view_from_json(entry) for entry in facts["views"]]
+        return Scene(views, points, colors, facts["metric"], facts["frame"], facts["report"])
+    except DAMAGE as error:
+        raise InputError(f"{folder}: the kept poses are damaged; delete {folder.parent} to start over") from error
 
 
 def view_json(view: View) -> dict[str, Any]:

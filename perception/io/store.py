@@ -15,6 +15,7 @@ map.json also lists size and SHA-256 of the other files (`files`) and its own (`
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import shutil
@@ -26,7 +27,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory, atomic_file
-from perception.io.checksums import EDITABLE, FACTS, REPORT, file_facts, seal, verify
+from perception.io.checksums import EDITABLE, FACTS, REPORT, facts_of, file_facts, seal, verify
 from perception.io.instance_index import InstanceIndex, build_index
 from perception.io.map_files import FORMAT_VERSION, MapFiles, map_signature, read_info
 from perception.io.map_lock import writing
@@ -165,11 +166,17 @@ def set_labels(path: Path, labels: dict[int, str | None]) -> None:
             if label is not None and not (isinstance(label, str) and label.strip()):
                 raise InputError(f"{path}: the label of instance {instance_id} is empty; give a name or none")
             files.instances[places[instance_id]]["label"] = label
-        with atomic_file(path / EDITABLE) as aside:
-            _dump(aside, {"instances": files.instances})
-        if "files" in files.info:
-            with atomic_file(path / FACTS) as aside:
-                _dump(aside, _with_checksums(files.info, path))
+        _write_instances(path, files)
+
+
+def _write_instances(path: Path, files: MapFiles) -> None:
+    """instances.json, and its checksum in map.json; those of other files stay, so that damage is not blessed."""
+    with contextlib.ExitStack() as both:  # ends in reverse: both are written whole before the first takes its place
+        facts = both.enter_context(atomic_file(path / FACTS)) if "files" in files.info else None
+        aside = both.enter_context(atomic_file(path / EDITABLE))
+        _dump(aside, {"instances": files.instances})
+        if facts is not None:
+            _dump(facts, seal({**files.info, "files": {**files.info["files"], EDITABLE: facts_of(aside)}}))
 
 
 def _with_checksums(info: dict[str, Any], folder: Path) -> dict[str, Any]:

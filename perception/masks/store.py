@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -110,7 +111,8 @@ def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
             Image.fromarray(labels.astype(np.uint16)).save(temporary, "PNG", compress_level=4, pnginfo=info)
             temporary.replace(file)
         finally:
-            temporary.unlink(missing_ok=True)
+            with suppress(OSError):  # a read-only disk is told by what was tried first
+                temporary.unlink()
     except OSError as error:
         raise InputError(f"{file}: cannot be written ({error.strerror or error})") from error
 

@@ -20,7 +20,7 @@ from perception.io.inputs import load_scene
 from perception.io.map_lock import writing
 from perception.io.photos import load_photo
 from perception.io.scene_cache import load_saved_scene, save_scene, view_json
-from perception.io.store import GaussianMap, read_map, write_map
+from perception.io.store import GaussianMap, read_info, read_map, write_map
 from perception.masks import MaskSource, make_source
 from perception.masks.source import GeometryMaskSource
 from perception.masks.store import compute_masks
@@ -57,16 +57,21 @@ def build_map(
     Raises InputError for bad input. What was done is kept in `work_folder(output)` until the map is written; with
     `resume` a run goes on from there. Names given to the instances of the map `labels_from` are carried over to those
     that fill the same place. A run refused before it trained leaves nothing behind. `on_note` sees the trainer each
-    time a point of its curve is noted.
+    time a point of its curve is noted. To resume a run that is finished is to be given its map.
     """
     if config.device == "cuda":
         raise InputError("--device cuda: this build has no CUDA rasterizer; use --device cpu or auto")
+    progress = progress or Progress(quiet=True)
+    if resume and _finished(source, output, config):
+        progress.log(f"{output}: this run is finished")
+        shutil.rmtree(work_folder(output), ignore_errors=True)
+        return read_map(output)
     labelled = None if labels_from is None else read_map(labels_from)
     fresh = not work_folder(output).exists()
     work = _prepare(source, output, resume)
     with writing(output):
         try:
-            return _build(source, output, work, config, progress or Progress(quiet=True), labelled, on_note)
+            return _build(source, output, work, config, progress, labelled, on_note)
         except OSError as error:
             if error.errno != errno.ENOSPC:
                 raise
@@ -99,7 +104,8 @@ def _build(
         views = _photos(training, config, progress)
         held = _photos(held_out, config, progress)
     trainer = Trainer(initial_gaussians(scene, config), views, config, held)
-    session = _Session(trainer, work, fingerprint(source, config), config, progress, on_note)
+    mark = fingerprint(source, config)
+    session = _Session(trainer, work, mark, config, progress, on_note)
     depth = None
     if isinstance(source_of_masks, GeometryMaskSource):  # its masks wait for the map's own geometry
         with stages("train"):
@@ -122,6 +128,7 @@ def _build(
         "metric": scene.metric,
         "source": str(source),
         "seed": config.seed,
+        "fingerprint": mark,
         "config": config.to_json(),
         "versions": versions(),
         "scene": scene.report,
@@ -166,6 +173,11 @@ def _prepare(source: Path, output: Path, resume: bool) -> Path:
             f"{output}: the disk has {free >> 20} MiB free, at least {LEAST_DISK >> 20} are needed; free some"
         )
     return work
+
+
+def _finished(source: Path, output: Path, config: MapConfig) -> bool:
+    """Whether the map of this very run lies there: a kill after it took its place leaves only tidying to do."""
+    return output.exists() and read_info(output).get("fingerprint") == fingerprint(source, config)
 
 
 def _scene(source: Path, work: Path, config: MapConfig, progress: Progress) -> Scene:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from perception.io.atomic import atomic_file
 from perception.pictures import error_map, instance_palette
 from perception.report.charts import columns, curve, stages
 from perception.report.data import InstanceRow, QueryRow, ReportData
@@ -30,9 +31,8 @@ def write_report(path: Path | str, data: ReportData) -> Path:
         page = _page(data, partial(_image, side=side, quality=quality)).encode()
         if len(page) < LIMIT:
             break
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_bytes(page)
-    temporary.replace(path)
+    with atomic_file(path) as aside:
+        aside.write_bytes(page)
     return path
 
 

@@ -1,0 +1,239 @@
+"""What is killed: mapping, exporting and label editing, and what must hold afterwards."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TIMES = frozenset({"seconds", "profile", "peak_memory_mib", "skipped", "files", "sha256"})
+"""Parts of map.json that tell what a run cost, not what it made."""
+
+
+def command(*words: object) -> int:
+    """Runs one `perception` command in this process."""
+    from perception.cli import main
+
+    return main([str(word) for word in words])
+
+
+def contents(path: Path) -> str:
+    """A digest of all that a map holds but what its run cost; opens it, and compares every checksum, on the way."""
+    from perception import load_map
+    from perception.io.store import read_map, verify_map
+
+    load_map(path).find()
+    assert set(verify_map(path).values()) <= {"ok", "edited"}, verify_map(path)
+    gmap, digest = read_map(path), hashlib.sha256()
+    for name, value in sorted(vars(gmap).items()):
+        _absorb(digest, name, _lasting(value) if name == "info" else value)
+    return digest.hexdigest()
+
+
+def _lasting(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _lasting(inner) for key, inner in value.items() if key not in TIMES}
+    return [_lasting(inner) for inner in value] if isinstance(value, list) else value
+
+
+def _absorb(digest: Any, name: str, value: Any) -> None:
+    if isinstance(value, dict) and any(isinstance(inner, np.ndarray) for inner in value.values()):
+        for key, inner in sorted(value.items()):
+            _absorb(digest, f"{name}.{key}", inner)
+    elif isinstance(value, np.ndarray):
+        digest.update(f"{name} {value.dtype} {value.shape}".encode() + value.tobytes())
+    else:
+        digest.update(f"{name} {json.dumps(value, sort_keys=True)}".encode())
+
+
+def names(folder: Path) -> list[str]:
+    """What lies in `folder`, hidden files too."""
+    return sorted(item.name for item in folder.iterdir())
+
+
+def tree(folder: Path) -> dict[str, str]:
+    """{path below `folder`: SHA-256 of the file}, hidden ones too."""
+    files = sorted(file for file in folder.rglob("*") if file.is_file())
+    return {str(f.relative_to(folder)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
+
+
+class Case:
+    """One kind of work. `trial` numbers let a case alternate between its variants."""
+
+    name: str
+    variants = 1
+    whole: list[Any]
+    """What the undisturbed work of each variant left, once it has run."""
+
+    def lay_out(self, place: Path, trial: int) -> None:
+        """The state before the work begins."""
+        raise NotImplementedError
+
+    def work(self, place: Path, trial: int) -> int:
+        """The work that is killed; the exit code."""
+        raise NotImplementedError
+
+    def again(self, place: Path, trial: int) -> int:
+        """How a user goes on after the kill; the exit code."""
+        return self.work(place, trial)
+
+    def after_kill(self, place: Path, trial: int) -> str:
+        """One word for what the kill left; AssertionError when something was lost."""
+        raise NotImplementedError
+
+    def result(self, place: Path, trial: int) -> Any:
+        """What the finished work left, comparable bit for bit."""
+        raise NotImplementedError
+
+
+class Mapping(Case):
+    """`perception map` of a folder of photos, names carried over from an earlier map that lies beside it."""
+
+    name = "mapping"
+    settings = (
+        "train.iterations=120",
+        "train.budget=1500",
+        "train.checkpoint_seconds=0.2",
+        "densify.every=20",
+        "instances.min_cluster_size=15",
+        "instances.min_samples=5",
+        "language.encoder=none",
+        "photos.holdout=4",
+        "photos.max_side=128",
+    )
+
+    def __init__(self, source: Path, labels: Path, earlier: Path):
+        self.source, self.labels, self.earlier = source, labels, earlier
+        self.digest = ""
+
+    def lay_out(self, place: Path, trial: int) -> None:
+        shutil.copytree(self.earlier, place / "earlier.gsmap")
+
+    def words(self, out: Path, earlier: Path | None) -> list[str]:
+        """The command's arguments."""
+        words = ["map", str(self.source), "-o", str(out), "--masks", f"labels:{self.labels}"]
+        words += [f"--set={pair}" for pair in self.settings]
+        return words if earlier is None else [*words, "--labels-from", str(earlier)]
+
+    def work(self, place: Path, trial: int) -> int:
+        return command(*self.words(place / "out.gsmap", place / "earlier.gsmap"))
+
+    def again(self, place: Path, trial: int) -> int:
+        return command(*self.words(place / "out.gsmap", place / "earlier.gsmap"), "--resume")
+
+    def after_kill(self, place: Path, trial: int) -> str:
+        assert tree(place / "earlier.gsmap") == tree(self.earlier), "the map from before changed"
+        self.digest = self.digest or contents(self.earlier)
+        assert contents(place / "earlier.gsmap") == self.digest
+        if not (place / "out.gsmap").exists():
+            return "not yet"
+        contents(place / "out.gsmap")
+        return "whole"
+
+    def result(self, place: Path, trial: int) -> Any:
+        assert names(place) == ["earlier.gsmap", "out.gsmap"], names(place)
+        assert (place / "out.gsmap" / "report.html").read_text().endswith("</html>\n")
+        return contents(place / "out.gsmap"), names(place / "out.gsmap")
+
+
+class Exporting(Case):
+    """`perception export` with every kind of file; odd trials overwrite an older export."""
+
+    name = "exporting"
+    variants = 2
+
+    def __init__(self, gmap: Path, cloud: Path, older: Path):
+        self.gmap, self.cloud, self.older = gmap, cloud, older
+
+    def lay_out(self, place: Path, trial: int) -> None:
+        shutil.copytree(self.gmap, place / "m.gsmap")
+        if trial % 2:
+            shutil.copytree(self.older, place / "out")
+        else:
+            (place / "out").mkdir()
+
+    def work(self, place: Path, trial: int) -> int:
+        return self.export(place, "--split", place / "out" / "split") if trial % 2 == 0 else self.export(place)
+
+    def export(self, place: Path, *more: object) -> int:
+        """One export into the folder `out`; the exit code."""
+        out = place / "out"
+        words = ["export", place / "m.gsmap", "--points", self.cloud, "-o", out / "cloud.ply", "--color", "instance"]
+        return command(*words, "--boxes", out / "boxes.json", "--scannet", out / "scannet", *more)
+
+    def after_kill(self, place: Path, trial: int) -> str:
+        assert tree(place / "m.gsmap") == tree(self.gmap), "the exported map changed"
+        whole, old = self.whole[trial % 2], tree(self.older) if trial % 2 else {}
+        here = {name: digest for name, digest in tree(place / "out").items() if not _aside(name)}
+        wrong = [name for name, digest in here.items() if digest not in (whole.get(name), old.get(name))]
+        assert not wrong, f"neither the old file nor the new one: {wrong}"
+        assert not [name for name in old if name not in here], "a file of the older export is gone"
+        split = [name for name in here if name.startswith("split")]
+        assert not split or len(split) == sum(name.startswith("split") for name in whole), "half of a split"
+        if here.get("cloud.ply") == whole["cloud.ply"]:
+            assert here == whole, "the cloud, written last, lies there before the rest does"
+        return "all files" if here == whole else "not all files"
+
+    def result(self, place: Path, trial: int) -> Any:
+        return tree(place / "out")
+
+
+def _aside(name: str) -> bool:
+    return any(part.startswith(".") for part in Path(name).parts)
+
+
+class Editing(Case):
+    """`perception label`, the viewer's corrections saved, and names carried over, in turns."""
+
+    name = "editing"
+    variants = 3
+
+    def __init__(self, gmap: Path, older: Path):
+        self.gmap, self.older = gmap, older
+
+    def lay_out(self, place: Path, trial: int) -> None:
+        shutil.copytree(self.gmap, place / "m.gsmap")
+
+    def work(self, place: Path, trial: int) -> int:
+        path = place / "m.gsmap"
+        kinds: list[Callable[[], int]] = [
+            lambda: command("label", path, 1, "grandma's cup"),
+            lambda: corrections(path),
+            lambda: command("label", path, "--from", self.older),
+        ]
+        return kinds[trial % 3]()
+
+    def again(self, place: Path, trial: int) -> int:
+        if trial % 3 == 1 and self.after_kill(place, trial) == "after":
+            return command("label", place / "m.gsmap", 0, "the table")  # what is merged cannot be merged again
+        return self.work(place, trial)
+
+    def after_kill(self, place: Path, trial: int) -> str:
+        now, whole = contents(place / "m.gsmap"), self.whole[trial % 3]
+        before = contents(self.gmap)
+        assert now in (before, whole[0]), "neither the map from before nor the edited one"
+        return "before" if now == before else "after"
+
+    def result(self, place: Path, trial: int) -> Any:
+        assert names(place) == ["m.gsmap"], names(place)
+        return contents(place / "m.gsmap"), names(place / "m.gsmap")
+
+
+def corrections(path: Path) -> int:
+    """What a person does in the viewer: rename, merge, remove, delete floaters, undo; then save."""
+    from perception.editing import Editor
+
+    editor = Editor(path)
+    ids = [entry["id"] for entry in editor.instances]
+    editor.rename(ids[0], "the table")
+    editor.merge(ids[1:3])
+    editor.remove(ids[3])
+    editor.undo()
+    editor.delete_floaters()
+    editor.save()
+    return 0
