@@ -10,6 +10,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.export import ExportOptions, Outputs, run_export
 from perception.gaussians.model import SH_C0
+from perception.io.recentre import map_origin
 from perception.io.store import GaussianMap, read_map
 from perception.types import PointCloud
 
@@ -22,18 +23,21 @@ def export_map(
 ) -> tuple[dict[str, Any], str]:
     """Writes the labelled cloud, its sidecar JSON and what `outputs` asks for; returns facts and a table.
 
-    Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids.
+    Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids. All coordinates are
+    those of the input that the map was made from.
     """
     if output.suffix.lower() not in (".ply", ".pcd", ".npz"):
         raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected .ply, .pcd or .npz")
     gmap = read_map(map_path)
-    cloud: PointCloud | Path = points if points is not None else surface_points(gmap)
+    origin = map_origin(map_path, gmap.info)
+    means = gmap.means + origin if origin.any() else gmap.means
+    cloud: PointCloud | Path = points if points is not None else surface_points(gmap, means)
     if points is None:  # every point is a Gaussian: nearest is itself
         options = ExportOptions(drop_noise=False, smooth=False)
     return run_export(
         output,
         cloud,
-        gmap.means,
+        means,
         gmap.instance_ids,
         {entry["id"]: entry for entry in gmap.instances},
         opacities=gmap.opacities,
@@ -44,8 +48,8 @@ def export_map(
     )
 
 
-def surface_points(gmap: GaussianMap) -> PointCloud:
-    """The means of opaque Gaussians with their colours."""
+def surface_points(gmap: GaussianMap, means: np.ndarray | None = None) -> PointCloud:
+    """The means of opaque Gaussians with their colours; `means` [N, 3] instead of the map's own."""
     rows = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY)
     colors = np.clip((gmap.sh[rows, 0] * SH_C0 + 0.5) * 255 + 0.5, 0, 255).astype(np.uint8)
-    return PointCloud(gmap.means[rows], colors)
+    return PointCloud((gmap.means if means is None else means)[rows], colors)
