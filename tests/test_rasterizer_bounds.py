@@ -60,7 +60,7 @@ def test_float32_gradients_of_colours_and_opacities_keep_their_bound(name):
 
     dL/dc_i = Σ g w_i errs by Σ |g| w_i b. dL/do_i = Σ g G_i T_i (c_i − R_i), R_i the colour behind, a weighted mean:
     all three factors are products of weights, |c_i − R_i| ≤ 2 max |c|, so it errs by Σ |g| (w_i / o_i) 2 max |c| 3 b.
-    Sums over P pixels add P U of the sum of magnitudes. Pixels on a threshold may be off by all they hold, in both builds.
+    Sums over P pixels add P U of the sum of magnitudes. Pixels on a threshold may be off by all that they hold.
     """
     inputs = {k: v.float().double() if isinstance(v, torch.Tensor) else v for k, v in SCENES[name]().items()}
     inputs["background"] = None
