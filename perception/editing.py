@@ -21,7 +21,7 @@ from perception.boxes import oriented_box
 from perception.config import InstanceConfig
 from perception.errors import InputError
 from perception.io.map_lock import writing
-from perception.io.store import GaussianMap, map_signature, read_map, write_map
+from perception.io.store import GaussianMap, map_signature, read_info, read_map, write_map
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
 
 FLOATER_SPREAD = 5.0
@@ -59,6 +59,7 @@ class Editor:
     def __init__(self, path: Path):
         self.path = Path(path)
         self._lock = threading.RLock()
+        read_info(self.path)  # says it best when there is no map
         self._signature = map_signature(self.path)
         self.original = read_map(self.path)
         gmap = self.original
