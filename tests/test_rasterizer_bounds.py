@@ -52,3 +52,62 @@ def test_float32_weights_keep_their_bound(name):
     assert bool(torch.isfinite(single).all())
     error = ((single - exact).abs() - 4 * U)[away] / exact[away].clamp(min=1e-300)
     assert bool((error <= bound[away]).all()), float((error / bound[away]).max())
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_float32_gradients_of_colours_and_opacities_keep_their_bound(name):
+    """L = Σ_p g_p C_p with b_p the largest bound on a weight's relative error in pixel p.
+
+    dL/dc_i = Σ g w_i errs by Σ |g| w_i b. dL/do_i = Σ g G_i T_i (c_i − R_i), R_i the colour behind, a weighted mean:
+    all three factors are products of weights, |c_i − R_i| ≤ 2 max |c|, so it errs by Σ |g| (w_i / o_i) 2 max |c| 3 b.
+    Sums over P pixels add P U of the sum of magnitudes. Pixels on a threshold may be off by all that they hold.
+    """
+    inputs = {k: v.float().double() if isinstance(v, torch.Tensor) else v for k, v in SCENES[name]().items()}
+    inputs["background"] = None
+    bound, away = relative_bound(inputs)
+    w = weights(reference.rasterize, inputs)
+    found = weights(perception.rasterize, cast(inputs))
+    opacity = inputs["opacities"].clamp(min=1e-300)
+    steep = (w / w.new_tensor(1).sub(_before(inputs, w)).clamp(min=1e-9)) > 0.99  # near the clamp of alpha
+    away = away & ~steep.any(dim=-1)
+    worst = torch.where(away, bound.amax(dim=-1), torch.ones_like(bound[..., 0]))
+    g = torch.rand(away.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64) - 0.4
+    grads = []
+    for given in (leaves(inputs), leaves(cast(inputs))):
+        image = perception.rasterize(**given).colors[0]
+        (image * g[..., None].to(image.dtype)).sum().backward()
+        grads.append((given["colors"].grad.double(), given["opacities"].grad.double()))
+    (color, opaque), (color32, opaque32) = grads
+    held = g.abs()[..., None] * torch.maximum(w, found)
+    slack = worst[..., None] + away.numel() * U
+    limit = (held * slack).sum(dim=(0, 1))
+    assert bool(((color32 - color).abs() <= limit[:, None] + 4 * U * g.abs().sum()).all())
+    # The slope of a threshold pixel is at most 1 / (1 − α) ≤ 1000 times what it holds.
+    slope = torch.where(away, 6 * worst, torch.full_like(worst, 2000.0))[..., None] + 2 * away.numel() * U
+    limit = (held * slope).sum(dim=(0, 1)) / opacity * inputs["colors"].abs().max()
+    assert bool(((opaque32 - opaque).abs() <= limit + 1e-5 * g.abs().sum()).all())
+
+
+def _before(inputs, w):
+    """[H, W, N] Σ of the weights in front of each Gaussian."""
+    z = inputs["means"] @ inputs["viewmats"][0, 2, :3] + inputs["viewmats"][0, 2, 3]
+    order = torch.argsort(z, stable=True)
+    before = torch.empty_like(w)
+    before[..., order] = torch.cumsum(w[..., order], dim=-1) - w[..., order]
+    return before
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_float32_gradients_are_finite_and_near_those_of_float64(name):
+    """Every argument. No bound is derived for sums that cancel: within 2 % of the largest component, except where a
+    pixel lies on a threshold in some Gaussian; needles and far cameras magnify roundings and are held to be finite."""
+    inputs = {k: v.float().double() if isinstance(v, torch.Tensor) else v for k, v in SCENES[name]().items()}
+    exact, single = gradients(perception.rasterize, inputs), gradients(perception.rasterize, cast(inputs))
+    bound, away = relative_bound(inputs)
+    known = bool(away.all()) and float(bound[weights(reference.rasterize, inputs) > 0].max()) < 1e-2
+    for argument in GIVEN:
+        assert bool(torch.isfinite(single[argument]).all()), argument
+        if known:
+            scale = float(exact[argument].abs().max())
+            error = float((single[argument].double() - exact[argument]).abs().max())
+            assert error <= 0.02 * scale + 1e-6, argument

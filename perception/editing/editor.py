@@ -22,7 +22,7 @@ from perception.config import InstanceConfig
 from perception.editing.changes import NEIGHBORS, described, instances_named, isolated, joined, nearest_filled
 from perception.errors import InputError
 from perception.io.map_lock import writing
-from perception.io.store import GaussianMap, map_signature, read_map, write_map
+from perception.io.store import GaussianMap, map_signature, read_info, read_map, write_map
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
 
 UNDO_DEPTH = 100
@@ -74,8 +74,8 @@ class Editor:
     def __init__(self, path: Path):
         self.path = Path(path)
         self._lock = threading.RLock()
-        # Taken before reading, so that a change in between is noticed; where nothing lies, read_map says it best.
-        self._signature = map_signature(self.path) if self.path.exists() else ()
+        read_info(self.path)  # says it best when there is no map
+        self._signature = map_signature(self.path)
         self.original = read_map(self.path)
         gmap = self.original
         descriptions, self._encoder = from_arrays(gmap.language) if gmap.language else ([], "")

@@ -10,6 +10,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.export import ExportOptions, Outputs, run_export
 from perception.gaussians.model import SH_C0
+from perception.io.recentre import map_origin
 from perception.io.store import GaussianMap, read_map
 from perception.types import PointCloud
 
@@ -22,8 +23,9 @@ def export_map(
 ) -> tuple[dict[str, Any], str]:
     """Writes the labelled cloud, its sidecar JSON and what `outputs` asks for; returns facts and a table.
 
-    Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids. An output of .mcap or
-    .rrd is the whole map for viewers: points, instances, boxes, cameras and photos.
+    Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids, and coordinates are
+    those of the input that the map was made from. An output of .mcap or .rrd is the whole map for viewers: points,
+    instances, boxes, cameras and photos.
     """
     if output.suffix.lower() in (".mcap", ".rrd"):
         return _for_viewers(map_path, output, points)
@@ -32,13 +34,15 @@ def export_map(
             f"{output}: unknown kind of cloud '{output.suffix}', expected .ply, .pcd, .npz, or for viewers .mcap, .rrd"
         )
     gmap = read_map(map_path)
-    cloud: PointCloud | Path = points if points is not None else surface_points(gmap)
+    origin = map_origin(map_path, gmap.info)
+    means = gmap.means + origin if origin.any() else gmap.means
+    cloud: PointCloud | Path = points if points is not None else surface_points(gmap, means)
     if points is None:  # every point is a Gaussian: nearest is itself
         options = ExportOptions(drop_noise=False, smooth=False)
     return run_export(
         output,
         cloud,
-        gmap.means,
+        means,
         gmap.instance_ids,
         {entry["id"]: entry for entry in gmap.instances},
         opacities=gmap.opacities,
@@ -67,8 +71,8 @@ def _for_viewers(map_path: Path, output: Path, points: Path | None) -> tuple[dic
     return facts, f"{output}: the map with {len(gmap.instances)} instances and {len(views)} cameras"
 
 
-def surface_points(gmap: GaussianMap) -> PointCloud:
-    """The means of opaque Gaussians with their colours."""
+def surface_points(gmap: GaussianMap, means: np.ndarray | None = None) -> PointCloud:
+    """The means of opaque Gaussians with their colours; `means` [N, 3] instead of the map's own."""
     rows = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY)
     colors = np.clip((gmap.sh[rows, 0] * SH_C0 + 0.5) * 255 + 0.5, 0, 255).astype(np.uint8)
-    return PointCloud(gmap.means[rows], colors)
+    return PointCloud((gmap.means if means is None else means)[rows], colors)

@@ -19,6 +19,7 @@ from perception.instances.survival import carried_text, carry_labels
 from perception.io.inputs import load_scene
 from perception.io.map_lock import writing
 from perception.io.photos import load_photo
+from perception.io.recentre import recentred
 from perception.io.scene_cache import load_saved_scene, save_scene, view_json
 from perception.io.store import GaussianMap, read_info, read_map, write_map
 from perception.masks import MaskSource, make_source
@@ -187,6 +188,7 @@ def _scene(source: Path, work: Path, config: MapConfig, progress: Progress) -> S
         scene = load_scene(
             source, work / "sfm", camera_file=camera, progress=_stage(progress, "poses"), seed=config.seed
         )
+        scene = recentred(scene)
         save_scene(work / "scene", scene)
     return scene
 
@@ -371,6 +373,8 @@ def _stage(progress: Progress, name: str) -> Callable[..., None]:
 def _tell_scene(scene: Scene, progress: Progress) -> None:
     report = scene.report
     progress.log(f"{len(scene.views)} posed photos, {len(scene.points)} points")
+    if "origin" in report:
+        progress.log(f"far from the origin: the map's own lies at {report['origin']}; exports are in the input's frame")
     for entry in report.get("left_out", []):
         progress.log(f"left out: {entry['name']} ({entry['why']})")
     for warning in report.get("warnings", []):

@@ -14,6 +14,7 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
 from perception.gaussians.train import depth_image
 from perception.instances.silhouettes import render_silhouettes
+from perception.io.recentre import map_origin, moved
 from perception.io.store import GaussianMap, read_map
 from perception.types import OrientedBox, View
 
@@ -26,14 +27,16 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     rgb: 8-bit PNG. depth: 16-bit PNG, thousandths of the map's unit along the optical axis, 0 = nothing.
     instances: 16-bit PNG of id + 1, 0 = none. features: 8-bit PNG of the three main components. boxes: rgb with the
     instances' oriented boxes, hidden edges thin.
-    cameras: a transforms.json; None takes the map's held-out views (all views if none were held out). A camera with
-    lens distortion is rendered as that lens sees, so that the picture lies over the photo it was given for.
+    cameras: a transforms.json in the coordinates of the map's input; None takes the map's held-out views (all views if
+    none were held out). A camera with lens distortion is rendered as that lens sees, so that the picture lies over the
+    photo it was given for.
     """
     for kind in what:
         if kind not in KINDS:
             raise InputError(f"--what: found '{kind}', expected one of: {', '.join(KINDS)}")
     gmap = read_map(map_path)
-    views = map_views(gmap) if cameras is None else _cameras(cameras)
+    origin = map_origin(map_path, gmap.info)
+    views = map_views(gmap) if cameras is None else [moved(view, origin) for view in _cameras(cameras)]
     gaussians = as_gaussians(gmap)
     for kind in what:
         folder = output if len(what) == 1 else output / kind

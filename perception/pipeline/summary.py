@@ -76,6 +76,8 @@ def info_text(path: Path, info: dict[str, Any]) -> str:
         f"trained {training.get('iterations')} iterations ({_rates(training)}); "
         f"peak memory {info.get('peak_memory_mib')} MiB",
     ]
+    if "origin" in scene:
+        lines.append(f"the map's origin lies at {scene['origin']} of its input; exports are in the input's frame")
     if training.get("profile"):
         lines.append("of training: " + ", ".join(f"{name} {share:.0%}" for name, share in shares(training).items()))
     if "psnr" in quality:

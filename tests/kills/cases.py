@@ -96,7 +96,6 @@ class Mapping(Case):
 
     name = "mapping"
     settings = (
-        "train.iterations=120",
         "train.budget=1500",
         "train.checkpoint_seconds=0.2",
         "densify.every=20",
@@ -107,8 +106,8 @@ class Mapping(Case):
         "photos.max_side=128",
     )
 
-    def __init__(self, source: Path, labels: Path, earlier: Path):
-        self.source, self.labels, self.earlier = source, labels, earlier
+    def __init__(self, source: Path, labels: Path, earlier: Path, iterations: int):
+        self.source, self.labels, self.earlier, self.iterations = source, labels, earlier, iterations
         self.digest = ""
 
     def lay_out(self, place: Path, trial: int) -> None:
@@ -117,7 +116,7 @@ class Mapping(Case):
     def words(self, out: Path, earlier: Path | None) -> list[str]:
         """The command's arguments."""
         words = ["map", str(self.source), "-o", str(out), "--masks", f"labels:{self.labels}"]
-        words += [f"--set={pair}" for pair in self.settings]
+        words += ["--iterations", str(self.iterations), *(f"--set={pair}" for pair in self.settings)]
         return words if earlier is None else [*words, "--labels-from", str(earlier)]
 
     def work(self, place: Path, trial: int) -> int:

@@ -96,15 +96,16 @@ def ask(work: Callable[[], Any]) -> Any:
     return value
 
 
-def writes_of(work: Callable[[], Any], folder: Path) -> list[str]:
-    """The changes `work` makes below `folder`, in order, as "event path": what Moment.write counts."""
+def watch(work: Callable[[], Any], folder: Path) -> tuple[float, list[str]]:
+    """Seconds that `work` takes, and the changes it makes below `folder`, as "event path": what Moment.write counts."""
 
-    def watched() -> list[str]:
+    def watched() -> tuple[float, list[str]]:
         seen: list[str] = []
         _on_write(folder, seen.append)
+        started = time.monotonic()
         code = work()
         assert code == 0, f"exit code {code}"
-        return seen
+        return time.monotonic() - started, seen
 
     return ask(lambda: _quiet(watched))
 

@@ -42,7 +42,7 @@ def main() -> int:
     args = _arguments()
     _warm()
     with tempfile.TemporaryDirectory(prefix="kills-", dir=args.folder) as folder:
-        cases = _cases(Path(folder), args.scene, args.sfm)
+        cases = _cases(Path(folder), args)
         rows = [_kill(cases[name], Path(folder), args) for name in args.what]
     print(f"{'':12}{'kills':>7}{'survived':>10}{'resumes killed':>16}{'run, s':>9}  left behind")
     for row in rows:
@@ -68,6 +68,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument(
         "--sfm", action=argparse.BooleanOptionalAction, default=True, help="from photos alone, or with given poses"
     )
+    parser.add_argument("--iterations", type=int, default=120, help="of training")
+    parser.add_argument("--fresh", action=argparse.BooleanOptionalAction, default=True, help="compare with no fork too")
     parser.add_argument("--folder", type=Path, help="where to work; a temporary one by default")
     parser.add_argument("--json", type=Path, metavar="OUT.json")
     args = parser.parse_args()
@@ -91,12 +93,14 @@ def _warm() -> None:
     import perception.pipeline.run  # noqa: F401
 
 
-def _cases(folder: Path, scene: Path | None, sfm: bool) -> dict[str, Case]:
+def _cases(folder: Path, args: argparse.Namespace) -> dict[str, Case]:
     """The scene, a finished map of it, and the three cases around them."""
+    scene = args.scene
     if scene is None:
         scene = folder / "scene"
         children.ask(lambda: _make_scene(scene))
-    mapping = Mapping(scene / "images" if sfm else scene / "transforms.json", scene / "labels", folder)
+    source = scene / "images" if args.sfm else scene / "transforms.json"
+    mapping = Mapping(source, scene / "labels", folder, args.iterations)
     mapping.earlier = gmap = folder / "earlier.gsmap"
     _do(lambda: command(*mapping.words(gmap, None)), folder)
     first = folder / "first"
@@ -130,7 +134,9 @@ def _make_scene(scene: Path) -> None:
 
 def _kill(case: Case, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     rng = np.random.default_rng([args.seed, NAMES.index(case.name)])
-    lengths, writes = _undisturbed(case, folder, case.name == "mapping" and args.kills >= 20)
+    lengths, writes = _undisturbed(case, folder)
+    if isinstance(case, Mapping) and args.fresh:
+        _check_forking(case, folder)
     row: dict[str, Any] = {"what": case.name, "kills": 0, "survived": 0, "killed_again": 0, "lost": []}
     row |= {"run_seconds": float(np.mean(lengths)), "writes": len(writes[0]), "left": collections.Counter()}
     for trial in range(3 * (args.kills + args.writes)):  # a run may end before its kill
@@ -152,7 +158,7 @@ def _kill(case: Case, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     return row
 
 
-def _undisturbed(case: Case, folder: Path, fresh: bool) -> tuple[list[float], list[list[str]]]:
+def _undisturbed(case: Case, folder: Path) -> tuple[list[float], list[list[str]]]:
     """How long each variant takes and which changes it makes; keeps what it ends with as the case's `whole`."""
     lengths, writes = [], []
     case.whole = []
@@ -160,19 +166,14 @@ def _undisturbed(case: Case, folder: Path, fresh: bool) -> tuple[list[float], li
         place = folder / f"{case.name}-whole-{variant}"
         place.mkdir()
         case.lay_out(place, variant)
-        lengths.append(_do(partial(case.work, place, variant), place))
+        seconds, changes = children.watch(partial(case.work, place, variant), place)
+        lengths.append(seconds)
+        writes.append(changes)
         case.whole.append(children.ask(partial(case.result, place, variant)))
-        place = folder / f"{case.name}-writes-{variant}"
-        place.mkdir()
-        case.lay_out(place, variant)
-        writes.append(children.writes_of(partial(case.work, place, variant), place))
-        assert children.ask(partial(case.result, place, variant)) == case.whole[-1], "two runs differ"
-    if fresh:
-        _check_forking(case, folder)
     return lengths, writes
 
 
-def _check_forking(case: Any, folder: Path) -> None:
+def _check_forking(case: Mapping, folder: Path) -> None:
     """A fresh interpreter must end with the very map that a forked child ends with."""
     place = folder / "fresh"
     place.mkdir()

@@ -1,0 +1,73 @@
+"""A seeded map is the same map, byte for byte, whatever the number of threads."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perception.cli import main
+from perception.config import load_config
+from perception.io.cloud import read_cloud, write_cloud
+from perception.io.store import read_map
+from perception.pipeline.mapping import build_map
+from perception.types import PointCloud
+
+PAIRS = ["train.iterations=100", "train.budget=3000", "densify.every=20", "densify.fill_every=2", "photos.holdout=6"]
+PAIRS += ["instances.min_cluster_size=15", "instances.min_samples=5", "language.encoder=none"]
+FILES = ("gaussians.ply", "features.npy", "instance_ids.npy", "membership.npy", "instances.json")
+
+
+@pytest.fixture
+def threads(monkeypatch: pytest.MonkeyPatch):
+    """Sets torch's number of threads, which the kernels follow; it is put back afterwards."""
+    import torch
+
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def thin(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small scene with one point in forty, so that the map has to grow."""
+    folder = tmp_path_factory.mktemp("thin")
+    cloud = read_cloud(small_scene / "truth" / "gt_points.ply")
+    assert cloud.colors is not None
+    write_cloud(folder / "points.ply", PointCloud(cloud.points[::40], cloud.colors[::40]))
+    cameras = json.loads((small_scene / "transforms.json").read_text())
+    for frame in cameras["frames"]:
+        frame["file_path"] = str(small_scene / frame["file_path"])
+    source = folder / "transforms.json"
+    source.write_text(json.dumps({**cameras, "ply_file_path": str(folder / "points.ply")}))
+    return source
+
+
+def test_a_seeded_map_is_the_same_for_one_two_and_three_threads(
+    thin: Path, small_scene: Path, tmp_path: Path, threads
+) -> None:
+    words = ["map", str(thin), "--masks", f"labels:{small_scene / 'labels'}", "--seed", "5"]
+    words += [f"--set={pair}" for pair in PAIRS]
+    for count in (1, 2, 3):
+        threads(count)
+        assert main([*words, "-o", str(tmp_path / f"{count}.gsmap")]) == 0
+    one = read_map(tmp_path / "1.gsmap")
+    for count in (2, 3):
+        for name in FILES:
+            assert (tmp_path / "1.gsmap" / name).read_bytes() == (tmp_path / f"{count}.gsmap" / name).read_bytes(), name
+        other = read_map(tmp_path / f"{count}.gsmap")
+        assert one.info["quality"] == other.info["quality"]
+        assert one.info["training"]["decisions"] == other.info["training"]["decisions"]
+        assert all(np.array_equal(one.cameras[name], other.cameras[name]) for name in one.cameras)
+    assert 700 < len(one) <= 3000 and any("holes" in told for told in one.info["training"]["decisions"])
+
+
+def test_another_seed_is_another_map(thin: Path, small_scene: Path, tmp_path: Path) -> None:
+    """Else the test above would show nothing."""
+    maps = []
+    for seed in (1, 2):
+        config = load_config(None, [*PAIRS, f"masks=labels:{small_scene / 'labels'}", f"seed={seed}"])
+        maps.append(build_map(thin, tmp_path / f"{seed}.gsmap", config))
+    assert len(maps[0]) != len(maps[1]) or not np.array_equal(maps[0].means, maps[1].means)

@@ -1,0 +1,109 @@
+"""A georeferenced scene gives the map that the same scene gives near the origin, and exports in its own coordinates."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from perception.cli import main
+from perception.config import load_config
+from perception.errors import InputError
+from perception.io.cloud import read_cloud, write_cloud
+from perception.io.recentre import FAR, map_origin, recentred
+from perception.io.store import read_map
+from perception.pipeline.mapping import build_map
+from perception.types import Scene, View
+
+ORIGIN = np.array([367_000.0, 5_790_000.0, 40.0])  # UTM 33N, metres
+QUICK = ["train.iterations=60", "train.budget=3000", "language.encoder=none", "densify.every=20", "photos.holdout=6"]
+QUICK += ["instances.min_cluster_size=15", "instances.min_samples=5", "train.random_background=false"]
+
+
+def scene_at(place: np.ndarray, path: float = 1.0) -> Scene:
+    """Five cameras on a line of length `path` whose middle is `place`, and a cloud around it."""
+    rng = np.random.default_rng(0)
+    views = []
+    for x in np.linspace(-0.5, 0.5, 5) * path:
+        turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, -turn @ (place + np.array([x, 0, 0]))
+        views.append(View(f"{x}", Path("x"), np.eye(3), 4, 4, pose))
+    return Scene(views, place + rng.normal(size=(50, 3)), np.zeros((50, 3), np.uint8))
+
+
+def test_only_what_is_far_is_moved() -> None:
+    near = scene_at(np.array([FAR / 2 - 1, 0, 0]))
+    assert recentred(near) is near
+    far = scene_at(ORIGIN)
+    scene = recentred(far)
+    origin = np.array(scene.report["origin"])
+    assert np.linalg.norm(origin - ORIGIN) < 1 and "origin" not in far.report
+    np.testing.assert_allclose(scene.points + origin, far.points, rtol=0, atol=1e-9)
+    for old, new in zip(far.views, scene.views, strict=True):  # a place is seen where it was
+        place = np.append(far.points[0], 1)
+        seen = new.camera_from_world @ np.append(far.points[0] - origin, 1)
+        np.testing.assert_allclose(seen, old.camera_from_world @ place, rtol=0, atol=1e-8)
+
+
+def test_one_camera_or_many_in_one_place_stay() -> None:
+    scene = scene_at(ORIGIN, path=0)
+    scene.views = scene.views[:1]
+    assert recentred(scene) is scene
+
+
+@pytest.mark.parametrize("origin", [[1, 2], "x", [1, 2, float("nan")], None, {}])
+def test_an_origin_that_is_none_is_told(origin: object) -> None:
+    with pytest.raises(InputError, match=r"scene\.origin is no place"):
+        map_origin(Path("m.gsmap"), {"scene": {"origin": origin}})
+
+
+@pytest.fixture(scope="module")
+def both(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The small scene where it is and at ORIGIN: {"near": folder, "far": folder}, each with cloud, cameras and map."""
+    folder = tmp_path_factory.mktemp("far")
+    config = load_config(None, [*QUICK, f"masks=labels:{small_scene / 'labels'}"])
+    for name, shift in (("near", np.zeros(3)), ("far", ORIGIN)):
+        (folder / name).mkdir()
+        cloud = read_cloud(small_scene / "truth" / "gt_points.ply")
+        cloud.points = cloud.points.astype(np.float64) + shift
+        write_cloud(folder / name / "points.ply", cloud)
+        cameras = json.loads((small_scene / "transforms.json").read_text())
+        for frame in cameras["frames"]:
+            frame["file_path"] = str(small_scene / frame["file_path"])
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, 3] += shift
+            frame["transform_matrix"] = matrix.tolist()
+        source = folder / name / "transforms.json"
+        source.write_text(json.dumps({**cameras, "ply_file_path": str(folder / name / "points.ply")}))
+        build_map(source, folder / name / "m.gsmap", config)
+    return {name: folder / name for name in ("near", "far")}
+
+
+def test_a_georeferenced_scene_maps_as_well_as_one_at_home(both: dict[str, Path]) -> None:
+    """The rounding of the moved coordinates differs, 1e-9 m in double, so bits do; the quality may not."""
+    near, far = (read_map(both[name] / "m.gsmap") for name in ("near", "far"))
+    assert "origin" not in near.info["scene"] and np.abs(far.means).max() < 100
+    assert far.info["quality"]["psnr"] == pytest.approx(near.info["quality"]["psnr"], abs=0.3)
+    assert len(far.instances) > 3
+
+
+def test_exports_and_cameras_are_in_the_inputs_coordinates(both: dict[str, Path], tmp_path: Path) -> None:
+    far = both["far"]
+    labelled, own = tmp_path / "labelled.ply", tmp_path / "own.ply"
+    words = ["--points", str(far / "points.ply"), "-o", str(labelled)]
+    assert main(["export", str(far / "m.gsmap"), *words]) == 0
+    given, result = read_cloud(far / "points.ply"), read_cloud(labelled)
+    assert np.array_equal(given.points, result.points) and (result.labels["instance_id"] >= 0).mean() > 0.3
+    assert main(["export", str(far / "m.gsmap"), "-o", str(own)]) == 0
+    gmap = read_map(far / "m.gsmap")
+    shown = gmap.means[gmap.opacities >= 0.5] + map_origin(far, gmap.info)
+    np.testing.assert_allclose(read_cloud(own).points, shown, rtol=0, atol=1e-9)
+    for given in ([], ["--cameras", str(far / "transforms.json")]):
+        assert main(["render", str(far / "m.gsmap"), *given, "-o", str(tmp_path / str(len(given)))]) == 0
+    for held in (tmp_path / "0").rglob("*.png"):  # the held-out views, from the map and from the file
+        one, other = cv2.imread(str(held)), cv2.imread(str(tmp_path / "2" / held.name))
+        assert np.abs(one.astype(int) - other).mean() < 0.5
