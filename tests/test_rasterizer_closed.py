@@ -7,9 +7,9 @@ from fractions import Fraction
 
 import pytest
 import torch
-from hard_scenes import SCENES, U
+from hard_scenes import SCENES, U, weights
 from test_rasterizer import IMAGES, grads_and_images, leaves, scene
-from test_rasterizer_bounds import cast
+from test_rasterizer_bounds import GIVEN, cast
 
 import perception
 
@@ -158,6 +158,37 @@ def test_a_background_that_is_not_finite_is_named(value):
     inputs["background"][1, 2] = value
     with pytest.raises(perception.InputError, match=r"background\[1\] is not finite"):
         perception.rasterize(**inputs)
+
+
+@pytest.mark.parametrize("factor", [1e-30, 1e-15, 1e15])
+@pytest.mark.parametrize("name", ["means", "scales", "colors", "features", "background", "viewmats", "Ks"])
+def test_float32_holds_whatever_lies_within_1e15(name, factor):
+    """Images and gradients of finite inputs are finite; beyond, squares of gradients' factors may overflow."""
+    inputs = scene(n=60, cameras=1)
+    inputs[name] = inputs[name] * factor
+    if name == "Ks":
+        inputs[name][:, 2, 2] = 1
+    given = leaves(cast(inputs))
+    out = perception.rasterize(**given)
+    sum(getattr(out, image).sum() for image in IMAGES).backward()
+    assert all(bool(torch.isfinite(getattr(out, image)).all()) for image in IMAGES)
+    for argument in GIVEN:
+        assert bool(torch.isfinite(given[argument].grad).all()), argument
+
+
+def test_a_cotangent_that_is_not_finite_reaches_only_what_the_pixel_shows():
+    """What a loss sends into one pixel is nobody else's concern; Adam skips and counts what is not finite."""
+    inputs = leaves(cast(scene(n=200, cameras=1)))
+    out = perception.rasterize(**inputs)
+    row, column = 14, 18
+    picks = torch.zeros_like(out.colors)
+    picks[0, row, column] = float("nan")
+    out.colors.backward(picks)
+    sees = weights(perception.rasterize, cast(scene(n=200, cameras=1)))[row, column] > 0
+    assert 0 < int(sees.sum()) < 200
+    for name in ("means", "opacities", "colors", "scales"):
+        spoilt = ~torch.isfinite(inputs[name].grad.reshape(200, -1)).all(dim=1)
+        assert torch.equal(spoilt, sees), name
 
 
 # ------------------------------------------------------------------------ bits

@@ -79,6 +79,8 @@ def _warnings(info: dict[str, Any], gaussians: Gaussians, views: list[View]) -> 
     mean = info["quality"].get("psnr")
     bad = [f"{name} ({figures['psnr']:.1f} dB)" for name, figures in scored.items() if mean - figures["psnr"] > 6]
     told = [*_left_out(info["scene"]), *info["scene"].get("warnings", []), *info["masks"].get("warnings", [])]
+    if skipped := info["training"].get("skipped_gradients"):
+        told.append(f"{skipped} gradients were not finite and were skipped")
     if bad:
         told.append(f"held-out views far below the mean of {mean:.1f} dB: {', '.join(bad)}")
     weak = weak_coverage(gaussians, views)
