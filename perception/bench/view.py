@@ -31,7 +31,7 @@ WIDTH, HEIGHT = 900, 400
 SCENE = slice(290, 490)
 """Columns that neither the panel nor the browser's notices cover."""
 STAGES = ("page", "panel", "received", "first", "whole")
-LIMIT = 300.0
+LIMIT = 400.0
 """Seconds after which a page without a picture is a failure."""
 ENOUGH = 200
 """Pixels of a colour that make it seen."""
