@@ -16,6 +16,7 @@ from perception.export.graph import (
     mesh_normals,
     radius_edges,
     scannet_weights,
+    step_weights,
 )
 from perception.export.neighbors import Neighbors
 from perception.export.smooth import SmoothOptions, felzenszwalb, read_segments, segment_cloud, vote
@@ -207,7 +208,34 @@ def test_colour_keeps_a_poster_from_its_wall():
     normals = np.tile(np.float32([0, 0, 1]), (4000, 1))
     assert segment_cloud(PointCloud(points, colors, normals), SmoothOptions(color_weight=0)).max() == 0
     segments = segment_cloud(PointCloud(points, colors, normals))
-    assert not set(segments[poster]) & set(segments[~poster])
+    assert segments.max() == 1
+    own = np.bincount(segments[poster]).argmax()
+    assert ((segments == own) != poster).mean() < 0.01  # its corners are rounded by the median
+
+
+def test_a_book_upon_a_book_is_a_segment_of_its_own_by_its_step_alone():
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.random((6000, 2)), np.zeros((6000, 1))], axis=1)
+    upper = (np.abs(points[:, :2] - 0.5) < 0.3).all(axis=1)
+    points[upper, 2] = 0.04  # about three times the points' spacing; their normals are the same
+    segments = segment_cloud(PointCloud(points, normals=np.tile(np.float32([0, 0, 1]), (6000, 1))))
+    assert len(set(segments[upper])) == len(set(segments[~upper])) == 1
+    assert not set(segments[upper]) & set(segments[~upper])
+
+
+def test_steps_are_squared_sines_against_the_tangent_planes():
+    points = np.array([[0, 0, 0], [2, 0, 0], [3, 0, 1], [3, 0, 1]])
+    normals = np.float32([[0, 0, 1], [0, 0, 1], [0, 0, 0], [1, 0, 0]])
+    edges = np.int32([[0, 1], [1, 2], [2, 3], [1, 3]])
+    np.testing.assert_allclose(step_weights(points, normals, edges), [0, 0.5, 0, 0.5], atol=1e-6)
+
+
+def test_prints_and_shades_do_not_part_one_surface():
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.random((6000, 2)), np.zeros((6000, 1))], axis=1)
+    shade = 90 + 120 * points[:, :1] + rng.normal(0, 25, (6000, 3))  # from dark to bright, and grainy
+    normals = np.tile(np.float32([0, 0, 1]), (6000, 1))
+    assert segment_cloud(PointCloud(points, shade.clip(0, 255).astype(np.uint8), normals)).max() == 0
 
 
 def test_the_vote_is_the_mode_and_ties_go_to_the_smallest():

@@ -4,6 +4,7 @@ BENCHES = (
     "rasterizer",
     "training",
     "masks",
+    "mask-speed",
     "language",
     "query",
     "view",

@@ -119,3 +119,15 @@ def scannet_weights(points: np.ndarray, normals: np.ndarray, edges: np.ndarray, 
     direction = (points[b] - points[a]).astype(np.float32)
     convex = np.einsum("ei,ei->e", normals[b], direction) > 0
     return np.where(convex, weights * weights, weights).astype(np.float32)
+
+
+def step_weights(points: np.ndarray, normals: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """How far each edge (a, b) leaves the planes of its ends, [E] float32: the squared sine of the larger angle.
+
+    0 on a plane, small on a curved surface, near 1 between parallel surfaces that overlap: a book on a book, a poster
+    on its wall. A missing (zero) normal has no say.
+    """
+    a, b = edges[:, 0], edges[:, 1]
+    chord = (points[b] - points[a]).astype(np.float32)
+    off = np.maximum(*(np.einsum("ei,ei->e", normals[end], chord) ** 2 for end in (a, b)))
+    return (off / np.maximum(np.einsum("ei,ei->e", chord, chord), np.finfo(np.float32).tiny)).astype(np.float32)

@@ -22,13 +22,15 @@ from perception.export.graph import (
     radius_edges,
     scannet_weights,
     spacing,
+    step_weights,
 )
 from perception.io.cloud_memory import require_memory
 from perception.types import PointCloud
 
-COLOR_WEIGHT = 0.05  # of bare clouds: without it a poster joins its wall, whose normals are the same
-
-
+COLOR_WEIGHT = 0.2  # of bare clouds: without it a sheet of paper joins its table, whose normals are the same
+_COLOR_EDGE = 0.3  # RGB distance from which colours part: less is texture and shade, which would part everything
+_COLOR_NEIGHBORS = 9  # points, itself included, whose median colour is a point's: fine prints are no borders
+_STEP_WEIGHT = 0.1  # of leaving the tangent plane: parallel surfaces have the same normals
 NORMAL_NEIGHBORS = 12  # of each point, for the plane that gives its normal
 _BYTES_PER_POINT = 250  # at the height of a kNN segmentation, measured with a margin
 
@@ -39,8 +41,8 @@ class SmoothOptions:
 
     graph: "auto" (mesh edges when there are faces, else kNN), "mesh", "knn" or "radius". neighbors: of each
     point in the kNN graph. radius: length in the cloud's unit; None means three times the cloud's spacing.
-    color_weight: weight added per unit of RGB distance in [0, √3]; None means COLOR_WEIGHT, but 0 on mesh
-    edges, where ScanNet has none.
+    color_weight: weight added per unit of RGB distance in [0, √3] beyond 0.3; None means COLOR_WEIGHT, but 0 on
+    mesh edges, where ScanNet has none.
     """
 
     k_threshold: float = 0.01
@@ -75,18 +77,31 @@ def segment_cloud(cloud: PointCloud, options: SmoothOptions | None = None) -> np
     edges, lists = _graph(points, faces, kind, options)
     normals, oriented = _normals(cloud, faces, lists)
     weights = scannet_weights(points, normals, edges, oriented=oriented)
+    if kind != "mesh" and cloud.normals is not None:  # a mesh has no edge across a gap; normals estimated feel it
+        weights += _STEP_WEIGHT * step_weights(points, normals, edges)
     color_weight = options.color_weight
     if color_weight is None:
         color_weight = 0.0 if kind == "mesh" else COLOR_WEIGHT
     if color_weight and cloud.colors is not None:
-        weights += color_weight * _color_difference(cloud.colors, edges)
+        if lists is None:
+            lists = neighbor_lists(points, _COLOR_NEIGHBORS)
+        difference = _color_difference(_median_colors(cloud.colors, lists[:, :_COLOR_NEIGHBORS]), edges)
+        weights += color_weight * np.maximum(difference - _COLOR_EDGE, 0)
     weights = np.nan_to_num(weights, nan=2.0).astype(np.float32)
     return felzenszwalb(edges, weights, len(points), options.k_threshold, options.min_size)
 
 
+def _median_colors(colors: np.ndarray, lists: np.ndarray) -> np.ndarray:
+    """Colours [P, 3] float32, each the median, channel by channel, of colors [P, 3] uint8 over its neighbour list
+    [P, k]; a missing neighbour (−1) is the point itself."""
+    own = np.arange(len(colors), dtype=lists.dtype)[:, None]
+    near = colors[np.where(lists >= 0, lists, own)]
+    return np.partition(near, lists.shape[1] // 2, axis=1)[:, lists.shape[1] // 2].astype(np.float32)
+
+
 def _color_difference(colors: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Euclidean RGB distance [E] float32 of the ends of edges, in [0, √3]."""
-    difference = colors[edges[:, 0]].astype(np.float32) - colors[edges[:, 1]]
+    """Euclidean RGB distance [E] float32 of the ends of edges, in [0, √3]; colors: [P, 3] float32 in 0..255."""
+    difference = colors[edges[:, 0]] - colors[edges[:, 1]]
     return np.sqrt(np.einsum("ei,ei->e", difference, difference)) / np.float32(255)
 
 
