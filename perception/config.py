@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import types
 import typing
 from dataclasses import dataclass, field
@@ -176,10 +177,15 @@ def _parse(text: str, kind: Any, where: str) -> Any:
     raise InputError(f"{where}: found {text!r}, expected {names}")
 
 
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    return typing.get_type_hints(kind)
+
+
 def set_value(config: Any, key: str, value: Any, where: str = "--set", prefix: str = "") -> Any:
     """A copy of a config dataclass with one dotted `key` ("train.iterations") replaced."""
     head, _, rest = key.partition(".")
-    hints = typing.get_type_hints(type(config))
+    hints = _hints(type(config))
     if head not in hints:
         raise InputError(f"{where}: unknown setting '{prefix}{head}', expected one of: {', '.join(hints)}")
     current = getattr(config, head)

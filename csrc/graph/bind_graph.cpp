@@ -10,6 +10,7 @@
 #include "felzenszwalb.hpp"
 #include "kdtree.hpp"
 #include "neighborhood.hpp"
+#include "parallel.hpp"
 
 namespace nb = nanobind;
 using perception::graph::KdTree;
@@ -28,7 +29,7 @@ KdTree *make_tree(Points points, int threads) {
     throw nb::value_error("points: all coordinates must be finite");
   }
   nb::gil_scoped_release release;
-  return new KdTree(data, count, std::max(threads, 1));
+  return new KdTree(data, count, perception::graph::sane_threads(threads));
 }
 
 void knn(const KdTree &tree, Points queries, Array<std::int32_t, nb::shape<-1, -1>> indices,
@@ -39,7 +40,7 @@ void knn(const KdTree &tree, Points queries, Array<std::int32_t, nb::shape<-1, -
   }
   if (!(max_distance >= 0)) throw nb::value_error("max_distance must not be negative");
   nb::gil_scoped_release release;
-  tree.knn(queries.data(), count, static_cast<int>(k), max_distance, std::max(threads, 1), indices.data(),
+  tree.knn(queries.data(), count, static_cast<int>(k), max_distance, perception::graph::sane_threads(threads), indices.data(),
            squared.data());
 }
 
@@ -77,7 +78,7 @@ void plane_normals(Points points, Lists neighbors, Array<float, nb::shape<-1, 3>
   if (!within(neighbors, points.shape(0))) throw nb::value_error("neighbors: an index lies outside the points");
   nb::gil_scoped_release release;
   perception::graph::plane_normals(points.data(), neighbors.data(), neighbors.shape(0), neighbors.shape(1),
-                                   std::max(threads, 1), normals.data());
+                                   perception::graph::sane_threads(threads), normals.data());
 }
 
 void densest(Points points, Points means, Array<const float, nb::shape<-1, 6>> precisions,
@@ -94,7 +95,7 @@ void densest(Points points, Points means, Array<const float, nb::shape<-1, 6>> p
   const perception::graph::Gaussians gaussians{means.data(), precisions.data(), opacities.data(), instances.data()};
   nb::gil_scoped_release release;
   perception::graph::densest(gaussians, points.data(), candidates.data(), count, candidates.shape(1),
-                             std::max(threads, 1), labels.data());
+                             perception::graph::sane_threads(threads), labels.data());
 }
 
 }  // namespace

@@ -394,7 +394,7 @@ def _label_png() -> Target:
     from PIL import Image
 
     from perception.masks.labels import LabelFolder
-    from perception.masks.store import load_labels, stored_key, write_labels
+    from perception.masks.store import load_labels, stored_key
     from perception.types import View
 
     labels = np.arange(48).reshape(6, 8)
@@ -501,7 +501,8 @@ def _map_store() -> Target:
         gmap = read_map(path)
         assert len(gmap.features) == len(gmap.instance_ids) == len(gmap.membership) == len(gmap)
         gmap.instance_index()
-        verify_map(path)
+        if "sealed" in name:
+            verify_map(path)
 
     words = [
         "format_version",
