@@ -9,6 +9,7 @@
 #include <optional>
 #include <stdexcept>
 
+#include "../arguments.h"
 #include "frames.h"
 #include "parallel.h"
 #include "rasterizer.h"
@@ -37,6 +38,7 @@ auto *checked(const char *name, A &array, const std::vector<int64_t> &expected) 
   for (std::size_t i = 0; i < array.ndim(); ++i) found.push_back(static_cast<int64_t>(array.shape(i)));
   if (found != expected)
     throw std::invalid_argument(std::string(name) + ": shape " + shape_text(found) + ", expected " + shape_text(expected));
+  perception::require_aligned(name, array);
   return array.data();
 }
 

@@ -67,15 +67,15 @@ def _walk(file: Path, record: Callable[[_Reader], tuple[int, int]]) -> list[tupl
     """(id, other id) of every record; [] where there is no such file. Records with the same id are refused."""
     if not file.is_file():
         return []
-    reader, found, number = _Reader(file.read_bytes()), [], 0
+    reader, found = _Reader(file.read_bytes()), []
     try:
         (count,) = reader.take(_U64)
-        for number in range(1, count + 1):
+        for _ in range(count):
             found.append(record(reader))
         if len({first for first, _ in found}) != len(found):
             raise ValueError("an id occurs twice")
     except ValueError as error:
-        raise InputError(f"{file}: record {number} cannot be right ({error}); the model is damaged") from error
+        raise InputError(f"{file}: what follows {len(found)} good records cannot be right ({error}); the model is damaged") from error
     return found
 
 

@@ -89,7 +89,7 @@ def pinhole_from_lens(lens: Lens) -> tuple[tuple[float, float, float, float], in
 def _check_pinhole(lens: Lens, values: tuple[float, float, float, float], width: int, height: int) -> None:
     """Beyond these bounds no optics is meant, and float32 cannot tell the pixels' rays apart."""
     *focal, cx, cy = values
-    if not (MIN_FOCAL <= min(focal) and max(focal) <= MOST_PIXELS and max(abs(cx), abs(cy)) <= MOST_PIXELS):
+    if not (min(focal) >= MIN_FOCAL and max(focal) <= MOST_PIXELS and max(abs(cx), abs(cy)) <= MOST_PIXELS):
         raise InputError(
             f"camera {lens.model} {list(lens.params)}: seen as a pinhole of focal lengths {focal[0]:g}, {focal[1]:g} "
             f"and centre {cx:g}, {cy:g}; expected {MIN_FOCAL:g} to {MOST_PIXELS:g} and at most {MOST_PIXELS:g} pixels"

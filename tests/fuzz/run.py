@@ -103,7 +103,9 @@ class Session:
 
 
 def limit_memory(mebibytes: int) -> None:
-    """The address space may grow by so much from here on."""
+    """The address space may grow by so much from here on (AddressSanitizer reserves it whole: see ASAN_OPTIONS)."""
+    if "libasan" in Path("/proc/self/maps").read_text():
+        return
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + (mebibytes << 20), resource.getrlimit(resource.RLIMIT_AS)[1]))
 
@@ -119,7 +121,8 @@ def by_mutation(session: Session, runs: int, seconds: float, seed: int) -> None:
     last = session.folder / "last-input"  # what it was doing when it died of a signal
     pool = list(seeds)
     while session.runs < runs and time.perf_counter() - session.started < seconds:
-        data = mutate(rng.choice(pool), rng, session.target.words, seeds)
+        fresh = session.target.decides and rng.random() < 0.5
+        data = rng.randbytes(64) if fresh else mutate(rng.choice(pool), rng, session.target.words, seeds)
         last.write_bytes(data)
         before = session.read
         signal.setitimer(signal.ITIMER_REAL, HANG)
@@ -149,7 +152,23 @@ def by_coverage(session: Session, runs: int, seconds: float, seed: int, corpus: 
     if seconds < float("inf"):
         options.append(f"-max_total_time={int(seconds)}")
     atheris.Setup([sys.argv[0], *options, str(corpus)], session.one)
+    _count_compiled_edges()
     atheris.Fuzz()
+
+
+def _count_compiled_edges() -> None:
+    """Gives libFuzzer the counters of a core built with PERCEPTION_COVERAGE; nothing to do for another."""
+    import ctypes
+
+    from atheris import core_with_libfuzzer  # type: ignore[attr-defined]
+
+    from perception import _core
+
+    core = ctypes.CDLL(_core.__file__)
+    if hasattr(core, "perception_coverage"):
+        begin, end = ctypes.c_void_p(), ctypes.c_void_p()
+        core.perception_coverage(ctypes.byref(begin), ctypes.byref(end))
+        ctypes.CDLL(core_with_libfuzzer.__file__).__sanitizer_cov_8bit_counters_init(begin, end)
 
 
 def main(arguments: list[str] | None = None) -> int:

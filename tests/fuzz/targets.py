@@ -33,6 +33,7 @@ class Target:
     files: dict[str, bytes]
     variants: list[tuple[str, Callable[[bytes], bytes], bytes]]
     words: list[str] = field(default_factory=list)
+    decides: bool = False  # the bytes are decisions rather than content: any will do
     folder: TemporaryDirectory[str] | None = None
 
     def seeds(self) -> list[bytes]:
@@ -133,8 +134,8 @@ def _vertices(kind: str = "binary_little_endian", face: bool = True) -> bytes:
 
 _RAGGED = (
     (
-        b"ply\nformat binary_big_endian 1.0\nelement vertex 1\nproperty double x\nproperty double y\nproperty double z\n"
-        b"element face 2\nproperty list uchar ushort vertex_index\nproperty uchar flag\nend_header\n"
+        b"ply\nformat binary_big_endian 1.0\nelement vertex 1\nproperty double x\nproperty double y\n"
+        b"property double z\nelement face 2\nproperty list uchar ushort vertex_index\nproperty uchar flag\nend_header\n"
     )
     + struct.pack(">ddd", 0, 1, 2)
     + bytes([3, 0, 0, 0, 0, 0, 0, 9])
