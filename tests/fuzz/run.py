@@ -139,16 +139,17 @@ def by_coverage(session: Session, runs: int, seconds: float, seed: int, corpus: 
 
     for data in session.target.seeds():
         (corpus / hashlib.sha256(data).hexdigest()[:16]).write_bytes(data)
-    dictionary = session.folder / "words.dict"
-    escaped = ["".join(f"\\x{byte:02x}" for byte in word.encode("latin-1")) for word in session.target.words]
-    dictionary.write_text("".join(f'"{word}"\n' for word in escaped))
     options = [f"-runs={runs}", f"-seed={seed + 1}", f"-max_len={LONGEST}", f"-timeout={HANG}", "-rss_limit_mb=4096"]
     options += [
         f"-artifact_prefix={session.folder}/",
-        f"-dict={dictionary}",
         "-print_final_stats=1",
         "-close_fd_mask=0",
     ]
+    if session.target.words:
+        dictionary = session.folder / "words.dict"
+        escaped = ["".join(f"\\x{byte:02x}" for byte in word.encode("latin-1")) for word in session.target.words]
+        dictionary.write_text("".join(f'"{word}"\n' for word in escaped))
+        options.append(f"-dict={dictionary}")
     if seconds < float("inf"):
         options.append(f"-max_total_time={int(seconds)}")
     atheris.Setup([sys.argv[0], *options, str(corpus)], session.one)
