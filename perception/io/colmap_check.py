@@ -75,7 +75,8 @@ def _walk(file: Path, record: Callable[[_Reader], tuple[int, int]]) -> list[tupl
         if len({first for first, _ in found}) != len(found):
             raise ValueError("an id occurs twice")
     except ValueError as error:
-        raise InputError(f"{file}: what follows {len(found)} good records cannot be right ({error}); the model is damaged") from error
+        what = f"what follows {len(found)} good records cannot be right ({error})"
+        raise InputError(f"{file}: {what}; the model is damaged") from error
     return found
 
 

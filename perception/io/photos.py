@@ -27,6 +27,7 @@ DECODE_ERRORS = (
     ArithmeticError,
     RuntimeError,
     EOFError,
+    MemoryError,  # Pillow asks for as many bytes as a chunk says it has
     struct.error,
     zlib.error,
     Image.DecompressionBombError,

@@ -325,6 +325,7 @@ class CoreTarget:
 
     words: tuple[str, ...] = ()
     decides = True
+    memory = 512
 
     def seeds(self) -> list[bytes]:
         """Every function with nothing spoiled."""

@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 LONGEST = 4096
 HANG = 20
-"""Seconds after which one input counts as a hang."""
+"""Seconds of processor time after which one input counts as a hang."""
 
 
 def load(name: str) -> Any:
@@ -117,7 +117,7 @@ def _hang(number: int, frame: FrameType | None) -> None:
 def by_mutation(session: Session, runs: int, seconds: float, seed: int) -> None:
     """Seeded mutation without coverage; the same inputs for the same seed."""
     rng, seeds = random.Random(seed), session.target.seeds()
-    signal.signal(signal.SIGALRM, _hang)
+    signal.signal(signal.SIGPROF, _hang)
     last = session.folder / "last-input"  # what it was doing when it died of a signal
     pool = list(seeds)
     while session.runs < runs and time.perf_counter() - session.started < seconds:
@@ -125,9 +125,9 @@ def by_mutation(session: Session, runs: int, seconds: float, seed: int) -> None:
         data = rng.randbytes(64) if fresh else mutate(rng.choice(pool), rng, session.target.words, seeds)
         last.write_bytes(data)
         before = session.read
-        signal.setitimer(signal.ITIMER_REAL, HANG)
+        signal.setitimer(signal.ITIMER_PROF, HANG)
         session.one(data)
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
         if session.read > before:  # a good input is a good start
             pool = [*seeds, *pool[len(seeds) :][-200:], data]
     last.unlink(missing_ok=True)
@@ -139,7 +139,13 @@ def by_coverage(session: Session, runs: int, seconds: float, seed: int, corpus: 
 
     for data in session.target.seeds():
         (corpus / hashlib.sha256(data).hexdigest()[:16]).write_bytes(data)
-    options = [f"-runs={runs}", f"-seed={seed + 1}", f"-max_len={LONGEST}", f"-timeout={HANG}", "-rss_limit_mb=4096"]
+    options = [
+        f"-runs={runs}",
+        f"-seed={seed + 1}",
+        f"-max_len={LONGEST}",
+        f"-timeout={10 * HANG}",
+        "-rss_limit_mb=4096",
+    ]
     options += [
         f"-artifact_prefix={session.folder}/",
         "-print_final_stats=1",
@@ -180,9 +186,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after so long")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--engine", choices=("auto", "atheris", "mutate"), default="auto")
-    parser.add_argument(
-        "--memory", type=int, default=512, help="MiB that reading a few kilobytes may take (default 512)"
-    )
+    parser.add_argument("--memory", type=int, help="MiB that reading a few kilobytes may take (512; pictures 6144)")
     parser.add_argument("--out", type=Path, help="where inputs of defects and the corpus go (default: a new folder)")
     parser.add_argument("--keep-going", action="store_true", help="go on after a defect")
     parser.add_argument("--replay", type=Path, nargs="+", help="run these inputs only")
@@ -198,7 +202,7 @@ def main(arguments: list[str] | None = None) -> int:
     for number, data in enumerate(target.seeds()):  # also imports what readers import late
         if not target.run(data):
             raise SystemExit(f"seed {number} of {given.target} is refused: the target reaches nothing")
-    limit_memory(given.memory)
+    limit_memory(given.memory or target.memory)
     session = Session(target, folder, given.keep_going)
     if given.replay:
         for file in given.replay:

@@ -33,6 +33,7 @@ class Target:
     files: dict[str, bytes]
     variants: list[tuple[str, Callable[[bytes], bytes], bytes]]
     words: list[str] = field(default_factory=list)
+    memory: int = 512  # MiB that reading one input may take
     decides: bool = False  # the bytes are decisions rather than content: any will do
     folder: TemporaryDirectory[str] | None = None
 
@@ -378,6 +379,11 @@ def _config() -> Target:
 # ------------------------------------------------------------------ pictures
 
 
+_PICTURE = 6144
+"""MiB of address space: Pillow takes pictures of up to 179 million pixels, and asks for as much as a chunk's length
+says, at most 4 GiB, before it reads what is there."""
+
+
 def repaired_png(data: bytes) -> bytes:
     """The chunks' checksums made good, so that mutations reach what they hold."""
     out, at = bytearray(data[:8]), 8
@@ -416,7 +422,11 @@ def _label_png() -> Target:
         (name, make, seed.getvalue()) for name in good for make in (same, repaired_png) for seed in (wide, palette)
     ]
     return Target(
-        read, good, seeds, ["IHDR", "IDAT", "PLTE", "tEXt", "zTXt", "iTXt", "tRNS", "IEND", "iCCP", "eXIf", "acTL"]
+        read,
+        good,
+        seeds,
+        ["IHDR", "IDAT", "PLTE", "tEXt", "zTXt", "iTXt", "tRNS", "IEND", "iCCP", "eXIf", "acTL"],
+        _PICTURE,
     )
 
 
@@ -452,7 +462,11 @@ def _photo() -> Target:
         assert photo.dtype == np.uint8 and photo.shape == (height, width, 3)
 
     return Target(
-        read, {}, seeds, ["IHDR", "IDAT", "PLTE", "Exif\0\0", "eXIf", "tRNS", "JFIF", "\xff\xd8", "VP8 ", "II*\0"]
+        read,
+        {},
+        seeds,
+        ["IHDR", "IDAT", "PLTE", "Exif\0\0", "eXIf", "tRNS", "JFIF", "\xff\xd8", "VP8 ", "II*\0"],
+        _PICTURE,
     )
 
 
