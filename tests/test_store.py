@@ -198,7 +198,7 @@ def test_numbers_that_are_none_and_repeated_ids_are_told(copied: Path) -> None:
 
 
 def test_an_archive_that_would_fill_the_memory_is_refused(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("perception.io.map_files.MOST_ARCHIVE", 1000)
+    monkeypatch.setattr("perception.io.arrays.MOST_ARCHIVE", 1000)
     with pytest.raises(InputError) as error:
         perception.load_map(copied).get(0)
     one_line(error, "index.npz", "unpacks")

@@ -6,12 +6,15 @@
 #include <cmath>
 #include <stdexcept>
 
+#include "../arguments.h"
 #include "density.hpp"
 #include "felzenszwalb.hpp"
 #include "kdtree.hpp"
 #include "neighborhood.hpp"
+#include "parallel.hpp"
 
 namespace nb = nanobind;
+using perception::require_aligned;
 using perception::graph::KdTree;
 
 namespace {
@@ -21,6 +24,7 @@ using Array = nb::ndarray<T, Shape..., nb::c_contig, nb::device::cpu>;
 using Points = Array<const float, nb::shape<-1, 3>>;
 
 KdTree *make_tree(Points points, int threads) {
+  require_aligned("points", points);
   const float *data = points.data();
   const std::size_t count = points.shape(0);
   if (count == 0 || count > 0x7ffffff0) throw nb::value_error("points: between 1 and 2^31 points are needed");
@@ -28,23 +32,25 @@ KdTree *make_tree(Points points, int threads) {
     throw nb::value_error("points: all coordinates must be finite");
   }
   nb::gil_scoped_release release;
-  return new KdTree(data, count, std::max(threads, 1));
+  return new KdTree(data, count, perception::graph::sane_threads(threads));
 }
 
 void knn(const KdTree &tree, Points queries, Array<std::int32_t, nb::shape<-1, -1>> indices,
          Array<float, nb::shape<-1, -1>> squared, float max_distance, int threads) {
+  require_aligned("queries", queries, "indices", indices, "squared", squared);
   const std::size_t count = queries.shape(0), k = indices.shape(1);
   if (indices.shape(0) != count || squared.shape(0) != count || squared.shape(1) != k || k < 1 || k > 1024) {
     throw nb::value_error("indices and squared must be [Q, k] for queries [Q, 3], 1 <= k <= 1024");
   }
   if (!(max_distance >= 0)) throw nb::value_error("max_distance must not be negative");
   nb::gil_scoped_release release;
-  tree.knn(queries.data(), count, static_cast<int>(k), max_distance, std::max(threads, 1), indices.data(),
+  tree.knn(queries.data(), count, static_cast<int>(k), max_distance, perception::graph::sane_threads(threads), indices.data(),
            squared.data());
 }
 
 std::size_t segment(Array<const std::int32_t, nb::shape<-1, 2>> edges, Array<const float, nb::shape<-1>> weights,
                     float k, std::size_t min_size, Array<std::int32_t, nb::shape<-1>> labels) {
+  require_aligned("edges", edges, "weights", weights, "labels", labels);
   const std::size_t count = edges.shape(0), nodes = labels.shape(0);
   if (weights.shape(0) != count) throw nb::value_error("weights must be [E] for edges [E, 2]");
   const std::int32_t *e = edges.data();
@@ -65,6 +71,7 @@ bool within(const Lists &lists, std::size_t points) {
 }
 
 std::size_t undirected(Lists neighbors, Array<std::int32_t, nb::shape<-1, 2>> edges) {
+  require_aligned("neighbors", neighbors, "edges", edges);
   const std::size_t count = neighbors.shape(0), k = neighbors.shape(1);
   if (edges.shape(0) < count * k) throw nb::value_error("edges must have room for N * k pairs");
   if (!within(neighbors, count)) throw nb::value_error("neighbors: an index lies outside the points");
@@ -73,16 +80,19 @@ std::size_t undirected(Lists neighbors, Array<std::int32_t, nb::shape<-1, 2>> ed
 }
 
 void plane_normals(Points points, Lists neighbors, Array<float, nb::shape<-1, 3>> normals, int threads) {
+  require_aligned("points", points, "neighbors", neighbors, "normals", normals);
   if (normals.shape(0) != neighbors.shape(0)) throw nb::value_error("normals must be [Q, 3] for neighbors [Q, k]");
   if (!within(neighbors, points.shape(0))) throw nb::value_error("neighbors: an index lies outside the points");
   nb::gil_scoped_release release;
   perception::graph::plane_normals(points.data(), neighbors.data(), neighbors.shape(0), neighbors.shape(1),
-                                   std::max(threads, 1), normals.data());
+                                   perception::graph::sane_threads(threads), normals.data());
 }
 
 void densest(Points points, Points means, Array<const float, nb::shape<-1, 6>> precisions,
              Array<const float, nb::shape<-1>> opacities, Array<const std::int32_t, nb::shape<-1>> instances,
              Lists candidates, Array<std::int32_t, nb::shape<-1>> labels, int threads) {
+  require_aligned("points", points, "means", means, "precisions", precisions, "opacities", opacities);
+  require_aligned("instances", instances, "candidates", candidates, "labels", labels);
   const std::size_t n = means.shape(0), count = points.shape(0);
   if (precisions.shape(0) != n || opacities.shape(0) != n || instances.shape(0) != n) {
     throw nb::value_error("means, precisions, opacities and instances must have one row a Gaussian");
@@ -94,7 +104,7 @@ void densest(Points points, Points means, Array<const float, nb::shape<-1, 6>> p
   const perception::graph::Gaussians gaussians{means.data(), precisions.data(), opacities.data(), instances.data()};
   nb::gil_scoped_release release;
   perception::graph::densest(gaussians, points.data(), candidates.data(), count, candidates.shape(1),
-                             std::max(threads, 1), labels.data());
+                             perception::graph::sane_threads(threads), labels.data());
 }
 
 }  // namespace

@@ -2,8 +2,9 @@
 
 #include <algorithm>
 #include <cmath>
-#include <thread>
 #include <vector>
+
+#include "parallel.hpp"
 
 namespace perception::graph {
 namespace {
@@ -50,13 +51,8 @@ void densest(const Gaussians &gaussians, const float *points, const std::int32_t
       labels[i] = winner(gaussians, points + 3 * i, candidates + i * k, k, sums);
     }
   };
-  const std::size_t share = count / static_cast<std::size_t>(threads) + 1;
-  std::vector<std::thread> others;
-  for (std::size_t begin = share; begin < count; begin += share) {
-    others.emplace_back(work, begin, std::min(begin + share, count));
-  }
-  work(0, std::min(share, count));
-  for (std::thread &other : others) other.join();
+  const std::size_t share = count / static_cast<std::size_t>(sane_threads(threads)) + 1;
+  parallel_blocks(count, share, threads, work);
 }
 
 }  // namespace perception::graph

@@ -1,9 +1,10 @@
 #include "felzenszwalb.hpp"
 
 #include <algorithm>
-#include <thread>
 #include <utility>
 #include <vector>
+
+#include "parallel.hpp"
 
 namespace perception::graph {
 namespace {
@@ -46,9 +47,7 @@ std::vector<Edge> sorted_edges(const std::int32_t *edges, const float *weights, 
     sorted[i] = {weights[i], a, b};
   }
   const auto middle = sorted.begin() + static_cast<std::ptrdiff_t>(count / 2);
-  std::thread half([&] { std::sort(sorted.begin(), middle); });
-  std::sort(middle, sorted.end());
-  half.join();
+  both([&] { std::sort(sorted.begin(), middle); }, [&] { std::sort(middle, sorted.end()); });
   std::inplace_merge(sorted.begin(), middle, sorted.end());
   return sorted;
 }

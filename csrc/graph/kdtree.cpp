@@ -1,9 +1,9 @@
 #include "kdtree.hpp"
 
 #include <algorithm>
-#include <atomic>
 #include <cmath>
-#include <thread>
+
+#include "parallel.hpp"
 
 namespace perception::graph {
 namespace {
@@ -212,9 +212,8 @@ void KdTree::build(std::vector<Entry> &entries, std::size_t begin, std::size_t e
   const std::size_t right = node + 2 * leaves(left);  // a subtree of n leaves has 2n - 1 nodes
   nodes_[node] = {entries[begin + left].at[axis], axis, static_cast<std::uint32_t>(right)};
   if (threads > 1 && end - begin > 4096) {
-    std::thread other([&] { build(entries, begin, begin + left, node + 1, threads / 2); });
-    build(entries, begin + left, end, right, threads - threads / 2);
-    other.join();
+    both([&] { build(entries, begin, begin + left, node + 1, threads / 2); },
+         [&] { build(entries, begin + left, end, right, threads - threads / 2); });
   } else {
     build(entries, begin, begin + left, node + 1, 1);
     build(entries, begin + left, end, right, 1);
@@ -233,16 +232,7 @@ void KdTree::knn(const float *queries, std::size_t count, int k, float max_dista
   }
   const Answer run = pick();
   const std::size_t block = std::min(kBlock, count / (4 * static_cast<std::size_t>(threads)) + 1);
-  std::atomic<std::size_t> next{0};
-  const auto work = [&] {
-    for (std::size_t begin = next.fetch_add(block); begin < count; begin = next.fetch_add(block)) {
-      run(task, begin, std::min(begin + block, count));
-    }
-  };
-  std::vector<std::thread> others;
-  for (int i = 1; i < threads; ++i) others.emplace_back(work);
-  work();
-  for (std::thread &other : others) other.join();
+  parallel_blocks(count, block, threads, [&](std::size_t begin, std::size_t end) { run(task, begin, end); });
 }
 
 }  // namespace perception::graph

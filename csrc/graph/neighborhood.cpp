@@ -2,8 +2,8 @@
 
 #include <algorithm>
 #include <cmath>
-#include <thread>
-#include <vector>
+
+#include "parallel.hpp"
 
 namespace perception::graph {
 namespace {
@@ -96,13 +96,8 @@ void plane_normals(const float *points, const std::int32_t *neighbors, std::size
   const auto work = [&](std::size_t begin, std::size_t end) {
     for (std::size_t i = begin; i < end; ++i) plane_normal(points, neighbors + i * k, k, normals + 3 * i);
   };
-  const std::size_t share = count / static_cast<std::size_t>(threads) + 1;
-  std::vector<std::thread> others;
-  for (std::size_t begin = share; begin < count; begin += share) {
-    others.emplace_back(work, begin, std::min(begin + share, count));
-  }
-  work(0, std::min(share, count));
-  for (std::thread &other : others) other.join();
+  const std::size_t share = count / static_cast<std::size_t>(sane_threads(threads)) + 1;
+  parallel_blocks(count, share, threads, work);
 }
 
 }  // namespace perception::graph

@@ -9,6 +9,7 @@
 #include <optional>
 #include <stdexcept>
 
+#include "../arguments.h"
 #include "frames.h"
 #include "parallel.h"
 #include "rasterizer.h"
@@ -37,6 +38,7 @@ auto *checked(const char *name, A &array, const std::vector<int64_t> &expected) 
   for (std::size_t i = 0; i < array.ndim(); ++i) found.push_back(static_cast<int64_t>(array.shape(i)));
   if (found != expected)
     throw std::invalid_argument(std::string(name) + ": shape " + shape_text(found) + ", expected " + shape_text(expected));
+  perception::require_aligned(name, array);
   return array.data();
 }
 
@@ -175,8 +177,10 @@ void backward(Arguments<T> &a, Handle<T> &handle, Images<T> images, Optional<con
               Optional<T> mean2d) {
   const perception::Inputs<T> in = a.inputs();
   const perception::Options opt = a.options(in);
-  if (!handle.frames || static_cast<int64_t>(handle.frames->cameras.size()) != in.cameras)
-    throw std::invalid_argument("frames: not of these inputs");
+  const perception::Frames<T> *frames = handle.frames.get();
+  if (!frames || static_cast<int64_t>(frames->cameras.size()) != in.cameras || frames->n != in.n ||
+      frames->width != in.width || frames->height != in.height)
+    throw std::invalid_argument("frames: not of inputs with as many Gaussians, cameras and pixels");
   const int64_t n = in.n, c = in.cameras, h = in.height, w = in.width, d = in.dims;
   perception::Outputs<T> out{};
   images.fill(in, opt, out);

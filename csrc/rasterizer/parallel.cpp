@@ -6,6 +6,7 @@
 #include <condition_variable>
 #include <exception>
 #include <mutex>
+#include <system_error>
 #include <thread>
 
 #include "buffer.h"
@@ -43,7 +44,11 @@ class Pool {
  public:
   void run(Job &job, int helpers) {
     std::unique_lock<std::mutex> lock(mutex_);
-    for (; started_ < helpers; ++started_) std::thread(&Pool::loop, this, started_ + 1).detach();
+    try {
+      for (; started_ < helpers; ++started_) std::thread(&Pool::loop, this, started_ + 1).detach();
+    } catch (const std::system_error &) {  // a thread that the system will not start is done without
+      helpers = started_;
+    }
     job_ = &job;
     wanted_ = running_ = helpers;
     ++generation_;

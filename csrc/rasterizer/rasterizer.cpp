@@ -82,7 +82,7 @@ FramesPtr<T> rasterize_forward(const Inputs<T> &in, const Options &opt, Level le
   if (bad.argument) return nullptr;
   const Kernels<T> &k = kernels<T>(level);
   const ScratchPtr<T> scratch = take_scratch<T>(opt.threads);
-  FramesPtr<T> frames(new Frames<T>{{}, level, {}});
+  FramesPtr<T> frames(new Frames<T>{{}, level, in.n, in.width, in.height, {}});
   for (int camera = 0; camera < in.cameras; ++camera) {
     frames->cameras.push_back(ObjectPool<Frame<T>>::get().take());
     Frame<T> &f = *frames->cameras.back();

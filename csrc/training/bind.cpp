@@ -8,12 +8,14 @@
 #include <optional>
 #include <stdexcept>
 
+#include "../arguments.h"
 #include "levels.h"
 #include "training.h"
 
 namespace nb = nanobind;
 namespace pt = perception::training;
 using namespace nb::literals;
+using perception::require_aligned;
 
 namespace {
 
@@ -37,9 +39,13 @@ bool same_shape(const A &a, const B &b) {
 template <class T, class Target>
 auto photometric(In<T, 3> render, In<Target, 3> target, std::optional<In<T, 2>> weight, Out<T, 3> gradient,
                  double beta, int threads, const std::string &level) {
-  require(same_shape(render, target) && same_shape(render, gradient), "photometric: shapes differ");
+  require_aligned("render", render, "target", target, "weight", weight, "gradient", gradient);
+  for (size_t side = 0; side < 3; ++side)
+    require(render.shape(side) < size_t(1) << 31, "render: expected sides under 2^31");
+  require(same_shape(render, target), "target: expected the shape of render");
+  require(same_shape(render, gradient), "gradient: expected the shape of render");
   require(!weight || (weight->shape(0) == render.shape(0) && weight->shape(1) == render.shape(1)),
-          "photometric: weight must be [H, W]");
+          "weight: expected [H, W] of render [H, W, C]");
   pt::PhotometricArguments<T> a{};
   a.render = render.data();
   if constexpr (std::is_same_v<Target, uint8_t>) a.target8 = target.data();
@@ -59,7 +65,8 @@ auto photometric(In<T, 3> render, In<Target, 3> target, std::optional<In<T, 2>> 
 }
 
 auto assign(In<int32_t, 1> labels, double fraction, uint64_t seed, Out<int32_t, 1> slots) {
-  require(same_shape(labels, slots), "assign: shapes differ");
+  require_aligned("labels", labels, "slots", slots);
+  require(same_shape(labels, slots), "slots: expected the shape of labels");
   pt::Assignment out;
   {
     nb::gil_scoped_release release;
@@ -77,14 +84,15 @@ template <class T>
 void prototypes(In<T, 2> features, In<int32_t, 1> slots, In<int64_t, 1> counts, In<int64_t, 1> first,
                 Out<double, 2> means, Out<double, 1> scatter, int threads, const std::string &level) {
   const size_t labels = counts.shape(0);
-  require(features.shape(0) == slots.shape(0), "prototypes: features [P, D] and slots [P] differ");
+  require_aligned("features", features, "slots", slots, "counts", counts, "first", first, "means", means, "scatter", scatter);
+  require(features.shape(0) == slots.shape(0), "slots: expected [P] of features [P, D]");
   require(first.shape(0) == labels && scatter.shape(0) == labels && means.shape(0) == labels &&
-              means.shape(1) == features.shape(1), "prototypes: outputs do not fit the labels");
+              means.shape(1) == features.shape(1), "first, means, scatter: expected [L], [L, D], [L] of counts [L] and features [P, D]");
   nb::gil_scoped_release release;
   check_slots(slots.data(), slots.shape(0), labels);
   for (size_t i = 0; i < labels; ++i)
     require(first.data()[i] >= 0 && first.data()[i] < static_cast<int64_t>(features.shape(0)) && counts.data()[i] > 0,
-            "prototypes: every label needs a pixel");
+            "first, counts: every label needs a pixel");
   pt::prototypes(features.data(), slots.data(), features.shape(0), features.shape(1), counts.data(), first.data(),
                  labels, means.data(), scatter.data(), {threads, level});
 }
@@ -92,9 +100,11 @@ void prototypes(In<T, 2> features, In<int32_t, 1> slots, In<int64_t, 1> counts, 
 template <class T>
 void spread(In<T, 2> features, In<int32_t, 1> slots, In<double, 2> means, In<double, 1> pull, In<double, 2> push,
             Out<T, 2> out, int threads, const std::string &level) {
-  require(features.shape(0) == slots.shape(0) && same_shape(features, out), "spread: shapes differ");
+  require_aligned("features", features, "slots", slots, "means", means, "pull", pull, "push", push, "out", out);
+  require(features.shape(0) == slots.shape(0), "slots: expected [P] of features [P, D]");
+  require(same_shape(features, out), "out: expected the shape of features");
   require(same_shape(means, push) && means.shape(0) == pull.shape(0) && means.shape(1) == features.shape(1),
-          "spread: means, pull and push differ");
+          "pull, push: expected [L] and [L, D] of means [L, D], with D of features [P, D]");
   nb::gil_scoped_release release;
   check_slots(slots.data(), slots.shape(0), means.shape(0));
   pt::spread(features.data(), slots.data(), features.shape(0), features.shape(1), means.data(), pull.data(),
@@ -103,8 +113,9 @@ void spread(In<T, 2> features, In<int32_t, 1> slots, In<double, 2> means, In<dou
 
 double separation(In<double, 2> a, std::optional<In<double, 2>> b, double margin, bool squared, Out<double, 2> grad_a,
                   std::optional<Out<double, 2>> grad_b) {
-  require(same_shape(a, grad_a) && b.has_value() == grad_b.has_value(), "separation: gradients do not fit");
-  require(!b || (same_shape(*b, *grad_b) && b->shape(1) == a.shape(1)), "separation: widths differ");
+  require_aligned("a", a, "b", b, "grad_a", grad_a, "grad_b", grad_b);
+  require(same_shape(a, grad_a) && b.has_value() == grad_b.has_value(), "grad_a, grad_b: expected the shape of a, and an array exactly where b is one");
+  require(!b || (same_shape(*b, *grad_b) && b->shape(1) == a.shape(1)), "b, grad_b: expected one shape, as wide as a");
   nb::gil_scoped_release release;
   return pt::separation(a.data(), a.shape(0), b ? b->data() : nullptr, b ? static_cast<int64_t>(b->shape(0)) : -1, a.shape(1), margin,
                         squared, grad_a.data(), grad_b ? grad_b->data() : nullptr);
@@ -112,13 +123,15 @@ double separation(In<double, 2> a, std::optional<In<double, 2>> b, double margin
 
 template <class T>
 double sum(In<T, 1> values, bool squared, int threads, const std::string &level) {
+  require_aligned("values", values);
   nb::gil_scoped_release release;
   return pt::sum(values.data(), static_cast<int64_t>(values.size()), squared, {threads, level});
 }
 
 template <class T>
 void scale(In<T, 1> values, double factor, Out<T, 1> out, int threads) {
-  require(same_shape(values, out), "scale: shapes differ");
+  require_aligned("values", values, "out", out);
+  require(same_shape(values, out), "out: expected the shape of values");
   nb::gil_scoped_release release;
   pt::scale(values.data(), static_cast<int64_t>(values.size()), factor, out.data(), {threads, "auto"});
 }
@@ -127,9 +140,10 @@ template <class T>
 auto adam(Out<T, 2> param, In<T, 2> grad, Out<T, 2> first, Out<T, 2> second,
           std::optional<In<uint8_t, 1>> visible, In<double, 1> rate, int64_t step, double beta1, double beta2,
           double eps, int threads, const std::string &level) {
-  require(same_shape(param, grad) && same_shape(param, first) && same_shape(param, second), "adam: shapes differ");
-  require(!visible || visible->shape(0) == param.shape(0), "adam: visible must be [N]");
-  require(rate.shape(0) == param.shape(1) && step >= 1, "adam: rate must be [K] and step >= 1");
+  require_aligned("param", param, "grad", grad, "first", first, "second", second, "rate", rate);
+  require(same_shape(param, grad) && same_shape(param, first) && same_shape(param, second), "grad, first, second: expected the shape of param");
+  require(!visible || visible->shape(0) == param.shape(0), "visible: expected [N] of param [N, K]");
+  require(rate.shape(0) == param.shape(1) && step >= 1, "rate, step: expected [K] of param [N, K], and 1 or more");
   pt::AdamResult result;
   {
     nb::gil_scoped_release release;

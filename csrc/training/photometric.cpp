@@ -54,7 +54,7 @@ double ordered_sum(const std::vector<double> &values) {
 template <class T>
 PhotometricResult photometric(const PhotometricArguments<T> &a, const Execution &how) {
   if (a.height < 1 || a.width < 1 || a.channels < 1 || a.channels > kMaxChannels)
-    throw std::invalid_argument("photometric: images must be [H >= 1, W >= 1, 1 <= C <= 16]");
+    throw std::invalid_argument("render: expected [H >= 1, W >= 1, 1 <= C <= 16]");
   const auto &table = kernels<T>(how.level);
   const double total_weight =
       a.weight ? sum(a.weight, int64_t(a.height) * a.width, false, how) : double(a.height) * a.width;

@@ -279,7 +279,8 @@ def rasterize(
 
     variance=False and depth=False leave out `feature_variance` and `depths` (None then) and save their time.
     threads: 0 takes torch.get_num_threads(). The result is the same, bit for bit, for any number of threads.
-    Finite inputs up to 1e15 in magnitude give finite images and gradients; InputError names an input that is not finite.
+    Finite inputs up to 1e15 in magnitude give finite images and gradients; InputError names an input that is not
+    finite.
     """
     global _function
     if _function is None:

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.documents import brief, read_yaml
+from perception.io.lens import MOST_SIDE
 from perception.types import Lens
 
 _COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
@@ -24,13 +26,14 @@ def read_camera(path: Path) -> Lens:
     width, height = (int(_numbers(data.get(key), 1, path, key)[0]) for key in ("image_width", "image_height"))
     matrix = _numbers(_data(data, "camera_matrix"), 9, path, "camera_matrix.data").reshape(3, 3)
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
-    if min(width, height) < 1 or min(fx, fy) <= 0:
+    if min(width, height) < 1 or max(width, height) > MOST_SIDE or min(fx, fy) <= 0:
         raise InputError(
-            f"{path}: image size and focal lengths must be positive, found {width}×{height}, {fx:g}, {fy:g}"
+            f"{path}: image sides must be 1 to {MOST_SIDE} pixels and focal lengths positive, found "
+            f"{width:.6g}×{height:.6g}, {fx:g}, {fy:g}"
         )
     name = data.get("distortion_model", "plumb_bob")
-    if name not in _COUNTS:
-        raise InputError(f"{path}: distortion_model '{name}' is not known; expected one of {', '.join(_COUNTS)}")
+    if not isinstance(name, str) or name not in _COUNTS:
+        raise InputError(f"{path}: distortion_model {brief(name)} is not known; expected one of {', '.join(_COUNTS)}")
     values = _data(data, "distortion_coefficients")
     found = len(values) if isinstance(values, (list, tuple)) else 0
     if found not in _COUNTS[name]:
@@ -97,14 +100,7 @@ def _colmap_distortion(name: str, k: list[float]) -> tuple[str, list[float]]:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    import yaml
-
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such camera file") from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: not a readable YAML file; expected ROS camera_info") from error
+    data = read_yaml(path, "ROS camera_info")
     if not isinstance(data, dict):
         raise InputError(f"{path}: expected a ROS camera_info mapping with image_width, image_height, camera_matrix")
     return data
@@ -118,8 +114,8 @@ def _data(data: dict[str, Any], key: str) -> Any:
 def _numbers(value: Any, count: int, path: Path, key: str) -> np.ndarray:
     try:
         array = np.asarray(value, dtype=np.float64).ravel()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.empty(0)
     if array.size != count or not np.isfinite(array).all():
-        raise InputError(f"{path}: {key} must hold {count} finite number(s), found {value!r}")
+        raise InputError(f"{path}: {key} must hold {count} finite number(s), found {brief(value)}")
     return array

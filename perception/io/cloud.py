@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.arrays import read_npz
 from perception.io.atomic import replacing
 from perception.io.cloud_las import read_las
 from perception.io.cloud_memory import require_memory
@@ -146,11 +147,7 @@ def _write_ply_cloud(path: Path, cloud: PointCloud) -> None:
 
 
 def _read_npz(path: Path) -> PointCloud:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: is not a readable NPZ file ({error})") from error
+    arrays = read_npz(path, path, "it is no NPZ file, or damaged")
     points = next((arrays.pop(n) for n in ("points", "xyz", "positions") if n in arrays), None)
     if points is None or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
         found = "none" if points is None else f"{points.dtype} {list(points.shape)}"

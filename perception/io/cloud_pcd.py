@@ -13,6 +13,7 @@ from perception.io.atomic import replacing
 from perception.types import PointCloud
 
 _SIZES = {"F": ("4", "8"), "I": ("1", "2", "4", "8"), "U": ("1", "2", "4", "8")}
+_MOST = 1 << 40
 _RGB = ("rgb", "rgba")
 
 
@@ -52,7 +53,7 @@ def _row_type(header: dict[str, list[str]], path: Path) -> tuple[np.dtype, int]:
         names, sizes, types = header["FIELDS"], header["SIZE"], header["TYPE"]
         counts = [int(c) for c in header.get("COUNT", ["1"] * len(names))]
         points = int(header["POINTS"][0] if "POINTS" in header else header["WIDTH"][0])
-        if not (len(names) == len(sizes) == len(types) == len(counts)) or points < 0 or min(counts) < 1:
+        if not (len(names) == len(sizes) == len(types) == len(counts)) or not 0 <= points <= _MOST or min(counts) < 1:
             raise ValueError("FIELDS, SIZE, TYPE and COUNT disagree")
         fields: list[tuple] = []
         for i, (name, size, type_, count) in enumerate(zip(names, sizes, types, counts, strict=True)):
@@ -130,6 +131,8 @@ def lzf_decompress(data: bytes, size: int) -> bytes | None:
             while len(piece) < length:  # the reference overlaps what it writes: the pattern repeats
                 piece += piece[: length - len(piece)]
             out += piece
+            if len(out) > size:
+                return None
     except IndexError:
         return None
     return bytes(out) if len(out) == size else None
@@ -137,12 +140,12 @@ def lzf_decompress(data: bytes, size: int) -> bytes | None:
 
 def _to_cloud(rows: np.ndarray, path: Path) -> PointCloud:
     names = rows.dtype.names or ()
-    if not {"x", "y", "z"} <= set(names):
-        raise InputError(f"{path}: PCD has the fields {', '.join(names)}; expected x, y and z")
+    if not {"x", "y", "z"} <= set(names) or any(rows[axis].ndim > 1 for axis in "xyz"):
+        raise InputError(f"{path}: PCD has the fields {', '.join(names)[:200]}; expected x, y and z, each of COUNT 1")
     kind = np.float64 if rows.dtype["x"] == np.float64 else np.float32
     cloud = PointCloud(np.stack([rows[axis] for axis in "xyz"], axis=1).astype(kind))
     normal = ("normal_x", "normal_y", "normal_z")
-    if set(normal) <= set(names):
+    if set(normal) <= set(names) and all(rows[name].ndim == 1 for name in normal):
         cloud.normals = np.stack([rows[name] for name in normal], axis=1).astype(np.float32)
     limits = np.iinfo(np.int32)
     for name in names:

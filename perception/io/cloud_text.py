@@ -57,6 +57,8 @@ def _table(path: Path) -> np.ndarray:
         uneven = [i for i, n in enumerate(rows) if n != width]
         if uneven:
             raise InputError(f"{path}: row {uneven[0] + 1} has {rows[uneven[0]]} numbers; expected {width} as before")
+        if len(numbers) != width * len(rows):
+            raise InputError(f"{path}: holds text where numbers are expected (the first {len(numbers)} are numbers)")
     return numbers.reshape(-1, width)
 
 
@@ -100,7 +102,8 @@ def read_obj(path: Path) -> PointCloud:
                     faces += [(corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1)]
         widths = {len(v) for v in vertices}
         table = np.array(vertices, np.float64) if vertices else np.empty((0, 3))
-    except ValueError as error:
+        triangles = np.array(faces, np.int32).reshape(-1, 3)
+    except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: line {number} cannot be understood as OBJ ({error})") from error
     if table.ndim != 2 or table.shape[1] < 3:
         raise InputError(f"{path}: vertices have {sorted(widths)} numbers; expected x y z or x y z r g b")
@@ -109,5 +112,5 @@ def read_obj(path: Path) -> PointCloud:
         scale = 255.0 if table[:, 3:].max(initial=0) <= 1 else 1.0
         cloud.colors = np.clip(np.round(table[:, 3:] * scale), 0, 255).astype(np.uint8)
     if faces:
-        cloud.faces = np.array(faces, np.int32)
+        cloud.faces = triangles
     return cloud

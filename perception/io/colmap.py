@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.colmap_check import check_binary_model
 from perception.io.features import Progress
 from perception.io.lens import lens_from_camera, load_pycolmap
 from perception.io.triangulate import MIN_POINTS, cloud_of, triangulated_cloud
@@ -106,10 +107,13 @@ def _read_model(path: Path) -> Any:
             if absent:
                 raise InputError(f"{path}: the sparse model lacks {', '.join(absent)}")
             break
-    _refuse_nan_text(path)
+    if (path / "images.bin").is_file():
+        check_binary_model(path)
+    else:
+        _refuse_nan_text(path)
     try:
         return pycolmap.Reconstruction(path)
-    except (ValueError, RuntimeError, IndexError) as error:
+    except (ValueError, RuntimeError, LookupError, TypeError) as error:
         reason = str(error).splitlines()[0][:120] if str(error) else "unknown reason"
         raise InputError(f"{path}: not a readable COLMAP model ({reason})") from error
 
@@ -117,9 +121,7 @@ def _read_model(path: Path) -> Any:
 def _refuse_nan_text(path: Path) -> None:
     """NaN poses in a text model, told by name (reading them may end in COLMAP's own fatal checks)."""
     file = path / "images.txt"
-    if not file.is_file() or (path / "images.bin").is_file():
-        return
-    lines = [line for line in file.read_text().splitlines() if line and not line.startswith("#")]
+    lines = [line for line in file.read_text(errors="replace").splitlines() if line and not line.startswith("#")]
     for line in lines:
         fields = line.split()
         if len(fields) == 10 and any(value.lower().lstrip("+-") in ("nan", "inf") for value in fields[1:8]):

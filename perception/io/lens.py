@@ -11,6 +11,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.types import Lens
 
+MIN_FOCAL, MOST_PIXELS, MOST_SIDE = 1e-2, 1e9, 1 << 20
 _PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 
 
@@ -71,6 +72,7 @@ def pinhole_from_lens(lens: Lens) -> tuple[tuple[float, float, float, float], in
     if is_pinhole(lens):
         focal = (camera.focal_length_x, camera.focal_length_y)
         center = (camera.principal_point_x, camera.principal_point_y)
+        _check_pinhole(lens, (*focal, *center), lens.width, lens.height)
         return (*focal, *center), lens.width, lens.height
     pycolmap = load_pycolmap()
     try:
@@ -78,9 +80,22 @@ def pinhole_from_lens(lens: Lens) -> tuple[tuple[float, float, float, float], in
     except (ValueError, RuntimeError) as error:
         raise InputError(f"camera model {lens.model} cannot be undistorted to a pinhole") from error
     fx, fy, cx, cy = (float(x) for x in ideal.params)
-    if not np.isfinite([fx, fy, cx, cy]).all() or min(ideal.width, ideal.height) < 2:
+    if min(ideal.width, ideal.height) < 2:
         raise InputError(f"camera {lens.model} {list(lens.params)} cannot be undistorted to a pinhole")
+    _check_pinhole(lens, (fx, fy, cx, cy), ideal.width, ideal.height)
     return (fx, fy, cx, cy), int(ideal.width), int(ideal.height)
+
+
+def _check_pinhole(lens: Lens, values: tuple[float, float, float, float], width: int, height: int) -> None:
+    """Beyond these bounds no optics is meant, and float32 cannot tell the pixels' rays apart."""
+    *focal, cx, cy = values
+    if not (min(focal) >= MIN_FOCAL and max(focal) <= MOST_PIXELS and max(abs(cx), abs(cy)) <= MOST_PIXELS):
+        raise InputError(
+            f"camera {lens.model} {list(lens.params)}: seen as a pinhole of focal lengths {focal[0]:g}, {focal[1]:g} "
+            f"and centre {cx:g}, {cy:g}; expected {MIN_FOCAL:g} to {MOST_PIXELS:g} and at most {MOST_PIXELS:g} pixels"
+        )
+    if min(width, height) < 1 or max(width, height) > MOST_SIDE:
+        raise InputError(f"camera {lens.model}: {width}×{height} pixels, expected sides of 1 to {MOST_SIDE}")
 
 
 def is_pinhole(lens: Lens) -> bool:

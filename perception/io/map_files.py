@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import json
-import struct
 import threading
-import tokenize
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -18,33 +13,17 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io import instance_index
+from perception.io.arrays import DAMAGE, read_npz
 from perception.io.atomic import recover
 from perception.io.checksums import EDITABLE, FACTS, check_file, check_sizes
+from perception.io.documents import brief
 from perception.io.instance_index import InstanceIndex, build_index
 from perception.io.ply import map_ply
 
 FORMAT_VERSION = 1
-MOST_ARCHIVE = 4 << 30
-"""Bytes an .npz of a map may unpack to; a damaged or hostile one must not fill the memory."""
 _ARRAYS = {"features": 2, "instance_ids": 1, "membership": 1}
 ARCHIVES = ("cameras", "language", "index", "parts")
 _TRIES = 5
-DAMAGE = (
-    ValueError,
-    KeyError,
-    TypeError,
-    OSError,
-    EOFError,
-    OverflowError,
-    MemoryError,
-    RuntimeError,  # NotImplementedError, RecursionError and "is encrypted" among them
-    SyntaxError,  # numpy reads the header of an array as Python
-    tokenize.TokenError,
-    struct.error,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-"""What numpy and zipfile raise on bytes that are no array or archive."""
 
 Signature = tuple[tuple[int, int, int], ...]
 
@@ -101,8 +80,10 @@ class MapFiles:
         except FileNotFoundError as error:
             raise InputError(f"{file}: is missing; the map is damaged, build it again or copy it anew") from error
         except DAMAGE as error:
-            raise InputError(f"{file}: cannot be read ({_short(error)}); the map is damaged, build it again") from error
+            raise InputError(f"{file}: cannot be read ({brief(error)}); the map is damaged, build it again") from error
         kind = "i" if name == "instance_ids" else "f"
+        if not isinstance(array, np.ndarray):
+            raise InputError(f"{file}: is an archive, expected one array; the map is damaged")
         if array.ndim != sides or array.dtype.kind != kind:
             raise InputError(f"{file}: holds {array.dtype} of shape {list(array.shape)}; the map is damaged")
         return array
@@ -175,19 +156,7 @@ class MapFiles:
     def _unpack(self, name: str) -> dict[str, np.ndarray]:
         """The arrays of an .npz; its CRC-32s tell damage."""
         raw, file = self._archives[name], self.path / f"{name}.npz"
-        if raw is None:
-            return {}
-        try:
-            with zipfile.ZipFile(io.BytesIO(raw)) as archive:
-                size = sum(entry.file_size for entry in archive.infolist())
-            if size > MOST_ARCHIVE:
-                raise InputError(f"{file}: unpacks to {size} bytes, expected at most {MOST_ARCHIVE}")
-            with np.load(io.BytesIO(raw), allow_pickle=False) as arrays:
-                return {key: arrays[key] for key in arrays.files}
-        except InputError:
-            raise
-        except DAMAGE as error:
-            raise InputError(f"{file}: cannot be read ({_short(error)}); the map is damaged, build it again") from error
+        return {} if raw is None else read_npz(raw, file, "the map is damaged, build it again")
 
 
 def read_info(path: Path) -> dict[str, Any]:
@@ -277,11 +246,6 @@ def _check_instance(entry: dict[str, Any]) -> None:
     label = entry.get("label")
     if label is not None and not isinstance(label, str):
         raise ValueError(f"instance {entry['id']}: label is {type(label).__name__}, expected a text or null")
-
-
-def _short(error: Exception) -> str:
-    """numpy explains at length, over several lines."""
-    return " ".join(str(error).split())[:120] or type(error).__name__
 
 
 def _bytes(file: Path) -> bytes | None:

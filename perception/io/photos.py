@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -13,7 +15,24 @@ from perception.io.lens import warp_grid
 from perception.types import View
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
-_DECODE_ERRORS = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+DECODE_ERRORS = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    KeyError,
+    IndexError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    ArithmeticError,
+    RuntimeError,
+    EOFError,
+    MemoryError,  # Pillow asks for as many bytes as a chunk says it has
+    struct.error,
+    zlib.error,
+    Image.DecompressionBombError,
+)
+"""What Pillow raises on bytes that are no picture, or only the beginning of one."""
 
 
 def list_photos(folder: Path) -> list[Path]:
@@ -137,14 +156,14 @@ def _open(path: Path) -> Image.Image:
         return Image.open(path)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such photo") from error
-    except (UnidentifiedImageError, *_DECODE_ERRORS) as error:
+    except (UnidentifiedImageError, *DECODE_ERRORS) as error:
         raise InputError(f"{path}: not a readable image; replace or remove it") from error
 
 
 def _decode(image: Image.Image, path: Path) -> None:
     try:
         image.load()
-    except _DECODE_ERRORS as error:
+    except DECODE_ERRORS as error:
         raise InputError(f"{path}: the photo is truncated or damaged; replace or remove it") from error
 
 

@@ -33,6 +33,7 @@ _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int
 _NAMES |= {"f4": "float", "f8": "double"}
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _MAX_HEADER = 1 << 20
+_MOST_ROWS = 1 << 40
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,6 @@ def map_ply(path: str | Path, element: str) -> np.ndarray:
         start, size = file.tell(), path.stat().st_size
         if order != "<" or not tables or tables[0].name != element or tables[0].has_list:
             raise InputError(f"{path}: expected a binary little-endian PLY that begins with plain element '{element}'")
-        names = [p.name for p in tables[0].properties]
-        if len(set(names)) != len(names) or tables[0].rows < 0:
-            raise InputError(f"{path}: PLY header names a property twice, or a negative number of rows")
         dtype = np.dtype([(p.name, order + p.kind) for p in tables[0].properties])
         found = (size - start) // max(dtype.itemsize, 1)
         if found < tables[0].rows:
@@ -139,6 +137,13 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_Table]]:
             raise InputError(f"{path}: PLY header line {' '.join(words)!r} cannot be understood") from error
     if words != ["end_header"] or order is None:
         raise InputError(f"{path}: PLY header is cut short: no 'format' or no 'end_header' line")
+    for table in tables:
+        names = [p.name for p in table.properties]
+        if len(set(names)) != len(names) or not names or not 0 <= table.rows <= _MOST_ROWS:
+            raise InputError(
+                f"{path}: element '{table.name}' of {table.rows} rows with {len(names)} properties: expected 0 to "
+                f"{_MOST_ROWS} rows and properties of distinct names"
+            )
     return order, tables
 
 
@@ -147,6 +152,8 @@ def _read_binary(file: BinaryIO, table: _Table, order: str, path: Path) -> Eleme
     start = file.tell()
     lengths = _first_lengths(file, table, order)
     file.seek(start)
+    if sum(lengths.values()) > path.stat().st_size:
+        return _read_ragged(file, table, order, path)
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
     for p in table.properties:
         if p.count_kind:
@@ -246,8 +253,10 @@ def _take_ascii(numbers: np.ndarray, at: int, table: _Table, path: Path) -> tupl
                 raise short
             n = 1
             if p.count_kind:
+                if not 0 <= numbers[at] <= len(numbers):
+                    raise short
                 n, at = int(numbers[at]), at + 1
-            if n < 0 or at + n > len(numbers):
+            if at + n > len(numbers):
                 raise short
             lists[p.name].append(numbers[at : at + n])
             at += n

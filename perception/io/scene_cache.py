@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.arrays import DAMAGE
 from perception.io.atomic import atomic_directory
-from perception.io.map_files import DAMAGE
 from perception.types import Lens, Scene, View
 
 

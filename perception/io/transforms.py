@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import contextlib
 import math
 import os
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
+from perception.io.documents import brief, read_json
 from perception.io.features import Progress
 from perception.io.photos import SUFFIXES, photo_size
 from perception.io.triangulate import triangulated_cloud
@@ -93,12 +94,7 @@ def _views(
 
 
 def _load(file: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{file}: no such file") from error
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{file}: not readable JSON ({error})") from error
+    data = read_json(file)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list):
         raise InputError(f"{file}: expected an object with a list 'frames' (nerfstudio / instant-ngp)")
@@ -121,10 +117,17 @@ def _photos(file: Path, frames: list[dict[str, Any]]) -> tuple[dict[int, Path], 
 
 def _find(folder: Path, listed: str) -> Path | None:
     plain = folder / listed
-    if plain.is_file():
+    if _is_file(plain):
         return plain
-    candidates = [plain.with_name(plain.name + suffix) for suffix in sorted(SUFFIXES)]
-    return next((path for path in candidates if path.is_file()), None)
+    candidates = [plain.with_name(plain.name + suffix) for suffix in sorted(SUFFIXES)] if plain.name else []
+    return next((path for path in candidates if _is_file(path)), None)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # such as a name too long for the file system
+        return False
 
 
 def _common_root(photos: list[Path]) -> Path:
@@ -135,7 +138,7 @@ def _pose(file: Path, frame: dict[str, Any]) -> np.ndarray:
     what = f"{file}: the pose of {frame['file_path']}"
     try:
         matrix = np.asarray(frame["transform_matrix"], dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{what} is not a 4×4 matrix of numbers") from error
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
@@ -189,9 +192,11 @@ def _number(values: dict[str, Any], key: str, what: str) -> float | None:
     value = values.get(key)
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise InputError(f"{what}: {key} must be a finite number, found {value!r}")
-    return float(value)
+    if not isinstance(value, bool) and isinstance(value, (int, float)):
+        with contextlib.suppress(OverflowError):  # a whole number beyond float64
+            if math.isfinite(number := float(value)):
+                return number
+    raise InputError(f"{what}: {key} must be a finite number, found {brief(value)}")
 
 
 def _summary(view: View) -> str:
@@ -206,8 +211,8 @@ def _listed_cloud(file: Path, data: dict[str, Any]) -> tuple[np.ndarray, np.ndar
     if not listed:
         return empty
     path = file.parent / str(listed)
-    if not path.is_file():
-        raise InputError(f"{file}: ply_file_path {listed} does not exist; remove the entry or add the file")
+    if not _is_file(path):
+        raise InputError(f"{file}: ply_file_path {brief(listed)} does not exist; remove the entry or add the file")
     from perception.io.cloud import read_cloud
 
     cloud = read_cloud(path)

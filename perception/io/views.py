@@ -13,6 +13,9 @@ from perception.io.lens import is_pinhole, pinhole_from_lens, rescale_lens
 from perception.io.photos import check_photo, photo_size
 from perception.types import Lens, View
 
+FARTHEST = 1e12
+"""Longest translation, in the scene's unit; float64 tells no millimetres there."""
+
 
 def make_view(name: str, photo: Path, lens: Lens, camera_from_world: np.ndarray, source: Path) -> View:
     """A view of `photo`, whose lens already has the photo's size; raises InputError on a NaN or non-rigid pose."""
@@ -26,6 +29,8 @@ def rigid_pose(matrix: np.ndarray, what: str) -> np.ndarray:
     """[4, 4] with an exact rotation; small numerical slack is repaired, anything else is an InputError."""
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"{what} is not a finite 4×4 matrix (NaN or missing values); repair or remove that frame")
+    if np.abs(matrix[:3, 3]).max() > FARTHEST:
+        raise InputError(f"{what} is more than {FARTHEST:g} from the origin; repair or remove that frame")
     rotation = nearest_rotation(matrix[:3, :3])
     if np.abs(matrix[:3, :3] - rotation).max() > 1e-2:
         raise InputError(f"{what} is not a rigid transform (scaled, sheared or mirrored); repair or remove that frame")

@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.documents import brief
 from perception.types import View
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -61,7 +62,7 @@ class LabelFolder:
             raise InputError(f"labels:{self.folder}: no label image for photo {view.name}")
         _check_header(file, *_photo_size(view))
         height, width = photo.shape[:2]
-        return warp_labels(view, _read(file), width, height)
+        return warp_labels(view, read_labels(file), width, height)
 
     def _find(self, view: View, views: list[View]) -> Path | None:
         stem = PurePosixPath(view.name).with_suffix(".png")
@@ -103,15 +104,20 @@ def _check_header(file: Path, width: int, height: int) -> None:
         )
 
 
-def _read(file: Path) -> np.ndarray:
+def read_labels(file: Path) -> np.ndarray:
     """[H, W] int32. Pillow keeps palette indices, where OpenCV would turn them into colours."""
     from PIL import Image
 
+    from perception.io.photos import DECODE_ERRORS
+
     try:
-        with Image.open(file) as image:
-            return np.asarray(image).astype(np.int32)
-    except (OSError, SyntaxError) as error:
-        raise InputError(f"{file}: cannot be read ({error}); the PNG is damaged or cut short") from error
+        with Image.open(file, formats=["PNG"]) as image:
+            labels = np.asarray(image)
+    except DECODE_ERRORS as error:
+        raise InputError(f"{file}: cannot be read ({brief(error)}); the PNG is damaged or cut short") from error
+    if labels.ndim != 2 or labels.dtype.kind not in "biu":
+        raise InputError(f"{file}: {labels.dtype} of shape {list(labels.shape)}; a label image has one channel")
+    return labels.astype(np.int32)
 
 
 def _photo_size(view: View) -> tuple[int, int]:

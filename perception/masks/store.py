@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.masks.labels import read_labels
 from perception.masks.source import GeometryMaskSource, MaskSource
 from perception.types import View
 
@@ -84,13 +85,10 @@ def label_file(folder: Path, view: View) -> Path:
 
 def load_labels(folder: Path, view: View) -> np.ndarray:
     """[h, w] int32 as written by compute_masks, 0 = unlabelled."""
-    from PIL import Image
-
     file = label_file(folder, view)
     if not file.is_file():
         raise InputError(f"{file}: no label image for photo {view.name}; run the masks stage again")
-    with Image.open(file) as image:
-        return np.asarray(image).astype(np.int32)
+    return read_labels(file)
 
 
 def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
@@ -121,13 +119,15 @@ def stored_key(file: Path) -> str | None:
     """The key a label image was written with; None when there is no readable one."""
     from PIL import Image
 
+    from perception.io.photos import DECODE_ERRORS
+
     if not file.is_file():
         return None
     try:
         with Image.open(file) as image:
             image.load()
             return str(image.info.get(_KEY))
-    except (OSError, SyntaxError):
+    except DECODE_ERRORS:
         return None
 
 

@@ -1,0 +1,71 @@
+"""NumPy's .npz archives from others: no more is allocated than the archive holds, and damage is told in one line."""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+import tokenize
+import zipfile
+import zlib
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.documents import brief
+
+MOST_ARCHIVE = 4 << 30
+"""Bytes an .npz may unpack to; a damaged or hostile one must not fill the memory."""
+DAMAGE = (
+    ValueError,
+    KeyError,
+    TypeError,
+    OSError,
+    EOFError,
+    OverflowError,
+    MemoryError,
+    RuntimeError,  # NotImplementedError, RecursionError and "is encrypted" among them
+    SyntaxError,  # numpy reads the header of an array as Python
+    tokenize.TokenError,
+    struct.error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What numpy and zipfile raise on bytes that are no array or archive."""
+
+
+def read_npz(source: Path | bytes, file: Path, advice: str) -> dict[str, np.ndarray]:
+    """The arrays of an .npz (a path, or its bytes; `file` names it), CRC-32s checked; pickled objects are refused."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else source) as archive:
+            entries = archive.infolist()
+            size = sum(entry.file_size for entry in entries)
+            if size > MOST_ARCHIVE:
+                raise InputError(f"{file}: unpacks to {size} bytes, expected at most {MOST_ARCHIVE}")
+            arrays = {}
+            for entry in entries:
+                with archive.open(entry) as stream:
+                    arrays[entry.filename.removesuffix(".npy")] = _read_npy(stream, entry.file_size)
+            return arrays
+    except InputError:
+        raise
+    except DAMAGE as error:
+        raise InputError(f"{file}: cannot be read ({brief(error)}); {advice}") from error
+
+
+def _read_npy(stream: IO[bytes], size: int) -> np.ndarray:
+    """One array of `size` bytes with its header; the header is believed only when it fits that size."""
+    version = np.lib.format.read_magic(stream)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"array format {version}, expected 1.0 or 2.0")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read(stream)
+    if dtype.hasobject or dtype.itemsize == 0:
+        raise ValueError(f"an array of {dtype}")
+    needed, left = math.prod(shape) * dtype.itemsize, size - stream.tell()
+    if min(shape, default=0) < 0 or needed != left:
+        raise ValueError(f"an array of shape {shape} needs {needed} bytes, {left} are there")
+    data = bytearray(stream.read(needed))  # writable, unlike the bytes
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
