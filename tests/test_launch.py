@@ -5,7 +5,6 @@ from __future__ import annotations
 import configparser
 import importlib.util
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -189,7 +188,6 @@ def ros_actions(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, config: Path, o
     program = tmp_path / "perception"
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m perception.cli "$@"\n')
     program.chmod(0o755)
-    monkeypatch.setenv("PYTHONPATH", str(LAUNCH.parent))
     ros_launch_stub(monkeypatch, {"config": str(config), "only": only, "perception": str(program)})
     spec = importlib.util.spec_from_file_location("perception_launch", LAUNCH / "perception.launch.py")
     assert spec is not None and spec.loader is not None
@@ -233,7 +231,6 @@ def test_cli_prints_the_commands(tmp_path: Path) -> None:
         text=True,
         check=True,
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(LAUNCH.parent)},
     )
     assert json.loads(out.stdout)["jobs"] == [one.to_json() for one in read_plan(file)]
 

@@ -46,7 +46,6 @@ def start(path: Path, namespace: str, *pairs: str) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
         cwd=path.parent,
-        env={**os.environ, "PYTHONPATH": f"{HERE.parent}{os.pathsep}{HERE}"},
     )
     assert node.stdout is not None
     node.stdout.readline()

@@ -36,9 +36,8 @@ def gmap(tmp_path: Path) -> Path:
 
 def child(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     """A fresh interpreter, away from the repository's root."""
-    environment = {**os.environ, "PYTHONPATH": f"{HERE.parent}{os.pathsep}{HERE}"}
     command = [sys.executable, "-c", code, *map(str, arguments)]
-    return subprocess.run(command, env=environment, cwd=HERE, capture_output=True, text=True, check=False)
+    return subprocess.run(command, cwd=HERE, capture_output=True, text=True, check=False)
 
 
 # ----------------------------------------------------------------------- disks
@@ -54,8 +53,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, str]]:
     (folder / "disk").mkdir()
     original = write_map_of(folder / "a.gsmap", gaussians=700)
     command = [*namespace, sys.executable, HERE / "small_disk.py", folder / "disk", original]
-    environment = {**os.environ, "PYTHONPATH": str(HERE.parent)}
-    ended = subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=False)
+    ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
     return json.loads(ended.stdout)
 
@@ -210,9 +208,8 @@ def test_a_second_mapper_is_refused_and_harms_nothing(small_scene: Path, tmp_pat
         "import sys; from pathlib import Path; from perception.io.map_lock import writing\n"
         "with writing(Path(sys.argv[1])):\n    print(flush=True); sys.stdin.read()"
     )
-    environment = {**os.environ, "PYTHONPATH": str(HERE.parent)}
     holder = subprocess.Popen(
-        [sys.executable, "-c", code, out], env=environment, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", code, out], cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     try:
         assert holder.stdout is not None and holder.stdout.readline()

@@ -14,8 +14,6 @@ from pathlib import Path
 
 import pytest
 
-import perception
-
 pty = pytest.importorskip("pty")  # not on Windows
 
 COLUMNS = 80
@@ -32,11 +30,9 @@ class Terminal:
 
         self.master, slave = pty.openpty()
         fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, COLUMNS, 0, 0))
-        env = {**os.environ, "PYTHONPATH": str(Path(perception.__file__).parents[1])}
         self.process = subprocess.Popen(
             [sys.executable, "-m", "perception.cli", *words],
             cwd=cwd,
-            env=env,
             stdin=slave,
             stdout=slave,
             stderr=slave,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import sys
@@ -215,11 +214,7 @@ def test_files_cut_in_place_while_served_do_not_end_the_process(path: Path) -> N
         "    told = engine.wait(engine.run(lambda gmap: gmap.describe(3).to_json()))\n"
         "    assert found == list(range(9)) and len(near) == 9 and told['num_points'] > 0\n"
     )
-    tests = Path(__file__).resolve().parent
-    environment = {**os.environ, "PYTHONPATH": f"{tests.parent}{os.pathsep}{tests}"}
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(path)], env=environment, cwd=path.parent, capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", code, str(path)], cwd=path.parent, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 

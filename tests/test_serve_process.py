@@ -38,7 +38,7 @@ SERVER = (
 @contextmanager
 def server(command: list[str], folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """A started server and its port; killed in the end."""
-    environment = {**os.environ, "PYTHONPATH": f"{TESTS.parent}{os.pathsep}{TESTS}", "PYTHONUNBUFFERED": "1"}
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(
         [sys.executable, *command],
         stderr=subprocess.PIPE,
@@ -146,8 +146,7 @@ def test_a_port_in_use_is_told_before_the_map_is_opened(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         command = [sys.executable, "-m", "perception.cli", "serve", str(tmp_path / "none.gsmap"), "--port", port]
-        environment = {**os.environ, "PYTHONPATH": str(TESTS.parent)}
-        done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
+        done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and f"--port {port}: is in use" in done.stderr
 
 

@@ -308,9 +308,8 @@ def test_another_process_is_refused_and_a_killed_one_is_not_in_the_way(copied: P
         "import sys, time; from pathlib import Path; from perception.io.map_lock import writing\n"
         "with writing(Path(sys.argv[1])):\n    print('held', flush=True); time.sleep(60)"
     )
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     holder = subprocess.Popen(
-        [sys.executable, "-c", code, str(copied)], stdout=subprocess.PIPE, text=True, env=environment, cwd=copied.parent
+        [sys.executable, "-c", code, str(copied)], stdout=subprocess.PIPE, text=True, cwd=copied.parent
     )
     try:
         assert holder.stdout is not None and holder.stdout.readline().strip() == "held"
@@ -335,11 +334,7 @@ def test_many_writers_at_once_lose_no_label(copied: Path) -> None:
         "    try:\n        set_labels(Path(sys.argv[1]), {int(sys.argv[2]): 'mine'}); break\n"
         "    except InputError as error:\n        assert 'is writing' in str(error), error; time.sleep(0.005)\n"
     )
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    writers = [
-        subprocess.Popen([sys.executable, "-c", code, str(copied), str(k)], env=environment, cwd=copied.parent)
-        for k in range(4)
-    ]
+    writers = [subprocess.Popen([sys.executable, "-c", code, str(copied), str(k)], cwd=copied.parent) for k in range(4)]
     assert [writer.wait(120) for writer in writers] == [0] * 4
     assert [entry["label"] for entry in read_map(copied).instances[:4]] == ["mine"] * 4
 
@@ -351,12 +346,9 @@ def test_a_writer_killed_at_any_moment_leaves_a_map_that_opens(copied: Path) -> 
         "path = Path(sys.argv[1]); gmap = read_map(path); print('go', flush=True); n = 0\n"
         "while True:\n    n += 1; write_map(path, gmap); set_labels(path, {0: f'n{n}'})\n"
     )
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     means = read_map(copied).means
     for delay in np.random.default_rng(0).uniform(0, 0.08, int(os.environ.get("PERCEPTION_KILLS", "4"))):
-        writer = subprocess.Popen(
-            [sys.executable, "-c", code, str(copied)], stdout=subprocess.PIPE, env=environment, cwd=copied.parent
-        )
+        writer = subprocess.Popen([sys.executable, "-c", code, str(copied)], stdout=subprocess.PIPE, cwd=copied.parent)
         assert writer.stdout is not None and writer.stdout.readline()
         time.sleep(delay)
         writer.kill()

@@ -10,7 +10,6 @@ import pytest
 import torch
 from viewer_maps import free_port, small_map
 
-import perception
 from perception.errors import InputError
 from perception.io.store import write_map
 from perception.viewer.paint import HIGHLIGHT, MODES, highlight, paint
@@ -110,13 +109,10 @@ def test_without_a_display_the_address_is_printed_and_ctrl_c_ends(tmp_path: Path
     from urllib.request import urlopen
 
     write_map(tmp_path / "m.gsmap", small_map(100))
-    home = str(Path(perception.__file__).parents[1])
     env = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
     port = free_port()
     command = [sys.executable, "-m", "perception.cli", "view", "m.gsmap", "--port", str(port)]
-    viewer = subprocess.Popen(
-        command, cwd=tmp_path, env=env | {"PYTHONPATH": home}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    viewer = subprocess.Popen(command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert viewer.stderr is not None
         told = viewer.stderr.readline()
