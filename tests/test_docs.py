@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import importlib
 import importlib.util
+import io
 import re
 import shlex
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -57,25 +61,41 @@ def runnable() -> list[str]:
 
 def test_documented_options_and_settings_exist() -> None:
     """Every `--option` in running text is one of some command, every `--set KEY=VALUE` can be set."""
+    from perception.bench import BENCHES
     from perception.config import load_config
 
-    helps = {name: command.format_help() for name, command in _commands().items()}
     options, settings = set(), set()
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
         for code in re.findall(r"`([^`\n]*)`", text):
             if not code.startswith(("pip", "cmake", "ros2")):
                 options |= set(re.findall(r"(?<![\w-])--[a-z][\w-]+", code))
-            settings |= set(re.findall(r"--set (\w[\w.]*=[\w:.]+)", code))
+            settings |= set(re.findall(r"--set ([a-z][\w.]*=[\w:.]+)", code))
     assert len(options) > 15 and settings
-    known = " ".join(helps.values())
+    known = " ".join([*(command.format_help() for command in _commands()), *map(_bench_help, sorted(BENCHES))])
     assert [option for option in sorted(options) if not re.search(rf"{option}\b", known)] == []
     load_config(None, sorted(settings))
 
 
-def _commands() -> dict[str, argparse.ArgumentParser]:
-    choices = next(a for a in build_parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
-    return dict(choices)
+def _bench_help(name: str) -> str:
+    """The `bench` commands parse their own arguments."""
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+        importlib.import_module(f"perception.bench.{name.replace('-', '_')}").main(["--help"])
+    return text.getvalue()
+
+
+def _commands() -> list[argparse.ArgumentParser]:
+    """Every command with its own commands."""
+
+    def below(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+        yield parser
+        for action in parser._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                for command in action.choices.values():
+                    yield from below(command)
+
+    return list(below(build_parser()))
 
 
 def test_the_walkthrough_runs(small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-import types
 from pathlib import Path
 
 import cv2
@@ -11,6 +9,7 @@ import numpy as np
 import pytest
 
 from perception.errors import InputError
+from perception.io import photos
 from perception.masks import make_source
 from perception.masks.store import compute_masks, label_file, load_labels, write_labels
 from perception.types import Lens, View
@@ -25,11 +24,7 @@ def view(name: str, lens: Lens | None = None) -> View:
 @pytest.fixture(autouse=True)
 def no_undistortion(monkeypatch):
     """These photos are pinhole images at training size, so labels pass through unchanged."""
-    photos = types.ModuleType("perception.io.photos")
-    photos.warp_labels = lambda view, labels, width, height: labels
-    io = types.ModuleType("perception.io")
-    monkeypatch.setitem(sys.modules, "perception.io", sys.modules.get("perception.io", io))
-    monkeypatch.setitem(sys.modules, "perception.io.photos", photos)
+    monkeypatch.setattr(photos, "warp_labels", lambda view, labels, width, height: labels)
 
 
 @pytest.fixture
