@@ -21,6 +21,7 @@ from perception.demo import load_truth
 from perception.errors import InputError
 from perception.gaussians.train import Trainer
 from perception.io.cloud import read_cloud
+from perception.io.map_lock import lock_file
 from perception.io.store import read_map
 from perception.pipeline import mapping
 from perception.pipeline.demo import truth_in_map_frame
@@ -179,6 +180,9 @@ def test_killed_and_resumed_is_the_run_that_was_never_killed(finished: Path, sma
     assert main(command[3:]) == 2  # the unfinished run is named, not overwritten
     assert main([*command[3:], "--resume", "--json"]) == 0
     assert (finished / "gaussians.ply").read_bytes() == (out / "gaussians.ply").read_bytes()
+    lock_file(out).touch()  # as a run leaves it that is killed after the map took its place
+    assert main([*command[3:], "--resume", "--json"]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == [out.name]
 
 
 def test_built_in_masks_are_made_from_the_maps_own_depth(small_scene: Path, tmp_path: Path) -> None:

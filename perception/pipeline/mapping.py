@@ -65,7 +65,8 @@ def build_map(
     progress = progress or Progress(quiet=True)
     if resume and _finished(source, output, config):
         progress.log(f"{output}: this run is finished")
-        shutil.rmtree(work_folder(output), ignore_errors=True)
+        with writing(output):  # one killed while it let go has left its lock and its work
+            shutil.rmtree(work_folder(output), ignore_errors=True)
         return read_map(output)
     labelled = None if labels_from is None else read_map(labels_from)
     fresh = not work_folder(output).exists()
