@@ -141,6 +141,15 @@ def test_ply_headers_that_make_no_sense(tmp_path: Path, order: str, elements: st
     refused(read_ply, file, match="a.ply")
 
 
+@pytest.mark.parametrize("order, body", [("ascii", b"1 2 3\n"), ("binary_little_endian", struct.pack("<3f", 1, 2, 3))])
+def test_a_ply_without_any_face(tmp_path: Path, order: str, body: bytes) -> None:
+    """A list property of no rows, as mesh tools write it for a cloud."""
+    vertex = "element vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    head = HEAD.format(order, vertex + "element face 0\nproperty list uchar int vertex_indices\n")
+    (tmp_path / "a.ply").write_bytes(head.encode() + body)
+    assert read_cloud(tmp_path / "a.ply").points.tolist() == [[1, 2, 3]]
+
+
 PCD = "FIELDS {}\nSIZE {}\nTYPE {}\nCOUNT {}\nWIDTH 1\nHEIGHT 1\nPOINTS {}\nDATA {}\n"
 
 

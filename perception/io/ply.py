@@ -218,7 +218,7 @@ def _column(values: list[np.ndarray], p: _Property) -> np.ndarray:
     if p.count_kind is None:
         return np.concatenate(values).astype(p.kind) if values else np.empty(0, p.kind)
     if len({len(v) for v in values}) <= 1:
-        return np.array(values, p.kind).reshape(len(values), -1)
+        return np.array(values, p.kind).reshape(len(values), len(values[0]) if values else 0)
     ragged = np.empty(len(values), object)
     ragged[:] = [v.astype(p.kind) for v in values]
     return ragged
