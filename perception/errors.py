@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
+import unicodedata
+
 
 class InputError(ValueError):
-    """Bad input from the user, told in one line: what was read, what was found, what was expected, what to do."""
+    """Bad input from the user, told in one line: what was read, what was found, what was expected, what to do.
+
+    What file names and contents bring along that is no visible text (line ends, control codes) is shown escaped.
+    """
+
+    def __init__(self, message: object = ""):
+        super().__init__("".join(c if _visible(c) else ascii(c)[1:-1] for c in str(message)))
+
+
+def _visible(character: str) -> bool:
+    return unicodedata.category(character) not in ("Cc", "Cs", "Zl", "Zp")
 
 
 def missing_extra(package: str, extra: str) -> InputError:

@@ -20,6 +20,7 @@ from perception.errors import InputError
 from perception.io.camera_file import read_camera
 from perception.io.cloud import read_cloud
 from perception.io.colmap import read_workspace
+from perception.io.inputs import load_scene
 from perception.io.ply import read_ply
 from perception.io.transforms import read_frames, read_transforms
 from perception.io.views import rigid_pose
@@ -370,3 +371,10 @@ def test_damaged_label_images_of_an_earlier_run(tmp_path: Path) -> None:
         refused(load_labels, tmp_path, view, match="damaged or cut short")
     Image.new("RGB", (8, 6)).save(file)  # came back as [6, 8, 3]
     refused(load_labels, tmp_path, view, match="one channel")
+
+
+def test_an_error_is_one_line_whatever_a_file_is_called(tmp_path: Path) -> None:
+    frame = {"file_path": "a\nb\x1b[31m\u2028.png", "transform_matrix": np.eye(4).tolist()}
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 7, "w": 8, "h": 6, "frames": [frame]}))
+    refused(load_scene, tmp_path, tmp_path / "work", match=r"a\\nb\\x1b\[31m\\u2028\.png")
+    assert str(InputError("grand-mère’s 杯子 🍵")) == "grand-mère’s 杯子 🍵"

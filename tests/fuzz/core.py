@@ -254,7 +254,10 @@ def spoiled(dice: Dice, value: Any) -> Any:
     if kind < 9:
         return _other_shape(dice, value, kind)
     if kind == 9:
-        return value.astype(dice.pick(_DTYPES))
+        try:
+            return value.astype(dice.pick(_DTYPES))
+        except (OverflowError, TypeError):  # Python's own numbers, that an earlier turn put there, need not fit
+            return value
     if kind == 10:
         copy = value.copy()
         copy.setflags(write=False)
