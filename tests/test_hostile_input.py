@@ -368,7 +368,9 @@ def test_damaged_label_images_of_an_earlier_run(tmp_path: Path) -> None:
     for content in (b"", b"\x89PNG\r\n\x1a\n", b"GIF89a"):  # Pillow's own error came through
         file.write_bytes(content)
         assert stored_key(file) is None
-        refused(load_labels, tmp_path, view, match="damaged or cut short")
+        refused(load_labels, tmp_path, view, match="damaged or cut short|not a PNG")
+    Image.new("L", (1 << 14, 1 << 14)).save(file)
+    refused(load_labels, tmp_path, view, match="16384×16384 pixels of a smaller photo")
     Image.new("RGB", (8, 6)).save(file)  # came back as [6, 8, 3]
     refused(load_labels, tmp_path, view, match="one channel")
 

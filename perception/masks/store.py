@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.masks.labels import read_labels
+from perception.masks.labels import read_labels, read_png_header
 from perception.masks.source import GeometryMaskSource, MaskSource
 from perception.types import View
 
@@ -88,6 +88,9 @@ def load_labels(folder: Path, view: View) -> np.ndarray:
     file = label_file(folder, view)
     if not file.is_file():
         raise InputError(f"{file}: no label image for photo {view.name}; run the masks stage again")
+    header = read_png_header(file)  # a damaged size must not cost gigabytes
+    if header.width * header.height > 4 * view.width * view.height:
+        raise InputError(f"{file}: {header.width}×{header.height} pixels of a smaller photo; the PNG is damaged")
     return read_labels(file)
 
 
