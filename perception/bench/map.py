@@ -93,6 +93,8 @@ def where(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 def _plot(path: Path, scene: str, rows: Sequence[dict[str, Any]], native: int) -> None:
     def draw(figure: Any) -> None:
+        from matplotlib.ticker import LogLocator, NullFormatter
+
         parts = [(key, label) for key, label in (("psnr", "held-out PSNR, dB"), ("ssim", "SSIM"), ("ap", "AP"))]
         parts = [(key, label) for key, label in parts if any(row.get(key) is not None for row in rows)]
         for axis, (key, label) in zip(figure.subplots(1, len(parts), squeeze=False)[0], parts, strict=True):
@@ -102,13 +104,18 @@ def _plot(path: Path, scene: str, rows: Sequence[dict[str, Any]], native: int) -
                 style = {"marker": "*" if preset else "o", "s": 130 if preset else 28}
                 color = "#cc3311" if preset else "#4477aa" if row["pixels"] == native else "0.7"
                 axis.scatter(row["cpu_minutes"], row[key], color=color, zorder=3 if preset else 2, **style)
-                name = row["name"] if preset else f"{row['group']} {row['name']}"
-                axis.annotate(
-                    name, (row["cpu_minutes"], row[key]), fontsize=6, xytext=(4, 3), textcoords="offset points"
-                )
+                if preset or row[f"front_{key}"]:  # the others crowd around the default
+                    name = row["name"] if preset else f"{row['group']} {row['name']}"
+                    place = {"ha": "left", "xytext": (7, -9)} if preset else {"ha": "right", "xytext": (-4, 4)}
+                    at = (row["cpu_minutes"], row[key])
+                    axis.annotate(name, at, fontsize=7, textcoords="offset points", annotation_clip=False, **place)
             front = sorted((row["cpu_minutes"], row[key]) for row in held if row[f"front_{key}"])
             axis.plot(*zip(*front, strict=True), color="#4477aa", linewidth=1, zorder=1)
             axis.set_xscale("log")
+            axis.margins(x=0.15)
+            axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.xaxis.set_major_formatter("{x:g}")
+            axis.xaxis.set_minor_formatter(NullFormatter())
             axis.set_xlabel("CPU minutes of training")
             axis.set_ylabel(label)
             axis.grid(alpha=0.3)

@@ -82,7 +82,7 @@ def _rasterizer(report: dict[str, Any]) -> str:
     heads += ["error p99.9", "mean", "gradients"]
     rows = []
     for row in report["rows"]:
-        if row["threads"] != 1:
+        if row["threads"] != 1 or (row["dtype"], row["simd"]) == ("float64", "baseline"):
             continue
         same = [r for r in report["rows"] if all(r[k] == row[k] for k in ("scene", "simd", "dtype", "channels"))]
         most = max(same, key=lambda r: r["threads"])
@@ -118,12 +118,21 @@ def _mapping(reports: Sequence[dict[str, Any]]) -> str:
                 row["front"] or "-",
             ]
             rows.append(cells)
-    short = "; `--quick`: a sixth of the iterations, 320 pixels" if reports[0]["arguments"].get("quick") else ""
+    schedules = ", ".join(map(_schedule, reports))
     links = ", ".join(f"[{report['scene']}](docs/{_plot_name(report)})" for report in reports)
     return (
         f"**Mapping**, the presets and whatever else lies on the front of time against quality (`perception bench map "
-        f"SCENE`{short}; {_machine(reports[0])}; all points: {links}):\n\n{_table(heads, rows)}"
+        f"SCENE`; {schedules}; {_machine(reports[0])}; all points: {links}):\n\n{_table(heads, rows)}"
     )
+
+
+def _schedule(report: dict[str, Any]) -> str:
+    given = report["arguments"]
+    if given.get("quick"):
+        return f"{report['scene']} `--quick`: a sixth of the iterations, 320 pixels, 20,000 Gaussians"
+    if given.get("shorten"):
+        return f"{report['scene']} `--shorten {given['shorten']:g}`: so many times fewer iterations"
+    return f"{report['scene']} in full"
 
 
 def _plot_name(report: dict[str, Any]) -> str:
