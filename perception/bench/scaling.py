@@ -68,8 +68,9 @@ def _plot(path: Path, scene: str, rows: Sequence[dict[str, Any]]) -> None:
             axes[1][column].plot(places, [row["peak_mib"] for row in held], "o-")
             axes[1][column].set_xlabel(label)
             for axis in axes[:, column]:
-                axis.set_ylim(bottom=0)
                 axis.grid(alpha=0.3)
+        for axis in axes[:, 0]:  # shared by its row, so once all of it is drawn
+            axis.set_ylim(bottom=0)
         axes[0][0].set_ylabel("seconds per 1000 iterations")
         axes[1][0].set_ylabel("peak memory, MiB")
         axes[0][0].legend(fontsize=8)
