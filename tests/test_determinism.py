@@ -71,3 +71,26 @@ def test_another_seed_is_another_map(thin: Path, small_scene: Path, tmp_path: Pa
         config = load_config(None, [*PAIRS, f"masks=labels:{small_scene / 'labels'}", f"seed={seed}"])
         maps.append(build_map(thin, tmp_path / f"{seed}.gsmap", config))
     assert len(maps[0]) != len(maps[1]) or not np.array_equal(maps[0].means, maps[1].means)
+
+
+def test_so_is_one_of_more_gaussians_than_torch_gives_one_thread(small_scene: Path, tmp_path: Path, threads) -> None:
+    """Above 32,768 elements torch shares an operation out, and some of its results depend on where the shares end."""
+    cloud = read_cloud(small_scene / "truth" / "gt_points.ply")
+    assert cloud.colors is not None
+    count = 40_001
+    rows = np.arange(count) % len(cloud.points)
+    points = cloud.points[rows] + np.random.default_rng(0).normal(0, 0.002, (count, 3))
+    write_cloud(tmp_path / "points.ply", PointCloud(points, cloud.colors[rows]))
+    cameras = json.loads((small_scene / "transforms.json").read_text())
+    for frame in cameras["frames"]:
+        frame["file_path"] = str(small_scene / frame["file_path"])
+    source = tmp_path / "transforms.json"
+    source.write_text(json.dumps({**cameras, "ply_file_path": str(tmp_path / "points.ply")}))
+    pairs = ["train.iterations=30", "train.budget=50000", "densify.every=10", "language.encoder=none"]
+    pairs.append(f"masks=labels:{small_scene / 'labels'}")
+    for number in (1, 2):
+        threads(number)
+        build_map(source, tmp_path / f"{number}.gsmap", load_config(None, pairs))
+    assert len(read_map(tmp_path / "1.gsmap")) > 2**15
+    for name in FILES:
+        assert (tmp_path / "1.gsmap" / name).read_bytes() == (tmp_path / "2.gsmap" / name).read_bytes(), name

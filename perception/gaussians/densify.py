@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from perception.config import DensifyConfig
-from perception.gaussians.model import Gaussians
+from perception.gaussians.model import Gaussians, sigmoid
 
 SPLIT_SHRINK = 1.6
 """Scales of the two halves of a split Gaussian are divided by this (Kerbl et al. 2023)."""
@@ -102,7 +102,7 @@ def _needed(gaussians: Gaussians, statistics: Statistics, config: DensifyConfig)
 
 
 def _halved_logit(logits: torch.Tensor) -> torch.Tensor:
-    opacities = 1 - torch.sqrt(1 - logits.sigmoid().clamp(max=1 - 1e-6))
+    opacities = 1 - torch.sqrt(1 - sigmoid(logits).clamp(max=1 - 1e-6))
     return torch.logit(opacities.clamp(1e-6, 1 - 1e-6))
 
 

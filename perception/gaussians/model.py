@@ -12,6 +12,15 @@ SH_C0 = 0.28209479177387814
 """Zeroth real spherical harmonic, 1 / (2 sqrt(pi))."""
 
 
+def sigmoid(logits: torch.Tensor) -> torch.Tensor:
+    """1 / (1 + exp(−x)), the same bits for any number of threads.
+
+    torch.sigmoid's are not beyond 32,768 elements: the last few of each thread's share are computed on another path.
+    exp(80) is the last power of e whose gradient float32 holds; opacities of 1e-35 have none to lose.
+    """
+    return 1 / (1 + torch.exp(-logits.clamp(-80, 80)))
+
+
 @dataclass
 class Gaussians:
     """N Gaussians in the world frame, float32.
@@ -45,7 +54,7 @@ class Gaussians:
 
     @property
     def opacities(self) -> torch.Tensor:
-        return self.opacity_logits.sigmoid()
+        return sigmoid(self.opacity_logits)
 
     @property
     def sh_degree(self) -> int:

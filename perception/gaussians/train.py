@@ -20,7 +20,7 @@ from perception.gaussians.densify import Statistics, decay_opacities, densify, t
 from perception.gaussians.economy import TRIAL, Economy
 from perception.gaussians.holes import fill_holes
 from perception.gaussians.losses import instance_loss, photometric, photometric_loss, variance_loss
-from perception.gaussians.model import Gaussians
+from perception.gaussians.model import Gaussians, sigmoid
 from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.profile import Profile
 from perception.gaussians.rasterize import Rasterization, rasterize
@@ -225,7 +225,7 @@ class Trainer:
             params["means"],
             params["quats"],
             params["log_scales"].exp(),
-            params["opacity_logits"].sigmoid(),
+            sigmoid(params["opacity_logits"]),
             params["sh"],
             view.camera_from_world[None],
             view.K[None],
