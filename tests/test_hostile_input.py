@@ -65,6 +65,16 @@ def test_backward_refuses_the_frames_of_another_scene(dtype: Any, other: dict[st
         getattr(_core, f"rasterize_backward_{kind}")(inputs, frames, *images, *[None] * 13)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_backward_refuses_a_gradient_of_depths_that_are_missing(dtype: Any) -> None:
+    """It read them through a null pointer."""
+    kind, inputs, images, seen = scene(40, dtype)
+    frames = getattr(_core, f"rasterize_forward_{kind}")(inputs, *images, *seen, "auto")
+    gradients = [None, None, np.ones((1, 8, 8), dtype), *[None] * 10]
+    with pytest.raises(ValueError, match="depths: missing"):
+        getattr(_core, f"rasterize_backward_{kind}")(inputs, frames, *images, *gradients)
+
+
 def unaligned(array: np.ndarray) -> np.ndarray:
     memory = np.zeros(array.nbytes + 1, np.uint8)[1:].view(array.dtype).reshape(array.shape)
     memory[...] = array

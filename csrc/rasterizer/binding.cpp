@@ -188,6 +188,7 @@ void backward(Arguments<T> &a, Handle<T> &handle, Images<T> images, Optional<con
   grad.colors = checked("colors' gradient", g_colors, {c, h, w, 3});
   grad.alphas = checked("alphas' gradient", g_alphas, {c, h, w});
   grad.depths = checked("depths' gradient", g_depths, {c, h, w});
+  if (opt.depth && grad.depths && !out.depths) throw std::invalid_argument("depths: missing, their gradient is given");
   grad.features = checked("features' gradient", g_features, {c, h, w, d});
   grad.variance = checked("feature_variance's gradient", g_variance, {c, h, w, d});
   perception::Gradients<T> result{};
