@@ -45,14 +45,21 @@ def test_growth_ends_where_all_that_was_gained_would_not_pay_for_it() -> None:
     assert economy(100.0, scores).growth_pays(2000, 2000) is None  # nothing to pay for
 
 
-def test_a_harmonic_is_kept_when_its_trial_gains_more_than_one_without() -> None:
-    held = economy(0.0, [])
-    degrees = []
-    for score in (18.0, 20.0, 20.1, 20.4, 20.45):  # base trial +.1; degree 1 +.3: kept; degree 2 +.05: taken back
-        held.scores.append(score)
-        degree, _ = held.harmonics_step(degrees[-1] if degrees else 0)
-        degrees.append(degree)
-    assert degrees == [0, 0, 1, 2, 1] and held.settled
+@pytest.mark.parametrize(
+    "cut, kept",
+    [
+        ((20.0, 20.3, 20.34, 20.38), 1),  # of .05 dB that are asked, degrees 3 and 2 bring .04 each
+        ((20.0, 20.3, 20.2, 20.3), 3),
+        ((20.0, 19.9, 19.8, 19.7), 0),  # they only learnt the training views by heart
+    ],
+)
+def test_the_highest_harmonics_go_while_they_are_worth_less_than_asked(cut: tuple[float, ...], kept: int) -> None:
+    held, degree = economy(0.0, []), 0
+    for expected in (1, 2, 3):
+        degree, told = held.harmonics_step(degree, cut.__getitem__)
+        assert degree == expected and told is None and not held.settled
+    degree, told = held.harmonics_step(degree, cut.__getitem__)
+    assert degree == kept and held.settled and str(told).startswith(f"harmonics: degree {kept} kept")
 
 
 def test_rates_cool_down_over_the_last_share_only() -> None:

@@ -7,6 +7,7 @@ more time must buy.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -24,14 +25,13 @@ COST_EXPONENT = 0.6
 class Economy:
     """What was measured and decided so far; `state` and `load` round-trip it through a checkpoint.
 
-    scores: PSNR in dB at the end of each trial. growing: Gaussians may be added. harmonics: PSNR at the ends of the
-    trials that are about harmonics. settled: no harmonics are tried any more. finished: only the cool-down is left.
+    scores: PSNR in dB at the end of each trial. growing: Gaussians may be added. settled: the degree of harmonics is
+    decided. finished: only the cool-down is left.
     """
 
     config: MapConfig
     scores: list[float] = field(default_factory=list)
     growing: bool = True
-    harmonics: list[float] = field(default_factory=list)
     settled: bool = False
     finished: bool = False
     due: float = TRIAL
@@ -78,22 +78,20 @@ class Economy:
             return None
         return f"stop: 10 % more time gains {gain / tenths:.3f} dB, {self.config.train.exchange_db:g} are asked"
 
-    def harmonics_step(self, degree: int) -> tuple[int, str | None]:
-        """The degree to go on with after a trial, and what was decided about the last raise, if anything.
+    def harmonics_step(self, degree: int, score: Callable[[int], float]) -> tuple[int, str | None]:
+        """The degree to go on with after a trial, and what was decided, if anything.
 
-        The first trial is left to what the end of growth sets free (opacities no longer decay), the second raises
-        nothing and tells what a trial gains by itself; a raise pays when its trial gains `sh_min_gain_db` more.
+        A trial adds a degree. One trial after the last, `score` tells the held-out PSNR with the colours cut to a
+        degree, and the highest degree goes when it is worth less than `sh_min_gain_db`; then the next is looked at.
+        What a degree gains in its own first trial says little: harmonics learn slowly, and the others make room.
         """
         train = self.config.train
-        self.harmonics.append(self.scores[-1])
-        told = None
-        if len(self.harmonics) > 3:
-            before = self.harmonics[2] - self.harmonics[1]
-            extra = self.harmonics[-1] - self.harmonics[-2] - before
-            paid = extra >= train.sh_min_gain_db
-            told = f"harmonics: degree {degree} gained {extra:+.2f} dB, {'kept' if paid else 'taken back'}"
-            degree -= not paid
-            self.settled = not paid or degree == train.sh_degree
-        if len(self.harmonics) > 2 and not self.settled:
-            degree += 1
-        return degree, told
+        if degree < train.sh_degree:
+            return degree + 1, None
+        self.settled = True
+        worth = [score(d) for d in range(degree + 1)]
+        kept = degree
+        while kept and worth[kept] - worth[kept - 1] < train.sh_min_gain_db:
+            kept -= 1
+        told = ", ".join(f"{psnr:.2f}" for psnr in worth)
+        return kept, f"harmonics: degree {kept} kept; cut to 0 to {degree}, held-out PSNR is {told} dB"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -318,7 +318,8 @@ class Trainer:
             economy.growing = False
             self._decide(f"growth: {count} of at most {self.config.train.budget} Gaussians")
         if not economy.settled:
-            degree, told = economy.harmonics_step(self.gaussians.sh_degree)
+            cut = lambda degree: self.score(limit=8, degree=degree)["psnr"]  # noqa: E731
+            degree, told = economy.harmonics_step(self.gaussians.sh_degree, cut)
             self._decide(told)
             if degree != self.gaussians.sh_degree:
                 self._set_degree(degree)
@@ -359,15 +360,19 @@ class Trainer:
 
     # ------------------------------------------------------------------ figures
 
-    def score(self, limit: int | None = None, with_ssim: bool = False) -> dict[str, float]:
-        """Mean PSNR (and SSIM as trained) over at most `limit` held-out views, training views if there are none."""
+    def score(self, limit: int | None = None, with_ssim: bool = False, degree: int = 3) -> dict[str, float]:
+        """Mean PSNR (and SSIM as trained) over at most `limit` held-out views, training views if there are none.
+
+        degree: of the harmonics that are shown.
+        """
+        shown = replace(self.gaussians, sh=self.gaussians.sh[:, : (degree + 1) ** 2].contiguous())
         views = self.held_out or self.views
         if limit is not None and len(views) > limit:
             views = [views[i] for i in np.linspace(0, len(views) - 1, limit).round().astype(int)]
         figures = []
         with self.profile("evaluation"):
             for view in views:
-                image = render_view(self.gaussians, view)
+                image = render_view(shown, view)
                 ssim = [photometric(image, view.photo, beta=1.0).ssim] if with_ssim else []
                 figures.append([psnr(image, view.photo), *ssim])
         return dict(zip(("psnr", "ssim"), np.mean(figures, axis=0).tolist(), strict=False))
