@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from conftest import hears_ctrl_c
 
 pty = pytest.importorskip("pty")  # not on Windows
 
@@ -37,6 +38,7 @@ class Terminal:
             stdout=slave,
             stderr=slave,
             start_new_session=True,
+            preexec_fn=hears_ctrl_c,
         )
         os.close(slave)
         self.text = ""

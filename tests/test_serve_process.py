@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from conftest import hears_ctrl_c
 from query_maps import NAMES, write_map_of
 
 from perception.bench.synthetic_map import write_synthetic_map
@@ -46,7 +47,7 @@ def server(command: list[str], folder: Path) -> Iterator[tuple[subprocess.Popen[
         text=True,
         env=environment,
         cwd=folder,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a suite run in the background ignores it
+        preexec_fn=hears_ctrl_c,
     )
     try:
         assert process.stderr is not None

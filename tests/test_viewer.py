@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import hears_ctrl_c
 from viewer_maps import free_port, small_map
 
 from perception.errors import InputError
@@ -112,7 +113,8 @@ def test_without_a_display_the_address_is_printed_and_ctrl_c_ends(tmp_path: Path
     env = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
     port = free_port()
     command = [sys.executable, "-m", "perception.cli", "view", "m.gsmap", "--port", str(port)]
-    viewer = subprocess.Popen(command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    viewer = subprocess.Popen(command, cwd=tmp_path, env=env, text=True, preexec_fn=hears_ctrl_c, **pipes)
     try:
         assert viewer.stderr is not None
         told = viewer.stderr.readline()
