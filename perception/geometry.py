@@ -28,6 +28,11 @@ def inverse_se3(a_from_b: np.ndarray) -> np.ndarray:
     return inverse
 
 
+def camera_centres(camera_from_world: np.ndarray) -> np.ndarray:
+    """Where cameras stand, [N, 3] in the world, of poses [N, 4, 4]."""
+    return np.asarray(-np.einsum("nji,nj->ni", camera_from_world[:, :3, :3], camera_from_world[:, :3, 3]))
+
+
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     """The rotation [3, 3] closest to `matrix` [3, 3] in the Frobenius norm (polar decomposition)."""
     u, _, vt = np.linalg.svd(matrix)

@@ -318,8 +318,9 @@ class Trainer:
             economy.growing = False
             self._decide(f"growth: {count} of at most {self.config.train.budget} Gaussians")
         if not economy.settled:
-            cut = lambda degree: self.score(limit=8, degree=degree)["psnr"]  # noqa: E731
-            degree, told = economy.harmonics_step(self.gaussians.sh_degree, cut)
+            degree, told = economy.harmonics_step(
+                self.gaussians.sh_degree, lambda shown: self.score(limit=8, degree=shown)["psnr"]
+            )
             self._decide(told)
             if degree != self.gaussians.sh_degree:
                 self._set_degree(degree)

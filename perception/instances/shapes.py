@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from perception.geometry import camera_centres
 from perception.language.shape_words import KINDS
 
 LEVEL = 0.12  # most mean square roll of the cameras at which "level" is believed
@@ -73,7 +74,7 @@ def shape_scores(
         scores[n, KINDS.index("ball")] = roundness(body.points)
     if up is None or not bodies:
         return scores
-    centres = -np.einsum("nji,nj->ni", camera_from_world[:, :3, :3], camera_from_world[:, :3, 3]) @ frame.T
+    centres = camera_centres(camera_from_world) @ frame.T
     for name, values in _room(bodies, centres).items():
         scores[list(values), KINDS.index(name)] = list(values.values())
     for n, body in bodies.items():

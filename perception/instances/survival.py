@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from perception.geometry import align_similarity
+from perception.geometry import align_similarity, camera_centres
 from perception.io.store import GaussianMap
 
 SHARE = 0.5  # of the points of either must lie nearest to the other: then each has at most one partner
@@ -91,7 +91,7 @@ def _into_frame_of(new: GaussianMap, old: GaussianMap) -> tuple[np.ndarray, bool
     if len(common) < 3:
         return old.means, False
     rows = np.array(common)
-    there, here = (_centres(m.cameras["camera_from_world"])[c] for m, c in ((new, rows[:, 0]), (old, rows[:, 1])))
+    there, here = (camera_centres(m.cameras["camera_from_world"])[c] for m, c in ((new, rows[:, 0]), (old, rows[:, 1])))
     if np.linalg.matrix_rank(here - here.mean(axis=0), tol=1e-3 * max(float(np.ptp(here)), 1e-12)) < 2:
         return old.means, False  # cameras on a line tie no rotation about it
     scale, rotation, shift = align_similarity(there, here)
@@ -99,10 +99,6 @@ def _into_frame_of(new: GaussianMap, old: GaussianMap) -> tuple[np.ndarray, bool
     if np.median(residual) > ALIGNED * float(np.linalg.norm(np.ptp(there, axis=0))):
         return old.means, False
     return (scale * old.means.astype(np.float64) @ rotation.T + shift).astype(np.float32), True
-
-
-def _centres(camera_from_world: np.ndarray) -> np.ndarray:
-    return -np.einsum("nji,nj->ni", camera_from_world[:, :3, :3], camera_from_world[:, :3, 3])
 
 
 def carried_text(carried: Carried) -> str:

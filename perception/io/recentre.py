@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.geometry import camera_centres
 from perception.types import Scene, View
 
 FAR = 100.0
@@ -18,7 +19,7 @@ FAR = 100.0
 
 def recentred(scene: Scene) -> Scene:
     """The scene about its own middle when it lies far from the origin; report["origin"] [3] is what was taken off."""
-    centres = np.array([-v.camera_from_world[:3, :3].T @ v.camera_from_world[:3, 3] for v in scene.views])
+    centres = camera_centres(np.stack([view.camera_from_world for view in scene.views]))
     middle = np.median(centres, axis=0)
     extent = float(np.linalg.norm(centres - middle, axis=1).max())
     if extent == 0 or np.linalg.norm(middle) <= FAR * extent:

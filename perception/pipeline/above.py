@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from perception.gaussians.rasterize import rasterize
+from perception.geometry import camera_centres
 from perception.io.store import GaussianMap
 from perception.pictures import instance_palette
 
@@ -26,7 +27,7 @@ def instances_from_above(gmap: GaussianMap, side: int = 480) -> np.ndarray:
     poses = gmap.cameras["camera_from_world"].astype(np.float64)
     axes = _axes(poses)
     turned = gmap.means @ axes.T
-    eyes = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3]) @ axes.T
+    eyes = camera_centres(poses) @ axes.T
     solid = (gmap.opacities > SOLID) & (gmap.instance_ids >= 0)
     below = solid & (turned[:, 2] >= eyes[:, 2].min())
     rows = np.flatnonzero(below if below.any() else solid)

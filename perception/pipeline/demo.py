@@ -14,7 +14,7 @@ from perception.demo import DemoTruth, make_photos
 from perception.errors import InputError
 from perception.evaluate.instances import evaluate
 from perception.export import export_labels, write_export
-from perception.geometry import align_similarity
+from perception.geometry import align_similarity, camera_centres
 from perception.io.store import GaussianMap, read_map
 from perception.pipeline.mapping import build_map
 from perception.pipeline.reporting import map_picture, write_map_report
@@ -78,16 +78,12 @@ def truth_in_map_frame(truth: DemoTruth, gmap: GaussianMap) -> tuple[PointCloud,
     """
     by_name = dict(zip(truth.names, truth.cameras, strict=True))
     names = [str(name) for name in gmap.cameras["names"]]
-    mapped = _centres(gmap.cameras["camera_from_world"])
+    mapped = camera_centres(gmap.cameras["camera_from_world"])
     true = np.stack([by_name[name].center for name in names])
     scale, rotation, shift = align_similarity(mapped, true)
     points = scale * truth.points.astype(np.float64) @ rotation.T + shift
     normals = (truth.normals.astype(np.float64) @ rotation.T).astype(np.float32)
     return PointCloud(points.astype(np.float32), truth.colors, normals), float(scale)
-
-
-def _centres(camera_from_world: np.ndarray) -> np.ndarray:
-    return -np.einsum("nji,nj->ni", camera_from_world[:, :3, :3], camera_from_world[:, :3, 3])
 
 
 def _ask(opened: LoadedMap, text: str, ids: list[int], truth: DemoTruth, labels: np.ndarray) -> dict[str, Any]:
