@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +9,6 @@ from perception.viewer.paint import MODES
 
 if TYPE_CHECKING:
     from perception.viewer.app import Viewer
-
-TYPED = 0.15
-"""Seconds to wait for what was typed: the page holds the last letters back (viser: 50 ms), yet sends Enter at once."""
 
 
 class Panel:
@@ -38,14 +34,10 @@ class Panel:
             self._parts = self.gui.add_checkbox("parts of things", False, hint='such as "handle of the mug"')
             button = self.gui.add_button("Search")
         button.on_click(lambda _: form.submit())
-        form.on_submit(self._submit)
+        form.on_submit(lambda event: self.viewer.guarded(self._ask, event.client))
         self._answer = self.gui.add_markdown("")
         self._hits_folder = self.gui.add_folder("Hits", visible=False)
         self._hit_buttons: list[Any] = []
-
-    def _submit(self, event: Any) -> None:
-        time.sleep(TYPED)
-        self.viewer.guarded(self._ask, event.client)
 
     def _ask(self) -> None:
         self.session.ask(self._text.value, parts=self._parts.value)
