@@ -217,6 +217,80 @@ def test_merging_patches_keeps_the_evidence_exact():
     assert compared > 3
 
 
+def test_growth_of_a_union_against_its_voxels():
+    """The last features of a pair, from the voxels themselves: extents by singular values, not from sums of squares."""
+    seen = true_sights()[:3]
+    surface = fuse(seen)
+    graph = surface_graph(seen, surface)
+    compared = 0
+    for a, links in enumerate(graph.borders):
+        for b in links:
+            one, two = (surface.points[graph.patch == i].astype(np.float64) for i in (a, b))
+            larger, smaller = (one, two) if len(one) > len(two) else (two, one)
+            if len(smaller) < 12:
+                continue
+            pixels, depths = graph.sums[[a, b], 0], graph.sums[[a, b], 5]
+            depth, least = depths.sum() / pixels.sum(), surface.size / 4
+
+            def extent(points: np.ndarray, least: float = least) -> np.ndarray:
+                centred = points - points.mean(axis=0)
+                spread = np.linalg.svd(centred, compute_uv=False)[::-1] / np.sqrt(len(points))
+                return np.maximum(spread, least)
+
+            chord = two.mean(axis=0) - one.mean(axis=0)
+            chord /= (distance := np.linalg.norm(chord))
+            along = max((one @ chord).std(), least) + max((two @ chord).std(), least)
+            union, big, small = (extent(points) for points in (np.concatenate([one, two]), larger, smaller))
+            expected = [
+                distance / along,
+                *np.log(union / big),
+                *np.log(big / depth),
+                *np.log(small / depth),
+                np.log(union.prod() / (big.prod() + small.prod())),
+            ]
+            np.testing.assert_allclose(graph.features(a, [b])[0, -11:], expected, atol=1e-4)  # points are float32
+            compared += 1
+    assert compared > 20
+
+
+def test_what_the_fitter_says_it_found(capsys):
+    """Two true instances of four patches, merged right, then all into one."""
+    from perception.bench.fit_masks import Example, found, report
+
+    class Chain:
+        """Four patches in a row; whether two go together is a number between them."""
+
+        def __init__(self, ties: list[float]) -> None:
+            self.sums = np.ones((4, 1))
+            self.borders = [{j: ties[min(i, j)] for j in (i - 1, i + 1) if 0 <= j < 4} for i in range(4)]
+
+        def features(self, a: int, others: list[int]) -> np.ndarray:
+            return np.array([[self.borders[a][b]] for b in others])
+
+        def size(self, a: int) -> float:
+            return float(self.sums[a, 0])
+
+        def negligible(self, a: int, smallest: float) -> bool:
+            return False
+
+        def merge(self, a: int, b: int) -> None:
+            from perception.masks.region_graph import join
+
+            self.borders[a].pop(b)
+            join(self.sums, self.borders, a, b)
+
+    covered = np.array([[9.0, 1], [9, 1], [0, 4], [0, 4]])
+    item = Example(Chain([2.0, 1.0, 2.0]), covered, 0.0)
+    recall, best, count = found(item, np.ones(1), 1.5)
+    assert (recall, count) == (1.0, 2)
+    assert best == pytest.approx((18 / 20 + 8 / 10) / 2)
+    recall, best, count = found(item, np.ones(1), 0.5)
+    assert (recall, count) == (0.5, 1)
+    assert best == pytest.approx((18 / 28 + 10 / 28) / 2)
+    report(["chain"], [[item]], np.ones(1), 1.5)
+    assert "chain" in (said := capsys.readouterr().out) and "1.000 0.850 2" in said
+
+
 def test_box_floor_and_wall_are_one_segment_each_in_all_photos(tmp_path):
     """Through the store, with rough depth, in millimetres: whole parts, and the same ids in every photo."""
     unit = 1000.0

@@ -2,8 +2,9 @@
 
 Pairs of regions are met while merging photos, or with --surface pairs of patches of the whole scene's surface; each
 says whether both lie mostly on the same truth instance. A logistic regression over them gives the log odds that
-`perception.masks.regions` and `perception.masks.scene` merge by. Depth for --surface is found by stereo as in a map;
-where it starts from is the scene's depth, spoilt as that of a half-trained map is.
+`perception.masks.regions` and `perception.masks.scene` merge by. Of each scene it prints what the merging finds with
+the weights fitted on all, and on the other scenes only: the second is what a new place may expect. Depth for --surface
+is found by stereo as in a map; where it starts from is the scene's depth, spoilt as that of a half-trained map is.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ from perception.masks.region_graph import RegionGraph, agglomerate
 from perception.types import View
 
 _PURE = 0.7  # share of a region that one instance must cover for the region to teach anything
-_PRIOR = 0.03  # C of the regression: few scenes must not decide much
+_PRIOR = 0.1  # C of the regression: few scenes must not decide much
 _HEAVIEST = 4.0  # times the mean weight: one wall must not outweigh a table full of things
+_METRES = 1e-3  # a truth scene's depth/ is in millimetres, its poses are in metres
 _ROUNDS = 2  # the first regions, then every level that merging them goes through
 
 
@@ -61,7 +63,7 @@ def surface_example(folder: Path) -> Example:
     sights, truths = [], []
     posed = posed_views(folder)
     for seed, (view, truth) in enumerate(views_with_truth(folder)):
-        depth = read_image(folder / "depth" / f"{view.photo.stem}.png")
+        depth = read_image(folder / "depth" / f"{view.photo.stem}.png") * _METRES
         sight = scene.make_sight(posed[view.name], read_image(view.photo), spoilt(depth, seed))
         if sight is not None:
             sights.append(sight)
@@ -75,7 +77,8 @@ def surface_example(folder: Path) -> Example:
 
 
 def spoilt(depth: np.ndarray, seed: int) -> np.ndarray:
-    """depth [h, w] in any unit as a half-trained map renders it: float32, waving by a few per cent, 0 = none."""
+    """depth [h, w], in the unit of the poses, as a half-trained map renders it: float32, waving by a few per cent, 0 =
+    none."""
     import cv2
 
     rng = np.random.default_rng(seed)
@@ -150,6 +153,28 @@ def learn(examples: list[Example]) -> tuple[np.ndarray, Pairs]:
     return weights, pairs
 
 
+def found(item: Example, weights: np.ndarray, threshold: float) -> tuple[float, float, int]:
+    """(recall, mean best IoU, segments) of the true instances: found are those with an IoU above one half."""
+    ends = agglomerate(copy.deepcopy(item.graph), weights, threshold, item.smallest)
+    names, segment = np.unique(ends, return_inverse=True)
+    shared = np.zeros((len(names), item.covered.shape[1]))
+    np.add.at(shared, segment, item.covered)
+    area = item.covered.sum(axis=0)
+    union = shared.sum(axis=1, keepdims=True) + area - shared
+    best = (shared / np.maximum(union, 1)).max(axis=0)[area > 0]
+    return float((best > 0.5).mean()), float(best.mean()), len(names)
+
+
+def report(names: list[str], scenes: list[list[Example]], weights: np.ndarray, threshold: float) -> None:
+    """Prints what is found in each scene with the weights of all, and with those of the others."""
+    print(f"threshold {threshold}: recall at IoU .5, mean best IoU, segments")
+    for place, (name, own) in enumerate(zip(names, scenes, strict=True)):
+        others = [item for i, items in enumerate(scenes) if i != place for item in items]
+        for title, w in [("fitted on all", weights), *([("on the others", learn(others)[0])] if others else [])]:
+            recall, best, count = np.mean([found(item, w, threshold) for item in own], axis=0)
+            print(f"{name:16} {title}: {recall:.3f} {best:.3f} {count:.0f}")
+
+
 def _covered(images: list[np.ndarray], truths: list[np.ndarray]) -> np.ndarray:
     """[R, I] pixels of region r (−1 = none) on instance i."""
     counts = np.zeros((1 + max(int(i.max()) for i in images), 1 + max(int(t.max()) for t in truths)))
@@ -172,16 +197,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--surface", action="store_true", help="fit the weights of the surface's patches")
     parser.add_argument("--every", type=int, default=8, help="take every n-th photo (without --surface)")
     options = parser.parse_args(arguments)
-    examples = []
+    scenes = []
     for folder in options.scenes:
         if options.surface:
-            examples.append(surface_example(folder))
+            scenes.append([surface_example(folder)])
         else:
             views = list(views_with_truth(folder))[:: options.every]
-            examples += [photo_example(read_image(view.photo), truth) for view, truth in views]
-    weights, pairs = learn(examples)
+            scenes.append([photo_example(read_image(view.photo), truth) for view, truth in views])
+    weights, pairs = learn([item for items in scenes for item in items])
     print(f"{len(pairs.same)} pairs, {np.mean(pairs.same):.3f} of one object")
     print(np.array2string(weights, precision=2, separator=", ", suppress_small=True))
+    threshold = scene.THRESHOLD if options.surface else regions.PHOTO_THRESHOLD
+    report([folder.name for folder in options.scenes], scenes, weights, threshold)
     return 0
 
 

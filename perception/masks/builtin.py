@@ -10,7 +10,7 @@ from perception.masks.regions import segment_photo
 from perception.masks.scene import SceneSegmentation
 from perception.types import View
 
-VERSION = 5  # raised whenever the label images change, so that cached ones are made anew
+VERSION = 6  # raised whenever the label images change, so that cached ones are made anew
 
 
 class PhotoSegmentation:

@@ -20,11 +20,12 @@ from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.types import View
 
 # Log odds that two patches are one object, in the order of SurfaceGraph.features; they are all that was learned: the
-# regression of `python -m perception.bench.fit_masks --surface`, on three rendered scenes, begun from the depth of
-# half-trained maps. Fitted on two of the scenes they part the third about as well.
+# regression of `python -m perception.bench.fit_masks --surface` on two rendered scenes. Fitted on either alone they
+# part the other nearly as well (the command prints both).
 WEIGHTS = np.array(
-    [5.99, -1.07, -0.89, 0.23, -3.48, -0.75, 0.42, -0.24, -0.47, 0.69, 0.16, 1.57,
-     -2.46, -0.1, 0.53, -2.85, 0.71, -0.39, 3.08, 0.26, 0.18, -2.49, 0.43, 0.35]
+    [7.25, -0.91, -0.97, 0.17, -5.47, 0.08, 0.0, -0.39, -0.48, 1.1, 0.23, -2.09,
+     0.69, -0.64, 0.27, -1.92, 1.53, 2.66, 4.16, 4.36, -5.11, -5.43, -1.69, 4.29,
+     0.7, -0.12, 2.58, 1.12, 0.28, 0.0, 0.35, -0.13, -0.01, 0.39, -2.6]
 )  # fmt: skip
 THRESHOLD = 1.2  # above even odds: a merged pair is lost, a split one costs less
 _SMOOTH = 0.03  # of the depth: a pixel over which the surface jumps farther shows no surface

@@ -1,7 +1,8 @@
 """A graph of patches of the scene's surface, with the evidence of all photos for and against their being one object.
 
 Everything a decision needs is a sum over pixels, border pixels or voxels, so a merged patch's evidence is the sum of
-its parts' and never goes stale. The convexity of patches follows Stein et al. 2014.
+its parts' and never goes stale. The convexity of patches follows Stein et al. 2014; what the shape of two together
+tells (two mugs side by side are longer than either, a box's side and its top are not) is our own.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from perception.masks.cues import COLOUR_WORDS, DepthCues, PhotoCues
 from perception.masks.region_graph import join, neighbours
 from perception.masks.surface import Surface
 
-FEATURES = 24
+FEATURES = 35
 NEIGHBOURS = 8
 _STEP = 0.012  # of the depth: what counts as a step between surfaces
 _STEP_CAP = 0.06
@@ -122,9 +123,10 @@ class SurfaceGraph:
         colour = (look_b[:, _LAB] - look_a[_LAB]) ** 2 @ np.array([0.5, 2.0, 2.0])
         smaller, larger = (f(one[_VOXELS], two[:, _VOXELS]) * self.unit / depth**2 for f in (np.minimum, np.maximum))
         turn, offset, concave, convex, same_plane = _surface_features(shape_a, shape_b, depth)
+        a_is_larger = one[_VOXELS] > two[:, _VOXELS]
         thick = np.stack([_thickness(shape_a[None])[0].repeat(len(others)), _thickness(shape_b)])
         flat = np.exp(-thick / (0.01 * depth))
-        flat_of_larger = np.where(one[_VOXELS] > two[:, _VOXELS], flat[0], flat[1])
+        flat_of_larger = np.where(a_is_larger, flat[0], flat[1])
         sharp, broken = border[:, _SHARPS] / length, border[:, _BROKEN] / length
         crease = border[:, _CONCAVE] / length
         grand = np.log(larger) + 2
@@ -154,6 +156,7 @@ class SurfaceGraph:
                 concave * flat_of_larger,
                 same_plane * sharp,
                 flat_of_larger * (1 - same_plane),
+                *_growth_features(one, two, a_is_larger, depth, self._scale / 4),
             ],
             axis=1,
         )
@@ -205,6 +208,32 @@ def _surface_features(shape_a: np.ndarray, shape_b: np.ndarray, depth: np.ndarra
     bend = ((normal_b - normal_a) * chord).sum(axis=1) / (np.linalg.norm(chord, axis=1) + 1e-9)
     same_plane = np.exp(-offset / 0.01 - turn / 0.05)
     return [turn, 5 * np.minimum(offset, 0.2), np.maximum(-bend, 0), np.maximum(bend, 0), same_plane]
+
+
+def _growth_features(
+    one: np.ndarray, two: np.ndarray, one_is_larger: np.ndarray, depth: np.ndarray, least: float
+) -> np.ndarray:
+    """[11, M] how the extents (standard deviations along the main axes) of two patches' union come from theirs.
+
+    Their distance in units of both extents along it; for each axis the union's extent over the larger patch's, the
+    larger patch's and the smaller one's over the depth; the volume of the union over both. All but the first in logs.
+    one: [C] sums of a patch; two: [M, C] of its neighbours. least: what an extent is at least, so that logs are finite.
+    """
+    a, b, union = (_covariance(sums / sums[:, _VOXELS, None]) for sums in (one[None], two, one + two))
+    chord = two[:, _POINT] / two[:, _VOXELS, None] - one[_POINT] / one[_VOXELS]
+    distance = np.maximum(np.linalg.norm(chord, axis=1), least)
+    chord = chord / distance[:, None]
+
+    def root(squares: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.maximum(squares, least**2))
+
+    along = sum(root(np.einsum("mi,mij,mj->m", chord, np.broadcast_to(c, b.shape), chord)) for c in (a, b))
+    extent_a, extent_b, extent = (root(np.linalg.eigvalsh(c)) for c in (a, b, union))
+    choose = one_is_larger[:, None]
+    larger, smaller = np.where(choose, extent_a, extent_b), np.where(choose, extent_b, extent_a)
+    volume = np.log(extent.prod(axis=1) / (extent_a.prod(axis=1) + extent_b.prod(axis=1)))
+    logs = [np.log(extent / larger), np.log(larger / depth[:, None]), np.log(smaller / depth[:, None])]
+    return np.concatenate([(distance / along)[None], *(log.T for log in logs), volume[None]])
 
 
 def _direction(shape: np.ndarray) -> np.ndarray:
