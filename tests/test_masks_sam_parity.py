@@ -1,14 +1,11 @@
 """Our automatic masks against `SamAutomaticMaskGenerator`: a small SAM with random weights, exported to ONNX.
 
-Needs `segment-anything` and `onnx` (the exporter); skips without. torchvision, of which segment-anything uses
-four small functions, is replaced by plain versions of them, box NMS by its definition.
+Needs `segment-anything` and `onnx` (the exporter); skips without.
 """
 
 from __future__ import annotations
 
-import sys
-import types
-import warnings
+import importlib.util
 from functools import partial
 
 import numpy as np
@@ -17,60 +14,20 @@ import pytest
 pytest.importorskip("onnx")
 torch = pytest.importorskip("torch")
 
+from sam_exports import export, imported  # noqa: E402
+
 from perception.masks.sam import AutomaticMasks, SamSettings, paint  # noqa: E402
 from perception.masks.sam_models import open_sam  # noqa: E402
 
 SIDE, CHANNELS = 256, 32
 
 
-def nms(boxes, scores, _categories, iou_threshold):
-    """Kept indices, best first: a box goes when it overlaps a better one that is kept."""
-    keep: list[int] = []
-    for i in torch.sort(scores, descending=True, stable=True).indices.tolist():
-        a = boxes[i]
-        for j in keep:
-            b = boxes[j]
-            w = torch.minimum(a[2], b[2]) - torch.maximum(a[0], b[0])
-            h = torch.minimum(a[3], b[3]) - torch.maximum(a[1], b[1])
-            shared = w.clamp(min=0) * h.clamp(min=0)
-            union = (a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - shared
-            if float(shared / union) > iou_threshold:
-                break
-        else:
-            keep.append(i)
-    return torch.tensor(keep, dtype=torch.int64)
-
-
-def resize(image, size):
-    from PIL import Image
-
-    return image.resize(size[::-1], Image.Resampling.BILINEAR)
-
-
-def pillow(array):
-    from PIL import Image
-
-    return Image.fromarray(array)
-
-
 @pytest.fixture(scope="module")
 def segment_anything():
-    """The package, imported beside a torchvision that holds only what it uses."""
-    names = ("torchvision", "torchvision.ops", "torchvision.ops.boxes")
-    names += ("torchvision.transforms", "torchvision.transforms.functional")
-    modules = {name: types.ModuleType(name) for name in names}
-    boxes, functional = modules["torchvision.ops.boxes"], modules["torchvision.transforms.functional"]
-    boxes.batched_nms = nms
-    boxes.box_area = lambda b: (b[:, 2] - b[:, 0]) * (b[:, 3] - b[:, 1])
-    functional.resize, functional.to_pil_image = resize, pillow
-    before = dict(sys.modules)
-    sys.modules.update(modules)
-    try:
-        yield pytest.importorskip("segment_anything")
-    finally:
-        for name in [n for n in sys.modules if n.split(".")[0] in ("torchvision", "segment_anything")]:
-            sys.modules.pop(name)
-        sys.modules.update(before)
+    if importlib.util.find_spec("segment_anything") is None:
+        pytest.skip("needs segment-anything")
+    with imported() as package:
+        yield package
 
 
 def local_decoder(segment_anything):
@@ -123,36 +80,8 @@ def sam(segment_anything):
 
 @pytest.fixture(scope="module")
 def exported(sam, tmp_path_factory):
-    """Encoder and decoder as ONNX, the decoder as the published exporter makes it."""
-    from segment_anything.utils.onnx import SamOnnxModel
-
     folder = tmp_path_factory.mktemp("sam")
-    grid = SIDE // 16
-    example = (
-        torch.randn(1, CHANNELS, grid, grid), torch.zeros(1, 2, 2), torch.ones(1, 2),
-        torch.zeros(1, 1, 4 * grid, 4 * grid), torch.zeros(1), torch.tensor([96.0, 128.0]),
-    )  # fmt: skip
-    inputs = [
-        "image_embeddings",
-        "point_coords",
-        "point_labels",
-        "mask_input",
-        "has_mask_input",
-        "orig_im_size",
-    ]
-    outputs = ["masks", "iou_predictions", "low_res_masks"]
-    points = {"point_coords": {1: "num_points"}, "point_labels": {1: "num_points"}}
-    export = partial(torch.onnx.export, dynamo=False, opset_version=17)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        export(
-            SamOnnxModel(sam, return_single_mask=False), example, str(folder / "decoder.onnx"),
-            input_names=inputs, output_names=outputs, dynamic_axes=points,
-        )  # fmt: skip
-        export(
-            sam.image_encoder, torch.randn(1, 3, SIDE, SIDE), str(folder / "encoder.onnx"),
-            input_names=["x"], output_names=["image_embeddings"],
-        )  # fmt: skip
+    export(sam, folder)
     return folder
 
 

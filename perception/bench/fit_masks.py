@@ -63,8 +63,8 @@ def surface_example(folder: Path) -> Example:
     sights, truths = [], []
     posed = posed_views(folder)
     for seed, (view, truth) in enumerate(views_with_truth(folder)):
-        depth = read_image(folder / "depth" / f"{view.photo.stem}.png") * _METRES
-        sight = scene.make_sight(posed[view.name], read_image(view.photo), spoilt(depth, seed))
+        depth = spoilt_depth(folder, view.photo.stem, seed)
+        sight = scene.make_sight(posed[view.name], read_image(view.photo), depth)
         if sight is not None:
             sights.append(sight)
             truths.append(_shrunk(truth, sight.depth.shape))
@@ -76,14 +76,15 @@ def surface_example(folder: Path) -> Example:
     return Example(graph, _covered(patches, truths), scene.SMALLEST)
 
 
-def spoilt(depth: np.ndarray, seed: int) -> np.ndarray:
-    """depth [h, w], in the unit of the poses, as a half-trained map renders it: float32, waving by a few per cent, 0 =
-    none."""
+def spoilt_depth(folder: Path, stem: str, seed: int) -> np.ndarray:
+    """[h, w] float32 depth of a truth scene's photo in the unit of its poses, as a half-trained map renders it: waving
+    by a few per cent, 0 = none."""
     import cv2
 
+    depth = read_image(folder / "depth" / f"{stem}.png") * np.float32(_METRES)
     rng = np.random.default_rng(seed)
     noise = [cv2.GaussianBlur(rng.normal(size=depth.shape).astype(np.float32), (0, 0), s) for s in (5, 40)]
-    rendered = cv2.GaussianBlur(depth.astype(np.float32), (0, 0), 2.0)
+    rendered = cv2.GaussianBlur(depth, (0, 0), 2.0)
     rendered *= 1 + 0.04 * sum(part / part.std() for part in noise)
     rendered[(depth == 0) | (rng.random(depth.shape) < 0.01)] = 0
     return rendered

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from perception.bench.children import child_options
-from perception.bench.fit_masks import posed_views, spoilt
+from perception.bench.fit_masks import posed_views, spoilt_depth
 from perception.bench.masks import read_image
 from perception.bench.sweep_cli import Column, finish, table
 from perception.errors import InputError
@@ -113,7 +113,7 @@ def _source(spec: str, points: int) -> MaskSource:
 
 
 def _depth(scene: Path, view: View) -> np.ndarray:
-    return spoilt(read_image(scene / "depth" / f"{view.photo.resolve().stem}.png"), int(Path(view.name).stem))
+    return spoilt_depth(scene, view.photo.resolve().stem, int(Path(view.name).stem))
 
 
 def _in_a_process(options: argparse.Namespace, source: str, count: int) -> dict[str, Any]:
