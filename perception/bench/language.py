@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from perception.bench.prompts import ABSENT, accuracy, chance
-from perception.bench.truth import TruthScene, read_truth, truth_view_scores
+from perception.bench.truth import TruthScene, read_truth, truth_directions, truth_view_scores
 from perception.instances.crops import choose_views
 from perception.instances.describe import describe_instances
 from perception.language.base import Encoder, make_encoder, reading_of
@@ -30,6 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--encoder", default="conse")
     parser.add_argument("--background", default="plain", choices=["plain", "dim", "blur", "fill"])
     parser.add_argument("--views", type=int, default=5)
+    parser.add_argument("--diversity", type=float, default=0.0, help="0 to 1: views shall look from different sides")
     parser.add_argument("--levels", type=int, default=0, help="crops a view; 0: as suits the encoder")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(argv)
@@ -49,7 +50,7 @@ def measure_scene(folder: str, options: argparse.Namespace) -> dict[str, Any]:
     if encoder is None:
         raise SystemExit("perception bench language: an encoder is needed, found 'none'")
     scene = read_truth(folder)
-    choices = choose_views(truth_view_scores(scene), options.views)
+    choices = choose_views(truth_view_scores(scene), options.views, truth_directions(scene), options.diversity)
     names = [frame["file_path"] for frame in scene.frames]
     before = time.perf_counter()
     descriptions = describe_instances(

@@ -73,6 +73,17 @@ def truth_view_scores(scene: TruthScene) -> np.ndarray:
     return view_scores(pixels, size, visible)
 
 
+def truth_directions(scene: TruthScene) -> np.ndarray:
+    """[I, V, 3] unit vectors from the middle of each instance's surface to each camera."""
+    points, owner = _surface_points(scene)
+    count = len(scene.ids)
+    number = np.maximum(np.bincount(owner, minlength=count), 1)
+    middle = np.stack([np.bincount(owner, weights=points[:, axis], minlength=count) / number for axis in range(3)], 1)
+    cameras = np.array([frame["transform_matrix"] for frame in scene.frames], np.float64)[:, :3, 3]
+    rays = cameras[None] - middle[:, None]
+    return np.asarray(rays / np.maximum(np.linalg.norm(rays, axis=2, keepdims=True), 1e-12))
+
+
 def _surface_points(scene: TruthScene) -> tuple[np.ndarray, np.ndarray]:
     vertices = _read_vertices(scene.folder / "gt_points.ply")
     points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
