@@ -152,9 +152,9 @@ def test_a_true_scene_answers(encoder: Any) -> None:
     if not data:
         pytest.skip("PERCEPTION_DATA is not set")
     scene = read_truth(Path(data) / "tabletop_a")
-    boxes = {i["id"]: np.mean([i["visible_bbox_min"], i["visible_bbox_max"]], axis=0) for i in scene.about["instances"]}
+    mug = next(i for i in scene.about["instances"] if i["id"] == 21)
     eyes = np.array([frame["transform_matrix"] for frame in scene.frames])[:, :3, 3]
-    ray = eyes - boxes[21]  # the mug's box is small, so that its middle is all but that of its surface
+    ray = eyes - np.mean([mug["visible_bbox_min"], mug["visible_bbox_max"]], axis=0)  # a small box: its middle will do
     cosine = (truth_directions(scene)[scene.ids.tolist().index(21)] * ray).sum(axis=1) / np.linalg.norm(ray, axis=1)
     assert cosine.min() > 0.99
     wanted = {"red mug": 21, "scissors": 31, "teddy bear": 30, "plate": 19, "moka pot": 29, "yellow mug": 22}
