@@ -82,7 +82,7 @@ class Trainer:
         train = self.config.train
         decay = (train.lr_means_final / train.lr_means) ** progress
         cool = cooling(progress, train.cooldown)
-        sh = torch.full((self.gaussians.sh.shape[1], 3), cool * train.lr_colors / 20)
+        sh = torch.full((self.gaussians.sh.shape[1], 3), cool * train.lr_harmonics)
         sh[0] = cool * train.lr_colors
         return {
             "means": cool * train.lr_means * decay * self.extent,
