@@ -17,10 +17,12 @@ import perception
 from perception import _core
 from perception.config import load_config
 from perception.errors import InputError
+from perception.io.arrays import map_npy
 from perception.io.camera_file import read_camera
 from perception.io.cloud import read_cloud
 from perception.io.colmap import read_workspace
 from perception.io.inputs import load_scene
+from perception.io.photos import photo_size, read_photo
 from perception.io.ply import read_ply
 from perception.io.transforms import read_frames, read_transforms
 from perception.io.views import rigid_pose
@@ -220,6 +222,36 @@ def test_npz_files_that_hold_no_arrays(tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "a.npz"
     file.write_bytes(content)
     refused(read_cloud, file, match="a.npz: (cannot be read|expected an array 'points')")
+
+
+def test_an_npy_header_longer_than_its_file_is_not_asked_for(tmp_path: Path) -> None:
+    """numpy would ask for 3 GiB to hold it."""
+    import resource
+
+    file = tmp_path / "features.npy"
+    np.save(file, np.arange(6, dtype=np.float32).reshape(2, 3))
+    array = map_npy(file)
+    np.testing.assert_array_equal(array, [[0, 1, 2], [3, 4, 5]])
+    assert not array.flags.writeable
+    file.write_bytes(b"\x93NUMPY\x02\x00" + struct.pack("<I", 3 << 30) + b"{'descr': '<f4'}")
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ValueError, match="header of 3221225472 bytes, 16 are there"):
+        map_npy(file)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 20  # KiB
+
+
+def test_photos_with_damaged_exif(tmp_path: Path) -> None:
+    photo = tmp_path / "x.jpg"
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (40, 30)).save(photo, exif=exif, dpi=(72, 72))  # else Pillow looks for them in the EXIF data
+    assert photo_size(photo) == (30, 40)
+    content = photo.read_bytes()
+    start = content.index(b"Exif\0\0") + 6
+    assert content[start : start + 4] in (b"MM\0*", b"II*\0")
+    photo.write_bytes(content[:start] + b"MM\0II*" + content[start + 6 :])
+    for reader in (photo_size, read_photo):
+        refused(reader, photo, match="x.jpg: the photo's EXIF data are damaged; save it anew")
 
 
 def test_npz_arrays_come_back_as_they_were(tmp_path: Path) -> None:

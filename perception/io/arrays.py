@@ -1,4 +1,4 @@
-"""NumPy's .npz archives from others: no more is allocated than the archive holds, and damage is told in one line."""
+"""NumPy's .npy and .npz from others: no more is allocated than the file holds, and damage is told in one line."""
 
 from __future__ import annotations
 
@@ -55,11 +55,28 @@ def read_npz(source: Path | bytes, file: Path, advice: str) -> dict[str, np.ndar
         raise InputError(f"{file}: cannot be read ({brief(error)}); {advice}") from error
 
 
-def _read_npy(stream: IO[bytes], size: int) -> np.ndarray:
-    """One array of `size` bytes with its header; the header is believed only when it fits that size."""
+def map_npy(file: Path) -> np.ndarray:
+    """The array of an .npy, mapped into memory for reading. Raises what DAMAGE lists, ValueError for a header that is
+    longer than the file: numpy would ask for up to 4 GiB to read it."""
+    with file.open("rb") as stream:
+        version = _version(stream)
+        length = struct.unpack("<H", stream.read(2)) if version == (1, 0) else struct.unpack("<I", stream.read(4))
+        left = file.stat().st_size - stream.tell()
+    if length[0] > left:
+        raise ValueError(f"an array header of {length[0]} bytes, {left} are there")
+    return np.lib.format.open_memmap(file, mode="r")
+
+
+def _version(stream: IO[bytes]) -> tuple[int, int]:
     version = np.lib.format.read_magic(stream)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"array format {version}, expected 1.0 or 2.0")
+    return version
+
+
+def _read_npy(stream: IO[bytes], size: int) -> np.ndarray:
+    """One array of `size` bytes with its header; the header is believed only when it fits that size."""
+    version = _version(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = read(stream)
     if dtype.hasobject or dtype.itemsize == 0:

@@ -17,7 +17,7 @@ from PIL import Image, ImageOps
 
 from perception.io.atomic import atomic_directory, recover
 from perception.io.lens import load_pycolmap
-from perception.io.photos import photo_size, read_photo
+from perception.io.photos import exif_of, photo_size, read_photo
 from perception.types import Lens
 
 Progress = Callable[[str, float], None]
@@ -112,7 +112,7 @@ def _stage(staged: Path, root: Path, photos: list[Path]) -> tuple[Path, list[str
 
 def _is_plain(photo: Path) -> bool:
     with Image.open(photo) as image:
-        upright = image.getexif().get(0x0112, 1) == 1
+        upright = exif_of(image, photo).get(0x0112, 1) == 1
         return upright and image.mode in ("RGB", "L") and image.format in ("JPEG", "PNG")
 
 
@@ -170,7 +170,7 @@ def _forget_poor(database: Path, names: list[str]) -> list[str]:
 def _camera_key(photo: Path) -> tuple[Any, ...]:
     """Photos with the same key share one camera: size, EXIF maker, model, focal length, zoom."""
     with Image.open(photo) as image:
-        exif = image.getexif()
+        exif = exif_of(image, photo)
         details = exif.get_ifd(0x8769)
     return (*photo_size(photo), exif.get(0x010F), exif.get(0x0110), details.get(0x920A), details.get(0xA404))
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io import instance_index
-from perception.io.arrays import DAMAGE, read_npz
+from perception.io.arrays import DAMAGE, map_npy, read_npz
 from perception.io.atomic import recover
 from perception.io.checksums import EDITABLE, FACTS, check_file, check_sizes
 from perception.io.documents import brief
@@ -76,14 +76,12 @@ class MapFiles:
     def _map_array(self, name: str, sides: int) -> np.ndarray:
         file = self.path / f"{name}.npy"
         try:
-            array = np.load(file, mmap_mode="r", allow_pickle=False)
+            array = map_npy(file)
         except FileNotFoundError as error:
             raise InputError(f"{file}: is missing; the map is damaged, build it again or copy it anew") from error
         except DAMAGE as error:
             raise InputError(f"{file}: cannot be read ({brief(error)}); the map is damaged, build it again") from error
         kind = "i" if name == "instance_ids" else "f"
-        if not isinstance(array, np.ndarray):
-            raise InputError(f"{file}: is an archive, expected one array; the map is damaged")
         if array.ndim != sides or array.dtype.kind != kind:
             raise InputError(f"{file}: holds {array.dtype} of shape {list(array.shape)}; the map is damaged")
         return array

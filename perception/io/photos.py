@@ -49,7 +49,26 @@ def photo_size(path: Path) -> tuple[int, int]:
     """(width, height) of a photo after EXIF rotation, from its header."""
     with _open(path) as image:
         width, height = image.size
-        return (height, width) if image.getexif().get(0x0112, 1) >= 5 else (width, height)
+        return (height, width) if exif_of(image, path).get(0x0112, 1) >= 5 else (width, height)
+
+
+def exif_of(image: Image.Image, path: Path) -> Image.Exif:
+    """The EXIF data of an open photo, empty if it has none. Raises InputError where they are damaged."""
+    try:
+        return image.getexif()
+    except DECODE_ERRORS as error:
+        raise _bad_exif(path) from error
+
+
+def _upright(image: Image.Image, path: Path) -> Image.Image:
+    try:
+        return ImageOps.exif_transpose(image)
+    except DECODE_ERRORS as error:  # it reads the data, and writes them anew without the rotation
+        raise _bad_exif(path) from error
+
+
+def _bad_exif(path: Path) -> InputError:
+    return InputError(f"{path}: the photo's EXIF data are damaged; save it anew without them, or remove it")
 
 
 def check_photo(path: Path) -> None:
@@ -67,7 +86,7 @@ def read_photo(path: Path) -> np.ndarray:
     """
     with _open(path) as image:
         _decode(image, path)
-        return _rgb(ImageOps.exif_transpose(image), path)
+        return _rgb(_upright(image, path), path)
 
 
 def scaled_size(view: View, max_side: int | None) -> tuple[int, int]:
