@@ -231,7 +231,7 @@ def corrections(path: Path) -> int:
     ids = [entry["id"] for entry in editor.instances]
     editor.rename(ids[0], "the table")
     editor.merge(ids[1:3])
-    editor.remove(ids[3])
+    editor.remove(editor.instances[-1]["id"])
     editor.undo()
     editor.delete_floaters()
     editor.save()
