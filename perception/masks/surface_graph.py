@@ -124,9 +124,9 @@ class SurfaceGraph:
         smaller, larger = (f(one[_VOXELS], two[:, _VOXELS]) * self.unit / depth**2 for f in (np.minimum, np.maximum))
         turn, offset, concave, convex, same_plane = _surface_features(shape_a, shape_b, depth)
         a_is_larger = one[_VOXELS] > two[:, _VOXELS]
-        thick = np.stack([_thickness(shape_a[None])[0].repeat(len(others)), _thickness(shape_b)])
-        flat = np.exp(-thick / (0.01 * depth))
-        flat_of_larger = np.where(a_is_larger, flat[0], flat[1])
+        extents = _extents(shape_a[None]), _extents(shape_b)
+        flat = [np.exp(-extent[:, 0] / (0.01 * depth)) for extent in extents]
+        flat_of_larger = np.where(a_is_larger, *flat)
         sharp, broken = border[:, _SHARPS] / length, border[:, _BROKEN] / length
         crease = border[:, _CONCAVE] / length
         grand = np.log(larger) + 2
@@ -156,7 +156,7 @@ class SurfaceGraph:
                 concave * flat_of_larger,
                 same_plane * sharp,
                 flat_of_larger * (1 - same_plane),
-                *_growth_features(one, two, a_is_larger, depth, self._scale / 4),
+                *_growth_features(one, two, extents, a_is_larger, depth, self._scale / 4),
             ],
             axis=1,
         )
@@ -171,7 +171,7 @@ class SurfaceGraph:
 
     def flatness(self, a: int) -> float:
         """Standard deviation across its own plane, in units of its depth."""
-        return float(_thickness(self.sums[a][None] / self.sums[a, _VOXELS])[0] / max(self.depth(a), 1e-9))
+        return float(_extents(self.sums[a][None] / self.sums[a, _VOXELS])[0, 0] / max(self.depth(a), 1e-9))
 
     def one_plane(self, a: int, b: int) -> bool:
         """Whether both are parts of one plane: they lie in it, and touch without an edge (a picture lies in the plane
@@ -211,28 +211,32 @@ def _surface_features(shape_a: np.ndarray, shape_b: np.ndarray, depth: np.ndarra
 
 
 def _growth_features(
-    one: np.ndarray, two: np.ndarray, one_is_larger: np.ndarray, depth: np.ndarray, least: float
+    one: np.ndarray,
+    two: np.ndarray,
+    extents: tuple[np.ndarray, np.ndarray],
+    one_is_larger: np.ndarray,
+    depth: np.ndarray,
+    least: float,
 ) -> np.ndarray:
-    """[11, M] how the extents (standard deviations along the main axes) of two patches' union come from theirs.
+    """[11, M] how the extents of two patches' union come from theirs (see `_extents`).
 
     Their distance in units of both extents along it; for each axis the union's extent over the larger patch's, the
     larger patch's and the smaller one's over the depth; the volume of the union over both. All but the first in logs.
-    one: [C] sums of a patch; two: [M, C] of its neighbours. least: what an extent is at least, so that logs are finite.
+    one: [C] sums of a patch; two: [M, C] of its neighbours; extents: [1, 3] and [M, 3] theirs. least: what an extent is
+    taken for at least, so that logs are finite.
     """
-    a, b, union = (_covariance(sums / sums[:, _VOXELS, None]) for sums in (one[None], two, one + two))
-    chord = two[:, _POINT] / two[:, _VOXELS, None] - one[_POINT] / one[_VOXELS]
+    shape_a, shape_b, union = (sums / sums[:, _VOXELS, None] for sums in (one[None], two, one + two))
+    chord = shape_b[:, _POINT] - shape_a[:, _POINT]
     distance = np.maximum(np.linalg.norm(chord, axis=1), least)
     chord = chord / distance[:, None]
-
-    def root(squares: np.ndarray) -> np.ndarray:
-        return np.sqrt(np.maximum(squares, least**2))
-
-    along = sum(root(np.einsum("mi,mij,mj->m", chord, np.broadcast_to(c, b.shape), chord)) for c in (a, b))
-    extent_a, extent_b, extent = (root(np.linalg.eigvalsh(c)) for c in (a, b, union))
-    choose = one_is_larger[:, None]
-    larger, smaller = np.where(choose, extent_a, extent_b), np.where(choose, extent_b, extent_a)
-    volume = np.log(extent.prod(axis=1) / (extent_a.prod(axis=1) + extent_b.prod(axis=1)))
-    logs = [np.log(extent / larger), np.log(larger / depth[:, None]), np.log(smaller / depth[:, None])]
+    along = np.zeros(len(two))
+    for shape in (shape_a, shape_b):
+        covariance = np.broadcast_to(_covariance(shape), (len(two), 3, 3))
+        along += np.sqrt(np.maximum(np.einsum("mi,mij,mj->m", chord, covariance, chord), least**2))
+    a, b, whole = (np.maximum(extent, least) for extent in (*extents, _extents(union)))
+    larger, smaller = (np.where(choice[:, None], a, b) for choice in (one_is_larger, ~one_is_larger))
+    volume = np.log(whole.prod(axis=1) / (a.prod(axis=1) + b.prod(axis=1)))
+    logs = [np.log(whole / larger), np.log(larger / depth[:, None]), np.log(smaller / depth[:, None])]
     return np.concatenate([(distance / along)[None], *(log.T for log in logs), volume[None]])
 
 
@@ -249,9 +253,10 @@ def _covariance(shape: np.ndarray) -> np.ndarray:
     return full - mean[:, :, None] * mean[:, None, :]
 
 
-def _thickness(shape: np.ndarray) -> np.ndarray:
-    """[M] standard deviation of each patch across its own plane."""
-    return np.sqrt(np.maximum(np.linalg.eigvalsh(_covariance(shape))[:, 0], 0))
+def _extents(shape: np.ndarray) -> np.ndarray:
+    """[M, 3] standard deviations of the voxels of each patch along its main axes, rising: the first is its thickness,
+    across its own plane."""
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(_covariance(shape)), 0))
 
 
 def _sum_by(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
