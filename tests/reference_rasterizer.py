@@ -44,7 +44,7 @@ def sh_colors(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
     return (torch.einsum("nk,nkc->nc", b, coefficients[:, : b.shape[1]]) + 0.5).clamp(min=0)
 
 
-def _camera(means, quats, scales, opacities, colors, viewmat, k, width, height, features, near_plane):  # type: ignore[no-untyped-def]
+def _camera(means, quats, scales, opacities, colors, viewmat, k, width, height, features, near_plane, eps2d):  # type: ignore[no-untyped-def]
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     p = means @ rotation.T + translation
     keep = p[:, 2] > near_plane
@@ -61,7 +61,7 @@ def _camera(means, quats, scales, opacities, colors, viewmat, k, width, height, 
         [torch.stack([fx / z, zero, -fx * tx / z], -1), torch.stack([zero, fy / z, -fy * ty / z], -1)], -2
     )
     m = jacobian @ rotation @ rotation_matrices(quats[index]) * scales[index][:, None, :]
-    cov = m @ m.transpose(1, 2) + 0.3 * torch.eye(2, dtype=m.dtype)
+    cov = m @ m.transpose(1, 2) + eps2d * torch.eye(2, dtype=m.dtype)
     conic = torch.linalg.inv(cov)
     ys, xs = torch.meshgrid(
         torch.arange(height, dtype=m.dtype) + 0.5, torch.arange(width, dtype=m.dtype) + 0.5, indexing="ij"
@@ -96,7 +96,7 @@ def _camera(means, quats, scales, opacities, colors, viewmat, k, width, height, 
 
 def rasterize(
     means, quats, scales, opacities, colors, viewmats, Ks, width, height,
-    sh_degree=None, features=None, background=None, near_plane=0.01,
+    sh_degree=None, features=None, background=None, near_plane=0.01, eps2d=0.3,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """The same arguments as perception.rasterize; a dict of tensors with the same names."""
     results = []
@@ -106,7 +106,7 @@ def rasterize(
             centre = -viewmats[c, :3, :3].T @ viewmats[c, :3, 3]
             rgb = sh_colors(sh_degree, means - centre, colors)
         out, visible = _camera(
-            means, quats, scales, opacities, rgb, viewmats[c], Ks[c], width, height, features, near_plane
+            means, quats, scales, opacities, rgb, viewmats[c], Ks[c], width, height, features, near_plane, eps2d
         )
         t = out.pop("transmittance")
         if background is not None:

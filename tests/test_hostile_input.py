@@ -50,7 +50,7 @@ def scene(n: int, dtype: Any, size: int = 8) -> Any:
     arrays = (rng.normal(size=(n, 4)), np.ones((n, 3)), np.full(n, 0.5), np.ones((n, 3)))
     inputs = getattr(_core, f"RasterizerInputs_{kind}")(
         means, *(a.astype(dtype) for a in arrays), None, np.eye(4, dtype=dtype)[None], K, None,
-        size, size, -1, 0.01, 1, True, False, 0,
+        size, size, -1, 0.01, 0.3, 1, True, False, 0,
     )  # fmt: skip
     images = [np.zeros((1, size, size, 3), dtype), np.zeros((1, size, size), dtype), None, None, None]
     return kind, inputs, images, (np.zeros((1, n), np.uint8), np.zeros((1, n), dtype))

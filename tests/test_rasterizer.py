@@ -57,13 +57,15 @@ def loss_of(images, seed=1):
 
 
 @pytest.mark.parametrize("simd", ["avx512", "avx2", "baseline"])
-@pytest.mark.parametrize(("dims", "sh_degree"), [(5, None), (8, 0), (13, 1), (16, 2), (21, 3)])
-def test_double_build_equals_the_naive_rasterizer(simd, dims, sh_degree):
+@pytest.mark.parametrize(
+    ("dims", "sh_degree", "eps2d"), [(5, None, 0.3), (8, 0, 0.1375), (13, 1, 2.0), (16, 2, 0.3), (21, 3, 0.3)]
+)
+def test_double_build_equals_the_naive_rasterizer(simd, dims, sh_degree, eps2d):
     from perception.gaussians.rasterize import simd_levels
 
     if simd not in simd_levels():
         pytest.skip(f"this processor has no {simd}")
-    inputs = scene(dims=dims, sh_degree=sh_degree)
+    inputs = {**scene(dims=dims, sh_degree=sh_degree), "eps2d": eps2d}
     ours_in, theirs_in = leaves(inputs), leaves(inputs)
     ours = perception.rasterize(**ours_in, simd=simd)
     theirs = reference.rasterize(**theirs_in)

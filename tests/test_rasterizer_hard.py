@@ -185,6 +185,8 @@ def test_non_finite_input_is_named(name, value):
         ({"width": 0}, r"image size 0"),
         ({"sh_degree": 4}, r"sh_degree is 4, expected 0 to 3"),
         ({"near_plane": float("nan")}, r"near_plane is nan"),
+        ({"eps2d": 0.0}, r"eps2d is 0.0, expected 0.01 to 10000 px²"),
+        ({"eps2d": float("nan")}, r"eps2d is nan"),
         ({"simd": "sse9"}, r"simd: 'sse9'"),
     ],
 )

@@ -88,7 +88,7 @@ struct Arguments {
   Array<const T> viewmats, Ks;
   Optional<const T> background;
   int width, height, sh_degree;
-  T near_plane;
+  T near_plane, eps2d;
   int threads;
   bool depth, variance;
   int64_t max_records;
@@ -101,6 +101,7 @@ struct Arguments {
     if (n >= INT32_MAX) throw std::invalid_argument("means: too many Gaussians");
     if (width < 1 || height < 1 || width > 1 << 20 || height > 1 << 20)
       throw std::invalid_argument("width, height: expected 1 to 1048576 pixels");
+    if (!(eps2d >= T(0.01) && eps2d <= T(1e4))) throw std::invalid_argument("eps2d: expected 0.01 to 10000 px²");
     if (sh_degree > 3) throw std::invalid_argument("sh_degree: expected at most 3");
     in.means = checked("means", means, {n, 3}), in.quats = checked("quats", quats, {n, 4});
     in.scales = checked("scales", scales, {n, 3}), in.opacities = checked("opacities", opacities, {n});
@@ -123,7 +124,7 @@ struct Arguments {
       if (!(in.Ks[9 * i] != 0 && in.Ks[9 * i + 4] != 0))
         throw std::invalid_argument("Ks[" + std::to_string(i) + "]: a focal length is 0");
     in.background = checked("background", background, {c, 3});
-    in.width = width, in.height = height, in.near_plane = near_plane;
+    in.width = width, in.height = height, in.near_plane = near_plane, in.eps2d = eps2d;
     return in;
   }
   perception::Options options(const perception::Inputs<T> &in) const {
@@ -217,15 +218,15 @@ void bind(nb::module_ &m, const char *suffix) {
           [](Arguments<T> *self, Array<const T> means, Array<const T> quats, Array<const T> scales,
              Array<const T> opacities, Array<const T> colors, Optional<const T> features, Array<const T> viewmats,
              Array<const T> Ks, Optional<const T> background, int width, int height, int sh_degree, double near_plane,
-             int threads, bool depth, bool variance, int64_t max_records) {
+             double eps2d, int threads, bool depth, bool variance, int64_t max_records) {
             new (self) Arguments<T>{means, quats, scales, opacities, colors, features, viewmats, Ks, background,
-                                    width, height, sh_degree, static_cast<T>(near_plane), threads, depth, variance,
-                                    max_records};
+                                    width, height, sh_degree, static_cast<T>(near_plane), static_cast<T>(eps2d),
+                                    threads, depth, variance, max_records};
           },
           "means"_a.noconvert(), "quats"_a.noconvert(), "scales"_a.noconvert(), "opacities"_a.noconvert(),
           "colors"_a.noconvert(), "features"_a.noconvert().none(), "viewmats"_a.noconvert(), "Ks"_a.noconvert(),
-          "background"_a.noconvert().none(), "width"_a, "height"_a, "sh_degree"_a, "near_plane"_a, "threads"_a,
-          "depth"_a, "variance"_a, "max_records"_a);
+          "background"_a.noconvert().none(), "width"_a, "height"_a, "sh_degree"_a, "near_plane"_a, "eps2d"_a,
+          "threads"_a, "depth"_a, "variance"_a, "max_records"_a);
   m.def(name("rasterize_forward").c_str(),
         [](Arguments<T> &inputs, Array<T> colors, Array<T> alphas, Optional<T> depths, Optional<T> features,
            Optional<T> variance, Array<uint8_t> visible, Optional<T> radii, const std::string &simd) {

@@ -21,7 +21,8 @@ void timed(Stats &stats, Stage stage, Body &&body) {
 template <class T>
 NonFinite prepare(const Inputs<T> &in, int camera, const Options &opt, Frame<T> &f, Scratch<T> &scratch,
                   const Outputs<T> &out, Stats &stats) {
-  f.camera = make_camera(in.viewmats + 16 * camera, in.Ks + 9 * camera, in.width, in.height, in.near_plane);
+  f.camera = make_camera(in.viewmats + 16 * camera, in.Ks + 9 * camera, in.width, in.height, in.near_plane,
+                         in.eps2d);
   f.tiles_x = (in.width + 63) / 64, f.tiles_y = (in.height + 63) / 64;
   f.count = 0;
   NonFinite bad;

@@ -1,7 +1,7 @@
 // One Gaussian through one pinhole camera, and the vector-Jacobian product. Scalar and branch-free, shared by every
 // device; the CPU kernels loop over structure-of-array blocks so that the compiler vectorises it.
 //
-// camera frame: p = R m + t; mean: x = fx p0/p2 + cx. Covariance (EWA splatting, 3DGS eq. 5): J R Q S S Qᵀ Rᵀ Jᵀ + 0.3 I,
+// camera frame: p = R m + t; mean: x = fx p0/p2 + cx. Covariance (EWA splatting, 3DGS eq. 5): J R Q S S Qᵀ Rᵀ Jᵀ + eps2d I,
 // with p0/p2 and p1/p2 in J clamped to 1.3 times the field of view (the gradient through a clamped value is zero).
 #pragma once
 #include <cmath>
@@ -20,14 +20,12 @@ struct Camera {
   T fx, fy, cx, cy;
   T limit_x0, limit_x1, limit_y0, limit_y1;  // bounds of p0/p2 and p1/p2 inside J
   T near_plane;
+  T eps2d;  // px², added to the diagonal of the 2D covariance: what a pixel averages over
   int width, height;
 };
 
 template <class T>
-constexpr T kBlur = T(0.3);  // px², added to the diagonal of the 2D covariance
-
-template <class T>
-Camera<T> make_camera(const T *viewmat, const T *K, int width, int height, T near_plane) {
+Camera<T> make_camera(const T *viewmat, const T *K, int width, int height, T near_plane, T eps2d) {
   Camera<T> c;
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) c.R[3 * i + j] = viewmat[4 * i + j];
@@ -37,7 +35,7 @@ Camera<T> make_camera(const T *viewmat, const T *K, int width, int height, T nea
   const T margin_x = T(0.3) * T(0.5) * width / c.fx, margin_y = T(0.3) * T(0.5) * height / c.fy;
   c.limit_x0 = -c.cx / c.fx - margin_x, c.limit_x1 = (width - c.cx) / c.fx + margin_x;
   c.limit_y0 = -c.cy / c.fy - margin_y, c.limit_y1 = (height - c.cy) / c.fy + margin_y;
-  c.near_plane = near_plane, c.width = width, c.height = height;
+  c.near_plane = near_plane, c.eps2d = eps2d, c.width = width, c.height = height;
   return c;
 }
 
@@ -93,17 +91,17 @@ PERCEPTION_HD Projected<T> project(const Camera<T> &cam, const T *m, const T *q,
   }
   for (int j = 0; j < 3; ++j) u[j] *= s[j], w[j] *= s[j];
   const T a = u[0] * u[0] + u[1] * u[1] + u[2] * u[2], c = w[0] * w[0] + w[1] * w[1] + w[2] * w[2];
-  const T vc = c + kBlur<T>, r = T(1) / vc;
+  const T vc = c + cam.eps2d, r = T(1) / vc;
   // det/c with the determinant as the sum of squared 2x2 minors of [u; w] plus the blur's terms: nothing cancels.
   const T scale = T(1) / std::sqrt(vc);
   const T n0 = (u[1] * w[2] - u[2] * w[1]) * scale, n1 = (u[2] * w[0] - u[0] * w[2]) * scale,
           n2 = (u[0] * w[1] - u[1] * w[0]) * scale;
   Projected<T> o;
   o.x = cam.fx * ux + cam.cx, o.y = cam.fy * uy + cam.cy, o.z = p2;
-  o.cov_xx = a + kBlur<T>;
+  o.cov_xx = a + cam.eps2d;
   o.cov_xy = u[0] * w[0] + u[1] * w[1] + u[2] * w[2];
   o.var_y = vc;
-  o.var_x = n0 * n0 + n1 * n1 + n2 * n2 + kBlur<T> * (a * r) + kBlur<T> * (c * r) + kBlur<T> * kBlur<T> * r;
+  o.var_x = n0 * n0 + n1 * n1 + n2 * n2 + cam.eps2d * (a * r) + cam.eps2d * (c * r) + cam.eps2d * cam.eps2d * r;
   o.k = -o.cov_xy * r;
   return o;
 }

@@ -27,6 +27,7 @@ struct Inputs {
   const T *background; // [C,3] or null
   int width, height;
   T near_plane;
+  T eps2d;             // px², > 0
 };
 
 template <class T>

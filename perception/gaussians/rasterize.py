@@ -1,6 +1,6 @@
 """Differentiable rasterization of 3D Gaussians on the CPU: the torch side of the compiled kernels.
 
-Follows the 3DGS equations: 2D covariance J R Σ Rᵀ Jᵀ + 0.3 I, alpha = min(0.999, o·exp(−½ dᵀ Σ⁻¹ d)),
+Follows the 3DGS equations: 2D covariance J R Σ Rᵀ Jᵀ + 0.3 px² I, alpha = min(0.999, o·exp(−½ dᵀ Σ⁻¹ d)),
 contributions under 1/255 skipped, front to back by depth (equal depths by index), stop before the
 transmittance falls under 1e-4.
 """
@@ -63,6 +63,7 @@ class Settings:
     height: int
     sh_degree: int = -1
     near_plane: float = 0.01
+    eps2d: float = 0.3
     variance: bool = True
     depth: bool = True
     threads: int = 0
@@ -131,6 +132,7 @@ def _core_inputs(inputs: tuple[Tensor | None, ...], background: Tensor | None, s
         settings.height,
         settings.sh_degree,
         settings.near_plane,
+        settings.eps2d,
         _threads(settings),
         settings.depth,
         settings.variance,
@@ -264,6 +266,7 @@ def rasterize(
     background: Tensor | None = None,
     near_plane: float = 0.01,
     *,
+    eps2d: float = 0.3,
     variance: bool = True,
     depth: bool = True,
     threads: int = 0,
@@ -277,6 +280,7 @@ def rasterize(
     viewmats [C,4,4] camera_from_world, Ks [C,3,3] pixels (pixel centres at +0.5, no skew), features [N,D],
     background [3] or [C,3]. float32 or float64, on the CPU. Gradients flow to all of them except Ks.
 
+    eps2d: px² added to the diagonal of every 2D covariance, the square of the blur that a pixel is (gsplat's name).
     variance=False and depth=False leave out `feature_variance` and `depths` (None then) and save their time.
     threads: 0 takes torch.get_num_threads(). The result is the same, bit for bit, for any number of threads.
     Finite inputs up to 1e15 in magnitude give finite images and gradients; InputError names an input that is not
@@ -289,11 +293,11 @@ def rasterize(
         "means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors,
         "features": features, "viewmats": viewmats, "Ks": Ks, "background": background,
     }  # fmt: skip
-    _check(tensors, width, height, sh_degree, near_plane)
+    _check(tensors, width, height, sh_degree, near_plane, eps2d)
     if background is not None and background.ndim == 1:
         background = background.expand(viewmats.shape[0], 3)
     settings = Settings(
-        int(width), int(height), -1 if sh_degree is None else int(sh_degree), float(near_plane),
+        int(width), int(height), -1 if sh_degree is None else int(sh_degree), float(near_plane), float(eps2d),
         variance and features is not None, depth, threads, simd,
     )  # fmt: skip
     stats = RasterizationStats(radii=means.new_zeros((0,)))
@@ -302,7 +306,7 @@ def rasterize(
 
 
 def _check(
-    tensors: dict[str, Tensor | None], width: int, height: int, sh_degree: int | None, near_plane: float
+    tensors: dict[str, Tensor | None], width: int, height: int, sh_degree: int | None, near_plane: float, eps2d: float
 ) -> None:
     """Names the first argument at fault."""
     import torch
@@ -323,6 +327,8 @@ def _check(
         raise InputError(f"rasterize: image size {width} × {height}, expected 1 to 1048576 pixels a side")
     if not (near_plane >= 0 and near_plane < float("inf")):
         raise InputError(f"rasterize: near_plane is {near_plane}, expected a finite number ≥ 0")
+    if not 0.01 <= eps2d <= 1e4:
+        raise InputError(f"rasterize: eps2d is {eps2d}, expected 0.01 to 10000 px²")
 
 
 def _check_shapes(tensors: dict[str, Any], sh_degree: int | None) -> None:

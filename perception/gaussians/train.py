@@ -235,6 +235,7 @@ class Trainer:
             features=params["features"] if with_features else None,
             background=background,
             depth=False,
+            eps2d=view.eps2d,
         )
 
     def _watch(self, view: TrainingView, out: Rasterization) -> None:

@@ -67,7 +67,8 @@ def _scene(dice: Dice, dtype: Any, cameras: int, n: int, dims: int, size: tuple[
         "scales": np.abs(normal(dice, (n, 3), dtype)), "opacities": np.full(n, 0.5, dtype),
         "colors": normal(dice, color, dtype), "features": normal(dice, (n, dims), dtype) if dims else None,
         "viewmats": poses, "Ks": lenses, "background": np.zeros((cameras, 3), dtype),
-        "width": size[0], "height": size[1], "sh_degree": degree, "near_plane": 0.01, "threads": 1 + dice.below(2),
+        "width": size[0], "height": size[1], "sh_degree": degree, "near_plane": 0.01, "eps2d": 0.3,
+        "threads": 1 + dice.below(2),
         "depth": True, "variance": bool(dims), "max_records": 0,
     }  # fmt: skip
     return getattr(_core, f"RasterizerInputs_{suffix}"), arguments
@@ -306,7 +307,7 @@ def _other_shape(dice: Dice, value: np.ndarray, kind: int) -> np.ndarray:
 
 
 _OF_INPUTS = ("means", "quats", "scales", "opacities", "colors", "features", "viewmats", "Ks", "background", "width")
-_OF_INPUTS += ("near_plane", "sh_degree", "threads", "max_records", "simd")
+_OF_INPUTS += ("near_plane", "eps2d", "sh_degree", "threads", "max_records", "simd")
 
 
 def _called(function: Callable[..., Any], arguments: dict[str, Any]) -> Any:
