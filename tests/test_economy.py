@@ -9,11 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from perception.cli import _resume, main
 from perception.config import MapConfig, load_config
 from perception.gaussians.economy import COST_EXPONENT, Economy
-from perception.gaussians.views import cooling
+from perception.gaussians.model import from_points
+from perception.gaussians.train import Trainer
+from perception.gaussians.views import TrainingView, cooling
 from perception.io.cloud import read_cloud, write_cloud
 from perception.pipeline.mapping import build_map
 from perception.pipeline.summary import shares, speed
@@ -124,3 +127,22 @@ def test_the_record_accounts_for_the_time(
     assert main(["info", str(out)]) == 0
     assert "M pairs/s" in capsys.readouterr().out
     assert _resume([*words]).endswith("--resume") and _resume(["query", "m", "a b"]) == "perception query m 'a b'"
+
+
+def test_the_time_between_two_legs_is_not_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Masks are made between two legs: their minutes counted as training, in the record and against --time-limit."""
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    K = torch.tensor([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]])
+    view = TrainingView("a", torch.full((12, 16, 3), 90, dtype=torch.uint8), None, K, torch.eye(4))
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3)) + np.array([0, 0, 2])
+    start = from_points(points, np.full((20, 3), 150, np.uint8), feature_dim=1, seed=0)
+    trainer = Trainer(start, [view], load_config(None, ["train.iterations=10", "train.sh_degree=0"]), [])
+
+    def a_second_later(trainer: Trainer, figures: dict[str, float]) -> None:
+        now[0] += 1
+
+    trainer.run(a_second_later, until=0.3)
+    now[0] += 1000
+    assert trainer.elapsed == 3
+    assert trainer.run(a_second_later).seconds == trainer.record.iterations == 10

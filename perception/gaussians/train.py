@@ -66,7 +66,7 @@ class Trainer:
         self.coarse: list[TrainingView] = []
         self.has_labels = False
         self.show(views)
-        self._started = time.monotonic()
+        self._since: float | None = None  # when the leg that runs began
         self._order: np.ndarray = np.zeros(0, dtype=np.int64)
 
     def show(self, views: list[TrainingView]) -> None:
@@ -95,8 +95,8 @@ class Trainer:
 
     @property
     def elapsed(self) -> float:
-        """Seconds of training, those before a resume counted in."""
-        return self.record.seconds + time.monotonic() - self._started
+        """Seconds of training: those before a resume counted in, those between two legs (masks are made then) not."""
+        return self.record.seconds + (0.0 if self._since is None else time.monotonic() - self._since)
 
     @property
     def progress(self) -> float:
@@ -134,7 +134,6 @@ class Trainer:
         self.profile = Profile(self.record.profile)
         self.economy.load(state["economy"])
         self._jump = state["jump"]
-        self._started = time.monotonic()
 
     def _restart_optimiser(self, state: dict[str, Any]) -> None:
         self.gaussians = Gaussians(**state["params"])
@@ -150,13 +149,16 @@ class Trainer:
 
     def run(self, on_step: Callable[[Trainer, dict[str, float]], None], until: float = 1.0) -> TrainRecord:
         """Trains until progress `until`; `on_step` sees every iteration (progress bars, checkpoints)."""
-        while self.progress < until:
-            figures = self.step()
-            if until >= 1.0:  # a leg that something waits for is not cut short
-                self._stop_early()
-            on_step(self, figures)
-        self.record.seconds, self.record.iterations = self.elapsed, self.iteration
-        self._started = time.monotonic()
+        self._since = time.monotonic()
+        try:
+            while self.progress < until:
+                figures = self.step()
+                if until >= 1.0:  # a leg that something waits for is not cut short
+                    self._stop_early()
+                on_step(self, figures)
+        finally:
+            self.record.seconds, self.record.iterations = self.elapsed, self.iteration
+            self._since = None
         return self.record
 
     def step(self) -> dict[str, float]:
