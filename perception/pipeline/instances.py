@@ -15,6 +15,7 @@ from perception.gaussians.train import TrainingView
 from perception.instances.group import Grouping, group
 from perception.instances.silhouettes import Silhouettes, render_silhouettes
 from perception.instances.votes import mask_votes
+from perception.language.base import Encoder
 from perception.progress import Progress
 from perception.types import Scene
 
@@ -47,14 +48,15 @@ def find_instances(
     grouped = group_gaussians(gaussians, views, config, progress)
     seen = _silhouettes(gaussians, grouped.ids, views, "silhouettes", progress) if grouped.count else []
     instances = _entries(grouped, means, opacities, seen)
-    language = _embed(grouped.ids, seen, views, config, progress) if grouped.count else {}
+    encoder = _encoder(config, progress) if grouped.count else None
+    language = _embed(encoder, grouped.ids, seen, views, config, progress) if encoder else {}
     report = {
         "count": grouped.count,
         "parts": len(grouped.parents),
         "noise_share": float(np.mean(grouped.ids < 0)),
         "encoder": str(language["encoder"]) if language else None,
     }
-    parts = _parts(gaussians, grouped, views, config, progress) if grouped.parents else {}
+    parts = _parts(encoder, gaussians, grouped, views, config, progress) if grouped.parents else {}
     return FoundInstances(grouped.ids, grouped.membership, instances, language, report, parts)
 
 
@@ -106,15 +108,20 @@ def _entries(
 
 
 def _parts(
-    gaussians: Gaussians, grouped: Grouping, views: list[TrainingView], config: MapConfig, progress: Progress
+    encoder: Encoder | None,
+    gaussians: Gaussians,
+    grouped: Grouping,
+    views: list[TrainingView],
+    config: MapConfig,
+    progress: Progress,
 ) -> dict[str, np.ndarray]:
     """The arrays of parts.npz: whose part each Gaussian is and, with an encoder, what the parts look like."""
     local = np.where(grouped.part_ids >= 0, grouped.part_ids - grouped.count, -1).astype(np.int32)
     language: dict[str, np.ndarray] = {}
-    if config.language.encoder != "none":
+    if encoder is not None:
         seen = _silhouettes(gaussians, local, views, "silhouettes of parts", progress)
         thrifty = replace(config, language=replace(config.language, views=min(2, config.language.views), zooms=1))
-        language = _embed(local, seen, views, thrifty, progress)
+        language = _embed(encoder, local, seen, views, thrifty, progress)
     return {"ids": grouped.part_ids, **{f"language_{name}": array for name, array in language.items()}}
 
 
@@ -141,26 +148,34 @@ def _describe(
     }
 
 
-def _embed(
-    ids: np.ndarray, seen: list[Silhouettes], views: list[TrainingView], config: MapConfig, progress: Progress
-) -> dict[str, np.ndarray]:
-    """Language arrays of all instances from their best views (paper eq. 8); {} without an encoder."""
-    from perception.instances.crops import choose_views, view_scores
-    from perception.instances.describe import describe_instances
+def _encoder(config: MapConfig, progress: Progress) -> Encoder | None:
+    """What turns pictures into words' vectors; None where none is wanted, or "auto" finds none."""
     from perception.language import make_encoder
-    from perception.language.base import reading_of
-    from perception.language.description import to_arrays
 
     spec = config.language.encoder
     try:
-        encoder = make_encoder("conse" if spec == "auto" else spec)
+        return make_encoder("conse" if spec == "auto" else spec)
     except InputError as error:
         if spec != "auto":
             raise
         progress.log(f"warning: no language: {error}")
-        return {}
-    if encoder is None:
-        return {}
+        return None
+
+
+def _embed(
+    encoder: Encoder,
+    ids: np.ndarray,
+    seen: list[Silhouettes],
+    views: list[TrainingView],
+    config: MapConfig,
+    progress: Progress,
+) -> dict[str, np.ndarray]:
+    """Language arrays of all instances from their best views (paper eq. 8)."""
+    from perception.instances.crops import choose_views, view_scores
+    from perception.instances.describe import describe_instances
+    from perception.language.base import reading_of
+    from perception.language.description import to_arrays
+
     pixels = np.stack([view.pixels for view in seen], axis=1)
     total = np.maximum(np.bincount(ids[ids >= 0], minlength=len(pixels)), 1)
     visible = np.stack([view.visible for view in seen], axis=1) / total[:, None]
