@@ -172,7 +172,7 @@ def _parse(text: str, kind: Any, where: str) -> Any:
                 return value
             if option is str and isinstance(text, str):
                 return text
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):  # the last: inf as a whole number
             continue
     names = " or ".join(getattr(option, "__name__", str(option)) for option in options)
     raise InputError(f"{where}: found {text!r}, expected {names}")

@@ -350,6 +350,13 @@ def test_poses_far_beyond_any_scene_are_refused() -> None:
     refused(rigid_pose, pose, "p", match="more than 1e")
 
 
+def test_an_infinite_whole_number_in_a_settings_file(tmp_path: Path) -> None:
+    """OverflowError: cannot convert float infinity to integer."""
+    file = tmp_path / "c.toml"
+    file.write_text("[train]\niterations = inf\n")
+    refused(load_config, file, match=r"train\.iterations.*found inf, expected int")
+
+
 def test_settings_nested_without_end(tmp_path: Path) -> None:
     file = tmp_path / "c.toml"
     file.write_text("seed = " + "[" * 20_000)
@@ -399,6 +406,14 @@ def test_damaged_binary_models(tmp_path: Path, file: str, content: bytes) -> Non
     assert len(read_workspace(folder, folder / "work", 0, quiet).points) == 60
     (folder / "sparse/0" / file).write_bytes(content)
     refused(read_workspace, folder, folder / "work", 0, quiet, match=r"sparse|camera")
+
+
+def test_faces_whose_corners_are_no_list(tmp_path: Path) -> None:
+    """IndexError: tuple index out of range."""
+    file = tmp_path / "a.ply"
+    head = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    file.write_text(head + "element face 1\nproperty int vertex_indices\nend_header\n0 1 2\n0\n")
+    refused(read_cloud, file, match="expected a property list")
 
 
 # ------------------------------------------------------------------ label images

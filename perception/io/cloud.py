@@ -124,6 +124,8 @@ def to_uint8(colors: np.ndarray) -> np.ndarray:
 
 def _triangles(faces: np.ndarray, path: Path) -> np.ndarray:
     if faces.dtype != object:
+        if faces.ndim != 2:
+            raise InputError(f"{path}: the corners of element 'face' are {faces.dtype}, expected a property list")
         if len(faces) == 0 or faces.shape[1] < 3:
             return np.empty((0, 3), np.int32)
         corners = [faces[:, [0, i, i + 1]] for i in range(1, faces.shape[1] - 1)]
