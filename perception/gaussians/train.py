@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,25 +24,10 @@ from perception.gaussians.model import Gaussians, sigmoid
 from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.profile import Profile
 from perception.gaussians.rasterize import Rasterization, rasterize
+from perception.gaussians.record import TrainRecord
 from perception.gaussians.views import TrainingView, cooling, depth_image, psnr, render_view, scene_extent, visible_in
 
 __all__ = ["TrainRecord", "Trainer", "TrainingView", "depth_image", "psnr", "render_view", "scene_extent"]
-
-
-@dataclass
-class TrainRecord:
-    """What training spent and what it bought; JSON-able.
-
-    profile: seconds by part. pairs: contributing (Gaussian, pixel) pairs of all training renders.
-    """
-
-    curve: list[dict[str, float]] = field(default_factory=list)
-    decisions: list[str] = field(default_factory=list)
-    profile: dict[str, float] = field(default_factory=dict)
-    pairs: int = 0
-    seconds: float = 0.0
-    iterations: int = 0
-    skipped_gradients: int = 0
 
 
 class Trainer:
