@@ -408,6 +408,15 @@ def test_damaged_binary_models(tmp_path: Path, file: str, content: bytes) -> Non
     refused(read_workspace, folder, folder / "work", 0, quiet, match=r"sparse|camera")
 
 
+def test_an_orientation_that_exif_does_not_know(tmp_path: Path) -> None:
+    """The size was told as of a photo on its side, which then was read upright."""
+    file, exif = tmp_path / "a.jpg", Image.Exif()
+    for orientation, turned in ((6, True), (9, False), (22341, False)):
+        exif[0x0112] = orientation
+        Image.new("RGB", (8, 6)).save(file, exif=exif)
+        assert photo_size(file) == ((6, 8) if turned else (8, 6)) == read_photo(file).shape[1::-1]
+
+
 def test_faces_whose_corners_are_no_list(tmp_path: Path) -> None:
     """IndexError: tuple index out of range."""
     file = tmp_path / "a.ply"

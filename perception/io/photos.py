@@ -49,7 +49,8 @@ def photo_size(path: Path) -> tuple[int, int]:
     """(width, height) of a photo after EXIF rotation, from its header."""
     with _open(path) as image:
         width, height = image.size
-        return (height, width) if exif_of(image, path).get(0x0112, 1) >= 5 else (width, height)
+        turned = exif_of(image, path).get(0x0112) in (5, 6, 7, 8)  # other values mean nothing
+        return (height, width) if turned else (width, height)
 
 
 def exif_of(image: Image.Image, path: Path) -> Image.Exif:
