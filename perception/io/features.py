@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image
 
 from perception.io.atomic import atomic_directory, recover
 from perception.io.lens import load_pycolmap
-from perception.io.photos import exif_of, photo_size, read_photo
+from perception.io.photos import exif_of, photo_size, read_photo, upright
 from perception.types import Lens
 
 Progress = Callable[[str, float], None]
@@ -105,15 +105,15 @@ def _stage(staged: Path, root: Path, photos: list[Path]) -> tuple[Path, list[str
             target.symlink_to(photo.resolve())
             continue
         with Image.open(photo) as image:
-            exif = ImageOps.exif_transpose(image).getexif()
+            exif = upright(image, photo).getexif()
         Image.fromarray(read_photo(photo)).save(target, quality=98, subsampling=0, exif=exif)
     return staged, names
 
 
 def _is_plain(photo: Path) -> bool:
     with Image.open(photo) as image:
-        upright = exif_of(image, photo).get(0x0112, 1) == 1
-        return upright and image.mode in ("RGB", "L") and image.format in ("JPEG", "PNG")
+        stored_upright = exif_of(image, photo).get(0x0112, 1) == 1
+        return stored_upright and image.mode in ("RGB", "L") and image.format in ("JPEG", "PNG")
 
 
 def _extract(

@@ -61,7 +61,8 @@ def exif_of(image: Image.Image, path: Path) -> Image.Exif:
         raise _bad_exif(path) from error
 
 
-def _upright(image: Image.Image, path: Path) -> Image.Image:
+def upright(image: Image.Image, path: Path) -> Image.Image:
+    """An open photo turned as its EXIF data say. Raises InputError where they are damaged."""
     try:
         return ImageOps.exif_transpose(image)
     except DECODE_ERRORS as error:  # it reads the data, and writes them anew without the rotation
@@ -87,7 +88,7 @@ def read_photo(path: Path) -> np.ndarray:
     """
     with _open(path) as image:
         _decode(image, path)
-        return _rgb(_upright(image, path), path)
+        return _rgb(upright(image, path), path)
 
 
 def scaled_size(view: View, max_side: int | None) -> tuple[int, int]:

@@ -49,7 +49,7 @@ def find_instances(
     seen = _silhouettes(gaussians, grouped.ids, views, "silhouettes", progress) if grouped.count else []
     instances = _entries(grouped, means, opacities, seen)
     encoder = _encoder(config, progress) if grouped.count else None
-    language = _embed(encoder, grouped.ids, seen, views, config, progress) if encoder else {}
+    language = _embed(encoder, grouped.ids, seen, views, config, progress) if encoder is not None else {}
     report = {
         "count": grouped.count,
         "parts": len(grouped.parents),
