@@ -54,6 +54,16 @@ def test_the_hole_gets_gaussians_on_the_wall_in_the_photos_colour() -> None:
     assert float(before[centre, centre].max()) < 0.1 and float(after[centre, centre, 0].min()) > 0.25
 
 
+def test_half_resolution_finds_the_empty_places_of_the_full_picture() -> None:
+    """Oracle: the full picture. A third of the wall's points, finer than a pixel, leave it emptier than half; blurred
+    by the 0.3 px² of larger pixels it would look covered (mean opacity .78)."""
+    thin = wall(None)
+    thin = thin.rows(torch.arange(0, len(thin), 3))
+    thin.log_scales = torch.full_like(thin.log_scales, 0.008).log()
+    full, half = (fill_holes(thin, [shown], 0, seed=1)[1] for shown in (view(), view().halved()))
+    assert full == 1 and half > 0.5, (full, half)
+
+
 def test_a_covered_wall_gets_nothing_and_the_room_holds() -> None:
     born, lacking = fill_holes(wall(None), [view()], 1000, seed=1)
     assert len(born) == 0 and lacking == 0

@@ -12,7 +12,9 @@ from sklearn.metrics import adjusted_rand_score
 pytest.importorskip("perception._core")
 from perception.bench.blob_scenes import BlobScene, make_scene, orbit, random_scene, with_errors
 from perception.config import InstanceConfig
+from perception.gaussians.model import from_points
 from perception.gaussians.rasterize import rasterize
+from perception.gaussians.views import TrainingView
 from perception.instances.group import Grouping, group
 from perception.instances.votes import mask_votes
 
@@ -56,6 +58,20 @@ def test_votes_are_the_weights_with_which_gaussians_enter_the_picture() -> None:
         assert np.abs(np.where(expected > 0.02, expected, 0) - found).max() < 1e-3
         assert votes.void[n].sum() == pytest.approx(picture[view.labels.numpy() == 0].sum(), abs=0.03)
     assert votes.area.tolist() == [int((view.labels == name).sum()) for name in names]
+
+
+def test_votes_at_half_resolution_weigh_what_the_full_picture_does() -> None:
+    """Closed form: a faint round Gaussian of deviation s pixels weighs in proportion to s² + eps2d, in pixels²; the
+    average of 2 × 2 pixels adds 1/4 to it, and no more."""
+    deviation, faint = 1.5, 0.1
+    g = from_points(np.array([[0, 0, 2.0]]), np.full((1, 3), 128, np.uint8), feature_dim=3, seed=0, opacity=faint)
+    g.log_scales = torch.full((1, 3), deviation * 2 / 64).log()
+    K = torch.tensor([[64.0, 0, 32], [0, 64, 32], [0, 0, 1]])
+    labels = torch.ones(64, 64, dtype=torch.int32)
+    view = TrainingView("a", torch.zeros(64, 64, 3, dtype=torch.uint8), labels, K, torch.eye(4))
+    full, half = (mask_votes(g, [view], half_resolution=choice).weights[0, 0] for choice in (False, True))
+    expected = (deviation**2 + 0.3 + 0.25) / (deviation**2 + 0.3)
+    assert 4 * half / full == pytest.approx(expected, rel=0.02)  # alpha under 1/255 is cut; with eps2d 0.3: 23 % more
 
 
 @pytest.mark.parametrize("dim", [1, 8, 32])

@@ -48,7 +48,7 @@ def fill_holes(gaussians: Gaussians, views: list[TrainingView], room: int, seed:
 def _blocks(gaussians: Gaussians, view: TrainingView) -> tuple[np.ndarray, np.ndarray]:
     """Mean opacity, and opacity-weighted depth (0 where nothing is), of each block [h, w]."""
     height, width = view.photo.shape[:2]
-    out = render(gaussians, view.camera_from_world, view.K, width, height)
+    out = render(gaussians, view.camera_from_world, view.K, width, height, eps2d=view.eps2d)
     images = torch.stack([out.alphas[0], out.depths[0]])[None]
     alpha, depth = torch.nn.functional.avg_pool2d(images, BLOCK, ceil_mode=True)[0].numpy()
     return alpha, np.where(alpha > 0, depth / np.maximum(alpha, 1e-6), 0)

@@ -123,7 +123,7 @@ def _of_view(gaussians: Gaussians, view: TrainingView) -> tuple[sparse.csr_matri
         view.camera_from_world[None].contiguous(),
         view.K[None].contiguous(),
     )
-    settings = Settings(width, height, variance=False, depth=False)
+    settings = Settings(width, height, variance=False, depth=False, eps2d=view.eps2d)
     forward = rasterize_forward(inputs, None, settings)
     columns = []
     for first in range(0, len(masks), BLOCK):
