@@ -150,7 +150,7 @@ BACKGROUNDS = ("plain", "dim", "blur", "fill")
 PRESETS: dict[str, list[str]] = {
     "default": [],
     "fast": ["train.iterations=1200", "train.budget=40000", "train.exchange_db=0.1"],
-    "quality": ["train.iterations=12000", "train.budget=300000", "train.exchange_db=0.005", "photos.max_side=1280"],
+    "quality": ["train.iterations=6000", "train.budget=300000", "train.exchange_db=0.005", "photos.max_side=1280"],
 }
 
 
