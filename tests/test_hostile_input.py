@@ -408,9 +408,10 @@ def test_damaged_binary_models(tmp_path: Path, file: str, content: bytes) -> Non
     refused(read_workspace, folder, folder / "work", 0, quiet, match=r"sparse|camera")
 
 
-def test_an_orientation_that_exif_does_not_know(tmp_path: Path) -> None:
-    """The size was told as of a photo on its side, which then was read upright."""
-    file, exif = tmp_path / "a.jpg", Image.Exif()
+@pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.webp", "a.tif"])
+def test_an_orientation_that_exif_does_not_know(name: str, tmp_path: Path) -> None:
+    """The size was told as of a photo on its side, which then was read upright; that of a TIFF was turned twice."""
+    file, exif = tmp_path / name, Image.Exif()
     for orientation, turned in ((6, True), (9, False), (22341, False)):
         exif[0x0112] = orientation
         Image.new("RGB", (8, 6)).save(file, exif=exif)

@@ -48,7 +48,8 @@ def list_photos(folder: Path) -> list[Path]:
 def photo_size(path: Path) -> tuple[int, int]:
     """(width, height) of a photo after EXIF rotation, from its header."""
     with _open(path) as image:
-        width, height = image.size
+        tags = getattr(image, "tag_v2", {})  # Pillow has turned the size of a TIFF already, or not, by its version
+        width, height = int(tags.get(0x0100, image.width)), int(tags.get(0x0101, image.height))
         turned = exif_of(image, path).get(0x0112) in (5, 6, 7, 8)  # other values mean nothing
         return (height, width) if turned else (width, height)
 
