@@ -159,10 +159,11 @@ class Trainer:
         self.iteration += 1
         every = self.config.densify.every
         if self.iteration % every == 0:
-            if self.economy.growing and self.config.densify.start <= progress < self.config.densify.stop:
-                self._densify(progress)
+            # Before densification, which sets the picture back for a while: a score taken then says nothing of growth.
             if self.progress >= self.economy.due and not self.economy.finished:
                 self._end_trial()
+            if self.economy.growing and self.config.densify.start <= progress < self.config.densify.stop:
+                self._densify(progress)
         if self.progress >= 1.0:
             self._prune_unseen()
         if self.iteration % (5 * every) == 0 or self.progress >= 1.0:
