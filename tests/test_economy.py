@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,9 +25,9 @@ from perception.pipeline.summary import shares, speed
 from perception.types import PointCloud
 
 
-def economy(rate: float, scores: list[float]) -> Economy:
+def economy(rate: float, scores: list[float], counts: list[int] | None = None) -> Economy:
     config = MapConfig()
-    return Economy(replace(config, train=replace(config.train, exchange_db=rate)), scores=scores)
+    return Economy(replace(config, train=replace(config.train, exchange_db=rate)), scores=scores, counts=counts or [])
 
 
 def test_a_plateau_is_where_ten_percent_more_time_gains_less_than_asked() -> None:
@@ -42,11 +43,14 @@ def test_a_plateau_is_where_ten_percent_more_time_gains_less_than_asked() -> Non
 
 def test_growth_ends_where_all_that_was_gained_would_not_pay_for_it() -> None:
     scores = [20.0, 22.0, 22.2]  # two trials gained 2.2, 1.1 each
-    tenths = (2**COST_EXPONENT - 1) / 0.1
-    assert economy(1.1 / tenths * 0.99, scores).growth_pays(1000, 2000) is None
-    ended = economy(1.1 / tenths * 1.01, scores)
-    assert "1000 Gaussians" in str(ended.growth_pays(1000, 2000)) and not ended.growing
-    assert economy(100.0, scores).growth_pays(2000, 2000) is None  # nothing to pay for
+    grew = [10, 500, 1000]  # by 500 in the last trial, and so in the next where 2000 are allowed
+    tenths = (1.5**COST_EXPONENT - 1) / 0.1
+    for allowed, next_tenths in ((2000, tenths), (1200, (1.2**COST_EXPONENT - 1) / 0.1)):
+        assert economy(1.1 / next_tenths * 0.99, scores, grew).growth_pays(allowed) is None
+        ended = economy(1.1 / next_tenths * 1.01, scores, grew)
+        assert "1000 Gaussians" in str(ended.growth_pays(allowed)) and not ended.growing
+    assert economy(100.0, scores, grew).growth_pays(1000) is None  # nothing to pay for
+    assert economy(100.0, scores, [10, 1000, 1000]).growth_pays(2000) is None
 
 
 @pytest.mark.parametrize(
@@ -140,18 +144,33 @@ def small_trainer(*pairs: str) -> Trainer:
 
 def test_a_trial_is_scored_before_growth_sets_the_picture_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scored after it, most trials of a short run gained nothing, and growth ended .6 dB too early (tabletop_a)."""
-    trainer, told = small_trainer("train.iterations=40", "densify.every=4", "train.exchange_db=-99"), []
-    for name in ("_end_trial", "_densify"):
+    trainer = small_trainer("train.iterations=40", "densify.every=4", "train.exchange_db=-99")
+    order = follow(monkeypatch, trainer, "score", "_grow", "_end_trial")
+    trainer.run(lambda trainer, figures: None)
+    grown = [n for n in range(40) if {"_grow", "_end_trial"} <= set(order.get(n, []))]
+    assert len(grown) > 3 and all(order[n][:3] == ["score", "_grow", "_end_trial"] for n in grown)
+
+
+def test_holes_are_filled_after_growth_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = small_trainer("train.iterations=40", "densify.every=4", "train.exchange_db=-99")
+    trainer.economy.growing = False
+    order = follow(monkeypatch, trainer, "_grow", "_fill")
+    trainer.run(lambda trainer, figures: None)
+    assert [name for names in order.values() for name in names] == ["_fill"] * 2  # turns 0 and 5 of .05 to .6
+
+
+def follow(monkeypatch: pytest.MonkeyPatch, trainer: Trainer, *names: str) -> dict[int, list[str]]:
+    """The calls of these methods from now on, by iteration."""
+    told: dict[int, list[str]] = {}
+    for name in names:
         original = getattr(trainer, name)
 
-        def called(*args: float, name: str = name, original: Callable[..., None] = original) -> None:
-            told.append((trainer.iteration, name))
-            original(*args)
+        def called(*args: Any, name: str = name, original: Callable[..., Any] = original, **more: Any) -> Any:
+            told.setdefault(trainer.iteration, []).append(name)
+            return original(*args, **more)
 
         monkeypatch.setattr(trainer, name, called)
-    trainer.run(lambda trainer, figures: None)
-    both = [n for n in range(40) if (n, "_densify") in told and (n, "_end_trial") in told]
-    assert len(both) > 3 and all(told.index((n, "_end_trial")) < told.index((n, "_densify")) for n in both)
+    return told
 
 
 def test_the_time_between_two_legs_is_not_training(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ def test_nothing_is_lost_to_a_few_kills(small_scene: Path, tmp_path: Path) -> No
     """Kills around changes to the file system, which do not hang on the clock; the long run also draws times."""
     facts = tmp_path / "kills.json"
     command = [sys.executable, HERE / "kills" / "run.py", "--kills", "0", "--writes", "3", "--json", facts]
-    command += ["--no-sfm", "--no-fresh", "--iterations", "60", "--scene", small_scene, "--folder", tmp_path]
+    command += ["--no-sfm", "--no-fresh", "--iterations", "100", "--scene", small_scene, "--folder", tmp_path]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     cases = {case["what"]: case for case in json.loads(facts.read_text())["cases"]}

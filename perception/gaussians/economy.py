@@ -25,12 +25,13 @@ COST_EXPONENT = 0.6
 class Economy:
     """What was measured and decided so far; `state` and `load` round-trip it through a checkpoint.
 
-    scores: PSNR in dB at the end of each trial. growing: Gaussians may be added. settled: the degree of harmonics is
-    decided. finished: only the cool-down is left.
+    scores, counts: PSNR in dB and number of Gaussians at the end of each trial. growing: Gaussians may be added.
+    settled: the degree of harmonics is decided. finished: only the cool-down is left.
     """
 
     config: MapConfig
     scores: list[float] = field(default_factory=list)
+    counts: list[int] = field(default_factory=list)
     growing: bool = True
     settled: bool = False
     finished: bool = False
@@ -52,14 +53,19 @@ class Economy:
             return None
         return min(max(self.scores), CEILING) - min(max(self.scores[:-2]), CEILING)
 
-    def growth_pays(self, gaussians: int, next_count: int) -> str | None:
-        """None while growth pays; else why it ends.
+    def growth_pays(self, allowed: int) -> str | None:
+        """None while growth pays; else why it ends. allowed: Gaussians at the end of the next trial, at most.
 
         All that two trials gained, by growth and by mere training, bounds what growth gained in them; when even that
-        is less than the next trial's growth costs at the exchange rate, growth does not pay.
+        is less than the next trial's growth costs at the exchange rate, growth does not pay. The next trial is taken
+        to add as many as the last: where little wants to grow, far fewer than are allowed.
         """
         gain = self.gain()
-        if gain is None or next_count <= gaussians:
+        if gain is None:
+            return None
+        before, gaussians = self.counts[-2:]
+        next_count = min(allowed, 2 * gaussians - before)
+        if next_count <= gaussians:
             return None
         tenths = ((next_count / gaussians) ** COST_EXPONENT - 1) / 0.1
         asked = self.config.train.exchange_db * tenths

@@ -159,11 +159,13 @@ class Trainer:
         self.iteration += 1
         every = self.config.densify.every
         if self.iteration % every == 0:
+            due = self.progress >= self.economy.due and not self.economy.finished
             # Before densification, which sets the picture back for a while: a score taken then says nothing of growth.
-            if self.progress >= self.economy.due and not self.economy.finished:
-                self._end_trial()
-            if self.economy.growing and self.config.densify.start <= progress < self.config.densify.stop:
+            reached = self.score(limit=8)["psnr"] if due else None
+            if self.config.densify.start <= progress < self.config.densify.stop:
                 self._densify(progress)
+            if reached is not None:
+                self._end_trial(reached)
         if self.progress >= 1.0:
             self._prune_unseen()
         if self.iteration % (5 * every) == 0 or self.progress >= 1.0:
@@ -256,19 +258,23 @@ class Trainer:
         return target_count(progress, self.initial_count, self.config.train.budget, self.config.densify)
 
     def _densify(self, progress: float) -> None:
+        """Growth while it pays; holes are filled all the same."""
         config = self.config
         with self.profile("densification"):
-            decay_opacities(self.gaussians, config.densify.opacity_decay)
             seed = int(np.random.default_rng([config.seed, self.iteration, 2]).integers(2**31))
-            allowed = self._allowed(progress)
-            change = densify(self.gaussians, self.statistics, allowed, self.extent, config.densify, seed)
-            self.optimiser.keep(change.keep)
-            self.optimiser.append(vars(change.born))
-            self._sync()
+            if self.economy.growing:
+                self._grow(self._allowed(progress), seed)
             turn = round((progress - config.densify.start) * config.train.iterations / config.densify.every)
             if config.densify.fill_every and turn % config.densify.fill_every == 0:
                 self._fill(seed)
             self.statistics = Statistics.zeros(len(self.gaussians))
+
+    def _grow(self, allowed: int, seed: int) -> None:
+        decay_opacities(self.gaussians, self.config.densify.opacity_decay)
+        change = densify(self.gaussians, self.statistics, allowed, self.extent, self.config.densify, seed)
+        self.optimiser.keep(change.keep)
+        self.optimiser.append(vars(change.born))
+        self._sync()
 
     def _fill(self, seed: int) -> None:
         room = self.config.train.budget - len(self.gaussians)
@@ -293,15 +299,16 @@ class Trainer:
 
     # ---------------------------------------------------------------- economy
 
-    def _end_trial(self) -> None:
-        """What the trial gained decides about growth while there is growth, then about harmonics."""
+    def _end_trial(self, reached: float) -> None:
+        """What the trial gained, now at `reached` dB, decides about growth while there is any, then about harmonics."""
         progress, economy = self.progress, self.economy
         economy.due = progress + TRIAL
-        economy.scores.append(self.score(limit=8)["psnr"])
         count = len(self.gaussians)
+        economy.scores.append(reached)
+        economy.counts.append(count)
         if progress < self.config.densify.stop and economy.growing:
             if progress > self.config.train.coarse_until + 2 * TRIAL:
-                self._decide(economy.growth_pays(count, self._allowed(progress + TRIAL)))
+                self._decide(economy.growth_pays(self._allowed(progress + TRIAL)))
             return
         if economy.growing:
             economy.growing = False
