@@ -51,6 +51,7 @@ def test_growth_ends_where_all_that_was_gained_would_not_pay_for_it() -> None:
         assert "1000 Gaussians" in str(ended.growth_pays(allowed)) and not ended.growing
     assert economy(100.0, scores, grew).growth_pays(1000) is None  # nothing to pay for
     assert economy(100.0, scores, [10, 1000, 1000]).growth_pays(2000) is None
+    assert economy(100.0, scores, [1000]).growth_pays(2000) is None  # resumed from a checkpoint without counts
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ class Economy:
         to add as many as the last: where little wants to grow, far fewer than are allowed.
         """
         gain = self.gain()
-        if gain is None:
+        if gain is None or len(self.counts) < 2:  # a checkpoint of an earlier version has no counts
             return None
         before, gaussians = self.counts[-2:]
         next_count = min(allowed, 2 * gaussians - before)
