@@ -6,6 +6,7 @@ import itertools
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 
 from perception.bench import ablation, export, scaling, sweep, switches
 from perception.bench import map as bench_map
+from perception.bench.memory import fresh_peak, status_mib
 from perception.bench.sweep import Limits, Sweep, SweepScene, Variant, pareto
 from perception.bench.sweep_cli import limits_of, sweep_parser, table
 from perception.bench.sweep_seeds import over_seeds, seeded
@@ -85,6 +87,26 @@ def test_an_interrupted_sweep_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
     (tmp_path / "rows.json").write_text("{")
     with pytest.raises(InputError, match="not valid JSON"):
         Sweep(tmp_path, Limits(), lambda text: None)
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux tells the peak and lets it go")
+def test_a_peak_of_memory_is_forgotten() -> None:
+    fresh_peak()
+    before = status_mib("VmHWM")
+    del (waste := [np.ones(1_000) for _ in range(16_000)])[:]  # 122 MiB in blocks that the allocator likes to keep
+    assert not waste and status_mib("VmHWM") > before + 100
+    fresh_peak()
+    assert status_mib("VmHWM") < before + 50  # the kernel's word; a page here and there is still in use
+
+
+def test_a_scene_keeps_the_photos_of_one_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "perception.pipeline.photos.load_all", lambda views, side, progress: [f"{v}-{side}" for v in views]
+    )
+    monkeypatch.setattr("perception.pipeline.photos.split_views", lambda views, every: (views[1:], views[:1]))
+    scene = SweepScene(tmp_path, tmp_path / "work", _scene=SimpleNamespace(views=["a", "b"]))
+    assert scene.photos(640) == (["b-640"], ["a-640"]) and scene.training(320, None) == ["b-320"]
+    assert list(scene._views) == [320]
 
 
 def test_seeds_become_a_median_and_a_spread() -> None:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import math
 import os
 import subprocess
 import sys
@@ -24,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from perception.bench.children import child_options
+from perception.bench.memory import fresh_peak, status_mib
 
 TREES = ("perception", "scipy", "open3d")
 LISTS = 12
@@ -98,12 +98,12 @@ def measure(task: str, tree: str, args: argparse.Namespace) -> dict[str, Any]:
     else:
         import open3d  # noqa: F401
     run = _task(task, tree, args)
-    _forget_peak()
-    before = _status("VmRSS")
+    fresh_peak()
+    before = status_mib("VmRSS")
     wall, cpu = time.perf_counter(), time.process_time()
     answer = run()
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    peak = _status("VmHWM") - before
+    peak = status_mib("VmHWM") - before
     mark = float(np.asarray(answer, np.float64)[:: max(np.size(answer) // 100_000, 1)].mean())
     return {"seconds": wall, "cpu_seconds": cpu, "peak_mib": peak, "mark": mark}
 
@@ -122,25 +122,6 @@ def _task(task: str, tree: str, args: argparse.Namespace) -> Callable[[], Any]:
         return lambda: smoothed(tree, points, labels)
     means = surfaces(args.gaussians, 2, 0.01)
     return lambda: nearest(tree, points, means)
-
-
-def _forget_peak() -> None:
-    """The kernel's mark of this process' highest memory starts anew (Linux), so that making the data is not in it."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    except OSError:
-        return
-
-
-def _status(key: str) -> float:
-    """A figure of /proc/self/status in MiB; NaN where the system does not tell."""
-    try:
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-            if line.startswith(f"{key}:"):
-                return int(line.split()[1]) / 1024
-    except OSError:
-        pass
-    return math.nan
 
 
 def _in_child(task: str, tree: str, arguments: Sequence[str]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ nanoseconds are CPU time of all threads: of the median round, and of the least d
 from __future__ import annotations
 
 import argparse
-import ctypes
+import math
 import statistics
 import time
 from collections.abc import Sequence
@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from perception.bench.memory import fresh_peak, status_mib
 from perception.bench.splats import SPLAT_KEYS, load_scene, synthetic_scene
 from perception.bench.sweep_cli import Column, finish, save_plot, table
 from perception.errors import InputError
@@ -116,23 +117,13 @@ def _peak_mib(scene: dict[str, Any], case: Case) -> float | None:
     """MiB a first forward and backward pass add to this process, images and gradients included; None off Linux."""
     import torch
 
-    from perception import _core
-
-    _core.rasterizer_release_memory()  # type: ignore[attr-defined]
-    try:
-        ctypes.CDLL(None).malloc_trim(0)  # what was freed before must not hide what is taken now
-        Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
-        before = _status("VmRSS")
-        _, images, leaves = _render(scene, case.rich, getattr(torch, case.dtype), simd=case.simd, threads=case.threads)
-        torch.autograd.grad(images, leaves, [torch.ones_like(t) for t in images])
-        return (_status("VmHWM") - before) / 1024
-    except (OSError, AttributeError):
+    fresh_peak()
+    before = status_mib("VmRSS")
+    if math.isnan(before):
         return None
-
-
-def _status(name: str) -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return int(next(line for line in lines if line.startswith(name)).split()[1])
+    _, images, leaves = _render(scene, case.rich, getattr(torch, case.dtype), simd=case.simd, threads=case.threads)
+    torch.autograd.grad(images, leaves, [torch.ones_like(t) for t in images])
+    return status_mib("VmHWM") - before
 
 
 def cases(threads: Sequence[int], dtypes: Sequence[str]) -> list[Case]:

@@ -69,6 +69,7 @@ def _plot(path: Path, scene: str, rows: Sequence[dict[str, Any]]) -> None:
             axes[1][column].set_xlabel(label)
             for axis in axes[:, column]:
                 axis.grid(alpha=0.3)
+                axis.set_xticks(places, [f"{place:.0f}" for place in places])
         for axis in axes[:, 0]:  # shared by its row, so once all of it is drawn
             axis.set_ylim(bottom=0)
         axes[0][0].set_ylabel("seconds per 1000 iterations")

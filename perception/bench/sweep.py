@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from perception.bench.memory import fresh_peak
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
@@ -68,7 +69,9 @@ class Limits:
 
 @dataclass
 class SweepScene:
-    """A scene with its photos and label images, each size decoded once. work: folder for what can be kept."""
+    """A scene with its photos and label images of one size at a time: of the size last asked for, so that none of
+    another is in a variant's memory. work: folder for what can be kept.
+    """
 
     folder: Path
     work: Path
@@ -102,6 +105,7 @@ class SweepScene:
         from perception.pipeline.photos import load_all, split_views
 
         if max_side not in self._views:
+            self._views = {}
             parts = split_views(self.scene().views, self.held_out_every)
             self._views[max_side] = tuple(load_all(part, max_side, _silent) for part in parts)
         return self._views[max_side]
@@ -111,7 +115,8 @@ class SweepScene:
         if masks is None or not (self.root / masks).is_dir():
             return self.photos(max_side)[0]
         if (max_side, masks) not in self._views:
-            self._views[max_side, masks] = self._labelled(max_side, masks)
+            labelled = self._labelled(max_side, masks)  # which may make room for its size first
+            self._views[max_side, masks] = labelled
         return self._views[max_side, masks]
 
     def _labelled(self, max_side: int, masks: str) -> list[Any]:
@@ -144,6 +149,7 @@ def run_variant(scene: SweepScene, variant: Variant, config: MapConfig) -> dict[
     try:
         views = scene.training(config.photos.max_side, variant.masks)
         held = scene.photos(config.photos.max_side)[1]
+        fresh_peak()
         peak, stages = PeakMemory(), Stages()
         trainer = Trainer(initial_gaussians(scene.scene(), config), views, config, held)
         began, cpu = time.monotonic(), time.process_time()
