@@ -21,4 +21,4 @@ def _visible(character: str) -> bool:
 
 def missing_extra(package: str, extra: str) -> InputError:
     """An error for an optional dependency that is absent, with the exact line that installs it."""
-    return InputError(f"the package '{package}' is not installed; run: pip install \"perception[{extra}]\"")
+    return InputError(f"the package '{package}' is not installed; run in its clone: pip install \".[{extra}]\"")

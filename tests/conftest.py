@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 from pathlib import Path
 
 import pytest
@@ -16,11 +15,6 @@ _HOMES = [Path(perception.__file__).resolve().parents[1], Path(__file__).resolve
 os.environ["PYTHONPATH"] = os.pathsep.join(map(str, _HOMES))
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
-
-
-def hears_ctrl_c() -> None:
-    """For `preexec_fn`: a suite that runs in the background ignores SIGINT, and so would its children."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session")

@@ -52,6 +52,15 @@ def test_documented_commands_are_understood(page: str, command: str, capsys: pyt
         assert done.code == 0
 
 
+def test_no_line_installs_the_stranger_called_perception() -> None:
+    """That name on the package index is another project; ours is installed from a clone, as `.`."""
+    kinds = {".py", ".md", ".toml", ".sh", ".yaml", ".yml", ".service", ".txt", ".cff"}
+    files = [path for path in ROOT.rglob("*") if path.suffix in kinds and ".git" not in path.parts]
+    assert len(files) > 200
+    found = [path for path in files if re.search(r"install\W+perception\b", path.read_text(encoding="utf-8"))]
+    assert not found
+
+
 def runnable() -> list[str]:
     """The complete commands of all pages on a map of one's own: the README's walkthrough, in its order, comes first."""
     commands = [re.sub(r" MAP\b", " kitchen.gsmap", command) for _, command in documented() if "SCENE" not in command]

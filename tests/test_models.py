@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from onnx_files import FLOAT, INT64, SAM_DECODER, write_onnx
 
 from perception.cli import main
 from perception.errors import InputError
@@ -20,6 +19,7 @@ from perception.io.download import download
 from perception.io.model_store import find_model, models_folder
 from perception.masks import make_source
 from perception.models import add_model, check_file
+from support.onnx_files import FLOAT, INT64, SAM_DECODER, write_onnx
 
 IMAGE = ((1, 3, 1024, 1024), FLOAT)
 

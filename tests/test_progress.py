@@ -13,7 +13,8 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import hears_ctrl_c
+
+from support.processes import hears_ctrl_c
 
 pty = pytest.importorskip("pty")  # not on Windows
 

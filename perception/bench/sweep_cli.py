@@ -148,7 +148,7 @@ def save_plot(path: Path, draw: Callable[[Any], None], size: tuple[float, float]
     try:
         from matplotlib.figure import Figure
     except ModuleNotFoundError:
-        print(f"no {path.name}: plots need matplotlib (pip install 'perception[bench]')", file=sys.stderr)
+        print(f"no {path.name}: plots need matplotlib (pip install '.[bench]' in the clone)", file=sys.stderr)
         return
     figure = Figure(figsize=size, dpi=120, layout="constrained")
     draw(figure)

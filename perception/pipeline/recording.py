@@ -123,5 +123,5 @@ def _rerun() -> Any:
     try:
         import rerun
     except ImportError as error:
-        raise InputError('--rrd needs Rerun: pip install "perception[rerun]"') from error
+        raise InputError('--rrd needs Rerun; run in the clone: pip install ".[rerun]"') from error
     return rerun

@@ -245,7 +245,7 @@ def _viser() -> Any:
     try:
         import viser
     except ImportError as error:
-        raise InputError('the viewer needs viser: pip install "perception[view]" (or pip install viser)') from error
+        raise InputError('the viewer needs viser; run in the clone: pip install ".[view]"') from error
     return viser
 
 

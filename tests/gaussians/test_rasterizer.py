@@ -1,0 +1,166 @@
+"""The compiled rasterizer against the naive one: values, gradients, invariances."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import perception
+from support import reference_rasterizer as reference
+from support.rasterizer import IMAGES, every_simd_level, grads_and_images, leaves, loss_of, scene  # noqa: F401
+
+
+@pytest.mark.parametrize(
+    ("dims", "sh_degree", "eps2d"), [(5, None, 0.3), (8, 0, 0.1375), (13, 1, 2.0), (16, 2, 0.3), (21, 3, 0.3)]
+)
+def test_double_build_equals_the_naive_rasterizer(dims, sh_degree, eps2d):
+    inputs = {**scene(dims=dims, sh_degree=sh_degree), "eps2d": eps2d}
+    ours_in, theirs_in = leaves(inputs), leaves(inputs)
+    ours = perception.rasterize(**ours_in)
+    theirs = reference.rasterize(**theirs_in)
+    for name in IMAGES:
+        torch.testing.assert_close(getattr(ours, name), theirs[name], rtol=1e-10, atol=1e-11)
+    assert torch.equal(ours.visible, theirs["visible"])
+    loss_of([getattr(ours, name) for name in IMAGES]).backward()
+    loss_of([theirs[name] for name in IMAGES]).backward()
+    for name, t in ours_in.items():
+        if isinstance(t, torch.Tensor) and t.requires_grad:
+            expected = theirs_in[name].grad
+            torch.testing.assert_close(t.grad, expected, rtol=1e-8, atol=1e-9 * float(expected.abs().max()), msg=name)
+
+
+@pytest.mark.parametrize("sh_degree", [None, 0, 1, 2, 3])
+def test_gradcheck_of_the_double_build(sh_degree):
+    # Large soft Gaussians away from every threshold, so that finite differences see a smooth function.
+    inputs = scene(n=6, width=6, height=5, dims=3, cameras=1, sh_degree=sh_degree, seed=3)
+    inputs["means"] = inputs["means"] * 0.2 + torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
+    inputs["scales"] = inputs["scales"] + 1.0
+    inputs["opacities"] = inputs["opacities"] * 0.3 + 0.3
+    inputs["Ks"] = torch.tensor([[[5.0, 0, 2.6], [0, 6.0, 2.4], [0, 0, 1]]], dtype=torch.float64)
+    if sh_degree is not None:
+        inputs["colors"] = inputs["colors"] * 0.1
+    names = ["means", "quats", "scales", "opacities", "colors", "features", "viewmats", "background"]
+    tensors = [inputs[k].clone().requires_grad_() for k in names]
+
+    def render(*args):
+        out = perception.rasterize(**{**inputs, **dict(zip(names, args, strict=True))})
+        return tuple(getattr(out, k) for k in IMAGES)
+
+    assert torch.autograd.gradcheck(render, tensors, eps=1e-6, atol=1e-6, rtol=1e-5)
+
+
+def test_same_bits_for_any_number_of_threads():
+    inputs = scene(n=3000, width=300, height=203, dims=9, dtype=torch.float32)
+    one = grads_and_images(inputs, threads=1)
+    for threads in (2, 3, 7):
+        for a, b in zip(one, grads_and_images(inputs, threads=threads), strict=True):
+            assert torch.equal(a, b)
+
+
+def test_levels_agree():
+    from perception.gaussians.rasterize import simd_levels
+
+    inputs = scene(n=2000, width=150, height=110, dims=8, dtype=torch.float32)
+    results = [grads_and_images(inputs, simd=level) for level in simd_levels()]
+    for other in results[1:]:
+        for a, b in zip(results[0], other, strict=True):
+            error = (a.double() - b.double()).abs() / (1e-3 + b.double().abs().mean())
+            assert float(error.mean()) < 2e-4
+            assert float((error > 1e-2).double().mean()) < 2e-3
+
+
+def test_float_build_follows_the_double_build():
+    inputs = scene(n=2000, width=150, height=110, dims=8)
+    exact = grads_and_images(inputs)
+    single = grads_and_images({k: v.float() if isinstance(v, torch.Tensor) else v for k, v in inputs.items()})
+    names = [
+        *IMAGES,
+        "visible",
+        "radii",
+        "mean2d_grad",
+        "means",
+        "quats",
+        "scales",
+        "opacities",
+        "colors",
+        "features",
+    ]
+    for name, a, b in zip(names, single, exact, strict=False):
+        a, b = a.double().flatten(), b.double().flatten()
+        error = (a - b).abs() / b.abs().mean()
+        # Flips at the 1/255 threshold are the outliers; everything else is rounding.
+        assert float(error.mean()) < 1e-3, name
+        assert (
+            float(error.quantile(0.95) if error.numel() < 1e6 else error.kthvalue(int(0.95 * error.numel()))[0]) < 1e-4
+        ), name
+        assert float((error > 0.1).double().mean()) < 2e-3, name
+
+
+def test_equal_depths_keep_the_order_of_their_index():
+    inputs = scene(n=40, dims=3, cameras=1)
+    inputs["means"][:, 2] = 2.0
+    out, expected = perception.rasterize(**inputs), reference.rasterize(**inputs)
+    for name in IMAGES:
+        torch.testing.assert_close(getattr(out, name), expected[name], rtol=1e-10, atol=1e-11)
+
+
+def test_cameras_are_independent():
+    inputs = scene(n=200, cameras=3)
+    together = perception.rasterize(**inputs)
+    for c in range(3):
+        one = {k: inputs[k][c : c + 1] for k in ("viewmats", "Ks", "background")}
+        alone = perception.rasterize(**{**inputs, **one})
+        for name in (*IMAGES, "visible"):
+            assert torch.equal(getattr(together, name)[c], getattr(alone, name)[0])
+
+
+def test_depth_and_variance_are_optional_and_change_nothing_else():
+    inputs = scene(n=200, dims=8)
+    full = perception.rasterize(**inputs)
+    lean = perception.rasterize(**inputs, variance=False)
+    assert lean.feature_variance is None
+    torch.testing.assert_close(lean.features, full.features, rtol=1e-12, atol=1e-12)
+    plain = perception.rasterize(**{**inputs, "features": None}, depth=False)
+    assert plain.depths is None and plain.features is None
+    assert torch.equal(plain.colors, full.colors)
+
+
+def test_backward_may_run_twice_and_adds_up():
+    inputs = leaves(scene(n=50))
+    out = perception.rasterize(**inputs)
+    loss = loss_of([out.colors])
+    loss.backward(retain_graph=True)
+    once = inputs["means"].grad.clone()
+    loss.backward()
+    assert torch.equal(inputs["means"].grad, 2 * once)
+
+
+def test_statistics_are_the_2d_mean_gradient_in_pixels():
+    # One tiny Gaussian: moving it by δ px in x is moving its mean by δ z / fx.
+    inputs = leaves(scene(n=1, dims=0, cameras=1))
+    inputs["means"] = torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64).requires_grad_()
+    inputs["viewmats"] = torch.eye(4, dtype=torch.float64)[None]
+    inputs["scales"] = torch.full((1, 3), 1e-3, dtype=torch.float64)
+    out = perception.rasterize(**inputs)
+    loss_of([out.colors]).backward()
+    gx, gy = (inputs["means"].grad[0, :2] * 2.0 / torch.tensor([30.0, 34.0])).tolist()
+    assert float(out.stats.mean2d_grad) == pytest.approx((gx**2 + gy**2) ** 0.5, rel=1e-5)
+    assert float(out.stats.radii) == pytest.approx(3 * 0.3**0.5, rel=1e-2)
+
+
+def test_pairs_are_those_the_naive_rasterizer_blends():
+    from perception.gaussians.rasterize import simd_levels
+
+    inputs = scene(n=300, width=70, height=45, dims=21)
+    expected = reference.rasterize(**inputs)["pairs"]
+    for simd in simd_levels():
+        out = perception.rasterize(**inputs, simd=simd)
+        assert out.stats.contributing_pairs == int(expected.sum())
+        assert out.stats.contributing_pairs <= out.stats.evaluated_pairs <= 2 * 300 * 80 * 48
+        assert set(out.stats.seconds) == {"project", "sort", "bin", "blend", "blend_backward", "reduce"}
+
+
+def test_pairs_do_not_depend_on_threads():
+    inputs = scene(n=3000, width=300, height=203, dtype=torch.float32)
+    pairs = [perception.rasterize(**inputs, threads=n).stats for n in (1, 2, 5)]
+    assert len({(p.evaluated_pairs, p.contributing_pairs) for p in pairs}) == 1

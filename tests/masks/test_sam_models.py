@@ -1,0 +1,173 @@
+"""Recognising SAM exports, preparing their inputs, refusing what is none. Graphs are written byte by byte."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perception.errors import InputError
+from perception.masks import make_source
+from perception.masks.sam_models import open_sam
+from perception.types import View
+from support.onnx_files import FLOAT, INT64, SAM_DECODER, write_onnx
+
+EMBEDDING = np.zeros((1, 2, 64, 64), np.float32)
+SAM2_DECODER = {
+    "image_embed": ((1, 2, 64, 64), FLOAT),
+    "high_res_feats_0": ((1, 1, 2, 2), FLOAT),
+    "high_res_feats_1": ((1, 1, 2, 2), FLOAT),
+    "point_coords": (("p", "n", 2), FLOAT),
+    "point_labels": (("p", "n"), FLOAT),
+    "mask_input": (("p", 1, 256, 256), FLOAT),
+    "has_mask_input": (("p",), FLOAT),
+    "orig_im_size": ((2,), INT64),
+}
+EFFICIENT_DECODER = {
+    "image_embeddings": ((1, 2, 64, 64), FLOAT),
+    "batched_point_coords": ((1, "q", "n", 2), FLOAT),
+    "batched_point_labels": ((1, "q", "n"), FLOAT),
+    "orig_im_size": ((2,), INT64),
+}
+OPTIMUM_DECODER = {
+    "image_embeddings": ((1, 2, 64, 64), FLOAT),
+    "image_positional_embeddings": ((1, 2, 64, 64), FLOAT),
+    "input_points": ((1, "q", "n", 2), FLOAT),
+    "input_labels": ((1, "q", "n"), INT64),
+}
+HIGH_RES = {f"high_res_feats_{i}": np.zeros((1, 1, 2, 2), np.float32) for i in (0, 1)}
+# family: encoder input, encoder outputs, decoder, name of the masks, of the scores and of the points
+FAMILIES = {
+    "SAM": (("x", (1, 3, 1024, 1024)), {}, SAM_DECODER, "masks", "iou_predictions", "point_coords"),
+    "SAM 2": (("image", (1, 3, 1024, 1024)), HIGH_RES, SAM2_DECODER, "masks", "iou_predictions", "point_coords"),
+    "EfficientSAM": (
+        ("batched_images", (1, 3, "h", "w")), {}, EFFICIENT_DECODER, "output_masks", "iou_predictions",
+        "batched_point_coords",
+    ),
+    "SAM by optimum": (
+        ("pixel_values", (1, 3, 1024, 1024)), {"image_positional_embeddings": EMBEDDING}, OPTIMUM_DECODER,
+        "pred_masks", "iou_scores", "input_points",
+    ),
+}  # fmt: skip
+
+
+def write_family(folder: Path, family: str, encoder_passes_image: bool = False) -> None:
+    """A pair with a signature; the decoder's "predicted IoU" are the coordinates it was given."""
+    (image, shape), extra, decoder, masks, iou, points = FAMILIES[family]
+    name = "image_embed" if family == "SAM 2" else "image_embeddings"
+    embedding = image if encoder_passes_image else EMBEDDING
+    write_onnx(folder / "encoder.onnx", {image: (shape, FLOAT)}, {name: embedding, **extra})
+    constant = np.zeros((1, 3, 256, 256), np.float32)
+    write_onnx(folder / "decoder.onnx", decoder, {masks: constant, iou: points})
+
+
+def photo(height: int = 60, width: int = 80) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (height, width, 3)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_family_and_where_its_points_lie(tmp_path, family):
+    """A photo of 80×60: the long side fills 1024 (SAM), both sides do (SAM 2), or nothing is scaled."""
+    write_family(tmp_path, family)
+    model = open_sam(str(tmp_path))
+    assert model.family == family and model.provider == "CPUExecutionProvider" and model.warnings == []
+    _, given = model.decode(model.encode(photo()), np.array([[20.0, 30.0]]))
+    x, y = {"SAM": (256, 384), "SAM 2": (256, 512), "EfficientSAM": (20, 30), "SAM by optimum": (256, 384)}[family]
+    padded = family in ("SAM", "SAM 2")  # x, y, 0, 0, of which the first of four is dropped
+    np.testing.assert_allclose(given[0], [y, 0, 0] if padded else [x, y], rtol=1e-6)
+
+
+def test_normalisation_and_padding(tmp_path):
+    write_family(tmp_path, "SAM", encoder_passes_image=True)
+    grey = np.full((60, 80, 3), 100, np.uint8)
+    image = open_sam(str(tmp_path)).encode(grey).tensors["embedding"]
+    expected = (100 - np.array([123.675, 116.28, 103.53])) / [58.395, 57.12, 57.375]
+    np.testing.assert_allclose(image[0, :, :768].mean(axis=(1, 2)), expected, rtol=1e-5)
+    assert not image[0, :, 768:].any()
+
+
+def test_raw_encoder_takes_the_photo_as_it_is(tmp_path):
+    write_onnx(tmp_path / "a_encoder.onnx", {"input_image": (("h", "w", 3), FLOAT)}, {"image_embeddings": EMBEDDING})
+    write_onnx(tmp_path / "a_decoder.onnx", SAM_DECODER, {"masks": EMBEDDING, "iou_predictions": "point_coords"})
+    model = open_sam(str(tmp_path / "a_encoder.onnx"))
+    encoded = model.encode(photo(60, 80))
+    assert encoded.used == (768, 1024)
+    _, given = model.decode(encoded, np.array([[20.0, 30.0]]))
+    np.testing.assert_allclose(given[0, 0], 384)
+
+
+@pytest.mark.parametrize("spec", ["{0}", "{0}/encoder.onnx", "{0}/decoder.onnx", "{0}/encoder.onnx,{0}/decoder.onnx"])
+def test_ways_to_name_a_pair(tmp_path, spec):
+    write_family(tmp_path, "SAM")
+    assert open_sam(spec.format(tmp_path)).family == "SAM"
+
+
+def test_photo_in_which_nothing_is_found(tmp_path):
+    write_family(tmp_path, "SAM")
+    scores = {
+        "masks": np.zeros((1, 4, 256, 256), np.float32),
+        "iou_predictions": np.zeros((1, 4), np.float32),
+    }
+    write_onnx(tmp_path / "decoder.onnx", SAM_DECODER, scores)
+    source = make_source(f"sam:{tmp_path}")
+    view = View("a.jpg", tmp_path / "a.jpg", np.eye(3), 80, 60, np.eye(4))
+    assert source.check([view]) == []
+    labels = source.label_image(view, photo())
+    assert labels.shape == (60, 80) and labels.dtype == np.int32 and not labels.any()
+
+
+def test_identity_follows_the_weights(tmp_path):
+    write_family(tmp_path, "SAM")
+    before = make_source(f"sam:{tmp_path}").identity
+    write_onnx(tmp_path / "encoder.onnx", {"x": ((1, 3, 1024, 1024), FLOAT)}, {"image_embeddings": EMBEDDING + 1})
+    assert make_source(f"sam:{tmp_path}").identity != before
+
+
+def test_no_onnx(tmp_path):
+    (tmp_path / "model.onnx").write_bytes(b"these are no weights")
+    with pytest.raises(InputError, match=r"model\.onnx: not an ONNX model"):
+        make_source(f"sam:{tmp_path / 'model.onnx'}")
+
+
+def test_nothing_there(tmp_path):
+    with pytest.raises(InputError, match=r"no \.onnx file"):
+        open_sam(str(tmp_path))
+    with pytest.raises(InputError, match="no such file or folder"):
+        open_sam(str(tmp_path / "absent"))
+
+
+@pytest.mark.parametrize(("kept", "missing"), [("decoder", "encoder"), ("encoder", "decoder")])
+def test_one_half_of_a_pair(tmp_path, kept, missing):
+    write_family(tmp_path, "SAM")
+    (tmp_path / f"{missing}.onnx").unlink()
+    with pytest.raises(InputError, match=f"is a {'decoder' if kept == 'decoder' else 'encoder'}.*{missing} is missing"):
+        open_sam(str(tmp_path))
+
+
+def test_another_kind_of_network(tmp_path):
+    write_onnx(tmp_path / "net.onnx", {"tokens": ((1, 4), INT64)}, {"logits": np.zeros((1, 2), np.float32)})
+    write_onnx(tmp_path / "two.onnx", {"tokens": ((1, 4), INT64)}, {"a": EMBEDDING, "b": EMBEDDING})
+    with pytest.raises(InputError, match="no SAM encoder or decoder recognised"):
+        open_sam(str(tmp_path))
+
+
+def test_decoder_without_scores(tmp_path):
+    write_family(tmp_path, "SAM")
+    write_onnx(tmp_path / "decoder.onnx", SAM_DECODER, {"masks": np.zeros((1, 4, 256, 256), np.float32)})
+    with pytest.raises(InputError, match="no output for iou"):
+        open_sam(str(tmp_path))
+
+
+def test_pair_of_two_families(tmp_path):
+    write_family(tmp_path, "SAM 2")
+    write_onnx(tmp_path / "encoder.onnx", {"x": ((1, 3, 1024, 1024), FLOAT)}, {"image_embeddings": EMBEDDING})
+    with pytest.raises(InputError, match=r"needs high_res_feats_0.*does not give"):
+        open_sam(str(tmp_path))
+
+
+def test_two_decoders_in_a_folder(tmp_path):
+    write_family(tmp_path, "SAM")
+    (tmp_path / "other_decoder.onnx").write_bytes((tmp_path / "decoder.onnx").read_bytes())
+    with pytest.raises(InputError, match="several models found"):
+        open_sam(str(tmp_path))

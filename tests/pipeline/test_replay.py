@@ -1,0 +1,132 @@
+"""A map as a bag for viewers, decoded by Foxglove's own reader and checked against the photos' geometry."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from support.viewer_maps import small_map
+
+pytest.importorskip("rosbags")
+reader = pytest.importorskip("mcap.reader")
+decoder = pytest.importorskip("mcap_ros2.decoder")
+
+from perception.errors import InputError  # noqa: E402
+from perception.export import ExportOptions, Outputs  # noqa: E402
+from perception.geometry import look_at  # noqa: E402
+from perception.io.scene_cache import view_json  # noqa: E402
+from perception.io.store import GaussianMap, write_map  # noqa: E402
+from perception.pipeline.exporting import export_map  # noqa: E402
+from perception.types import View  # noqa: E402
+
+# What Foxglove's 3D panel and RViz draw by themselves.
+DRAWN = {
+    "/map/points": "sensor_msgs/msg/PointCloud2",
+    "/map/instances": "sensor_msgs/msg/PointCloud2",
+    "/map/boxes": "visualization_msgs/msg/MarkerArray",
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/camera/camera_info": "sensor_msgs/msg/CameraInfo",
+    "/camera/image/compressed": "sensor_msgs/msg/CompressedImage",
+}
+K = np.array([[500.0, 0, 330], [0, 500, 235], [0, 0, 1]])
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    gmap = small_map()
+    poses = [look_at(np.array([x, -1.0, 0]), np.array([0, 0, 5.0]), np.array([0, -1.0, 0])) for x in (-1.0, 0, 1.0)]
+    views = []
+    for i, pose in enumerate(poses):
+        photo = tmp_path / f"{i}.png"
+        if i < 2:  # the last photo is gone
+            cv2.imwrite(str(photo), np.full((480, 1280 // 2, 3), 40 * (i + 1), np.uint8))
+        views.append(View(photo.name, photo, K, 640, 480, pose))
+    gmap.info["views"] = [view_json(view) for view in views]
+    gmap.cameras = {"camera_from_world": np.array(poses)}
+    gmap.instances[2]["label"] = "blue ball"
+    write_map(tmp_path / "m.gsmap", gmap)
+    return tmp_path / "m.gsmap"
+
+
+def messages(file: Path) -> tuple[dict[str, str], dict[str, list[Any]]]:
+    """(schema of each topic, its messages in order), every one decoded."""
+    schemas, found = {}, defaultdict(list)
+    with file.open("rb") as stream:
+        for schema, channel, _, message in reader.make_reader(
+            stream, decoder_factories=[decoder.DecoderFactory()]
+        ).iter_decoded_messages():
+            assert (channel.message_encoding, schema.encoding) == ("cdr", "ros2msg")
+            schemas[channel.topic] = schema.name
+            found[channel.topic].append(message)
+    return schemas, found
+
+
+def test_every_message_decodes_and_lies_over_the_photos(path: Path, tmp_path: Path) -> None:
+    out = tmp_path / "m.mcap"
+    facts, _ = export_map(path, out, None, ExportOptions(), Outputs())
+    assert facts["views"] == 3
+    schemas, found = messages(out)
+    assert schemas == DRAWN
+    assert {topic: len(told) for topic, told in found.items()} == dict(zip(DRAWN, (1, 1, 1, 3, 2, 2), strict=True))
+
+    gmap: GaussianMap = small_map()
+    points = found["/map/points"][0]
+    solid = gmap.opacities >= 0.5
+    rows = np.frombuffer(points.data, [("p", "<f4", 3), ("rgb", "<u4")])
+    np.testing.assert_array_equal(rows["p"], gmap.means[solid])
+    assert points.header.frame_id == "map"
+    pixels = {}
+    for n, told in enumerate(found["/tf"]):
+        transform = told.transforms[0]
+        assert (transform.header.frame_id, transform.child_frame_id) == ("map", "camera")
+        pixels[n] = _projected(gmap.means.astype(float), transform.transform, K)
+    for n, (info, image) in enumerate(
+        zip(found["/camera/camera_info"], found["/camera/image/compressed"], strict=True)
+    ):
+        assert info.header.frame_id == image.header.frame_id == "camera"
+        assert (info.width, info.height, image.format) == (640, 480, "jpeg")
+        photo = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
+        assert photo is not None and photo.shape == (480, 640, 3) and abs(int(photo[0, 0, 0]) - 40 * (n + 1)) < 3
+        np.testing.assert_allclose(np.array(info.p).reshape(3, 4)[:, :3], K)
+        pose = look_at(np.array([n - 1.0, -1.0, 0]), np.array([0, 0, 5.0]), np.array([0, -1.0, 0]))
+        own = gmap.means @ pose[:3, :3].T + pose[:3, 3]
+        np.testing.assert_allclose(pixels[n], (own @ K.T)[:, :2] / own[:, 2:], atol=1e-3)
+    markers = found["/map/boxes"][0].markers
+    assert [marker.text for marker in markers if marker.type == 9] == ["0", "1", "blue ball"]
+    assert {marker.header.frame_id for marker in markers} == {"map"}
+
+
+def _projected(points: np.ndarray, transform: Any, intrinsics: np.ndarray) -> np.ndarray:
+    """Pixels of points, by the transform as ROS defines it: the pose of the child in the parent, xyzw."""
+    x, y, z, w = (getattr(transform.rotation, name) for name in "xyzw")
+    place = np.array([getattr(transform.translation, name) for name in "xyz"])
+    away = points - place
+    # v' = v + 2 q × (q × v + w v), turned back: the conjugate
+    axis = -np.array([x, y, z])
+    own = away + 2 * np.cross(axis, np.cross(axis, away) + w * away)
+    return (own @ intrinsics.T)[:, :2] / own[:, 2:]
+
+
+def test_a_cloud_with_its_boxes_is_drawn_too(path: Path, tmp_path: Path) -> None:
+    export_map(path, tmp_path / "own.ply", None, ExportOptions(), Outputs(mcap=tmp_path / "own.mcap"))
+    schemas, found = messages(tmp_path / "own.mcap")
+    assert schemas["/perception/boxes"] == "visualization_msgs/msg/MarkerArray"
+    assert sum(marker.type == 1 and marker.action == 0 for marker in found["/perception/boxes"][0].markers) == 3
+
+
+def test_a_map_for_viewers_takes_no_cloud(path: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="leave --points out"):
+        export_map(path, tmp_path / "m.mcap", tmp_path / "scan.ply", ExportOptions(), Outputs())
+    with pytest.raises(InputError, match=r"\.mcap, \.rrd"):
+        export_map(path, tmp_path / "m.obj", None, ExportOptions(), Outputs())
+
+
+def test_a_map_opens_in_rerun(path: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    export_map(path, tmp_path / "m.rrd", None, ExportOptions(), Outputs())
+    assert (tmp_path / "m.rrd").read_bytes()[:3] == b"RRF"

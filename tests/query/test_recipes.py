@@ -1,0 +1,116 @@
+"""docs/recipes.md: every snippet runs, in order, and finds what the map is known to hold."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from support.paths import REPOSITORY
+from support.query_maps import encoders, write_map_of
+
+pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
+from perception.bench.synthetic_map import SIGMA, grid
+from perception.cli import build_parser
+from perception.io.cloud import read_cloud
+from perception.io.store import read_map
+from support.processes import served
+
+PAGE = (REPOSITORY / "docs" / "recipes.md").read_text(encoding="utf-8")
+NAMES = ["red mug", "banana", "laptop", "teapot", "kettle", "lamp", "violin", "anchor", "drum"]
+SNIPPETS = re.findall(r"```(\w+)\n(.*?)```", PAGE, re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_map_of(tmp_path_factory.mktemp("recipes") / "kitchen.gsmap", NAMES, gaussians=3000)
+
+
+@pytest.fixture(scope="module")
+def world(kitchen: Path) -> Iterator[dict[str, Any]]:
+    """The names after all Python snippets have run, a server at the port they speak of."""
+    before = read_map(kitchen)
+    patch = pytest.MonkeyPatch()
+    for module in ("words", "engine"):
+        patch.setattr(f"perception.query.{module}.make_encoder", encoders)
+    patch.chdir(kitchen.parent)
+    names: dict[str, Any] = {"before": before}
+    try:
+        with served(kitchen) as (_, port):
+            for kind, code in SNIPPETS:
+                if kind == "python":
+                    exec(compile(code.replace(":8765", f":{port}"), "recipes.md", "exec"), names)
+            yield names
+    finally:
+        patch.undo()
+
+
+def members(world: dict[str, Any], number: int) -> np.ndarray:
+    return world["before"].means[world["before"].instance_ids == number]
+
+
+def test_the_page_has_snippets_of_both_kinds() -> None:
+    assert {kind for kind, _ in SNIPPETS} == {"python", "sh"} and len(SNIPPETS) >= 11
+
+
+def test_the_mug_is_found_and_moved(world: dict[str, Any]) -> None:
+    points, move = members(world, 0), world["base_from_map"]
+    assert world["mug"].instance_id == 0 and np.array_equal(world["mug"].points, points)
+    expected = points @ move[:3, :3].T + move[:3, 3]
+    for hit in (world["mug_in_base"], world["same"]):
+        assert hit.frame == "base_link" and np.allclose(hit.points, expected, atol=1e-5)
+    assert np.isclose(world["length"], max(world["mug"].obb.extent) * 2.03 / 4.1)
+
+
+def test_filters_leave_what_lies_there(world: dict[str, Any]) -> None:
+    assert next(hit.instance_id for hit in world["on_counter"]) == 0
+    assert {hit.instance_id for hit in world["on_counter"]} <= {0, 1, 2}
+    reach = [k for k in range(9) if np.linalg.norm(members(world, k), axis=1).min() <= 1.5]
+    assert [hit.instance_id for hit in world["graspable"]] == reach
+    assert [hit.instance_id for hit in world["in_kitchen"]] == [0, 1, 2, 3, 6]
+
+
+def test_places_are_judged_right(world: dict[str, Any]) -> None:
+    robot = np.linalg.inv(world["base_from_map"])[:3, 3]
+    gaps = {k: np.linalg.norm(members(world, k) - robot, axis=1).min() for k in range(9)}
+    assert [hit.instance_id for hit in world["nearest"]] == sorted(gaps, key=lambda k: gaps[k])[:3]
+    assert np.isclose(world["clearance"], min(gaps.values()))
+    assert [hit.instance_id for hit in world["blocking"]] == [1]
+    assert world["pointed"].instance_id == 4 and world["told"].hit.instance_id == 4
+    assert np.allclose(world["spread"], SIGMA, rtol=0.2) and np.isclose(np.linalg.norm(world["axis"]), 1)
+    assert np.isclose(np.linalg.norm((world["stand"] - grid(1)[0])[:2]), 0.7, atol=0.35)
+
+
+def test_labels_engine_and_http_answer_alike(world: dict[str, Any]) -> None:
+    assert world["cup"].instance_id == 0 and [hit.instance_id for hit in world["named"]] == [0]
+    assert world["reply"].hits[0].instance_id == 0 and world["reply"].frame == "base_link"
+    assert world["closest"][0].instance_id == world["nearest"][0].instance_id
+    assert world["health"]["status"] == "ok" and world["health"]["answered"] == 2
+    assert [result["hits"][0]["instance_id"] for result in world["answer"]["results"]] == [0, 3]
+    assert np.array_equal(world["points"], members(world, 0))
+
+
+def test_shell_lines_do_what_they_say(kitchen: Path, tmp_path: Path) -> None:
+    lines = [line for kind, code in SNIPPETS if kind == "sh" for line in code.strip().splitlines()]
+    commands = [shlex.split(line)[1:] for line in lines if line.startswith("perception ")]
+    assert [build_parser().parse_args(words).command for words in commands] == ["serve"]
+    if shutil.which("curl") is None or shutil.which("bash") is None:
+        pytest.skip("no curl here")
+    out = []
+    with served(kitchen) as (_, port):
+        for line in (line.replace(":8765", f":{port}") for line in lines if line.startswith("curl ")):
+            done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, cwd=tmp_path)
+            assert done.returncode == 0, done.stderr
+            out.append(done.stdout)
+    assert json.loads(out[0])["results"][0]["hits"][0]["instance_id"] == 0
+    assert json.loads(out[1])["hits"][0]["instance_id"] == 0 and len(json.loads(out[1])["hits"]) == 2
+    assert json.loads(out[3])["status"] == "ok"
+    assert len(read_cloud(tmp_path / "mug.ply").points) == json.loads(out[0])["results"][0]["hits"][0]["num_points"]

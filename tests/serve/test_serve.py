@@ -1,0 +1,422 @@
+"""The map over HTTP: what it answers, what it refuses, and that its OpenAPI document tells the truth."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from support.query_maps import NAMES, encoders, write_map_of
+
+pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
+pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")
+from openapi_schema_validator import OAS31Validator
+from openapi_spec_validator import validate as validate_document
+from starlette.testclient import TestClient
+
+from perception.cli import main
+from perception.errors import InputError
+from perception.io.cloud import read_cloud
+from perception.io.store import read_map
+from perception.query import LoadedMap, QueryEngine
+from perception.serve.app import build_app
+from perception.serve.guard import Guard
+from perception.serve.openapi import document
+from perception.serve.settings import ServeSettings, read_token
+
+TOKEN = "0123456789abcdef0123"
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_map_of(tmp_path_factory.mktemp("serve") / "a.gsmap", gaussians=900)
+
+
+@pytest.fixture(scope="module")
+def engine(path: Path) -> Iterator[QueryEngine]:
+    with QueryEngine(path, watch=None, encoders=encoders) as engine:
+        yield engine
+
+
+def client_of(engine: QueryEngine, **settings: Any) -> TestClient:
+    app = build_app(engine, ServeSettings(**{"rate": 0, **settings}))
+    return TestClient(app, base_url="http://127.0.0.1:8765", raise_server_exceptions=False)
+
+
+@pytest.fixture(scope="module")
+def client(engine: QueryEngine) -> TestClient:
+    return client_of(engine)
+
+
+def refused(answer: Any, status: int, *words: str) -> None:
+    """One JSON object with one clear line."""
+    body = answer.json()
+    assert (answer.status_code, body["status"], set(body)) == (status, status, {"error", "status"})
+    assert "\n" not in body["error"] and len(body["error"]) < 300 and "Traceback" not in body["error"]
+    for word in words:
+        assert word in body["error"]
+
+
+# -------------------------------------------------------------------- answers
+
+
+def test_a_query_answers_as_the_contract_says(client: TestClient, engine: QueryEngine) -> None:
+    answer = client.post("/query", json={"text": ["teapot", "lamp"], "top_k": 2, "min_score": 0}).json()
+    assert set(answer) == {"results", "frame", "metric", "map_id"}
+    assert (answer["frame"], answer["metric"], answer["map_id"]) == ("map", True, engine.current.map_id)
+    for text, result in zip(["teapot", "lamp"], answer["results"], strict=True):
+        expected = engine.current.query(text, 2, 0)
+        assert result == {"text": text, "present": True, "hits": [hit.to_json() for hit in expected]}
+    single = client.post("/query", json={"text": "nothing 7", "top_k": 1, "min_score": 0.9999}).json()
+    assert single["results"] == [{"text": "nothing 7", "present": False, "hits": []}]
+
+
+def test_filters_and_frames_pass_through(client: TestClient, engine: QueryEngine) -> None:
+    where = {"region": {"min": [1.5, -0.5, -1], "max": [2.5, 0.5, 1]}, "min_size": 0.1}
+    answer = client.post("/query", json={"text": "mug", "min_score": 0, "where": where}).json()
+    assert [hit["instance_id"] for hit in answer["results"][0]["hits"]] == [2]
+    lifted = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 10], [0, 0, 0, 1]]
+    frame = {"name": "base", "from_map": lifted}
+    hits = client.post("/nearest", json={"near": [1, 1, 10], "top_k": 2, "frame": frame}).json()
+    assert hits["frame"] == "base" and hits["hits"][0]["instance_id"] == 4
+    assert np.allclose(hits["hits"][0]["centroid"], [1, 1, 10], atol=0.05)
+    at = client.post("/at", json={"point": [2, 1, 0]}).json()
+    assert [hit["instance_id"] for hit in at["hits"]] == [5]
+    assert client.post("/at", json={"point": [2, 1, 50]}).json()["hits"] == []
+    polygon = {"polygon": [[-0.5, -0.5], [0.5, -0.5], [0.5, 2.5], [-0.5, 2.5]]}
+    found = client.post("/find", json={"where": {"region": polygon, "share": 1}}).json()
+    assert [hit["instance_id"] for hit in found["hits"]] == [0, 3, 6]
+    turned = {"center": [1, 1, 0], "extent": [1, 1, 1], "rotation": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]}
+    found = client.post("/find", json={"where": {"region": turned}}).json()
+    assert [hit["instance_id"] for hit in found["hits"]] == [4]
+    assert len(client.get("/instances").json()["hits"]) == 9
+
+
+def test_points_come_as_the_gaussians_lie(client: TestClient, path: Path, tmp_path: Path) -> None:
+    gmap = read_map(path)
+    expected = gmap.means[gmap.instance_ids == 3]
+    answer = client.get("/instances/3/points?format=ply")
+    (tmp_path / "points.ply").write_bytes(answer.content)
+    cloud = read_cloud(tmp_path / "points.ply")
+    assert np.array_equal(cloud.points, expected) and set(cloud.labels["instance_id"]) == {3}
+    answer = client.get("/instances/3/points")
+    with np.load(io.BytesIO(answer.content), allow_pickle=False) as arrays:
+        assert np.array_equal(arrays["points"], expected) and arrays["points"].dtype == np.float32
+        assert str(arrays["map_id"]) == answer.headers["X-Map-Id"]
+
+
+def test_a_pinned_map_that_was_replaced_is_a_conflict(tmp_path: Path) -> None:
+    path = write_map_of(tmp_path / "a.gsmap", gaussians=300)
+    with QueryEngine(path, watch=None, encoders=encoders) as engine:
+        client = client_of(engine)
+        first = client.post("/query", json={"text": "mug"}).json()["map_id"]
+        assert client.get(f"/instances/0/points?map_id={first}").status_code == 200
+        assert client.post("/reload", json={}).json() == {"changed": False, "map_id": first}
+        write_map_of(path, NAMES[:2], gaussians=100, seed=3)
+        answer = client.post("/reload", json={}).json()
+        assert answer["changed"] and answer["map_id"] != first
+        refused(client.get(f"/instances/0/points?map_id={first}"), 409, first)
+        shutil.rmtree(path)
+        refused(client.post("/reload", json={}), 400, "gone")
+        assert client.get("/health").json()["status"] == "degraded"
+        assert client.post("/query", json={"text": "mug"}).json()["results"][0]["present"]
+
+
+def test_the_best_photo_is_cut_around_its_box(tmp_path: Path) -> None:
+    """A red square on a grey photo; the crop must hold it, centred, and be gone when the photo is."""
+    path = write_map_of(tmp_path / "a.gsmap", ["square"], gaussians=50)
+    photo = np.full((100, 160, 3), 128, np.uint8)
+    photo[40:60, 100:130] = (255, 0, 0)
+    cv2.imwrite(str(tmp_path / "p.png"), photo[..., ::-1])
+    gmap = read_map(path)
+    from perception.io.scene_cache import view_json
+    from perception.io.store import write_map
+    from perception.types import View
+
+    view = View("00000.jpg", tmp_path / "p.png", np.eye(3), 160, 100, np.eye(4))
+    gmap.info["views"] = [view_json(view)]
+    gmap.language["view_boxes"] = np.array([[100, 40, 130, 60]], np.int32)
+    write_map(path, gmap)
+    with QueryEngine(path, watch=None, encoders=encoders) as engine:
+        client = client_of(engine)
+        answer = client.get("/instances/0/crop.jpg?side=64")
+        picture = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+        height, width = picture.shape[:2]
+        assert answer.headers["content-type"] == "image/jpeg" and max(height, width) <= 64
+        red = (picture[..., 0] > 200) & (picture[..., 1] < 80)
+        rows, columns = np.nonzero(red)
+        assert abs(rows.mean() - height / 2) < 2 and abs(columns.mean() - width / 2) < 2
+        assert 0.3 < red.mean() < 0.9
+        (tmp_path / "p.png").unlink()
+        refused(client.get("/instances/0/crop.jpg?side=65"), 404, "photo")
+        refused(client.get("/instances/0/crop.jpg?side=9999"), 400, "side")
+
+
+def test_the_page_is_there_and_loads_nothing_from_elsewhere(client: TestClient) -> None:
+    page = client.get("/")
+    assert page.headers["content-type"].startswith("text/html") and 'type="search"' in page.text
+    policy = page.headers["content-security-policy"]
+    assert "default-src 'none'" in policy and "script-src 'self'" in policy
+    for name in ("/page.js", "/page.css"):
+        assert client.get(name).status_code == 200
+    together = page.text + client.get("/page.js").text + client.get("/page.css").text
+    assert "://" not in together and "innerHTML" not in together
+
+
+# ------------------------------------------------------------------- document
+
+
+def test_the_document_is_valid_and_lists_every_route(engine: QueryEngine) -> None:
+    described = document()
+    validate_document(described)
+    app = build_app(engine, ServeSettings())
+    routes = {(route.path, method.lower()) for route in app.routes for method in route.methods - {"HEAD"}}  # type: ignore[attr-defined]
+    paths = {(path, method) for path, item in described["paths"].items() for method in item}
+    assert routes - paths == {("/", "get"), ("/page.js", "get"), ("/page.css", "get")} and paths <= routes
+
+
+def test_answers_are_as_the_document_says(client: TestClient) -> None:
+    described = document()
+    frame = {"name": "base", "from_map": np.eye(4).tolist()}
+    box = {"region": {"min": [0, 0, 0], "max": [1, 1, 1]}, "near": [0, 0, 0], "within": 9.0, "labels": ["x"]}
+    asked = [
+        ("post", "/query", "/query", {"text": "mug", "top_k": 2, "min_score": None, "where": None, "frame": frame}),
+        ("post", "/query", "/query", {"text": ["mug", "lamp"], "where": box}),
+        ("post", "/find", "/find", {}),
+        ("post", "/nearest", "/nearest", {"near": np.eye(4).tolist(), "top_k": 3}),
+        ("post", "/at", "/at", {"point": [0, 0, 0]}),
+        ("post", "/reload", "/reload", {}),
+        ("get", "/instances", "/instances", None),
+        ("get", "/instances/{id}", "/instances/4", None),
+        ("get", "/health", "/health", None),
+        ("get", "/instances/{id}", "/instances/400", None),
+    ]
+    for method, template, url, body in asked:
+        operation = described["paths"][template][method]
+        if body is not None:
+            schema = operation["requestBody"]["content"]["application/json"]["schema"]
+            assert _errors(described, schema, body) == []
+        answer = client.request(method, url, json=body) if body is not None else client.get(url)
+        told = (
+            operation["responses"]["200"]
+            if answer.status_code == 200
+            else described["components"]["responses"]["Error"]
+        )
+        assert _errors(described, told["content"]["application/json"]["schema"], answer.json()) == []
+
+
+def _errors(described: dict[str, Any], schema: dict[str, Any], value: Any) -> list[str]:
+    whole = {**schema, "components": described["components"]}
+    return [error.message for error in OAS31Validator(whole).iter_errors(value)]
+
+
+# ------------------------------------------------------------------ bad input
+
+
+@pytest.mark.parametrize(
+    ("body", "word"),
+    [
+        (b"", "JSON"),
+        (b"{", "JSON"),
+        (b"\xff\xfe", "JSON"),
+        (b"[" * 30_000, "JSON"),
+        (b'{"text": NaN}', "JSON"),
+        (b"3", "object"),
+        (b"{}", "missing"),
+        (b'{"text": ""}', "empty"),
+        (b'{"text": "  "}', "empty"),
+        (b'{"text": 3}', "text"),
+        (b'{"text": []}', "texts"),
+        (b'{"text": ["mug", null]}', "text"),
+        (b'{"text": "mug", "top_k": 0}', "top_k"),
+        (b'{"text": "mug", "top_k": 1e3}', "top_k"),
+        (b'{"text": "mug", "top_k": true}', "top_k"),
+        (b'{"text": "mug", "min_score": "high"}', "min_score"),
+        (b'{"text": "mug", "colour": "red"}', "colour"),
+        (b'{"text": "mug", "where": 3}', "where"),
+        (b'{"text": "mug", "where": {"region": {}}}', "region"),
+        (b'{"text": "mug", "where": {"region": {"min": [0, 0], "max": [1, 1]}}}', "region"),
+        (b'{"text": "mug", "where": {"region": {"min": ["a", 0, 0], "max": [1, 1, 1]}}}', "region"),
+        (b'{"text": "mug", "where": {"region": {"polygon": [[0, 0], [1, 1e400], [0, 1]]}}}', "finite"),
+        (b'{"text": "mug", "where": {"within": 1}}', "near"),
+        (b'{"text": "mug", "where": {"labels": {"a": 1}}}', "labels"),
+        (b'{"text": "mug", "frame": "base"}', "frame"),
+        (b'{"text": "mug", "frame": {"name": "b", "from_map": [[1]]}}', "frame"),
+    ],
+)
+def test_bad_bodies_are_told_in_one_line(client: TestClient, body: bytes, word: str) -> None:
+    refused(client.post("/query", content=body, headers={"Content-Type": "application/json"}), 400, word)
+
+
+def test_other_bad_requests_are_told_too(client: TestClient) -> None:
+    refused(client.get("/nowhere"), 404, "/nowhere", "openapi")
+    refused(client.get("/query"), 405, "GET")
+    refused(client.get("/instances/77"), 404, "77")
+    for number in ("-1", "x", "%2e%2e", "9" * 40, "٣"):
+        refused(client.get(f"/instances/{number}"), 404, "instance")
+    refused(client.get("/instances/1/points?format=las"), 400, "npz or ply")
+    refused(client.post("/nearest", json={}), 400, "near")
+    refused(client.post("/nearest", json={"near": [0, 0]}), 400, "near")
+    refused(client.post("/nearest", json={"near": [0, 0, 0], "top_k": 0}), 400, "top_k")
+    refused(client.post("/at", json={"point": [0, 0, 0], "max_distance": "far"}), 400, "max_distance")
+    refused(client.post("/find", json={"were": {}}), 400, "were")
+
+
+def test_a_prompt_of_a_megabyte_is_too_large(client: TestClient) -> None:
+    refused(client.post("/query", json={"text": "x" * 1_000_000}), 413, "65536")
+    refused(client.post("/query", json={"text": "x" * 2000}), 400, "2000 characters")
+
+    def stream() -> Iterator[bytes]:  # no Content-Length to be warned by
+        for _ in range(100):
+            yield b"x" * 1000
+
+    refused(client.post("/query", content=stream(), headers={"Content-Type": "application/json"}), 413, "65536")
+
+
+# --------------------------------------------------------------- who may ask
+
+
+def test_without_the_token_nothing_of_the_map_is_told(engine: QueryEngine) -> None:
+    client = client_of(engine, token=TOKEN, host="0.0.0.0")
+    for wrong in (
+        {},
+        {"Authorization": f"Bearer {TOKEN[:-1]}"},
+        {"Authorization": f"Basic {TOKEN}"},
+        {"Authorization": "é"},
+    ):
+        headers = {name: value.encode("latin-1") for name, value in wrong.items()}
+        for answer in (
+            client.post("/query", json={"text": "mug"}, headers=headers),
+            client.get("/instances/1/points", headers=headers),
+            client.post("/reload", json={}, headers=headers),
+        ):
+            refused(answer, 401, "token")
+            assert answer.headers["WWW-Authenticate"] == "Bearer"
+        assert client.get("/health", headers=headers).json() == {"status": "ok"}
+    good = {"Authorization": f"Bearer {TOKEN}"}
+    assert client.post("/query", json={"text": "mug"}, headers=good).json()["results"][0]["present"]
+    assert client.get("/health", headers=good).json()["instances"] == 9
+    assert client.get("/").status_code == 200
+
+
+def test_other_sites_cannot_ask_through_a_browser_on_this_machine(client: TestClient) -> None:
+    for host in ("evil.example", "evil.example:8765", "127.0.0.1.evil.example", ""):
+        refused(client.get("/instances", headers={"Host": host}), 403, "not this machine")
+    for host in ("localhost:8765", "127.0.0.1", "[::1]:8765", "[::1]"):
+        assert client.get("/instances", headers={"Host": host}).status_code == 200
+    plain = {"Content-Type": "text/plain", "Origin": "http://evil.example"}
+    refused(client.post("/query", content=b'{"text": "mug"}', headers=plain), 415, "application/json")
+    preflight = client.options("/query", headers={"Origin": "http://evil.example"})
+    assert preflight.status_code == 405 and "access-control-allow-origin" not in preflight.headers
+
+
+def test_who_asks_too_often_waits(engine: QueryEngine) -> None:
+    """A bucket of 2 · rate drops that fills at the rate: the oracle is arithmetic on a clock of our own."""
+    now = [0.0]
+    guard = Guard(None, ServeSettings(rate=5), clock=lambda: now[0])
+    assert [guard._wait("a") > 0 for _ in range(12)] == [False] * 10 + [True] * 2
+    assert guard._wait("b") == 0  # another client has a bucket of its own
+    now[0] = 0.41  # two drops and a little
+    assert [guard._wait("a") > 0 for _ in range(3)] == [False, False, True]
+    for number in range(10_000):
+        guard._wait(f"client {number}")
+    assert len(guard._buckets) <= 4096
+    client = client_of(engine, rate=1)
+    answers = [client.get("/health") for _ in range(4)]
+    assert [answer.status_code for answer in answers[:2]] == [200, 200]
+    refused(answers[-1], 429, "1 requests a second")
+    assert int(answers[-1].headers["Retry-After"]) >= 1
+
+
+def test_a_full_queue_and_a_slow_answer_are_told(path: Path) -> None:
+    with QueryEngine(path, watch=None, workers=1, queue_size=1, timeout=0.2, encoders=encoders) as engine:
+        client = client_of(engine)
+        begun, end = threading.Event(), threading.Event()
+
+        def work(gmap: LoadedMap) -> None:
+            begun.set()
+            end.wait(30)
+
+        engine.run(work)
+        assert begun.wait(30)
+        refused(client.post("/query", json={"text": "mug"}), 504, "0.2 s")
+        waiting = engine.submit("mug")
+        busy = client.post("/query", json={"text": "mug"})
+        refused(busy, 503, "waiting")
+        assert busy.headers["Retry-After"] == "1"
+        end.set()
+        del waiting
+    refused(client.post("/query", json={"text": "mug"}), 503, "closed")
+    assert client.get("/health").status_code == 503
+
+
+def test_a_defect_is_logged_and_not_shown(
+    engine: QueryEngine, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(self: LoadedMap, *_: Any, **__: Any) -> None:
+        raise ZeroDivisionError("secret detail")
+
+    monkeypatch.setattr(LoadedMap, "find", broken)
+    answer = client_of(engine).get("/instances")
+    refused(answer, 500, "log")
+    assert "secret" not in answer.text and "secret detail" in caplog.text
+
+
+# -------------------------------------------------------------------- settings
+
+
+def test_other_machines_need_a_token(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for host in ("0.0.0.0", "::", "192.168.1.5", "robot.local"):
+        with pytest.raises(InputError, match="token"):
+            ServeSettings(host=host)
+        ServeSettings(host=host, token=TOKEN)
+    for host in ("127.0.0.1", "127.8.8.8", "::1", "localhost"):
+        assert ServeSettings(host=host).local
+    assert main(["serve", str(tmp_path), "--host", "0.0.0.0"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_token_file_must_hold_one_long_word(tmp_path: Path) -> None:
+    file = tmp_path / "token"
+    file.write_text(f"  {TOKEN}\n")
+    assert read_token(file) == TOKEN
+    for text in ("", "short", "two words of enough length", "größer" * 4, "a" * 20 + "\x00"):
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(InputError, match="token"):
+            read_token(file)
+    file.write_bytes(b"\xff" * 30)
+    with pytest.raises(InputError, match="token"):
+        read_token(file)
+    with pytest.raises(InputError, match="token"):
+        read_token(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"port": -1}, {"port": 70000}, {"timeout": 0}, {"workers": 0}, {"queue_size": 0}, {"rate": -1}, {"watch": -1}],
+)
+def test_settings_out_of_range_are_refused(settings: dict[str, Any]) -> None:
+    with pytest.raises(InputError):
+        ServeSettings(**settings)
+
+
+def test_without_the_packages_the_install_line_is_told(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("perception.serve.run.importlib.util.find_spec", lambda name: None)
+    assert main(["serve", str(path)]) == 2
+    assert 'pip install ".[serve]"' in capsys.readouterr().err
+
+
+def test_json_of_nothing_but_numbers(client: TestClient) -> None:
+    """No NaN or Infinity leaves the server, whatever is asked."""
+    for url in ("/instances", "/instances/0", "/health"):
+        json.loads(client.get(url).text, parse_constant=lambda name: pytest.fail(name))

@@ -1,0 +1,1 @@
+"""What tests of several folders share: scenes, small maps, model files, reference implementations, child processes."""

@@ -1,0 +1,9 @@
+"""Where the repository and the tests' helpers lie."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+SUPPORT = Path(__file__).resolve().parent
+TESTS = SUPPORT.parent
+REPOSITORY = TESTS.parent

@@ -1,0 +1,82 @@
+"""Random scenes for the rasterizer, and what its tests do with them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+import perception
+from perception.gaussians.rasterize import set_simd, simd_levels
+from support import reference_rasterizer as reference
+
+IMAGES = ("colors", "alphas", "depths", "features", "feature_variance")
+GIVEN = ("means", "quats", "scales", "opacities", "colors", "features", "viewmats", "background")
+
+
+@pytest.fixture(params=simd_levels(), autouse=True)
+def every_simd_level(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Where it is imported, every test of the file runs once at each level that the processor has."""
+    set_simd(request.param)
+    yield request.param
+    set_simd("auto")
+
+
+def scene(n=60, width=37, height=29, dims=5, cameras=2, sh_degree=None, dtype=torch.float64, seed=0):
+    """Random Gaussians before cameras with an off-centre principal point; some behind, some off screen."""
+    g = torch.Generator().manual_seed(seed)
+
+    def rand(*shape):
+        return torch.rand(shape, generator=g, dtype=torch.float64)
+
+    means = (rand(n, 3) - 0.5) * torch.tensor([4.0, 3.0, 4.0]) + torch.tensor([0.0, 0.0, 2.2])
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(cameras, 1, 1)
+    for c in range(cameras):
+        q = torch.tensor([[1.0, 0.05 * c, -0.1 * c, 0.08 * c]], dtype=torch.float64)
+        viewmats[c, :3, :3] = reference.rotation_matrices(q)[0]
+        viewmats[c, :3, 3] = torch.tensor([0.1 * c, -0.05, 0.2 * c])
+    k = torch.tensor([[30.0, 0, 16.0], [0, 34.0, 17.0], [0, 0, 1]], dtype=torch.float64).repeat(cameras, 1, 1)
+    color_shape = (n, 3) if sh_degree is None else (n, (sh_degree + 1) ** 2, 3)
+    inputs = {
+        "means": means,
+        "quats": rand(n, 4) * 2 - 1,
+        "scales": torch.exp(rand(n, 3) * 2.5 - 3.5),
+        "opacities": rand(n) * 0.98 + 0.01,
+        "colors": rand(*color_shape) - (0.0 if sh_degree is None else 0.3),
+        "features": (rand(n, dims) - 0.5) if dims else None,
+        "viewmats": viewmats,
+        "Ks": k,
+        "background": rand(cameras, 3),
+    }
+    inputs = {name: None if t is None else t.to(dtype) for name, t in inputs.items()}
+    return {**inputs, "width": width, "height": height, "sh_degree": sh_degree}
+
+
+def leaves(inputs, skip=("Ks",)):
+    """The same scene with every differentiable input a leaf of its own."""
+    return {
+        k: v.clone().requires_grad_() if isinstance(v, torch.Tensor) and k not in skip else v for k, v in inputs.items()
+    }
+
+
+def loss_of(images, seed=1):
+    g = torch.Generator().manual_seed(seed)
+    total = torch.zeros((), dtype=torch.float64)
+    for t in images:
+        total = total + (t.double() * (torch.rand(t.shape, generator=g, dtype=torch.float64) - 0.4)).sum()
+    return total
+
+
+def grads_and_images(inputs, **options):
+    inputs = leaves(inputs)
+    out = perception.rasterize(**inputs, **options)
+    images = [getattr(out, k) for k in IMAGES if getattr(out, k) is not None]
+    loss_of(images).backward()
+    grads = [t.grad for t in inputs.values() if isinstance(t, torch.Tensor) and t.requires_grad]
+    images = [t.detach() for t in images]
+    return [*images, out.visible, out.stats.radii, out.stats.mean2d_grad, *grads]
+
+
+def cast(inputs, dtype=torch.float32):
+    return {k: v.to(dtype) if isinstance(v, torch.Tensor) else v for k, v in inputs.items()}

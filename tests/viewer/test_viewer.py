@@ -1,0 +1,166 @@
+"""The viewer: picking against the rasterizer, painting against what it promises, what arrives first."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from perception.errors import InputError
+from perception.io.store import write_map
+from perception.viewer.paint import HIGHLIGHT, MODES, highlight, paint
+from perception.viewer.picking import covariances, pick
+from support.processes import hears_ctrl_c
+from support.viewer_maps import free_port, small_map
+
+
+def test_picking_agrees_with_the_rasterizer() -> None:
+    """The instance with the largest rendered weight at a pixel is the one its ray picks."""
+    from perception.gaussians.model import Gaussians
+    from perception.gaussians.rasterize import rasterize
+
+    gmap = small_map()
+    names = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
+    g = Gaussians(**{name: torch.from_numpy(getattr(gmap, name)) for name in names})
+    K = torch.tensor([[400.0, 0, 160], [0, 400.0, 120], [0, 0, 1]])
+    one_hot = torch.nn.functional.one_hot(torch.from_numpy(gmap.instance_ids.astype(np.int64)) + 1, 4).float()
+    out = rasterize(
+        g.means, g.quats, g.scales, g.opacities, g.base_colors, torch.eye(4)[None], K[None], 320, 240, features=one_hot
+    )
+    assert out.features is not None
+    shown = np.ones(len(gmap), bool)
+    rng = np.random.default_rng(1)
+    agreed = asked = 0
+    for _ in range(150):
+        x, y = rng.uniform(0, 320), rng.uniform(0, 240)
+        weights = out.features[0, int(y), int(x), 1:].numpy()
+        if 0.1 < weights.max() < 0.25 or np.sort(weights)[-2] > 0.7 * weights.max() > 0:
+            continue  # a tie for the eye as well
+        direction = np.array([(int(x) + 0.5 - 160) / 400, (int(y) + 0.5 - 120) / 400, 1.0])
+        expected = int(weights.argmax()) if weights.max() >= 0.25 else None
+        asked += 1
+        agreed += pick(gmap, gmap.instance_ids, shown, np.zeros(3), direction) == expected
+    # The rasterizer draws the local linearisation of each Gaussian, the ray its exact section: edges may differ.
+    assert asked > 80 and agreed >= 0.95 * asked
+
+
+def test_picking_sees_through_what_is_hidden_and_behind() -> None:
+    gmap = small_map()
+    front = np.array([-1.2, 0, 4]) / np.linalg.norm([-1.2, 0, 4])
+    shown = np.ones(len(gmap), bool)
+    assert pick(gmap, gmap.instance_ids, shown, np.zeros(3), front) == 0
+    assert pick(gmap, gmap.instance_ids, gmap.instance_ids != 0, np.zeros(3), front) is None
+    assert pick(gmap, gmap.instance_ids, shown, np.zeros(3), -front) is None
+    assert pick(gmap, gmap.instance_ids, shown, np.zeros(3), np.zeros(3)) is None
+    assert pick(gmap, gmap.instance_ids, shown, np.full(3, np.nan), front) is None
+
+
+def test_covariances_are_those_of_the_rotated_axes() -> None:
+    from perception.geometry import rotation_from_quaternion
+
+    gmap = small_map(20)
+    for i, found in enumerate(covariances(gmap)):
+        axes = rotation_from_quaternion(gmap.quats[i]) * np.exp(gmap.log_scales[i].astype(float))
+        np.testing.assert_allclose(found, axes @ axes.T, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_every_mode_paints_every_gaussian(mode: str) -> None:
+    gmap = small_map()
+    scores = {i: 0.2 + 0.3 * i for i in range(3)}
+    colors = paint(gmap, gmap.instance_ids, mode, scores)
+    assert colors.shape == (len(gmap), 3) and colors.dtype == np.uint8
+    if mode in ("instances", "confidence"):
+        assert len({tuple(c) for c in colors}) == 4  # three instances and grey
+        assert (colors[gmap.instance_ids < 0] == 128).all()
+
+
+def test_highlight_dims_the_rest() -> None:
+    gmap = small_map()
+    colors = paint(gmap, gmap.instance_ids, "photo", {})
+    lit = highlight(colors, gmap.instance_ids, [1])
+    near = np.abs(lit.astype(int) - HIGHLIGHT).sum(axis=1)
+    assert near[gmap.instance_ids == 1].max() < near[gmap.instance_ids != 1].min()
+    np.testing.assert_array_equal(highlight(colors, gmap.instance_ids, []), colors)
+
+
+def test_a_port_in_use_is_told(tmp_path: Path) -> None:
+    pytest.importorskip("viser")
+    from perception.viewer import start_viewer
+
+    with socket.socket() as busy:
+        busy.bind(("127.0.0.1", 0))
+        busy.listen()
+        with pytest.raises(InputError, match="cannot be opened"):
+            start_viewer(tmp_path / "none.gsmap", port=busy.getsockname()[1])
+    with pytest.raises(InputError, match="no map"):
+        start_viewer(tmp_path / "none.gsmap", port=free_port())
+
+
+def test_without_a_display_the_address_is_printed_and_ctrl_c_ends(tmp_path: Path) -> None:
+    """As over SSH: no DISPLAY, no browser; the page answers, and Ctrl-C ends it without noise."""
+    pytest.importorskip("viser")
+    import os
+    import signal
+    import subprocess
+    import sys
+    from urllib.request import urlopen
+
+    write_map(tmp_path / "m.gsmap", small_map(100))
+    env = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    port = free_port()
+    command = [sys.executable, "-m", "perception.cli", "view", "m.gsmap", "--port", str(port)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    viewer = subprocess.Popen(command, cwd=tmp_path, env=env, text=True, preexec_fn=hears_ctrl_c, **pipes)
+    try:
+        assert viewer.stderr is not None
+        told = viewer.stderr.readline()
+        assert f"http://localhost:{port}" in told and f"ssh -L {port}:localhost:{port}" in told
+        with urlopen(f"http://127.0.0.1:{port}", timeout=30) as page:
+            assert page.status == 200
+        viewer.send_signal(signal.SIGINT)
+        out, err = viewer.communicate(timeout=60)
+    finally:
+        viewer.kill()
+    assert viewer.returncode == 0 and "Traceback" not in err and out.strip() == ""
+
+
+def test_what_arrives_first_covers_most() -> None:
+    """The coarse picture's Gaussians against the definition: opacity times the product of the two longest axes."""
+    from perception.viewer.splats import most_visible
+
+    gmap = small_map(500)
+    gmap.opacity_logits = np.random.default_rng(3).normal(size=500).astype(np.float32)
+    cover = [o * np.prod(sorted(s)[1:]) for o, s in zip(gmap.opacities, gmap.scales, strict=True)]
+    assert set(most_visible(gmap, 40)) == set(np.argsort(cover)[-40:])
+    np.testing.assert_array_equal(most_visible(gmap, 500), np.arange(500))
+
+
+def test_every_browser_gets_the_coarse_picture_then_the_whole_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    from types import SimpleNamespace
+
+    from perception.viewer import splats
+
+    monkeypatch.setattr(splats, "FIRST", 40)
+    sent: list[tuple[int, int]] = []
+
+    def client(number: int) -> SimpleNamespace:
+        def add(name: str, centers: np.ndarray, *rest: np.ndarray) -> SimpleNamespace:
+            sent.append((number, len(centers)))
+            assert {len(array) for array in rest} == {len(centers)}
+            return SimpleNamespace(set_gaussians=lambda centers, *rest: sent.append((number, len(centers))))
+
+        return SimpleNamespace(client_id=number, scene=SimpleNamespace(add_gaussian_splats=add))
+
+    gmap = small_map(100)
+    shown = splats.Splats(gmap, 2.0)
+    np.testing.assert_allclose(shown.centers, 2 * gmap.means, rtol=1e-6)
+    first, second = client(1), client(2)
+    for one in (first, second, first):
+        shown.show(one, np.zeros((100, 3), np.uint8), np.ones(100, np.float32))
+    shown.forget(first)
+    shown.show(client(1), np.zeros((100, 3), np.uint8), np.ones(100, np.float32))
+    assert sent == [(1, 40), (2, 40), (1, 100), (1, 40)]
