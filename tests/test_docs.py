@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
-import importlib.util
 import io
 import re
 import shlex
@@ -117,8 +116,6 @@ def test_the_walkthrough_runs(small_scene: Path, tmp_path: Path, monkeypatch: py
     small = f"--masks labels:{small_scene / 'labels'} --iterations 60 --budget 2000 --set instances.min_cluster_size=8"
     for command in commands:
         words = arguments(command)
-        if command.endswith(".rrd") and importlib.util.find_spec("rerun") is None:
-            continue
         words = ["mug" if word == "TEXT" else word for word in words]
         if words[0] == "map":
             words = [str(small_scene / "transforms.json") if word == "PHOTOS" else word for word in words]

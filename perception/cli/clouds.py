@@ -25,7 +25,7 @@ def _add_export(commands: Any) -> None:
         type=Path,
         required=True,
         metavar="OUT",
-        help=".ply, .pcd, .npz, or .mcap (Foxglove), .rrd (Rerun): the map with its photos",
+        help=".ply, .pcd, .npz, or .mcap (Foxglove): the map with its photos",
     )
     p.add_argument("--smooth", action=argparse.BooleanOptionalAction, default=True)
     p.add_argument("--rule", choices=("nearest", "densest"), default="nearest", help="nearest mean is the paper's")

@@ -35,7 +35,6 @@ def _add_map(commands: Any) -> None:
     p.add_argument("--seed", metavar="S")
     p.add_argument("--device", help="auto, cpu or cuda")
     p.add_argument("--labels-from", type=Path, metavar="OLD.gsmap", help="carry over the names given to its instances")
-    p.add_argument("--rrd", type=Path, metavar="OUT.rrd", help="record the run for the Rerun viewer")
     p.add_argument("--profile", action="store_true", help="print where the time went")
     p.add_argument("--resume", action="store_true", help="go on with an interrupted run")
 
@@ -70,7 +69,6 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
             resume=args.resume,
             progress=progress,
             labels_from=args.labels_from,
-            rrd=args.rrd,
         )
     from perception.pipeline.summary import map_facts, profile_text
 

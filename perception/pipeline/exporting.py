@@ -24,14 +24,14 @@ def export_map(
     """Writes the labelled cloud, its sidecar JSON and what `outputs` asks for; returns facts and a table.
 
     Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids, and coordinates are
-    those of the input that the map was made from. An output of .mcap or .rrd is the whole map for viewers: points,
+    those of the input that the map was made from. An output of .mcap is the whole map for viewers: points,
     instances, boxes, cameras and photos.
     """
-    if output.suffix.lower() in (".mcap", ".rrd"):
+    if output.suffix.lower() == ".mcap":
         return _for_viewers(map_path, output, points)
     if output.suffix.lower() not in (".ply", ".pcd", ".npz"):
         raise InputError(
-            f"{output}: unknown kind of cloud '{output.suffix}', expected .ply, .pcd, .npz, or for viewers .mcap, .rrd"
+            f"{output}: unknown kind of cloud '{output.suffix}', expected .ply, .pcd, .npz, or for viewers .mcap"
         )
     gmap = read_map(map_path)
     origin = map_origin(map_path, gmap.info)
@@ -54,7 +54,6 @@ def export_map(
 
 
 def _for_viewers(map_path: Path, output: Path, points: Path | None) -> tuple[dict[str, Any], str]:
-    from perception.pipeline.recording import write_recording
     from perception.pipeline.replay import write_replay
     from perception.pipeline.reporting import saved_views
 
@@ -65,8 +64,7 @@ def _for_viewers(map_path: Path, output: Path, points: Path | None) -> tuple[dic
         )
     gmap = read_map(map_path)
     views = saved_views(gmap)
-    write = write_replay if output.suffix.lower() == ".mcap" else write_recording
-    write(output, gmap, views)
+    write_replay(output, gmap, views)
     facts = {"output": str(output), "views": len(views), "instances": len(gmap.instances)}
     return facts, f"{output}: the map with {len(gmap.instances)} instances and {len(views)} cameras"
 

@@ -122,11 +122,5 @@ def test_a_cloud_with_its_boxes_is_drawn_too(path: Path, tmp_path: Path) -> None
 def test_a_map_for_viewers_takes_no_cloud(path: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="leave --points out"):
         export_map(path, tmp_path / "m.mcap", tmp_path / "scan.ply", ExportOptions(), Outputs())
-    with pytest.raises(InputError, match=r"\.mcap, \.rrd"):
+    with pytest.raises(InputError, match=r"\.mcap"):
         export_map(path, tmp_path / "m.obj", None, ExportOptions(), Outputs())
-
-
-def test_a_map_opens_in_rerun(path: Path, tmp_path: Path) -> None:
-    pytest.importorskip("rerun")
-    export_map(path, tmp_path / "m.rrd", None, ExportOptions(), Outputs())
-    assert (tmp_path / "m.rrd").read_bytes()[:3] == b"RRF"
