@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from perception.bags.choose import Chooser
 from perception.bags.decode import decode_image, encoded
 from perception.bags.poses import FIXED_FRAMES, Poses, read_poses
 from perception.bags.read import CAMERA_INFO, IMAGES, Bag, open_bag, stamp_of
@@ -18,6 +17,7 @@ from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.atomic import atomic_directory
 from perception.io.camera_file import read_camera, write_camera_info
+from perception.io.frame_choice import Chooser
 from perception.types import Lens
 
 

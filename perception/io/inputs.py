@@ -1,4 +1,4 @@
-"""The one door for inputs: a transforms.json, a COLMAP workspace or a folder of photos becomes a Scene."""
+"""Reading any input as a Scene: a transforms.json, a COLMAP workspace or a folder of photos."""
 
 from __future__ import annotations
 
@@ -58,4 +58,4 @@ def _lens(camera_file: Path | None) -> Lens | None:
 
 
 def _silent(stage: str, fraction: float) -> None:
-    """Nobody listens."""
+    """Reports to nobody."""

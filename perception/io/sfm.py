@@ -1,7 +1,7 @@
-"""Structure from motion from a folder of photos: features, matching, incremental mapping (pycolmap), and its doubts.
+"""Structure from motion from a folder of photos: features, matches, incremental model (pycolmap), checks, report.
 
-The seed fixes every random choice: up to mapping.REPEATABLE_PHOTOS photos the same machine gives the same poses bit for
-bit. Larger sets are mapped by several threads, and poses differ between runs, also in the choice of unit and origin.
+The seed fixes every random choice: up to incremental_sfm.REPEATABLE_PHOTOS photos the same machine gives the same
+poses bit for bit. Larger sets are mapped by several threads; their poses differ between runs, as do unit and origin.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import Any
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory, recover
 from perception.io.colmap import views_of_model
-from perception.io.doubts import doubts_about
 from perception.io.features import FeatureStore, Progress, build_features
+from perception.io.incremental_sfm import map_photos
 from perception.io.lens import lens_from_camera, load_pycolmap
-from perception.io.mapping import map_photos
 from perception.io.photos import check_photo, list_photos, photo_size
+from perception.io.sfm_checks import model_warnings
 from perception.io.triangulate import cloud_of
 from perception.types import Lens, Scene
 
@@ -102,7 +102,7 @@ def _report(
         "pairs_matched": store.facts["pairs_matched"],
         "pairs_possible": store.facts["pairs_possible"],
         "seconds": seconds,
-        "warnings": doubts_about(models, store.database, len(photos)),
+        "warnings": model_warnings(models, store.database, len(photos)),
     }
 
 

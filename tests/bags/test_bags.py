@@ -13,7 +13,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perception.bags import FrameOptions, run_frames
-from perception.bags.choose import Chooser
 from perception.bags.decode import decode_image
 from perception.bags.poses import Poses
 from perception.cli import main
@@ -21,6 +20,7 @@ from perception.config import load_config
 from perception.errors import InputError
 from perception.geometry import inverse_se3
 from perception.io.camera_file import read_camera
+from perception.io.frame_choice import Chooser
 from perception.io.transforms import read_frames
 from perception.pipeline.mapping import build_map
 

@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 
 from perception.geometry import align_similarity, inverse_se3, look_at, rotation_angle
-from perception.io import doubts, features
-from perception.io.doubts import Pair
+from perception.io import features, sfm_checks
 from perception.io.inputs import load_scene
 from perception.io.lens import load_pycolmap
+from perception.io.sfm_checks import Pair
 
 WIDTH, HEIGHT, FOCAL, VIEWS = 320, 240, 300.0, 10
 
@@ -118,16 +118,16 @@ def test_a_seed_repeats(corner, run, tmp_path):
 
 
 @pytest.mark.parametrize("wrecked", [1, VIEWS // 2])
-def test_a_wrecked_model_is_doubted(run, wrecked):
+def test_a_wrecked_model_raises_a_warning(run, wrecked):
     pycolmap = load_pycolmap()
     (store,) = run[2].glob("features-*")
     model = pycolmap.Reconstruction(store / "model")
-    assert doubts.doubts_about([model], store / "database.db", VIEWS) == []
+    assert sfm_checks.model_warnings([model], store / "database.db", VIEWS) == []
     half_turn = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(np.diag([-1.0, -1.0, 1.0])), np.zeros(3))
     for image in sorted(model.images.values(), key=lambda image: image.name)[-wrecked:]:
         frame = model.frames[image.frame_id]
         frame.rig_from_world = pycolmap.Rigid3d((frame.rig_from_world.matrix() @ matrix_4x4(half_turn))[:3])
-    warnings = doubts.doubts_about([model], store / "database.db", VIEWS)
+    warnings = sfm_checks.model_warnings([model], store / "database.db", VIEWS)
     assert len(warnings) == 1 and "folded" in warnings[0]
 
 
@@ -135,12 +135,12 @@ def matrix_4x4(transform):
     return np.vstack([transform.matrix(), [0, 0, 0, 1]])
 
 
-def test_overruled_pairs_are_those_stronger_than_every_chain():
+def test_contradictions_count_when_stronger_than_every_chain():
     chain = [Pair(0, 1, 100, 1.0), Pair(1, 2, 60, 0.9)]
-    assert doubts.overruled([*chain, Pair(0, 2, 50, 0.0)]) == []
-    assert doubts.overruled([*chain, Pair(0, 2, 70, 0.1)]) == [Pair(0, 2, 70, 0.1)]
-    assert doubts.overruled([*chain, Pair(0, 2, 60, 0.1)]) == []  # equal strength: no ground for doubt
-    assert doubts.outvoted_photos([*chain, Pair(0, 2, 70, 0.1)]) == {2}
+    assert sfm_checks.stronger_contradictions([*chain, Pair(0, 2, 50, 0.0)]) == []
+    assert sfm_checks.stronger_contradictions([*chain, Pair(0, 2, 70, 0.1)]) == [Pair(0, 2, 70, 0.1)]
+    assert sfm_checks.stronger_contradictions([*chain, Pair(0, 2, 60, 0.1)]) == []  # equal strength: no contradiction
+    assert sfm_checks.outvoted_photos([*chain, Pair(0, 2, 70, 0.1)]) == {2}
 
 
 def test_photos_with_few_features_are_upsampled(corner, tmp_path, monkeypatch):

@@ -1,7 +1,7 @@
-"""Can a model be wrong although nearly every photo registered? Equal textures fold scenes: check what can be checked.
+"""Checks of a structure-from-motion model against the verified photo pairs it was made from.
 
-The oracle is the verified pairs: each knows how many matches satisfy one epipolar geometry, and the model either has
-that geometry or contradicts it.
+Equal textures can fold a scene onto itself although nearly every photo registers. Each verified pair has matches that
+satisfy one epipolar geometry; the model either has that geometry or contradicts it.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import numpy as np
 
 from perception.io.lens import load_pycolmap
 
-MAX_UNREGISTERED, MAX_SECOND_MODEL, MAX_OVERRULED, MAX_UNMATCHED = 0.15, 0.30, 0.005, 0.30
+MAX_UNREGISTERED, MAX_SECOND_MODEL, MAX_CONTRADICTED, MAX_UNMATCHED = 0.15, 0.30, 0.005, 0.30
 EPIPOLAR_TOLERANCE, TOLERANCE_PIXELS = 4.0 / 1000, 4.0
-"""Sampson distance in normalised image coordinates; for short focal lengths, that of TOLERANCE_PIXELS if larger (the
-error that verification allows)."""
+"""Largest Sampson distance of a match that agrees, in normalised image coordinates; TOLERANCE_PIXELS (the error that
+verification allows) divided by the focal length where that is larger."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two registered photos with verified matches. share: of the matches that satisfy the model's epipolar geometry."""
+    """Two registered photos with `inliers` verified matches; `share` of them satisfy the model's epipolar geometry."""
 
     i: int
     j: int
@@ -31,12 +31,12 @@ class Pair:
 
     @property
     def agrees(self) -> bool:
-        """Whether the model has the relative pose that the matches tell."""
+        """Whether at least half of the matches satisfy the model's epipolar geometry."""
         return self.share >= 0.5
 
 
-def doubts_about(models: list[Any], database: Path, photos: int) -> list[str]:
-    """Warnings, one line each, about models sorted by size; models[0] is the one used."""
+def model_warnings(models: list[Any], database: Path, photos: int) -> list[str]:
+    """Warnings, one line each, on pycolmap models sorted by size, of which models[0] is used; photos: number."""
     best = models[0]
     warnings = []
     registered = best.num_reg_images()
@@ -48,26 +48,26 @@ def doubts_about(models: list[Any], database: Path, photos: int) -> list[str]:
             f"the photos split into {len(models)} unconnected models (photos: {sizes}); the largest is used"
         )
     pairs = verified_pairs(best, database)
-    wrong = len(overruled(pairs))
-    if len(pairs) >= 5 and wrong > MAX_OVERRULED * len(pairs):
+    wrong = len(stronger_contradictions(pairs))
+    if len(pairs) >= 5 and wrong > MAX_CONTRADICTED * len(pairs):
         warnings.append(
             f"{wrong} of {len(pairs)} matched photo pairs contradict the model and are stronger than the pairs it rests"
             " on: it may be folded (equal textures?)"
         )
-    lonely, near = _unmatched_neighbors(best, {(pair.i, pair.j) for pair in pairs})
-    if near >= 5 and lonely > MAX_UNMATCHED * near:
+    unmatched, near = _unmatched_neighbors(best, {(pair.i, pair.j) for pair in pairs})
+    if near >= 5 and unmatched > MAX_UNMATCHED * near:
         warnings.append(
-            f"{lonely} of {near} photo pairs that the model puts at one place, looking the same way, do not match: "
+            f"{unmatched} of {near} photo pairs that the model puts at one place, looking the same way, do not match: "
             "it may be folded (equal textures?)"
         )
     return warnings
 
 
-def overruled(pairs: list[Pair]) -> list[Pair]:
+def stronger_contradictions(pairs: list[Pair]) -> list[Pair]:
     """The contradicted pairs whose photos no chain of agreeing pairs joins that are all at least as strong.
 
-    Equal textures make verified pairs too, so contradicted pairs alone prove nothing. But a model that keeps a weak
-    pair and contradicts a stronger one has chosen badly.
+    Equal textures make verified pairs too, so a contradicted pair alone is no error. A model that rests on a weak pair
+    and contradicts a stronger one is.
     """
     parent: dict[int, int] = {}
 
@@ -145,5 +145,5 @@ def _unmatched_neighbors(model: Any, matched: set[tuple[int, int]]) -> tuple[int
     depth = np.median(np.linalg.norm(xyz[:: max(1, len(xyz) // 2000), None] - centers[None], axis=2), axis=0)
     close = (distances < 0.1 * np.minimum.outer(depth, depth)) & (forward @ forward.T > np.cos(np.radians(15)))
     pairs = [(ids[r], ids[c]) for r, c in zip(*np.nonzero(np.triu(close, 1)), strict=True)]
-    alone = sum((i, j) not in matched and (j, i) not in matched for i, j in pairs)
-    return alone, len(pairs)
+    unmatched = sum((i, j) not in matched and (j, i) not in matched for i, j in pairs)
+    return unmatched, len(pairs)

@@ -1,4 +1,4 @@
-"""Which frames of a stream to keep: the sharpest of every stretch over which the view has moved enough."""
+"""The frames of a bag or video to keep: the sharpest of every stretch over which the view moves by `spacing`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Chooser:
         small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else picture
         grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY))
         self.sharpness.append(float(cv2.Laplacian(grey, cv2.CV_64F).var()))
-        self.motion.append(0.0 if self._last is None else _motion(self._last, grey))
+        self.motion.append(0.0 if self._last is None else motion_between(self._last, grey))
         self._last = grey
 
     def chosen(self, most: int) -> list[int]:
@@ -52,12 +52,12 @@ class Chooser:
         return kept[:most]
 
 
-def _motion(before: np.ndarray, after: np.ndarray) -> float:
-    """Median way of tracked corners as share of the width; 1 where the tracks are lost."""
+def motion_between(before: np.ndarray, after: np.ndarray) -> float:
+    """Median motion of tracked corners as share of the width; 1 where the tracks are lost."""
     corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 6)
     if corners is None or len(corners) < _MIN_TRACKS or before.shape != after.shape:
         same = before.shape == after.shape and abs(float(before.mean()) - float(after.mean())) < 8
-        return 0.0 if same else 1.0  # a bare wall: nothing to track, nothing to see
+        return 0.0 if same else 1.0  # too little texture to track; equal brightness counts as no motion
     there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None)  # type: ignore[call-overload]
     good = found.ravel() == 1
     if good.sum() < _MIN_TRACKS:

@@ -1,4 +1,4 @@
-"""Incremental mapping (pycolmap) that trusts the strongest pairs first: equal textures must not fold the model."""
+"""Incremental structure from motion (pycolmap) on the strongest pairs first, so that equal textures fold no model."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from perception.io.doubts import MAX_OVERRULED, Pair, outvoted_photos, overruled, verified_pairs
 from perception.io.features import MIN_INLIERS, FeatureStore, Progress
 from perception.io.lens import load_pycolmap
+from perception.io.sfm_checks import MAX_CONTRADICTED, Pair, outvoted_photos, stronger_contradictions, verified_pairs
 
 MIN_MODEL_SIZE = 3
 REPEATABLE_PHOTOS = 150
-"""Up to so many photos one thread maps, which repeats bit for bit and costs next to nothing at that size."""
+"""Up to this many photos are mapped by one thread, which gives the same bits each time."""
 Found = tuple[list[Any], set[str]]
 """Models, largest first, and the names of the photos left out because most of their matches contradict the largest."""
 LEVELS = (MIN_INLIERS, 2 * MIN_INLIERS, 4 * MIN_INLIERS, 8 * MIN_INLIERS)
-"""Pairs with fewer verified matches are left out in turn until a model stands that overrules no stronger pair."""
+"""Least verified matches of a pair; raised in turn until the model contradicts no stronger pair than it rests on."""
 
 
 def map_photos(store: FeatureStore, fixed: bool, seed: int, count: int, progress: Progress) -> Found:
@@ -45,12 +45,12 @@ class _Mapping:
         self.told, self.runs = 0.0, 0
 
     def run(self) -> Found:
-        """Stops at the first model that overrules almost nothing; else the one that explains most matches is taken."""
+        """The first model that contradicts at most MAX_CONTRADICTED pairs, else that with most agreeing matches."""
         tried: list[tuple[int, Found]] = []
         for found in self._candidates():
             pairs = verified_pairs(found[0][0], self.database)
             tried.append((sum(pair.inliers for pair in pairs if pair.agrees), found))
-            if len(overruled(pairs)) <= MAX_OVERRULED * len(pairs):
+            if len(stronger_contradictions(pairs)) <= MAX_CONTRADICTED * len(pairs):
                 break
         if not tried:
             return [], set()
