@@ -117,7 +117,7 @@ class InstanceConfig:
 class LanguageConfig:
     """Encoder and view choice (paper: K = 5 views, L = 3 zooms, expansion 0.3). zooms 0: as suits the encoder.
 
-    background of the crops: plain, dim, blur or fill; plain measured best at top-3 (`perception bench language`).
+    background of the crops: plain, dim, blur or fill; plain measured best at top-3 on two rendered scenes.
     """
 
     encoder: str = "auto"

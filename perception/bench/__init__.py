@@ -1,29 +1,15 @@
-"""Measurements anyone can rerun: `perception bench NAME`. Each module has `main(arguments)`."""
+"""Measurements that anyone can rerun: `perception bench NAME`. Each module has `main(arguments)`."""
 
 BENCHES = (
     "rasterizer",
-    "training",
-    "masks",
-    "mask-speed",
-    "language",
+    "map",
+    "scaling",
+    "clouds",
     "query",
-    "view",
+    "instances",
+    "queries",
     "lerf-mask",
     "lerf-ovs",
     "scannetpp",
-    "clouds",
-    "smoothing",
-    "calibrate",
-    "queries",
-    "sam",
-    "map",
-    "switches",
-    "scaling",
-    "ablation",
-    "export",
-    "instances",
-    "collisions",
-    "clustering",
-    "section",
 )
 """Names on the command line; a dash in a name is an underscore in its module's."""

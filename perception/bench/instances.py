@@ -1,8 +1,6 @@
-"""A map's instances against its scene's truth, and where the confidences come from: `perception bench instances`.
+"""A map's instances against its scene's truth: `perception bench instances SCENE MAP`.
 
-perception bench instances SCENE MAP [-o DIR]    AP with the map's scores and with constant ones, things and stuff
-                                                 together and apart, mIoU of rendered masks; pictures into DIR
-perception bench instances --calibrate           fits the calibration on random scenes that are no one's truth
+AP with the map's scores and with constant ones, things and stuff together and apart, and mIoU of rendered masks.
 """
 
 from __future__ import annotations
@@ -14,9 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-RATES = (0.15, 0.3, 0.45, 0.54)
-KNOTS = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0)
 
 
 def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
@@ -78,67 +73,14 @@ def write_pictures(map_path: Path, folder: Path) -> list[str]:
     return [str(folder / f"{name}.png") for name in pictures]
 
 
-def calibrate(scenes: int) -> dict[str, Any]:
-    """Raw scores of instances found in random scenes with erring masks, beside whether each is right (IoU > .5).
-
-    Returns the isotonic fit at KNOTS, made strictly rising by a hundredth so that ranks survive, and the counts.
-    """
-    from sklearn.isotonic import IsotonicRegression
-
-    from perception.bench.blob_scenes import random_scene, with_errors
-    from perception.config import InstanceConfig
-    from perception.instances.group import group
-    from perception.instances.votes import mask_votes
-
-    raw, right = [], []
-    for seed in range(scenes):
-        rng = np.random.default_rng([seed, 1])
-        made = random_scene(
-            seed,
-            int(rng.integers(8, 30)),
-            views=int(rng.integers(2, 9)),
-            crowding=float(rng.uniform(1, 2.2)),
-            feature_noise=float(rng.uniform(0.1, 0.5)),
-        )
-        scene = with_errors(made, rng, RATES[seed % len(RATES)])
-        g = scene.gaussians
-        means, scales, opacities, features = (t.numpy() for t in (g.means, g.scales, g.opacities, g.features))
-        found = group(means, scales, opacities, features, mask_votes(g, scene.views), InstanceConfig())
-        raw += found.raw.tolist()
-        right += (_best_iou(found.ids, scene.truth, found.count) > 0.5).tolist()
-    fit = IsotonicRegression(y_min=0, y_max=1, out_of_bounds="clip").fit(raw, np.array(right, float))
-    chance = 0.99 * fit.predict(KNOTS) + 0.01 * np.array(KNOTS)
-    return {
-        "scenes": scenes,
-        "instances": len(raw),
-        "right": int(np.sum(right)),
-        "knots": [[x, round(float(y), 3)] for x, y in zip(KNOTS, chance, strict=True)],
-    }
-
-
-def _best_iou(ids: np.ndarray, truth: np.ndarray, count: int) -> np.ndarray:
-    table = np.zeros((count + 1, int(truth.max()) + 1))
-    np.add.at(table, (ids, truth), 1)
-    inside = table[:-1]
-    union = inside.sum(axis=1, keepdims=True) + table.sum(axis=0) - inside
-    return np.asarray((inside / union).max(axis=1))
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Prints the table, or one JSON object with --json."""
     parser = argparse.ArgumentParser(prog="perception bench instances", description=__doc__.splitlines()[0])
-    parser.add_argument("scene", type=Path, nargs="?", help="folder of a truth scene")
-    parser.add_argument("map", type=Path, nargs="?", help="its map")
+    parser.add_argument("scene", type=Path, help="folder of a truth scene")
+    parser.add_argument("map", type=Path, help="its map")
     parser.add_argument("-o", "--output", type=Path, help="folder for pictures from above and of two views")
-    parser.add_argument("--calibrate", action="store_true", help="fit the confidences on random scenes")
-    parser.add_argument("--scenes", type=int, default=40, help="random scenes for --calibrate")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args(arguments)
-    if args.calibrate:
-        print(json.dumps(calibrate(args.scenes)))
-        return 0
-    if args.scene is None or args.map is None:
-        parser.error("give SCENE and MAP, or --calibrate")
     result = score_map(args.scene, args.map)
     if args.output is not None:
         result["pictures"] = write_pictures(args.map, args.output)

@@ -22,7 +22,6 @@ from perception.bench.sweep_cli import (
     table,
     with_minutes,
 )
-from perception.bench.sweep_seeds import over_seeds, seeded
 
 PRESET_NAMES = ("default", "fast", "quality")
 BUDGETS = (12_500, 25_000, 50_000, 200_000)
@@ -52,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sweep, scenes, masks = prepare(options)
     if masks is not None and not (scenes[0].root / masks).is_dir():
         masks = None
-    rows = with_minutes(over_seeds(sweep.run(scenes[0], seeded(chosen(variants(masks), options.only), options.seeds))))
+    rows = with_minutes(sweep.run(scenes[0], chosen(variants(masks), options.only)))
     share_the_least_time(rows)
     native = rows[0]["pixels"]
     for key in ("psnr", "ssim", "ap"):

@@ -12,7 +12,6 @@ from typing import Any
 
 from perception.bench.sweep import Variant
 from perception.bench.sweep_cli import chosen, finish, prepare, save_plot, sweep_parser, table, with_minutes
-from perception.bench.sweep_seeds import over_seeds, seeded
 
 BUDGETS = (25_000, 50_000, 100_000, 200_000)
 PIXELS = (1, 2, 4)
@@ -39,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sweep, scenes, masks = prepare(options)
     threads = sorted({1, 2, os.cpu_count() or 1} & set(range(1, (os.cpu_count() or 1) + 1)))
     cells = chosen(variants(masks, options.side, threads), options.only)
-    rows = with_minutes(over_seeds(sweep.run(scenes[0], seeded(cells, options.seeds))))
+    rows = with_minutes(sweep.run(scenes[0], cells))
     columns = (
         ("Gaussians", "gaussians", "d"),
         ("s / 1000 it", "wall_per_1000", ".1f"),

@@ -1,4 +1,4 @@
-"""The engine of `bench map`, `switches`, `scaling` and `ablation`: one scene loaded once, many settings trained on it.
+"""The engine of `bench map` and `bench scaling`: one scene loaded once, many settings trained on it.
 
 A row is kept on disk as soon as it is there, under everything it depends on (scene, settings, threads, the code that
 makes a map), so a sweep that was stopped goes on where it was, and a row is never told of another program.
@@ -41,7 +41,6 @@ class Variant:
     masks: str | None = "labels"
     threads: int = 0
     preset: str = "default"
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class Limits:
 
     def config(self, variant: Variant) -> MapConfig:
         """The variant's settings within these limits. Growth keeps its number of steps as a run gets shorter."""
-        pairs = [*self.settings, *variant.settings, f"seed={variant.seed}", "language.encoder=none"]
+        pairs = [*self.settings, *variant.settings, "language.encoder=none"]
         config = load_config(None, pairs, variant.preset)
         train, photos = config.train, config.photos
         iterations = self.iterations or train.iterations
@@ -258,12 +257,6 @@ def _brief(row: dict[str, Any], known: bool) -> str:
     return f"{', '.join(figures)}, {row['seconds']:.0f} s{' (kept)' if known else ''}"
 
 
-def difference(row: dict[str, Any], base: dict[str, Any], key: str) -> float | None:
-    """row − base of a figure; None where either has none."""
-    one, other = row.get(key), base.get(key)
-    return None if one is None or other is None else float(one) - float(other)
-
-
 def pareto(points: Sequence[tuple[float, float | None]]) -> list[int]:
     """Indices of (cost, value) pairs, cheapest first, that no other beats: at most as dear and at least as good."""
     kept: list[int] = []
@@ -276,4 +269,4 @@ def pareto(points: Sequence[tuple[float, float | None]]) -> list[int]:
 
 
 def _silent(done: int, total: int) -> None:
-    """Nobody listens."""
+    """Progress that is not shown."""

@@ -50,7 +50,6 @@ def sweep_parser(name: str, about: str | None, *, many: bool = False) -> argpars
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
     parser.add_argument("--masks", default="labels", metavar="DIR", help="label images inside SCENE, or none")
     parser.add_argument("--only", metavar="TEXT", help="only variants with TEXT in their group or name")
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="repeat every variant with N seeds")
     return parser
 
 

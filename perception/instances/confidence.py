@@ -24,7 +24,7 @@ CALIBRATION = (
     (1.0, 1.0),
 )
 """Raw score → chance of IoU > .5 with a true object: isotonic fit on 662 instances of 40 random scenes of balls whose
-masks err, 537 of them right (`perception bench instances --calibrate`); strictly rising, so that ranks survive."""
+masks err, 537 of them right; made strictly rising by a hundredth, so that the order of raw scores is kept."""
 
 
 def raw_scores(ids: np.ndarray, membership: np.ndarray, found: Evidence) -> np.ndarray:

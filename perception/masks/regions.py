@@ -1,8 +1,8 @@
 """Object-sized regions of one photo by its colours alone: many small ones first, then merged on evidence.
 
-The weights are log odds fitted by `python -m perception.bench.fit_masks` on two rendered scenes; they are all
-that was learned. Order: constant, border gradient, colour distance, colour histograms' distance, texture
-difference, smaller area, common share of the border, texture.
+The weights are log odds: a logistic regression on pairs of regions met while merging every 8th photo of two rendered
+scenes with exact truth. Nothing else was learned. Order: constant, border gradient, colour distance, distance of the
+colour histograms, texture difference, smaller area, common share of the border, texture.
 """
 
 from __future__ import annotations

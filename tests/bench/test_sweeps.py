@@ -1,4 +1,4 @@
-"""Sweeps resume, tell their variants apart, and find the front; the made scene of `bench export` is labelled right."""
+"""Sweeps resume, tell their variants apart, and find the Pareto front."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perception.bench import ablation, export, scaling, sweep, switches
 from perception.bench import map as bench_map
+from perception.bench import scaling, sweep
 from perception.bench.memory import fresh_peak, status_mib
 from perception.bench.sweep import Limits, Sweep, SweepScene, Variant, pareto
 from perception.bench.sweep_cli import limits_of, sweep_parser, table
-from perception.bench.sweep_seeds import over_seeds, seeded
 from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
@@ -51,8 +50,6 @@ def test_one_map_under_two_names_is_one_point() -> None:
 @pytest.mark.parametrize(
     "cells",
     [
-        ablation.variants("labels"),
-        switches.variants("labels"),
         bench_map.variants("labels"),
         scaling.variants(None, 640, (1, 2)),
     ],
@@ -83,7 +80,7 @@ def test_an_interrupted_sweep_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
             stop.clear()
             raise KeyboardInterrupt
         trained.append(variant.name)
-        return {"seconds": 1.0, "psnr": 20.0 + variant.seed}
+        return {"seconds": 1.0, "psnr": 20.0}
 
     monkeypatch.setattr(sweep, "run_variant", train)
     scene = SweepScene(tmp_path, tmp_path / "work")
@@ -119,30 +116,9 @@ def test_a_scene_keeps_the_photos_of_one_size(tmp_path: Path, monkeypatch: pytes
     assert list(scene._views) == [320]
 
 
-def test_seeds_become_a_median_and_a_spread() -> None:
-    cells = seeded([Variant("g", "a"), Variant("g", "b")], 3)
-    psnr = [20.0, 23.0, 21.0, 30.0, 30.0, 30.0]
-    rows = over_seeds(
-        [
-            {"scene": "s", "group": v.group, "name": v.name, "seed": v.seed, "psnr": p, "seconds": 1.0, "ap": None}
-            for v, p in zip(cells, psnr, strict=True)
-        ]
-    )
-    assert [(row["psnr"], row["spread"]["psnr"]) for row in rows] == [(21.0, 3.0), (30.0, 0.0)]
-    assert "ap" not in rows[0]["spread"] and len(rows[0]["runs"]) == 3
-
-
 def test_a_table_shows_what_is_missing() -> None:
     text = table([{"group": "g", "name": "n", "psnr": 20.0}], (("PSNR", "psnr", ".2f"), ("AP", "ap", ".3f")))
     assert text.splitlines()[1].split() == ["g", "n", "20.00", "-"]
-
-
-def test_bench_export_labels_its_own_scene(tmp_path: Path) -> None:
-    small = ["--gaussians", "4000", "--cloud", "12000", "--turns", "1", "--shares", "1"]
-    assert main(["bench", "export", "-o", str(tmp_path), *small]) == 0
-    rows = json.loads((tmp_path / "export.json").read_text())["rows"]
-    assert len(rows) == len(export.CASES) and rows[0]["ap25"] == 1.0
-    assert main(["bench", "export", "-o", str(tmp_path), "--shares", "2"]) == 2
 
 
 def test_a_bench_trains_and_scores_a_scene(small_scene: Path, tmp_path: Path) -> None:
@@ -151,10 +127,10 @@ def test_a_bench_trains_and_scores_a_scene(small_scene: Path, tmp_path: Path) ->
     shutil.copytree(small_scene, scene)
     shutil.copy(small_scene / "truth" / "gt_points.ply", scene / "gt_points.ply")
     small = ["train.iterations=120", "train.budget=3000", "densify.every=20", "instances.min_cluster_size=15"]
-    command = ["bench", "ablation", str(scene / "transforms.json"), "-o", str(out), "--only", "d 4"]
+    command = ["bench", "map", str(scene / "transforms.json"), "-o", str(out), "--only", "d 4"]
     assert main([*command, *(f"--set={pair}" for pair in [*small, "instances.min_samples=5"])]) == 0
-    rows = json.loads((out / "ablation.json").read_text())["scenes"]["scene"]
-    assert [(row["group"], row["name"]) for row in rows] == [("default", "labels"), ("d", "4")]
+    rows = json.loads((out / "map.json").read_text())["rows"]
+    assert [(row["group"], row["name"]) for row in rows] == [("preset", "default"), ("d", "4")]
     assert rows[0]["iterations"] == 120 and rows[0]["cpu_seconds"] > 0 and rows[0]["ap25"] is not None
 
     config = load_config(None, [*(json_pairs(rows[0]["config"])), f"masks=labels:{scene / 'labels'}"])

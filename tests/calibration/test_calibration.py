@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 import yaml
 
-from perception.bench.calibrate import known_camera, make_boards
 from perception.calibration.board import Board, Detection
 from perception.calibration.judge import distinct_views
 from perception.calibration.run import best_model, run_calibration
 from perception.calibration.solve import NAMES, project, solve
-from perception.calibration.synthetic import KnownCamera, board_views, render_board
 from perception.cli import main
 from perception.io.camera_file import read_camera
 from perception.io.lens import camera_from_lens
+from support.board_pictures import KnownCamera, board_views, render_board
 
 CHARUCO = Board("charuco", (8, 11), 0.02, 0.015)
 CAMERAS = {
@@ -33,6 +32,14 @@ def pictures(request, tmp_path_factory) -> tuple[KnownCamera, Path]:
     folder = tmp_path_factory.mktemp("boards") / "photos"
     make_boards(folder, CHARUCO, camera, 12, 2.0)
     return camera, folder
+
+
+def make_boards(folder: Path, board: Board, camera: KnownCamera, count: int, noise: float) -> None:
+    """Writes `count` pictures of the board; noise in grey levels."""
+    folder.mkdir(parents=True)
+    reach = 0.8 if board.kind == "charuco" else 0.4
+    for number, pose in enumerate(board_views(board, camera, count, reach=reach)):
+        cv2.imwrite(str(folder / f"{number:03d}.png"), render_board(board, camera, pose, number, noise))
 
 
 def perfect_views(camera: KnownCamera, count: int, noise: float = 0.0, seed: int = 0) -> list[Detection]:
@@ -207,7 +214,7 @@ def test_refined_corners_lie_where_the_board_is() -> None:
 
 
 def test_distinct_views_are_those_that_moved() -> None:
-    camera = known_camera("pinhole", (640, 480))
+    camera = CAMERAS["pinhole"]
     views = perfect_views(camera, 3)
     shaken = [Detection("s", v.board_points, v.pixels + 2.0) for v in views]
     assert distinct_views([*views, *shaken], 640) == views

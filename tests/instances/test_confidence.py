@@ -1,4 +1,4 @@
-"""Scores in [0, 1] that rank, collision counts by hand."""
+"""Scores in [0, 1] that rank."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("perception._core")
-from perception.bench.collisions import collision_rate, pair_scene
-from perception.bench.instances import _best_iou
 from perception.instances.confidence import CALIBRATION, calibrated, raw_scores
 from perception.instances.consensus import evidence
 from perception.instances.votes import Table
@@ -47,26 +45,3 @@ def test_better_evidence_scores_higher() -> None:
     ids, membership = np.repeat([0, 1], 10).astype(np.int32), np.repeat([0.9, 0.8], 10)
     raw = raw_scores(ids, membership, found)
     assert 1 > raw[0] > raw[1] > 0
-
-
-def test_collisions_by_hand() -> None:
-    together = np.eye(3, dtype=bool)
-    together[0, 1] = together[1, 0] = True
-    truth = np.array([0, 0, 1, 1, 2, 2])
-    assert (
-        collision_rate(np.array([5, 5, 5, 5, 6, 6]), truth, together)["collisions"] == 0
-    )  # 0 and 1 were seen together
-    assert collision_rate(np.array([5, 5, 6, 6, 5, 5]), truth, together) == {"pairs": 2, "collisions": 1, "rate": 0.5}
-
-
-def test_the_two_rows_share_no_photo() -> None:
-    scene, together = pair_scene(2.0, pairs=3)
-    assert not together[:3, 3:].any() and together[0, 0] and together[0, 1]
-    features = scene.gaussians.features.numpy()
-    means = [features[scene.truth == k].mean(axis=0) for k in (0, 3)]
-    assert np.abs(means[0] - means[1]).max() < 0.05
-
-
-def test_best_iou() -> None:
-    truth, ids = np.array([0, 0, 0, 1]), np.array([0, 0, -1, 1])
-    assert _best_iou(ids, truth, 2).tolist() == pytest.approx([2 / 3, 1])

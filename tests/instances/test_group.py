@@ -10,13 +10,13 @@ import torch
 from sklearn.metrics import adjusted_rand_score
 
 pytest.importorskip("perception._core")
-from perception.bench.blob_scenes import BlobScene, make_scene, orbit, random_scene, with_errors
 from perception.config import InstanceConfig
 from perception.gaussians.model import from_points
 from perception.gaussians.rasterize import rasterize
 from perception.gaussians.views import TrainingView
 from perception.instances.group import Grouping, group
 from perception.instances.votes import mask_votes
+from support.blob_scenes import BlobScene, make_scene, orbit, random_scene, with_errors
 
 
 def run(scene: BlobScene, **changes: object) -> Grouping:

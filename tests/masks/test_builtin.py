@@ -1,20 +1,17 @@
-"""The built-in segmentation on known pictures, and the benchmark's scores against brute force."""
+"""The built-in segmentation on known pictures."""
 
 from __future__ import annotations
-
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from perception.bench.masks import main, score_photo
 from perception.errors import InputError
 from perception.masks import make_source
 from perception.masks.cues import photo_cues
 from perception.masks.region_graph import RegionGraph
 from perception.masks.regions import segment_photo
 from perception.masks.source import GeometryMaskSource
+from support.mask_scores import best_ious
 
 
 def disc_and_box(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -33,8 +30,7 @@ def test_flat_objects_are_found_whole(seed):
     photo, truth = disc_and_box(seed)
     labels = segment_photo(photo)
     assert labels.dtype == np.int32 and labels.shape == truth.shape
-    score = score_photo(labels, truth + 1)
-    assert (score.best_iou > 0.9).all() and score.masks <= 8
+    assert (best_ious(labels, truth + 1) > 0.9).all() and len(np.unique(labels)) <= 8
 
 
 def test_an_even_photo_is_one_region():
@@ -45,30 +41,6 @@ def test_an_even_photo_is_one_region():
 def test_the_same_photo_gives_the_same_labels():
     photo, _ = disc_and_box(3)
     np.testing.assert_array_equal(segment_photo(photo), segment_photo(photo.copy()))
-
-
-def test_scores_against_brute_force():
-    rng = np.random.default_rng(0)
-    truth = rng.integers(0, 4, (30, 30))
-    labels = np.where(rng.random((30, 30)) < 0.6, truth * 3, rng.integers(0, 9, (30, 30)))
-    score = score_photo(labels, truth, smallest=1)
-    for row, i in enumerate((1, 2, 3)):
-        pairs = [((truth == i) & (labels == m), (truth == i) | (labels == m)) for m in np.unique(labels) if m]
-        assert score.best_iou[row] == pytest.approx(max(a.sum() / b.sum() for a, b in pairs))
-    assert score.masks == len(np.unique(labels[labels > 0]))
-
-
-def test_unlabelled_pixels_match_nothing():
-    assert score_photo(np.zeros((20, 20), int), np.ones((20, 20), int)).best_iou.tolist() == [0.0]
-
-
-@pytest.mark.skipif("PERCEPTION_DATA" not in os.environ, reason="needs PERCEPTION_DATA")
-def test_benchmark_runs_on_a_truth_scene(capsys):
-    import json
-
-    assert main([str(Path(os.environ["PERCEPTION_DATA"]) / "tabletop_a"), "--every", "20"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert result["mean_best_iou"] > 0.4 and result["photos"] == 4
 
 
 def test_merging_keeps_the_evidence_exact():

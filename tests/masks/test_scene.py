@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perception.bench.masks import score_photo
 from perception.masks import GeometryMaskSource, compute_masks, load_labels, make_source
 from perception.masks.cues import depth_cues
 from perception.masks.regions import segment_photo
@@ -17,6 +16,7 @@ from perception.masks.stereo import Eye, confirmed, homographies, plane_depths, 
 from perception.masks.surface import joined, parted, voxel_keys
 from perception.masks.surface_graph import SurfaceGraph, voxel_edges
 from perception.types import View
+from support.mask_scores import best_ious
 
 K = np.array([[150.0, 0.0, 80.0], [0.0, 150.0, 60.0], [0.0, 0.0, 1.0]])
 LOW, HIGH = np.array([-0.3, 1.0, 0.0]), np.array([0.3, 1.5, 0.45])  # the box
@@ -253,44 +253,6 @@ def test_growth_of_a_union_against_its_voxels():
     assert compared > 20
 
 
-def test_what_the_fitter_says_it_found(capsys):
-    """Two true instances of four patches, merged right, then all into one."""
-    from perception.bench.fit_masks import Example, found, report
-
-    class Chain:
-        """Four patches in a row; whether two go together is a number between them."""
-
-        def __init__(self, ties: list[float]) -> None:
-            self.sums = np.ones((4, 1))
-            self.borders = [{j: ties[min(i, j)] for j in (i - 1, i + 1) if 0 <= j < 4} for i in range(4)]
-
-        def features(self, a: int, others: list[int]) -> np.ndarray:
-            return np.array([[self.borders[a][b]] for b in others])
-
-        def size(self, a: int) -> float:
-            return float(self.sums[a, 0])
-
-        def negligible(self, a: int, smallest: float) -> bool:
-            return False
-
-        def merge(self, a: int, b: int) -> None:
-            from perception.masks.region_graph import join
-
-            self.borders[a].pop(b)
-            join(self.sums, self.borders, a, b)
-
-    covered = np.array([[9.0, 1], [9, 1], [0, 4], [0, 4]])
-    item = Example(Chain([2.0, 1.0, 2.0]), covered, 0.0)
-    recall, best, count = found(item, np.ones(1), 1.5)
-    assert (recall, count) == (1.0, 2)
-    assert best == pytest.approx((18 / 20 + 8 / 10) / 2)
-    recall, best, count = found(item, np.ones(1), 0.5)
-    assert (recall, count) == (0.5, 1)
-    assert best == pytest.approx((18 / 28 + 10 / 28) / 2)
-    report(["chain"], [[item]], np.ones(1), 1.5)
-    assert "chain" in (said := capsys.readouterr().out) and "1.000 0.850 2" in said
-
-
 def test_box_floor_and_wall_are_one_segment_each_in_all_photos(tmp_path):
     """Through the store, with rough depth, in millimetres: whole parts, and the same ids in every photo."""
     unit = 1000.0
@@ -309,7 +271,7 @@ def test_box_floor_and_wall_are_one_segment_each_in_all_photos(tmp_path):
     names = []
     for view, (_, _, _, ids) in zip(views, world(), strict=True):
         labels = load_labels(tmp_path, view)
-        assert score_photo(labels, ids).best_iou.mean() > 0.8
+        assert best_ious(labels, ids).mean() > 0.8
         names.append([np.bincount(labels[ids == part]).argmax() for part in (1, 2, 3)])
     assert len({tuple(n) for n in names}) == 1 and len(set(names[0])) == 3
 
@@ -344,7 +306,7 @@ def test_a_photo_that_sees_another_place_takes_part_alone(tmp_path):
         depth_key="1",
     )
     assert report["photos"] == 10 and report["empty"] == []
-    assert score_photo(load_labels(tmp_path, views[0]), world()[0][3]).best_iou.mean() > 0.6
+    assert best_ious(load_labels(tmp_path, views[0]), world()[0][3]).mean() > 0.6
 
 
 def test_normals_and_creases_of_known_surfaces():

@@ -1,7 +1,7 @@
 """segment-anything without torchvision, and its models exported to ONNX as the published exporter does.
 
 `python tests/sam_exports.py vit_b OUT` writes encoder.onnx and decoder.onnx of a SAM of real size with random weights:
-its masks mean nothing, its speed is that of the trained one (`perception bench mask-speed SCENE sam:OUT`).
+its masks mean nothing, its speed is that of the trained one.
 """
 
 from __future__ import annotations

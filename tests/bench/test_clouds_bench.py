@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perception.bench import clouds, smoothing
+from perception.bench import clouds
 from perception.cli import main
 from perception.errors import InputError
 from perception.export.assign import auto_distance
@@ -55,19 +55,6 @@ def test_bench_clouds_measures_in_processes_of_their_own(tmp_path: Path, capsys:
     assert len({round(rows[0]["mark"], 6) for rows in turns.values()}) == 1  # the same answer from all of them
     assert all(rows[0]["cpu_seconds"] > 0 for rows in turns.values())
     assert "assignment perception" in capsys.readouterr().out
-
-
-def test_bench_smoothing_tells_what_smoothing_is_worth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    points = clouds.surfaces(20_000, 3)
-    ids = 1 + (points[:, 0] > 4) + 2 * (points[:, 2] > 0)
-    write_cloud(tmp_path / "c.ply", PointCloud(points, labels={"instance_id": ids.astype(np.int32)}))
-    smoothing.main([str(tmp_path / "c.ply"), "--gaussians", "8000", "--json"])
-    rows = {row["variant"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
-    assert rows["nearest, not smoothed"]["ap"] < 0.9  # 15 % of the Gaussians are wrong
-    assert {"nearest, knn graph", "nearest, radius graph"} <= rows.keys()
-    write_cloud(tmp_path / "bare.ply", PointCloud(points))
-    with pytest.raises(InputError, match="instance_id"):
-        smoothing.main([str(tmp_path / "bare.ply")])
 
 
 def test_eval_takes_the_switches_of_a_protocol(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""The rasterizer and training benches: their figures against each other and against what they are made of."""
+"""The rasterizer bench: its figures against each other."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import json
 
 import pytest
 
-from perception.bench import rasterizer, training
-from perception.bench.iteration import PARTS, make_trainer, measure_iteration
+from perception.bench import rasterizer
 from perception.bench.splats import load_scene, synthetic_scene
 from perception.errors import InputError
 
@@ -16,7 +15,6 @@ from perception.errors import InputError
 def small(monkeypatch):
     scene = synthetic_scene(300, 48, 32)
     monkeypatch.setattr(rasterizer, "synthetic_scene", lambda: scene)
-    monkeypatch.setattr(training, "default_scene", lambda path: scene)
     return scene
 
 
@@ -33,25 +31,6 @@ def test_rasterizer_rows_are_consistent(small, tmp_path, capsys):
         assert (row["error_max"] == 0) == exact and (row["gradient_error"] == 0) == exact
         assert row["error_mean"] <= row["error_max"] and row["error_p999"] <= row["error_max"] < 0.1
     assert "M pairs contribute" in capsys.readouterr().out
-
-
-def test_iteration_parts_add_up(small):
-    for losses in (True, False):
-        parts = measure_iteration(make_trainer(small, 4, 1, losses), 1)
-        assert set(parts) == {*PARTS, "total"}
-        assert sum(parts[p] for p in PARTS) == pytest.approx(parts["total"])
-        assert all(ms > 0 for name, ms in parts.items() if losses or name not in ("instance", "variance"))
-        if not losses:
-            assert parts["instance"] == parts["variance"] == 0
-
-
-def test_training_bench_keeps_its_figures(small, tmp_path, capsys):
-    size = ["--height", "24", "--width", "32", "--labels", "4", "--gaussians", "100"]
-    training.main(["-o", str(tmp_path), "--turns", "1", "--threads", "1", *size])
-    report = json.loads((tmp_path / "training.json").read_text())
-    assert {row["group"] for row in report["operations"]} == {"photometric", "instance", "variance", "adam"}
-    assert all(0 < row["rasterizer_share"] < 1 for row in report["iterations"])
-    assert "Whole iteration" in capsys.readouterr().out
 
 
 def test_a_file_that_holds_no_splats_is_named(tmp_path):

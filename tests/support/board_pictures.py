@@ -1,4 +1,4 @@
-"""Pictures of a board taken by a camera that is known exactly: the oracle of tests and of `bench calibrate`."""
+"""Pictures of a calibration board taken by a camera that is known exactly."""
 
 from __future__ import annotations
 
