@@ -47,13 +47,14 @@ def check_file(file: str) -> dict[str, Any]:
         raise InputError(f"{file}: no such file, folder or stored model; {known_names()}")
     found = [describe_graph(graph) for graph in graphs]
     family, purpose, problem = judge(found)
-    warnings = [text for entry in found for text in entry.pop("warnings")] + [problem] * bool(problem)
+    warnings = [text for text in (*(entry.pop("warning") for entry in found), problem) if text]
     return {"model": str(path), "family": family, "purpose": purpose, "files": found, "warnings": warnings}
 
 
 def describe_graph(path: Path) -> dict[str, Any]:
     """Family, role, inputs, outputs and providers of one ONNX file."""
-    from perception.masks.sam_models import open_graph, provider_warnings
+    from perception.io.onnx_sessions import provider_warning
+    from perception.masks.sam_models import open_graph
 
     graph = open_graph(path)
     family, role = recognise(graph)
@@ -65,7 +66,7 @@ def describe_graph(path: Path) -> dict[str, Any]:
         "inputs": [_argument(value) for value in graph.session.get_inputs()],
         "outputs": [_argument(value) for value in graph.session.get_outputs()],
         "providers": list(graph.session.get_providers()),
-        "warnings": provider_warnings(graph),
+        "warning": provider_warning(path, graph.session),
     }
 
 

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from perception.bench.synthetic_map import write_synthetic_map
-from perception.language import make_encoder
+from perception.language.encoders import make_encoder
 from support.paths import REPOSITORY
 from support.query_maps import write_map_of
 

@@ -256,7 +256,7 @@ def test_a_cuda_that_did_not_come_up_is_told(sam: tuple[Path, Path], monkeypatch
     names = ["CUDAExecutionProvider", "CPUExecutionProvider"]
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: names)
     warnings = check_file(str(sam[0].parent))["warnings"]
-    assert warnings[0] == "a.decoder.onnx: CUDAExecutionProvider did not come up, running on CPUExecutionProvider"
+    assert warnings[0] == "a.decoder.onnx: CUDAExecutionProvider did not load, running on CPUExecutionProvider"
 
 
 def test_the_command_line(sam: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:

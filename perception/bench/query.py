@@ -205,7 +205,7 @@ def resident_mib(process: int | None = None) -> int | None:
 
 def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """All of it, as JSON."""
-    from perception.language.base import make_encoder
+    from perception.language.encoders import make_encoder
     from perception.pipeline.record import versions
 
     names, encoder = prompts(options.instances), make_encoder("conse")

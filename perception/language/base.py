@@ -1,4 +1,4 @@
-"""The one protocol all encoders speak, and the factory that makes them from a short text."""
+"""The protocol of all encoders, how their similarities are to be read, and checks that they share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Protocol
 import numpy as np
 
 from perception.errors import InputError
-from perception.language.onnx import Device
 
 
 @dataclass(frozen=True)
@@ -70,26 +69,6 @@ class Encoder(Protocol):
     def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
         """Texts in any script → float32 [n, dim], unit rows. An empty text is an InputError."""
         ...
-
-
-def make_encoder(spec: str, device: Device = "auto") -> Encoder | None:
-    """Make the encoder named by `spec`.
-
-    "conse": the offline default. "clip:IMAGE.onnx,TEXT.onnx" or "clip:DIR": a CLIP-family pair. "none": None.
-    device: where ONNX models run; "cuda" is an InputError where they would silently run on the CPU.
-    """
-    kind, _, argument = spec.partition(":")
-    if kind == "none" and not argument:
-        return None
-    if kind == "conse" and not argument:
-        from perception.language.conse import ConseEncoder
-
-        return ConseEncoder()
-    if kind == "clip" and argument:
-        from perception.language.clip import ClipEncoder
-
-        return ClipEncoder.from_spec(argument, device)
-    raise InputError(f"encoder '{spec}': expected conse, clip:IMAGE.onnx,TEXT.onnx, clip:DIR or none")
 
 
 def check_texts(texts: Sequence[str]) -> list[str]:

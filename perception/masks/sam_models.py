@@ -10,18 +10,15 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from perception.errors import InputError
 from perception.io.model_store import known_names, resolve
-
-if TYPE_CHECKING:
-    from onnxruntime import InferenceSession
+from perception.io.onnx_sessions import dtype_of, fingerprint, open_session, provider_warning, shape_of, signature
 
 # One role, the names it goes by in public exporters.
 _ALIASES = {
@@ -42,12 +39,6 @@ _ALIASES = {
 _ROLES = {alias: role for role, aliases in reversed(_ALIASES.items()) for alias in aliases}
 _MEAN = np.array([123.675, 116.28, 103.53], np.float32)
 _STD = np.array([58.395, 57.12, 57.375], np.float32)
-_NUMPY: dict[str, Any] = {
-    "tensor(float)": np.float32,
-    "tensor(float16)": np.float16,
-    "tensor(double)": np.float64,
-}
-_NUMPY |= {"tensor(int64)": np.int64, "tensor(int32)": np.int32, "tensor(uint8)": np.uint8}
 
 
 @dataclass(frozen=True)
@@ -55,7 +46,7 @@ class Graph:
     """An opened ONNX file with its inputs and outputs by role."""
 
     path: Path
-    session: InferenceSession
+    session: Any
     inputs: dict[str, Any]
     outputs: dict[str, str]
 
@@ -69,9 +60,9 @@ class Graph:
 
     def run(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """values by role, cast to the types the graph asks for; outputs by role."""
-        feeds = {}
-        for role, argument in self.inputs.items():
-            feeds[argument.name] = values[role].astype(_NUMPY[argument.type], copy=False)
+        feeds: dict[str, np.ndarray] = {
+            x.name: values[role].astype(dtype_of(x), copy=False) for role, x in self.inputs.items()
+        }
         results = self.session.run(list(self.outputs.values()), feeds)
         return dict(zip(self.outputs, results, strict=True))
 
@@ -94,9 +85,10 @@ class SamModel:
         self.encoder, self.decoder = encoder, decoder
         self.family = decoder_family(decoder)
         _check_pair(encoder, decoder)
-        self.fingerprint = f"{_digest(encoder.path)}-{_digest(decoder.path)}"
+        self.fingerprint = f"{fingerprint(encoder.path)}-{fingerprint(decoder.path)}"
         self.provider = " + ".join(dict.fromkeys(g.session.get_providers()[0] for g in (encoder, decoder)))
-        self.warnings = [w for graph in (encoder, decoder) for w in provider_warnings(graph)]
+        found = (provider_warning(graph.path, graph.session) for graph in (encoder, decoder))
+        self.warnings = [warning for warning in found if warning]
 
     def encode(self, photo: np.ndarray) -> Encoded:
         """photo: [h, w, 3] uint8 RGB."""
@@ -116,24 +108,24 @@ class SamModel:
     def _batched(self) -> bool:
         """Whether the graph takes many single-point prompts at once: the axis is named, not fixed to 1."""
         axis = 1 if self.family in ("EfficientSAM", "SAM by optimum") else 0
-        return not isinstance(self.decoder.inputs["points"].shape[axis], int)
+        return shape_of(self.decoder.inputs["points"])[axis] is None
 
     def _prepare(self, photo: np.ndarray) -> tuple[np.ndarray, tuple[int, int], tuple[int, int]]:
         """The encoder's input, the (h, w) the photo fills in it, and its whole (h, w)."""
-        shape = self.encoder.inputs["image"].shape
+        shape = shape_of(self.encoder.inputs["image"])
         if self.family == "EfficientSAM":
             return photo.transpose(2, 0, 1)[None] / np.float32(255), photo.shape[:2], photo.shape[:2]
         if self.family == "SAM 2":
-            height, width = (_fixed(n, 1024) for n in shape[2:])
+            height, width = (n or 1024 for n in shape[2:])
             squashed = _resize(photo, height, width)
             normal = (squashed / np.float32(255) - _MEAN / 255) / (_STD / 255)
             return normal.transpose(2, 0, 1)[None], (height, width), (height, width)
         raw = len(shape) == 3
-        height, width = (_fixed(n, 1024) for n in (shape[:2] if raw else shape[2:]))
+        height, width = (n or 1024 for n in (shape[:2] if raw else shape[2:]))
         ratio = min(height / photo.shape[0], width / photo.shape[1])
         used = (int(photo.shape[0] * ratio + 0.5), int(photo.shape[1] * ratio + 0.5))
         resized = _resize(photo, *used).astype(np.float32)
-        if raw and not isinstance(shape[0], int):
+        if raw and shape[0] is None:
             return resized, used, used  # the graph pads by itself
         padded = np.zeros((height, width, 3), np.float32)
         padded[: used[0], : used[1]] = resized if raw else (resized - _MEAN) / _STD
@@ -170,8 +162,8 @@ class SamModel:
     def _mask_shape(self, points: int, side: int) -> tuple[int, int, int]:
         """Rows, height and width of the (empty) mask prompt: one row, or one a point where left open."""
         argument = self.decoder.inputs.get("mask_input")
-        shape = [1, 1, side, side] if argument is None else argument.shape
-        return _fixed(shape[0], points), _fixed(shape[2], side), _fixed(shape[3], side)
+        shape = [1, 1, side, side] if argument is None else shape_of(argument)
+        return shape[0] or points, shape[2] or side, shape[3] or side
 
     def _whole_photo(self, embedding: Encoded) -> bool:
         """Whether the decoder may be told the photo's size: its scaling then is the one that `encode` did.
@@ -208,7 +200,7 @@ def open_sam(spec: str) -> SamModel:
     if len(encoders) == 1 and len(decoders) == 1:
         return SamModel(encoders[0], decoders[0])
     if not encoders and not decoders:
-        found = ", ".join(f"{g.path.name}: {_signature(g)}" for g in graphs)
+        found = ", ".join(f"{g.path.name}: {signature(g.session)}" for g in graphs)
         raise InputError(f"sam:{spec}: no SAM encoder or decoder recognised ({found})")
     for kind, here, other in (("encoder", encoders, decoders), ("decoder", decoders, encoders)):
         if not here:
@@ -222,27 +214,10 @@ def open_sam(spec: str) -> SamModel:
 
 
 def open_graph(path: Path) -> Graph:
-    """Opens an ONNX file on the best provider that onnxruntime has."""
-    import onnxruntime
-
-    if not path.is_file():
-        raise InputError(f"sam:{path}: no such file; expected an ONNX model")
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3
-    try:
-        session = onnxruntime.InferenceSession(str(path), options, providers=wanted_providers())
-    except Exception as error:  # onnxruntime's own exceptions share no public base class
-        raise InputError(f"{path}: not an ONNX model that onnxruntime can open ({_first_line(error)})") from error
+    """Opens an ONNX file and names its inputs and outputs by role."""
+    session = open_session(path)
     inputs = {_ROLES.get(argument.name, argument.name): argument for argument in session.get_inputs()}
     return Graph(path, session, inputs, _outputs([argument.name for argument in session.get_outputs()]))
-
-
-def wanted_providers() -> list[str]:
-    """CUDA where this onnxruntime was built with it, then the CPU."""
-    import onnxruntime
-
-    available = onnxruntime.get_available_providers()
-    return [name for name in ("CUDAExecutionProvider", "CPUExecutionProvider") if name in available]
 
 
 def _outputs(names: list[str]) -> dict[str, str]:
@@ -302,19 +277,9 @@ def _check_pair(encoder: Graph, decoder: Graph) -> None:
         raise InputError(f"{decoder.path}: no output for {' and '.join(lacking)} (found {found}); not a SAM decoder")
 
 
-def provider_warnings(graph: Graph) -> list[str]:
-    """Says so where the best provider did not come up and onnxruntime took another without a word."""
-    wanted, used = wanted_providers()[0], graph.session.get_providers()[0]
-    return [] if wanted == used else [f"{graph.path.name}: {wanted} did not come up, running on {used}"]
-
-
 def _square(embedding: Encoded) -> int:
     """Side of the padded square: SAM's encoders have a stride of 16."""
     return 16 * embedding.tensors["embedding"].shape[-1]
-
-
-def _fixed(size: Any, default: int) -> int:
-    return size if isinstance(size, int) and size > 0 else default
 
 
 def _resize(photo: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -322,22 +287,3 @@ def _resize(photo: np.ndarray, height: int, width: int) -> np.ndarray:
     from PIL import Image
 
     return np.asarray(Image.fromarray(photo).resize((width, height), Image.Resampling.BILINEAR))
-
-
-def _signature(graph: Graph) -> str:
-    takes = ", ".join(argument.name for argument in graph.session.get_inputs())
-    return f"{takes} → {', '.join(argument.name for argument in graph.session.get_outputs())}"
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__
-
-
-def _digest(path: Path) -> str:
-    """Size, first and last MiB: enough to tell models apart without reading gigabytes."""
-    digest = hashlib.sha256(str(path.stat().st_size).encode())
-    with path.open("rb") as stream:
-        digest.update(stream.read(1 << 20))
-        stream.seek(max(0, path.stat().st_size - (1 << 20)))
-        digest.update(stream.read(1 << 20))
-    return digest.hexdigest()[:12]

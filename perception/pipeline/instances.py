@@ -150,7 +150,7 @@ def _describe(
 
 def _encoder(config: MapConfig, progress: Progress) -> Encoder | None:
     """What turns pictures into words' vectors; None where none is wanted, or "auto" finds none."""
-    from perception.language import make_encoder
+    from perception.language.encoders import make_encoder
 
     spec = config.language.encoder
     try:

@@ -17,7 +17,8 @@ from typing import Any, TypeVar
 
 from perception.errors import InputError
 from perception.io.store import map_signature
-from perception.language.base import Encoder, make_encoder
+from perception.language.base import Encoder
+from perception.language.encoders import make_encoder
 from perception.query.line import Figures, Job, Line
 from perception.query.opened import LoadedMap, load_map
 from perception.query.requests import Reply, Request

@@ -328,7 +328,7 @@ class LoadedMap:
 def load_map(path: str | Path, encoders: Encoders | None = None) -> LoadedMap:
     """Opens a map directory, a million Gaussians in well under a second.
 
-    encoders: makes an encoder from its name in the map's config; perception.language.make_encoder when None.
+    encoders: makes an encoder from its name in the map's config; perception.language.encoders.make_encoder when None.
     Raises InputError when `path` is no map, damaged, or of another format version.
     """
     path = Path(path)

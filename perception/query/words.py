@@ -16,7 +16,8 @@ from perception.errors import InputError
 from perception.io.instance_index import InstanceIndex
 from perception.io.map_files import MapFiles
 from perception.io.store import GaussianMap
-from perception.language.base import Encoder, make_encoder
+from perception.language.base import Encoder
+from perception.language.encoders import make_encoder
 
 if TYPE_CHECKING:
     from perception.language.ranking import Answer, Ranker
