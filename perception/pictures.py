@@ -9,30 +9,8 @@ import cv2
 import numpy as np
 
 from perception.boxes import BOX_EDGES, box_corners
+from perception.colors import instance_palette
 from perception.types import OrientedBox
-
-GREY = np.array([128, 128, 128], np.uint8)  # the colour of "no instance"
-_GOLDEN = 0.6180339887498949
-
-
-def instance_palette(ids: int | np.ndarray | Sequence[int]) -> np.ndarray:
-    """Colours [N, 3] uint8 for instance ids (or for 0..n-1): the same id always gets the same colour, -1 is
-    grey.
-
-    Hues step by the golden ratio, so ids near each other lie far apart on the wheel; lightness and saturation
-    change as the wheel fills up.
-    """
-    wanted = np.arange(ids) if isinstance(ids, int | np.integer) else np.asarray(ids, np.int64)
-    k = np.maximum(wanted, 0)
-    hue = (0.02 + k * _GOLDEN) % 1.0
-    saturation = np.array([0.80, 0.55, 0.95])[(k // 8) % 3]
-    value = np.array([0.95, 0.78, 0.62])[(k // 8 + k // 24) % 3]
-    hsv = np.stack([hue * 360, saturation, value], -1).astype(np.float32).reshape(1, -1, 3)
-    if not hsv.size:
-        return np.zeros((0, 3), np.uint8)
-    colors = np.round(255 * cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0]).astype(np.uint8)
-    colors[np.ravel(wanted) < 0] = GREY
-    return colors
 
 
 def colorize_instances(ids: np.ndarray) -> np.ndarray:

@@ -2,31 +2,52 @@
 
 from __future__ import annotations
 
+import colorsys
+import math
+
 import numpy as np
 import pytest
 from skimage.color import deltaE_ciede2000, rgb2lab
 
 from perception import pictures
+from perception.colors import GREY, instance_palette, rgb8_from_sh, rgb_from_sh, sh_from_rgb
 from perception.pictures import draw_boxes
 from perception.types import OrientedBox
 
 
 def test_palette_is_stable_separated_and_grey_for_none() -> None:
-    colors = pictures.instance_palette(24)
-    np.testing.assert_array_equal(pictures.instance_palette([7, -1, 3]), [colors[7], pictures.GREY, colors[3]])
-    lab = rgb2lab(np.concatenate([colors, pictures.GREY[None]])[None] / 255.0)[0]
+    colors = instance_palette(24)
+    np.testing.assert_array_equal(instance_palette([7, -1, 3]), [colors[7], GREY, colors[3]])
+    lab = rgb2lab(np.concatenate([colors, GREY[None]])[None] / 255.0)[0]
     distance = deltaE_ciede2000(lab[:, None], lab[None])[np.triu_indices(25, 1)]
     assert distance.min() > 5  # told apart side by side; 2.3 is about the least difference seen
     neighbours = deltaE_ciede2000(lab[:23], lab[1:24])
     assert neighbours.min() > 20
-    assert pictures.instance_palette(0).shape == (0, 3)
+    assert instance_palette(0).shape == (0, 3)
+
+
+def test_palette_is_the_hsv_formula_of_the_standard_library() -> None:
+    """Byte for byte: an instance has one colour in reports, clouds, the viewer and ROS messages."""
+    for i, color in enumerate(instance_palette(200)):
+        saturation, value = (0.80, 0.55, 0.95)[i // 8 % 3], (0.95, 0.78, 0.62)[(i // 8 + i // 24) % 3]
+        rgb = colorsys.hsv_to_rgb((0.02 + i * 0.6180339887498949) % 1.0, saturation, value)
+        assert color.tolist() == [round(255 * c) for c in rgb]
+
+
+def test_colours_of_the_constant_harmonic() -> None:
+    """c = 1/2 + k / (2 √π) (Kerbl et al. 2023, the degree 0 term of the real spherical harmonics)."""
+    sh = np.array([[0.0, 1.0, -9.0], [9.0, 0.3, -0.3]])
+    rgb = 0.5 + sh / (2 * math.sqrt(math.pi))
+    np.testing.assert_allclose(rgb_from_sh(sh), rgb, atol=1e-15)
+    np.testing.assert_allclose(sh_from_rgb(rgb), sh, atol=1e-14)
+    np.testing.assert_array_equal(rgb8_from_sh(sh), np.round(255 * rgb.clip(0, 1)))
 
 
 def test_instances_and_overlay() -> None:
     ids = np.array([[-1, -1, 2, 2]] * 4)
     picture = pictures.colorize_instances(ids)
-    np.testing.assert_array_equal(picture[0, 0], pictures.GREY)
-    np.testing.assert_array_equal(picture[3, 3], pictures.instance_palette([2])[0])
+    np.testing.assert_array_equal(picture[0, 0], GREY)
+    np.testing.assert_array_equal(picture[3, 3], instance_palette([2])[0])
     photo = np.full((4, 4, 3), 90, np.uint8)
     laid = pictures.overlay(photo, ids, 0.5)
     np.testing.assert_array_equal(laid[:, 0], photo[:, 0])

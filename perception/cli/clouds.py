@@ -16,7 +16,7 @@ def register(commands: Any) -> None:
 
 
 def _add_export(commands: Any) -> None:
-    p = command(commands, "export", _export, "instances onto a point cloud or mesh, or the map itself for viewers")
+    p = command(commands, "export", _export, "instances onto a point cloud or mesh, or onto the map's own points")
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("--points", type=Path, metavar="CLOUD")
     p.add_argument(
@@ -25,7 +25,7 @@ def _add_export(commands: Any) -> None:
         type=Path,
         required=True,
         metavar="OUT",
-        help=".ply, .pcd, .npz, or .mcap (Foxglove): the map with its photos",
+        help=".ply, .pcd or .npz; .mcap (Foxglove, RViz): with boxes, cameras and photos",
     )
     p.add_argument("--smooth", action=argparse.BooleanOptionalAction, default=True)
     p.add_argument("--rule", choices=("nearest", "densest"), default="nearest", help="nearest mean is the paper's")
@@ -43,7 +43,6 @@ def _add_export(commands: Any) -> None:
     p.add_argument("--split", type=Path, metavar="DIR", help="one cloud an instance")
     p.add_argument("--boxes", type=Path, metavar="OUT.json", help="3D boxes")
     p.add_argument("--scannet", type=Path, metavar="DIR", help="ScanNet submission layout")
-    p.add_argument("--mcap", type=Path, metavar="OUT.mcap", help="ROS 2 bag with cloud, detections and boxes")
 
 
 def _length(text: str) -> float | str:
@@ -51,12 +50,10 @@ def _length(text: str) -> float | str:
 
 
 def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.export import ExportOptions, Outputs
+    from perception.export import ExportOptions
     from perception.export.smooth import SmoothOptions
-    from perception.io.store import read_info
-    from perception.pipeline.exporting import export_map
+    from perception.pipeline.exporting import Outputs, export_map
 
-    info = read_info(args.map)
     options = ExportOptions(
         rule=args.rule,
         drop_noise=args.fill,
@@ -65,9 +62,7 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         smoothing=SmoothOptions(graph=args.graph, color_weight=args.color_weight),
         segments=args.segments,
     )
-    outputs = Outputs(
-        args.color, args.split, args.boxes, args.scannet, args.mcap, info.get("frame", "map"), bool(info.get("metric"))
-    )
+    outputs = Outputs(args.color, args.split, args.boxes, args.scannet)
     return export_map(args.map, args.output, args.points, options, outputs)
 
 

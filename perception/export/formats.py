@@ -1,4 +1,4 @@
-"""Files of labelled clouds for other programs: coloured, split, boxes, and ScanNet's submission layout."""
+"""Files of labelled clouds: the cloud with its sidecar, one cloud an instance, boxes, ScanNet's submission layout."""
 
 from __future__ import annotations
 
@@ -16,29 +16,31 @@ from perception.io.cloud import write_cloud
 from perception.types import PointCloud
 
 Instances = Mapping[int, Mapping[str, Any]]
-NO_INSTANCE = (90, 90, 90)
 
 
-def instance_colors(labels: np.ndarray) -> np.ndarray:
-    """A fixed, well spread colour [P, 3] uint8 for each instance id, grey for −1; the same id is always the
-    same.
+def write_export(path: str | Path, cloud: PointCloud, labels: np.ndarray, instances: Instances) -> dict[str, Any]:
+    """Writes the cloud with `instance_id` and its sidecar JSON (same stem); returns the sidecar.
 
-    Hues step by the golden angle; lightness and saturation take turns, so that neighbouring ids differ
-    clearly.
+    labels [P] int32, −1 = none; points and order are the cloud's own. instances: {id: {"score", "label"}} of the map.
     """
-    ids, index = np.unique(labels, return_inverse=True)
-    palette = np.empty((len(ids), 3), np.uint8)
-    for row, i in enumerate(ids.tolist()):
-        palette[row] = NO_INSTANCE if i < 0 else _color(i)
-    return palette[index]
+    path = Path(path)
+    sidecar = sidecar_of(labels, instances)
+    with replacing(path.with_suffix(".json")) as file:
+        file.write(json.dumps(sidecar, indent=1).encode())
+    labelled = {"instance_id": labels.astype(np.int32)}
+    write_cloud(path, PointCloud(cloud.points, cloud.colors, cloud.normals, cloud.faces, labelled))
+    return sidecar
 
 
-def _color(i: int) -> tuple[int, ...]:
-    import colorsys
-
-    hue = (0.61803398875 * i) % 1.0
-    rgb = colorsys.hsv_to_rgb(hue, (0.85, 0.55, 0.95)[i % 3], (0.95, 1.0, 0.7)[(i // 3) % 3])
-    return tuple(round(255 * c) for c in rgb)
+def sidecar_of(labels: np.ndarray, instances: Instances) -> dict[str, Any]:
+    """{"instances": {"<id>": {"score", "label", "num_points"}}} of the instances that labels [P] name."""
+    ids, counts = np.unique(labels[labels >= 0], return_counts=True)
+    rows = {}
+    for i, n in zip(ids.tolist(), counts.tolist(), strict=True):
+        known = instances.get(i, {})
+        score = float(known.get("score", 1.0))
+        rows[str(i)] = {"score": score, "label": known.get("label"), "num_points": n}
+    return {"instances": rows}
 
 
 def write_split(folder: str | Path, cloud: PointCloud, labels: np.ndarray, suffix: str = ".ply") -> list[Path]:

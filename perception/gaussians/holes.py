@@ -11,7 +11,8 @@ import math
 import numpy as np
 import torch
 
-from perception.gaussians.model import SH_C0, Gaussians
+from perception.colors import sh_from_rgb
+from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
 from perception.gaussians.views import TrainingView
 
@@ -77,7 +78,7 @@ def _placed(
     means = ((rays * depth[:, None] - pose[:3, 3])[:, :, None] * pose[:3, :3]).sum(axis=1)
     colors = torch.nn.functional.avg_pool2d(view.photo.float().permute(2, 0, 1)[None], BLOCK, ceil_mode=True)[0]
     sh = torch.zeros(len(empty), *like.sh.shape[1:])
-    sh[:, 0] = (colors[:, torch.from_numpy(holes)].T / 255 - 0.5) / SH_C0
+    sh[:, 0] = sh_from_rgb(colors[:, torch.from_numpy(holes)].T / 255)
     quats = torch.zeros(len(empty), 4)
     quats[:, 0] = 1.0
     scale = torch.from_numpy(depth) * (0.5 * BLOCK / float(K[0, 0]))

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-SH_C0 = 0.28209479177387814
-"""Zeroth real spherical harmonic, 1 / (2 sqrt(pi))."""
+from perception.colors import rgb_from_sh, sh_from_rgb
 
 
 def sigmoid(logits: torch.Tensor) -> torch.Tensor:
@@ -63,7 +62,7 @@ class Gaussians:
     @property
     def base_colors(self) -> torch.Tensor:
         """[N, 3] RGB in about [0, 1] as seen without view dependence."""
-        return self.sh[:, 0] * SH_C0 + 0.5
+        return rgb_from_sh(self.sh[:, 0])
 
 
 def from_points(
@@ -95,6 +94,6 @@ def from_points(
         quats=quats,
         log_scales=torch.from_numpy(np.log(spacing).astype(np.float32))[:, None].repeat(1, 3),
         opacity_logits=torch.full((count,), math.log(opacity / (1 - opacity))),
-        sh=((torch.from_numpy(np.ascontiguousarray(colors)).float() / 255 - 0.5) / SH_C0)[:, None, :],
+        sh=sh_from_rgb(torch.from_numpy(np.ascontiguousarray(colors)).float() / 255)[:, None, :],
         features=torch.rand(count, feature_dim, generator=generator) - 0.5,
     )

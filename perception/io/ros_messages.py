@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from perception.colors import instance_palette
 from perception.types import OrientedBox
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -83,15 +84,16 @@ def detection(
 
 
 def box_markers(
-    boxes: Iterable[tuple[OrientedBox, str]], namespace: str, head: dict[str, Any], least: float = 1e-3
+    boxes: Iterable[tuple[int, OrientedBox, str]], namespace: str, head: dict[str, Any], least: float = 1e-3
 ) -> dict[str, Any]:
-    """visualization_msgs/MarkerArray: a mark that clears what was shown before, then a see-through box and its words
-    for each of `boxes`. Viewers refuse a side of no length, so sides are at least `least`."""
+    """visualization_msgs/MarkerArray: one marker that deletes the markers before it, then for each of `boxes`
+    (instance id, box, text) a transparent box in the instance's colour and its text. Viewers refuse a side of no
+    length, so sides are at least `least`."""
     markers: list[dict[str, Any]] = [{"header": head, "action": _DELETE_ALL}]
-    for i, (box, words) in enumerate(boxes):
+    for i, (instance, box, words) in enumerate(boxes):
         at = pose(box)
         size = {axis: max(side, least) for axis, side in _xyz(box.extent).items()}
-        red, green, blue = _color(i)
+        tint = dict(zip("rgb", (instance_palette([instance])[0] / 255).tolist(), strict=True))
         markers.append(
             {
                 "header": head,
@@ -100,7 +102,7 @@ def box_markers(
                 "type": _CUBE,
                 "pose": at,
                 "scale": size,
-                "color": {"r": red, "g": green, "b": blue, "a": 0.4},
+                "color": tint | {"a": 0.4},
             }
         )
         above = {"position": at["position"], "orientation": {"w": 1.0}}
@@ -123,12 +125,6 @@ def box_markers(
 
 def _xyz(vector: np.ndarray) -> dict[str, float]:
     return dict(zip("xyz", (float(v) for v in vector), strict=True))
-
-
-def _color(i: int) -> tuple[float, float, float]:
-    """Green for the best, then around the wheel."""
-    turn = (1 / 3 + 0.381966 * i) % 1.0
-    return tuple(float(np.clip(abs((turn * 6 + k) % 6 - 3) - 1, 0, 1)) for k in (0, 4, 2))  # type: ignore[return-value]
 
 
 def _quaternion(rotation: np.ndarray) -> np.ndarray:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from perception.colors import rgb8_from_sh
 from perception.io.ros_messages import Stamp, box_markers, detection, header, packed_rgb, point_cloud2
 from perception.query import Hit, LoadedMap, Reply
 
 _STRING, _DOUBLE_ARRAY = 4, 8  # rcl_interfaces/ParameterType
 _OK, _WARN, _ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
-_SH_C0 = 0.5 / math.sqrt(math.pi)
 
 
 def answer_json(reply: Reply, identity: str | None) -> dict[str, Any]:
@@ -54,7 +53,9 @@ def hits_detections(reply: Reply, stamp: Stamp) -> dict[str, Any]:
 
 def hits_markers(reply: Reply, identity: str | None, stamp: Stamp) -> dict[str, Any]:
     """MarkerArray: a box and its words a hit; ns is the asker's id, else the text."""
-    boxes = [(hit.obb, f"{reply.request.text} #{hit.instance_id} {hit.score:.2f}") for hit in reply.hits]
+    boxes = [
+        (hit.instance_id, hit.obb, f"{reply.request.text} #{hit.instance_id} {hit.score:.2f}") for hit in reply.hits
+    ]
     return box_markers(boxes, identity or reply.request.text, header(reply.frame, stamp))
 
 
@@ -74,7 +75,7 @@ def map_cloud(opened: LoadedMap, most: int, stamp: Stamp) -> dict[str, Any]:
     """PointCloud2 of the whole map, at most `most` points evenly thinned: x y z, rgb, instance_id (−1 = none)."""
     gmap = opened.gmap
     rows = slice(None, None, max(1, -(-len(gmap) // most)))
-    colors = np.clip((gmap.sh[rows, 0] * _SH_C0 + 0.5) * 255 + 0.5, 0, 255).astype(np.uint8)
+    colors = rgb8_from_sh(gmap.sh[rows, 0])
     columns = {axis: np.asarray(gmap.means[rows, i], np.float32) for i, axis in enumerate("xyz")}
     columns["rgb"] = packed_rgb(colors)
     columns["instance_id"] = np.asarray(gmap.instance_ids[rows], np.int32)

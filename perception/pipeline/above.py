@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import torch
 
+from perception.colors import instance_palette
 from perception.gaussians.rasterize import rasterize
 from perception.geometry import camera_centres
 from perception.io.store import GaussianMap
-from perception.pictures import instance_palette
 
 SOLID = 0.3
 """Opacity from which a Gaussian is drawn."""

@@ -2,75 +2,117 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
-from perception.export import ExportOptions, Outputs, run_export
-from perception.gaussians.model import SH_C0
+from perception.export.formats import sidecar_of, write_boxes, write_export, write_scannet, write_split
+from perception.export.labels import ExportOptions, check_overlap, export_labels, resolved
+from perception.io.cloud import read_cloud
 from perception.io.recentre import map_origin
+from perception.io.scene_cache import view_from_json
 from perception.io.store import GaussianMap, read_map
 from perception.types import PointCloud
 
+SUFFIXES = (".ply", ".pcd", ".npz", ".mcap")
 SURFACE_OPACITY = 0.5
 """Gaussians at least this opaque stand for the map's own surface."""
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What is written beside the labelled cloud: paths, None = not.
+
+    color: of the cloud's points, "original" or "instance". split: folder for one cloud an instance; boxes: JSON;
+    scannet: folder of a submission (scene = the output's stem).
+    """
+
+    color: str = "original"
+    split: Path | None = None
+    boxes: Path | None = None
+    scannet: Path | None = None
 
 
 def export_map(
     map_path: Path, output: Path, points: Path | None, options: ExportOptions, outputs: Outputs
 ) -> tuple[dict[str, Any], str]:
-    """Writes the labelled cloud, its sidecar JSON and what `outputs` asks for; returns facts and a table.
+    """Labels a cloud and writes it with what `outputs` asks for: (JSON-able facts, table).
 
-    Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids, and coordinates are
-    those of the input that the map was made from. An output of .mcap is the whole map for viewers: points,
-    instances, boxes, cameras and photos.
+    Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids. Coordinates are those of
+    the input that the map was made from. .ply, .pcd, .npz: the cloud and its sidecar JSON. .mcap: a recording in the
+    map's frame, the cloud together with the map's boxes, cameras and photos.
     """
-    if output.suffix.lower() == ".mcap":
-        return _for_viewers(map_path, output, points)
-    if output.suffix.lower() not in (".ply", ".pcd", ".npz"):
-        raise InputError(
-            f"{output}: unknown kind of cloud '{output.suffix}', expected .ply, .pcd, .npz, or for viewers .mcap"
-        )
+    if output.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected one of {', '.join(SUFFIXES)}")
+    if outputs.color not in ("original", "instance"):
+        raise InputError(f"color is '{outputs.color}'; expected original or instance")
     gmap = read_map(map_path)
     origin = map_origin(map_path, gmap.info)
     means = gmap.means + origin if origin.any() else gmap.means
-    cloud: PointCloud | Path = points if points is not None else surface_points(gmap, means)
+    began = time.perf_counter()
     if points is None:  # every point is a Gaussian: nearest is itself
-        options = ExportOptions(drop_noise=False, smooth=False)
-    return run_export(
-        output,
-        cloud,
-        means,
-        gmap.instance_ids,
-        {entry["id"]: entry for entry in gmap.instances},
-        opacities=gmap.opacities,
-        quats=gmap.quats,
-        scales=gmap.scales,
-        options=options,
-        outputs=outputs,
+        cloud, options = surface_points(gmap, means), ExportOptions(drop_noise=False, smooth=False)
+    else:
+        cloud, options = read_cloud(points), resolved(options, means, gmap.instance_ids)
+    inside = check_overlap(means, cloud.points)
+    labels = export_labels(
+        means, gmap.instance_ids, gmap.opacities, cloud, options, quats=gmap.quats, scales=gmap.scales
     )
-
-
-def _for_viewers(map_path: Path, output: Path, points: Path | None) -> tuple[dict[str, Any], str]:
-    from perception.pipeline.replay import write_replay
-    from perception.pipeline.reporting import saved_views
-
-    if points is not None:
-        raise InputError(
-            f"{output}: such a file holds the map itself; leave --points out, or write the cloud with -o OUT.ply "
-            "and --mcap OUT.mcap beside it"
-        )
-    gmap = read_map(map_path)
-    views = saved_views(gmap)
-    write_replay(output, gmap, views)
-    facts = {"output": str(output), "views": len(views), "instances": len(gmap.instances)}
-    return facts, f"{output}: the map with {len(gmap.instances)} instances and {len(views)} cameras"
+    if outputs.color == "instance":
+        cloud = replace(cloud, colors=instance_palette(labels))
+    sidecar = _write(output, gmap, cloud, labels, origin, outputs)
+    result = {
+        "points": len(labels),
+        "labelled": int((labels >= 0).sum()),
+        "inside_map": inside,
+        "seconds": time.perf_counter() - began,
+        "rule": options.rule,
+        "max_distance": options.max_distance,
+        "smoothed": options.smooth,
+        **sidecar,
+    }
+    return result, _table(result)
 
 
 def surface_points(gmap: GaussianMap, means: np.ndarray | None = None) -> PointCloud:
     """The means of opaque Gaussians with their colours; `means` [N, 3] instead of the map's own."""
     rows = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY)
-    colors = np.clip((gmap.sh[rows, 0] * SH_C0 + 0.5) * 255 + 0.5, 0, 255).astype(np.uint8)
-    return PointCloud((gmap.means if means is None else means)[rows], colors)
+    return PointCloud((gmap.means if means is None else means)[rows], rgb8_from_sh(gmap.sh[rows, 0]))
+
+
+def _write(
+    output: Path, gmap: GaussianMap, cloud: PointCloud, labels: np.ndarray, origin: np.ndarray, outputs: Outputs
+) -> dict[str, Any]:
+    """Writes everything, the output last: where it lies, all lies. Returns the sidecar."""
+    instances, frame = {entry["id"]: entry for entry in gmap.instances}, str(gmap.info.get("frame", "map"))
+    if outputs.split is not None:
+        write_split(outputs.split, cloud, labels)
+    if outputs.boxes is not None:
+        metric = bool(gmap.info.get("metric"))
+        write_boxes(outputs.boxes, cloud.points, labels, instances, frame=frame, metric=metric)
+    if outputs.scannet is not None:
+        write_scannet(outputs.scannet, output.stem, labels, instances)
+    if output.suffix.lower() != ".mcap":
+        return write_export(output, cloud, labels, instances)
+    from perception.export.mcap import write_recording
+
+    local = replace(cloud, points=cloud.points - origin) if origin.any() else cloud
+    write_recording(output, local, labels, gmap.instances, [view_from_json(v) for v in gmap.info["views"]], frame)
+    return sidecar_of(labels, instances)
+
+
+def _table(result: dict[str, Any]) -> str:
+    lines = [f"{'id':>6}{'points':>12}{'score':>8}  label"]
+    rows = sorted(result["instances"].items(), key=lambda row: -row[1]["num_points"])
+    lines += [f"{i:>6}{r['num_points']:>12}{r['score']:>8.3f}  {r['label'] or ''}" for i, r in rows]
+    lines.append(f"{result['labelled']} of {result['points']} points labelled, {result['seconds']:.1f} s")
+    if result["max_distance"] is not None:
+        lines.append(f"points farther than {result['max_distance']:.4g} from every Gaussian are -1")
+    if result["inside_map"] < 0.5:
+        lines.append(f"only {result['inside_map']:.0%} of the points lie inside the map: same frame and unit?")
+    return "\n".join(lines)

@@ -116,10 +116,10 @@ def query_text(answers: list[tuple[str, list[Hit]]], metric: bool) -> str:
 
 def write_hits(path: Path, gmap: GaussianMap, hits: list[Hit]) -> None:
     """The hits' points as one cloud with `instance_id` and the map's colours."""
-    from perception.gaussians.model import SH_C0
+    from perception.colors import rgb8_from_sh
     from perception.io.cloud import write_cloud
     from perception.types import PointCloud
 
     rows = np.flatnonzero(np.isin(gmap.instance_ids, [hit.instance_id for hit in hits]))
-    colors = np.clip((gmap.sh[rows, 0] * SH_C0 + 0.5) * 255 + 0.5, 0, 255).astype(np.uint8)
+    colors = rgb8_from_sh(gmap.sh[rows, 0])
     write_cloud(path, PointCloud(gmap.means[rows], colors, labels={"instance_id": gmap.instance_ids[rows]}))

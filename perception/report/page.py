@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from perception.colors import instance_palette
 from perception.io.atomic import atomic_file
-from perception.pictures import error_map, instance_palette
+from perception.pictures import error_map
 from perception.report.charts import columns, curve, stages
 from perception.report.data import InstanceRow, QueryRow, ReportData
 

@@ -126,7 +126,7 @@ class Viewer:
         return [entry for entry in entries if not chosen or entry["id"] in chosen]
 
     def _boxes(self) -> list[Any]:
-        from perception.pictures import instance_palette
+        from perception.colors import instance_palette
 
         handles = []
         for entry in self._visible_entries():

@@ -7,17 +7,17 @@ from collections.abc import Collection, Mapping
 import cv2
 import numpy as np
 
+from perception.colors import instance_palette, rgb8_from_sh
 from perception.io.store import GaussianMap
-from perception.pictures import features_to_rgb, instance_palette
+from perception.pictures import features_to_rgb
 
 MODES = ("photo", "instances", "parts", "features", "confidence", "depth")
 HIGHLIGHT = np.array([255, 214, 10], np.uint8)
-_SH_CONSTANT = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
 
 
 def base_colors(gmap: GaussianMap) -> np.ndarray:
     """[N, 3] uint8: each Gaussian's colour seen from anywhere (its constant harmonic)."""
-    return np.clip(np.round(255 * (0.5 + _SH_CONSTANT * gmap.sh[:, 0])), 0, 255).astype(np.uint8)
+    return rgb8_from_sh(gmap.sh[:, 0])
 
 
 def paint(

@@ -9,9 +9,8 @@ import pytest
 
 from perception.boxes import instance_boxes, oriented_box
 from perception.errors import InputError
-from perception.export.formats import instance_colors, write_boxes, write_scannet, write_split
+from perception.export.formats import write_boxes, write_export, write_scannet, write_split
 from perception.export.labels import ExportOptions, check_overlap, export_labels
-from perception.export.run import Outputs, run_export, write_export
 from perception.export.smooth import SmoothOptions
 from perception.io.cloud import read_cloud, write_cloud
 from perception.types import PointCloud
@@ -114,39 +113,6 @@ def test_export_file_and_sidecar(tmp_path):
     assert sidecar["0"] == {"score": 0.25, "label": "mug", "num_points": int((labels == 0).sum())}
 
 
-def test_run_export_writes_all_that_was_asked_for(tmp_path):
-    pytest.importorskip("rosbags")
-    cloud, labels = scene()
-    write_cloud(tmp_path / "in.pcd", cloud)
-    outputs = Outputs(
-        color="instance",
-        split=tmp_path / "parts",
-        boxes=tmp_path / "boxes.json",
-        scannet=tmp_path / "submission",
-        mcap=tmp_path / "out.mcap",
-    )
-    result, table = run_export(
-        tmp_path / "out.ply",
-        tmp_path / "in.pcd",
-        cloud.points,
-        labels,
-        {0: {"score": 0.5, "label": "cup"}},
-        classes={0: 4, 2: 9},
-        options=ExportOptions(smooth=False, drop_noise=False),
-        outputs=outputs,
-    )
-    back = read_cloud(tmp_path / "out.ply")
-    np.testing.assert_array_equal(back.labels["instance_id"], labels)
-    np.testing.assert_array_equal(back.colors, instance_colors(labels))
-    np.testing.assert_array_equal(back.labels["semantic_id"], np.array([0, 4, 0, 9])[labels + 1])
-    assert result["points"] == 3000 and result["labelled"] == (labels >= 0).sum()
-    assert "cup" in table and json.loads(json.dumps(result))["instances"]["0"]["label"] == "cup"
-    names = {p.name for p in tmp_path.iterdir()}
-    assert names == {"in.pcd", "out.ply", "out.json", "parts", "boxes.json", "submission", "out.mcap"}
-    with pytest.raises(InputError, match="original or instance"):
-        run_export(tmp_path / "x.ply", cloud, cloud.points, labels, {}, outputs=Outputs(color="red"))
-
-
 def test_plyfile_reads_what_is_written(tmp_path):
     plyfile = pytest.importorskip("plyfile")
     cloud, labels = scene(200)
@@ -177,14 +143,6 @@ def test_one_point_and_duplicated_points_are_exported(graph):
     twins = PointCloud(np.tile([[0.1, 0, 0]], (50, 1)))
     assert export_labels(means, ids, None, twins, options).tolist() == [3] * 50
     assert export_labels(means[:0], ids[:0], None, twins, options).tolist() == [-1] * 50
-
-
-def test_colours_are_fixed_by_id_and_distinct():
-    labels = np.array([3, -1, 0, 3, 41], np.int32)
-    colors = instance_colors(labels)
-    assert colors[1].tolist() == [90, 90, 90] and colors[0].tolist() == colors[3].tolist()
-    np.testing.assert_array_equal(instance_colors(np.array([41, 0])), colors[[4, 2]])
-    assert len({tuple(c) for c in instance_colors(np.arange(60)).tolist()}) == 60
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3, 1.2])
@@ -237,45 +195,6 @@ def test_scannet_submission_layout(tmp_path):
     assert [(row[1], float(row[2])) for row in rows] == [("1", 0.9), ("1", 0.5), ("1", 0.2)]
     for row, i in zip(rows, (1, 2, 0), strict=True):
         np.testing.assert_array_equal(np.loadtxt(tmp_path / row[0], dtype=int), labels == i)
-
-
-def test_mcap_is_read_back_by_rosbags(tmp_path):
-    highlevel = pytest.importorskip("rosbags.highlevel")
-    from perception.export.mcap import write_mcap
-
-    cloud, labels = scene(400)
-    path = tmp_path / "out.mcap"
-    write_mcap(path, cloud, labels, {0: {"score": 0.25, "label": "mug"}}, frame="world", stamp_ns=3_000_000_007)
-    messages = {}
-    with highlevel.AnyReader([path]) as reader:
-        for connection, time, raw in reader.messages():
-            assert time == 3_000_000_007
-            messages[connection.msgtype] = reader.deserialize(raw, connection.msgtype)
-    points = messages["sensor_msgs/msg/PointCloud2"]
-    assert points.header.frame_id == "world" and (points.header.stamp.sec, points.header.stamp.nanosec) == (
-        3,
-        7,
-    )
-    assert [(f.name, f.offset) for f in points.fields] == [
-        ("x", 0),
-        ("y", 4),
-        ("z", 8),
-        ("rgb", 12),
-        ("instance_id", 16),
-    ]
-    rows = np.frombuffer(points.data, [("p", "<f4", 3), ("rgb", "<u4"), ("i", "<i4")])
-    np.testing.assert_array_equal(rows["p"], cloud.points)
-    np.testing.assert_array_equal(rows["i"], labels)
-    np.testing.assert_array_equal(rows["rgb"] >> 8 & 255, cloud.colors[:, 1])
-    found = {d.id: d for d in messages["vision_msgs/msg/Detection3DArray"].detections}
-    assert found.keys() == {"0", "1", "2"}
-    hypothesis = found["0"].results[0].hypothesis
-    assert (hypothesis.class_id, hypothesis.score) == ("mug", 0.25)
-    size, center = found["0"].bbox.size, found["0"].bbox.center.position
-    own = cloud.points[labels == 0]
-    assert size.x * size.y * size.z <= np.ptp(own, axis=0).prod() * 1.002
-    middle = (own.min(axis=0) + own.max(axis=0)) / 2
-    np.testing.assert_allclose([center.x, center.y, center.z], middle, atol=0.02)
 
 
 def test_laz_through_laspy(tmp_path):

@@ -160,12 +160,12 @@ def test_every_type_is_rosbags_serialisation_of_a_message_made_by_hand() -> None
     nowhere = t["geometry_msgs/msg/Pose"](point(0.0, 0.0, 0.0), turn(0.0, 0.0, 0.0, 1.0))
     marks = [
         marker(0, 0, 3, nowhere, vector(0.0, 0.0, 0.0), color(0.0, 0.0, 0.0, 0.0), "", ""),
-        marker(0, 1, 0, at, vector(0.5, 0.25, 0.125), color(0.0, 1.0, 0.0, 0.4), "", "q"),
+        marker(0, 1, 0, at, vector(0.5, 0.25, 0.125), color(177 / 255, 199 / 255, 90 / 255, 0.4), "", "q"),
         marker(1, 9, 0, at, vector(0.0, 0.0, 0.05), color(1.0, 1.0, 1.0, 1.0), "mug", "q"),
     ]
     expected["visualization_msgs/msg/MarkerArray"] = (
         t["visualization_msgs/msg/MarkerArray"](marks),
-        box_markers([(box, "mug")], "q", header("map", STAMP)),
+        box_markers([(10, box, "mug")], "q", header("map", STAMP)),
     )
     for kind, (message, own) in expected.items():
         assert serialize(kind, own) == bytes(store.serialize_cdr(message, kind)), kind

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from perception.colors import instance_palette
 from perception.config import load_config
 from perception.io.store import GaussianMap
-from perception.pictures import instance_palette
 from perception.pipeline.above import instances_from_above
 from perception.pipeline.reporting import _left_out, rerun_command
 

@@ -1,7 +1,8 @@
-"""A map as a bag for viewers, decoded by Foxglove's own reader and checked against the photos' geometry."""
+"""`perception export`: files read back, a recording by Foxglove's own reader and against the photos' geometry."""
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -16,19 +17,22 @@ pytest.importorskip("rosbags")
 reader = pytest.importorskip("mcap.reader")
 decoder = pytest.importorskip("mcap_ros2.decoder")
 
+from perception.colors import instance_palette  # noqa: E402
 from perception.errors import InputError  # noqa: E402
-from perception.export import ExportOptions, Outputs  # noqa: E402
+from perception.export import ExportOptions  # noqa: E402
 from perception.geometry import look_at  # noqa: E402
+from perception.io.cloud import read_cloud, write_cloud  # noqa: E402
 from perception.io.scene_cache import view_json  # noqa: E402
 from perception.io.store import GaussianMap, write_map  # noqa: E402
-from perception.pipeline.exporting import export_map  # noqa: E402
-from perception.types import View  # noqa: E402
+from perception.pipeline.exporting import Outputs, export_map  # noqa: E402
+from perception.types import PointCloud, View  # noqa: E402
 
 # What Foxglove's 3D panel and RViz draw by themselves.
 DRAWN = {
     "/map/points": "sensor_msgs/msg/PointCloud2",
     "/map/instances": "sensor_msgs/msg/PointCloud2",
     "/map/boxes": "visualization_msgs/msg/MarkerArray",
+    "/map/detections": "vision_msgs/msg/Detection3DArray",
     "/tf": "tf2_msgs/msg/TFMessage",
     "/camera/camera_info": "sensor_msgs/msg/CameraInfo",
     "/camera/image/compressed": "sensor_msgs/msg/CompressedImage",
@@ -68,11 +72,10 @@ def messages(file: Path) -> tuple[dict[str, str], dict[str, list[Any]]]:
 
 def test_every_message_decodes_and_lies_over_the_photos(path: Path, tmp_path: Path) -> None:
     out = tmp_path / "m.mcap"
-    facts, _ = export_map(path, out, None, ExportOptions(), Outputs())
-    assert facts["views"] == 3
+    export_map(path, out, None, ExportOptions(), Outputs())
     schemas, found = messages(out)
     assert schemas == DRAWN
-    assert {topic: len(told) for topic, told in found.items()} == dict(zip(DRAWN, (1, 1, 1, 3, 2, 2), strict=True))
+    assert {topic: len(told) for topic, told in found.items()} == dict(zip(DRAWN, (1, 1, 1, 1, 3, 2, 2), strict=True))
 
     gmap: GaussianMap = small_map()
     points = found["/map/points"][0]
@@ -112,15 +115,47 @@ def _projected(points: np.ndarray, transform: Any, intrinsics: np.ndarray) -> np
     return (own @ intrinsics.T)[:, :2] / own[:, 2:]
 
 
-def test_a_cloud_with_its_boxes_is_drawn_too(path: Path, tmp_path: Path) -> None:
-    export_map(path, tmp_path / "own.ply", None, ExportOptions(), Outputs(mcap=tmp_path / "own.mcap"))
-    schemas, found = messages(tmp_path / "own.mcap")
-    assert schemas["/perception/boxes"] == "visualization_msgs/msg/MarkerArray"
-    assert sum(marker.type == 1 and marker.action == 0 for marker in found["/perception/boxes"][0].markers) == 3
+def test_a_recording_of_a_labelled_cloud_holds_that_cloud(path: Path, tmp_path: Path) -> None:
+    """The cloud's own points and colours, each labelled point in the colour that the instance has everywhere."""
+    gmap = small_map()
+    rng = np.random.default_rng(0)
+    cloud = PointCloud(gmap.means[::3] + np.float32(0.001), rng.integers(0, 256, (200, 3)).astype(np.uint8))
+    write_cloud(tmp_path / "scan.ply", cloud)
+    options = ExportOptions(smooth=False, drop_noise=False)
+    facts, _ = export_map(path, tmp_path / "m.mcap", tmp_path / "scan.ply", options, Outputs())
+    _, found = messages(tmp_path / "m.mcap")
+    rows = np.frombuffer(found["/map/points"][0].data, [("p", "<f4", 3), ("rgb", "<u4")])
+    np.testing.assert_array_equal(rows["p"], cloud.points)
+    np.testing.assert_array_equal(rows["rgb"] >> 8 & 255, cloud.colors[:, 1])
+    rows = np.frombuffer(found["/map/instances"][0].data, [("p", "<f4", 3), ("rgb", "<u4"), ("i", "<i4")])
+    assert len(rows) == facts["labelled"] == sum(row["num_points"] for row in facts["instances"].values())
+    nearest = np.linalg.norm(gmap.means[:, None] - rows["p"][None], axis=2).argmin(axis=0)
+    np.testing.assert_array_equal(rows["i"], gmap.instance_ids[nearest])
+    np.testing.assert_array_equal(rows["rgb"] & 255, instance_palette(rows["i"])[:, 2])
+    boxes = [m for m in found["/map/boxes"][0].markers if m.type == 1 and m.action == 0]
+    tints = [[round(255 * value) for value in (m.color.r, m.color.g, m.color.b)] for m in boxes]
+    assert tints == instance_palette(3).tolist()
+    told = found["/map/detections"][0].detections
+    assert [(d.id, d.results[0].hypothesis.class_id) for d in told] == [("0", "0"), ("1", "1"), ("2", "blue ball")]
+    assert [d.results[0].hypothesis.score for d in told] == pytest.approx([0.2, 0.5, 0.8])
+    assert [told[1].bbox.center.position.x, told[1].bbox.center.position.y] == pytest.approx([0, 0.2])
 
 
-def test_a_map_for_viewers_takes_no_cloud(path: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="leave --points out"):
-        export_map(path, tmp_path / "m.mcap", tmp_path / "scan.ply", ExportOptions(), Outputs())
-    with pytest.raises(InputError, match=r"\.mcap"):
-        export_map(path, tmp_path / "m.obj", None, ExportOptions(), Outputs())
+def test_all_that_was_asked_for_is_written(path: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    outputs = Outputs("instance", folder / "parts", folder / "boxes.json", folder / "submission")
+    facts, table = export_map(path, folder / "out.ply", None, ExportOptions(), outputs)
+    gmap = small_map()
+    solid = gmap.opacities >= 0.5
+    back = read_cloud(folder / "out.ply")
+    np.testing.assert_array_equal(back.labels["instance_id"], gmap.instance_ids[solid])
+    np.testing.assert_array_equal(back.colors, instance_palette(gmap.instance_ids[solid]))
+    assert facts["points"] == solid.sum() and facts["labelled"] == (solid & (gmap.instance_ids >= 0)).sum()
+    assert "blue ball" in table and json.loads(json.dumps(facts))["instances"]["2"]["label"] == "blue ball"
+    assert {p.name for p in folder.iterdir()} == {"out.ply", "out.json", "parts", "boxes.json", "submission"}
+    for wrong in (folder / "m.obj", folder / "m.rrd"):
+        with pytest.raises(InputError, match=r"\.mcap"):
+            export_map(path, wrong, None, ExportOptions(), Outputs())
+    with pytest.raises(InputError, match="original or instance"):
+        export_map(path, folder / "x.ply", None, ExportOptions(), Outputs("red"))
