@@ -25,7 +25,8 @@ def register(commands: Any) -> None:
 
 
 def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.serve.settings import ServeSettings, read_token
+    from perception.listening import read_token
+    from perception.serve.settings import ServeSettings
 
     settings = ServeSettings(
         host=args.host,

@@ -9,12 +9,12 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
 
+from perception.listening import names_this_machine
 from perception.serve.errors import problem
 from perception.serve.settings import ServeSettings
 
 OPEN = {"/", "/page.js", "/page.css", "/openapi.json", "/health"}
 """Paths that tell nothing of the map without a token; /health then says only its status."""
-_LOCAL_NAMES = {"localhost", "127.0.0.1", "[::1]"}
 _MOST_CLIENTS = 4096
 _MOST_DROPPED = 8 << 20
 _HEADERS = [
@@ -61,8 +61,8 @@ class Guard:
         """The answer that turns the request away, or None."""
         settings = self.settings
         if settings.token is None:
-            name = headers.get("host", "").rsplit(":", 1)[0] if not headers.get("host", "").endswith("]") else "[::1]"
-            if name not in {*_LOCAL_NAMES, settings.host, f"[{settings.host}]"}:
+            name = headers.get("host", "")
+            if not names_this_machine(name, settings.host):
                 return problem(403, f"Host '{name[:80]}' is not this machine; ask for 127.0.0.1 or localhost")
         wait = self._wait(scope["client"][0] if scope.get("client") else "")
         if wait > 0:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import io
-import socket
+import secrets
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
-from perception.errors import InputError
+from perception.errors import InputError, missing_extra
+from perception.listening import check_address, listen, url_host
+from perception.viewer.guard import Guard, guarded_server
 from perception.viewer.panel import Panel
 from perception.viewer.session import Session
 from perception.viewer.splats import Splats
@@ -28,15 +32,22 @@ WATCH = 1.0
 
 
 class Viewer:
-    """A running page. `url` is where; `stop` ends it."""
+    """A running page. `address` is where, `url` the same with the token that opens it; `stop` ends it."""
 
-    def __init__(self, path: Path, host: str = "127.0.0.1", port: int = 8090):
-        viser = _viser()
-        _check_port(host, port)
-        self.session = Session(path)
-        with contextlib.redirect_stdout(io.StringIO()):  # viser greets on stdout, which belongs to --json
-            self.server = viser.ViserServer(host=host, port=port, label=f"perception · {path.name}", verbose=False)
-        self.url = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0', '::') else host}:{port}"
+    def __init__(self, path: Path, host: str = "127.0.0.1", port: int = 8090, token: str | None = None):
+        check_address(host, port, token)
+        if importlib.util.find_spec("viser") is None:
+            raise missing_extra("viser", "view")
+        token = token or secrets.token_urlsafe(24)
+        with contextlib.ExitStack() as undo:
+            sock = undo.enter_context(listen(host, port))
+            self.session = Session(path)
+            label = f"perception · {path.name}"
+            self.server = guarded_server(Guard(token, host), sock, host=host, port=port, label=label, verbose=False)
+            undo.pop_all()  # the socket is the server's now
+        shown = "localhost" if host in ("127.0.0.1", "0.0.0.0", "::") else url_host(host)
+        self.address = f"http://{shown}:{sock.getsockname()[1]}"
+        self.url = f"{self.address}/?token={quote(token, safe='')}"
         self._one = threading.RLock()  # what browsers ask for is done one after the other
         self._overlays: dict[str, list[Any]] = {"cameras": [], "boxes": [], "names": []}
         self._overlays_on = dict.fromkeys(self._overlays, False)
@@ -236,24 +247,10 @@ class Viewer:
         return ""
 
 
-def start_viewer(path: Path, host: str = "127.0.0.1", port: int = 8090) -> Viewer:
-    """Opens a map in a page at http://host:port. Raises InputError for no map, a port in use, or viser missing."""
-    return Viewer(Path(path), host, port)
+def start_viewer(path: Path, host: str = "127.0.0.1", port: int = 8090, token: str | None = None) -> Viewer:
+    """Opens a map in a page at http://host:port (port 0: any free one).
 
-
-def _viser() -> Any:
-    try:
-        import viser
-    except ImportError as error:
-        raise InputError('the viewer needs viser; run in the clone: pip install ".[view]"') from error
-    return viser
-
-
-def _check_port(host: str, port: int) -> None:
-    """viser would silently take another port; a person who wrote one down must be told."""
-    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError as error:
-            raise InputError(f"--port {port}: cannot be opened on {host} ({error.strerror}); choose another") from error
+    token: what opens the page; None makes one up, and is refused where other machines can reach `host`.
+    Raises InputError for no map, a port in use, an address without a token, or viser missing.
+    """
+    return Viewer(Path(path), host, port, token)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import string
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +11,16 @@ from perception.viewer.paint import MODES
 
 if TYPE_CHECKING:
     from perception.viewer.app import Viewer
+
+
+def escaped(text: str) -> str:
+    """`text` as Markdown that shows exactly these characters: viser renders HTML in it, and names are anybody's.
+
+    Every ASCII punctuation character becomes a character reference, which Markdown never takes for structure. The
+    characters that make a web or mail address one are set apart by an invisible element, else viser makes it a link.
+    """
+    shown = (f"&#{ord(c)};" if c in string.punctuation else c for c in " ".join(text.split()))
+    return re.sub("(&#(?:46|58|64);)", r"<wbr>\1", "".join(shown))  # . : @
 
 
 class Panel:
@@ -141,14 +153,14 @@ class Panel:
             self._words.content = "Click a thing; shift-click adds another."
             self._show_photo(None)
         elif len(session.selected) > 1:
-            names = [session.name(editor.entry(i)) for i in session.selected]
+            names = [escaped(session.name(editor.entry(i))) for i in session.selected]
             self._words.content = f"{len(names)} selected: {', '.join(names)}"
             self._show_photo(None)
         else:
             entry = editor.entry(session.selected[0])
             sides = " × ".join(f"{side:.2f}" for side in entry["obb"]["extent"])
             self._words.content = (
-                f"**{session.name(entry)}** (id {entry['id']})  \nconfidence {entry['score']:.2f} · "
+                f"**{escaped(session.name(entry))}** (id {entry['id']})  \nconfidence {entry['score']:.2f} · "
                 f"{entry['num_gaussians']} Gaussians  \nbox {sides} {unit}"
                 + (f"  \n{len(entry['parts'])} parts; Split takes it apart" if entry.get("parts") else "")
             )
@@ -159,7 +171,7 @@ class Panel:
             self._show_photo(session.crop(entry["id"]))
         last = editor.history[-3:]
         unsaved = "unsaved changes" if editor.dirty else "all saved"
-        self._history.content = f"*{unsaved}*" + "".join(f"  \n{what}" for what in reversed(last))
+        self._history.content = f"*{unsaved}*" + "".join(f"  \n{escaped(what)}" for what in reversed(last))
 
     def _refresh_answer(self) -> None:
         session = self.session
@@ -171,9 +183,9 @@ class Panel:
             self._answer.content = ""
             return
         if not session.hits:
-            self._answer.content = f'"{session.question}": **not present**'
+            self._answer.content = f'"{escaped(session.question)}": **not present**'
             return
-        self._answer.content = f'"{session.question}": {len(session.hits)} found'
+        self._answer.content = f'"{escaped(session.question)}": {len(session.hits)} found'
         with self._hits_folder:
             for rank, hit in enumerate(session.hits, start=1):
                 whole = session.editor.entry(hit.instance_id if hit.parent is None else hit.parent)

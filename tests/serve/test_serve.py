@@ -26,11 +26,12 @@ from perception.cli import main
 from perception.errors import InputError
 from perception.io.cloud import read_cloud
 from perception.io.store import read_map
+from perception.listening import is_local, read_token
 from perception.query import LoadedMap, QueryEngine
 from perception.serve.app import build_app
 from perception.serve.guard import Guard
 from perception.serve.openapi import document
-from perception.serve.settings import ServeSettings, read_token
+from perception.serve.settings import ServeSettings
 
 TOKEN = "0123456789abcdef0123"
 
@@ -379,7 +380,7 @@ def test_other_machines_need_a_token(tmp_path: Path, capsys: pytest.CaptureFixtu
             ServeSettings(host=host)
         ServeSettings(host=host, token=TOKEN)
     for host in ("127.0.0.1", "127.8.8.8", "::1", "localhost"):
-        assert ServeSettings(host=host).local
+        assert is_local(host)
     assert main(["serve", str(tmp_path), "--host", "0.0.0.0"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,7 +19,7 @@ from perception.io.store import GaussianMap, read_map, set_labels, write_map
 from perception.language.description import InstanceDescription, to_arrays
 from support.viewer_maps import free_port, small_map
 
-pytest.importorskip("viser")
+viser = pytest.importorskip("viser")
 api = pytest.importorskip("playwright.sync_api")
 CHROMIUM = os.environ.get("PERCEPTION_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a Chromium (PERCEPTION_CHROMIUM or on the PATH)")
@@ -269,6 +271,93 @@ def test_parts_are_shown_found_and_split_along(path: Path, browser: Any, monkeyp
         assert len(viewer.session.editor.instances) == 4
     finally:
         viewer.stop()
+
+
+EVIL = "<img src=x onerror=\"document.body.dataset.owned='yes'\">"
+"""A label that runs a script where HTML is rendered."""
+MARKED = "**bold** [link](http://evil.example) <b>b</b> www.evil.example a@evil.example {1+1} `code` &amp; # | ~~x~~"
+
+
+@pytest.mark.parametrize(
+    "label", [EVIL, MARKED, f"<script>{'x'}</script>", "a\n\n# heading\n<iframe src=//evil.example>"]
+)
+def test_names_and_prompts_are_shown_as_they_are_and_run_nothing(
+    viewer: Any, visit: Callable[[], Any], path: Path, label: str
+) -> None:
+    """In every place: facts, selection of one and of several, answer, hits, history, notices, names in the scene."""
+    from perception.errors import InputError
+
+    label, elements = " ".join(label.split()), "body img[src=x], iframe, a, b, h1, del, code, script"
+    page = visit()
+    before = page.locator(elements).count()
+
+    def several() -> None:
+        viewer.session.select(0)
+        viewer.session.select(1, add=True)
+
+    def refuse() -> None:
+        raise InputError(f"notice {label}")
+
+    viewer.guarded(lambda: viewer.session.editor.rename(1, label), edited=True)
+    viewer.guarded(lambda: viewer.session.ask("pear"))
+    page.wait_for_selector("text=1. ")
+    shown = page.locator("body")
+    until(lambda: shown.inner_text().count(label) >= 3)  # the hit's button, the selection, the history
+    viewer.guarded(several)
+    until(lambda: f"2 selected: instance 0, {label}" in shown.inner_text())
+    viewer.guarded(lambda: viewer.session.ask(label))
+    until(lambda: f'"{label}": not present' in shown.inner_text())
+    viewer.overlay("names", True)
+    viewer.guarded(refuse)
+    until(lambda: f"notice {label}" in shown.inner_text())
+    assert page.evaluate("document.body.dataset.owned") is None
+    assert page.locator(elements).count() == before
+
+
+def test_a_page_of_another_origin_cannot_drive_the_viewer(viewer: Any, browser: Any, tmp_path: Path) -> None:
+    """In the browser that has the viewer open: another site's script connects, embeds and reads, and gets nothing."""
+    context, port = browser.new_context(), free_port()
+    context.set_default_timeout(120_000)
+    page = context.new_page()
+    page.goto(viewer.url)
+    page.wait_for_selector("text=Gaussians · instances")
+    (tmp_path / "evil").mkdir()
+    (tmp_path / "evil" / "index.html").write_text("<title>evil</title>")
+    served = subprocess.Popen(
+        [sys.executable, "-m", "http.server", str(port), "--bind", "127.0.0.1", "-d", str(tmp_path / "evil")],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        evil = context.new_page()
+        until(lambda: _opens(evil, f"http://localhost:{port}/"))
+        opened = evil.evaluate(
+            """async ([address, protocol]) => {
+              const socket = new WebSocket(address, [protocol]);
+              return await new Promise((done) => {
+                socket.onopen = () => done(true);
+                socket.onclose = () => done(false);
+              });
+            }""",
+            [viewer.address.replace("http", "ws"), f"viser-v{viser.__version__}"],
+        )
+        assert opened is False
+        read = "(a) => fetch(a, {credentials: 'include'}).then((r) => r.text(), () => 'refused')"
+        assert evil.evaluate(read, viewer.address) == "refused"
+        evil.goto(f"{viewer.address}/?websocket=ws://localhost:{port}")
+        evil.wait_for_selector("text=Gaussians · instances")
+        assert evil.url == f"{viewer.address}/"
+    finally:
+        context.close()
+        served.kill()
+        served.wait()
+
+
+def _opens(page: Any, address: str) -> bool:
+    try:
+        return bool(page.goto(address).ok)
+    except api.Error:  # it does not listen yet
+        return False
 
 
 def _yellow(page: Any) -> int:

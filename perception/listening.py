@@ -1,0 +1,84 @@
+"""Where a server listens and who may reach it: the rules that `perception serve` and `perception view` share."""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+import socket
+from pathlib import Path
+
+from perception.errors import InputError
+
+MAKE_TOKEN = "openssl rand -hex 24 > token, then --token-file token"
+_MIN_TOKEN = 16
+_LOCAL_NAMES = {"localhost", "127.0.0.1", "[::1]"}
+_BACKLOG = 256
+
+
+def is_local(host: str) -> bool:
+    """Whether only this machine can reach a server that listens on `host`."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def check_address(host: str, port: int, token: str | None) -> None:
+    """Raises InputError for a port out of range, and for a host that others can reach without a token."""
+    if not 0 <= port <= 65535:
+        raise InputError(f"--port: found {port}, expected 0 to 65535")
+    if token is None and not is_local(host):
+        raise InputError(f"--host {host}: others could reach the map there, so a token is needed: {MAKE_TOKEN}")
+
+
+def names_this_machine(header: str, host: str) -> bool:
+    """Whether a request's Host header is a loopback name or the name `host` that the server was told to listen on.
+
+    DNS rebinding: a page of another site can make its own name resolve to 127.0.0.1, and the browser then lets it read
+    answers from here. Its requests still carry that name.
+    """
+    name = header[: header.index("]") + 1] if header.startswith("[") and "]" in header else header.partition(":")[0]
+    return name.lower() in _LOCAL_NAMES | {url_host(host).lower()}
+
+
+def url_host(host: str) -> str:
+    """`host` as it stands in a URL: IPv6 addresses in brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A bound, listening TCP socket; InputError naming the argument when the address or port cannot be had."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"--host {host}: is no address of this machine ({error})") from error
+    sock = socket.socket(family, kind, protocol)
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a restart must not wait for old connections
+        sock.bind(address)
+        sock.listen(_BACKLOG)
+    except OSError as error:
+        sock.close()
+        if error.errno == errno.EADDRINUSE:
+            raise InputError(f"--port {port}: is in use on {host}; stop that server or choose another port") from error
+        if error.errno == errno.EADDRNOTAVAIL:
+            raise InputError(f"--host {host}: is no address of this machine") from error
+        raise InputError(f"--host {host} --port {port}: cannot listen there ({error.strerror})") from error
+    return sock
+
+
+def read_token(path: Path) -> str:
+    """The token in a file, white space around it dropped; InputError when it is unreadable, short or not ASCII."""
+    try:
+        token = path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as a token ({error})") from error
+    if len(token) < _MIN_TOKEN or not token.isascii() or not token.isprintable() or " " in token:
+        raise InputError(
+            f"{path}: holds {len(token)} characters, expected one ASCII word of at least {_MIN_TOKEN}: {MAKE_TOKEN}"
+        )
+    return token

@@ -1,0 +1,134 @@
+"""Who may use the viewer's page: a check of every HTTP request and websocket handshake, before viser sees it.
+
+Any web page that the same browser shows can open a connection to this machine, and viser accepts all of them. Three
+checks keep others out: the Host header names this machine (against DNS rebinding), a websocket's Origin is the page
+that this server sent, and the browser has the token. The token comes in the printed address and is kept as a cookie.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hmac
+import io
+import re
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from http import HTTPStatus
+from typing import Any
+from urllib.parse import parse_qs, quote, unquote
+
+from perception.errors import InputError
+from perception.listening import is_local, names_this_machine
+
+_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "X-Frame-Options": "DENY",
+    # viser's page is one inline script that compiles WebAssembly and starts workers from blobs. Inline event handlers
+    # (onerror=…) and connections to other servers are what injected HTML would need; the page itself needs neither.
+    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; "
+    "script-src-attr 'none'; style-src 'unsafe-inline'; img-src 'self' data: blob:; font-src data:; "
+    "worker-src blob: data:; connect-src 'self' ws://{host} wss://{host} data: blob:; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
+}
+_HOST = re.compile(r"([\w.-]+|\[[0-9a-fA-F:.]+\])(:\d{1,5})?", re.ASCII)
+_patching = threading.Lock()
+
+
+class Guard:
+    """Answers what must not reach viser. token: what the browser must show; host: where the server listens."""
+
+    def __init__(self, token: str, host: str) -> None:
+        self._token, self._host = token.encode(), host
+
+    def __call__(self, request: Any) -> Any:
+        """The `websockets` Response that ends this request, or None when viser may answer it."""
+        host, origins = _only(request, "Host") or "", request.headers.get_all("Origin")
+        if not _HOST.fullmatch(host) or (is_local(self._host) and not names_this_machine(host, self._host)):
+            return _answer(HTTPStatus.FORBIDDEN, "the Host header does not name this machine")
+        if any(origin.partition("://")[2].lower() != host.lower() for origin in origins):
+            return _answer(HTTPStatus.FORBIDDEN, "a page of another origin may not connect")
+        cookie = f"perception_{host.rpartition(':')[2] if host[-1] != ']' and ':' in host else 80}"
+        query = request.path.partition("?")[2]
+        shown = parse_qs(query).get("token", [])
+        if shown and self._right(shown[0]):
+            kept = f"{cookie}={quote(shown[0], safe='')}; HttpOnly; SameSite=Lax; Path=/"
+            return _answer(HTTPStatus.SEE_OTHER, "", {"Location": "/", "Set-Cookie": kept})
+        if not any(self._right(value) for value in _cookies(request, cookie)):
+            return _answer(HTTPStatus.FORBIDDEN, "open the address with the token that perception view printed")
+        if query:
+            # viser's page would connect to any server that ?websocket=… names, and run what that one sends.
+            return _answer(HTTPStatus.SEE_OTHER, "", {"Location": "/"})
+        return None
+
+    def _right(self, shown: str) -> bool:
+        return hmac.compare_digest(shown.encode("utf-8", "replace"), self._token)
+
+
+def _only(request: Any, name: str) -> str | None:
+    """A header that is there once, else None."""
+    values = request.headers.get_all(name)
+    return values[0] if len(values) == 1 else None
+
+
+def _cookies(request: Any, name: str) -> Iterator[str]:
+    for header in request.headers.get_all("Cookie"):
+        for pair in header.split(";"):
+            key, _, value = pair.strip().partition("=")
+            if key == name:
+                yield unquote(value)
+
+
+def _answer(status: HTTPStatus, line: str, headers: dict[str, str] | None = None) -> Any:
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
+
+    body = (line + "\n").encode()
+    fields = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close"}
+    return Response(status, status.phrase, Headers(**fields, **(headers or {})), body)
+
+
+def guarded_server(guard: Guard, sock: socket.socket, **settings: Any) -> Any:
+    """A viser.ViserServer that listens on `sock` and lets `guard` answer first. settings: of ViserServer.
+
+    viser 1.1 offers no such hook. It starts its server by `websockets.asyncio.server.serve`, whose documented argument
+    `process_request` is called with each request before a handshake, and `sock` says where to listen: that function is
+    replaced while the server starts. Raises InputError when viser starts its server in another way.
+    """
+    import viser
+    import websockets.asyncio.server as ws
+
+    original, seen = ws.serve, threading.Event()
+
+    @functools.wraps(original)
+    def serve(handler: Any, host: Any, port: Any, *, process_request: Any = None, **rest: Any) -> Any:
+        seen.set()
+        check = _process_request(guard, process_request)
+        return original(handler, None, None, sock=sock, process_request=check, **rest)
+
+    with _patching, contextlib.redirect_stdout(io.StringIO()):  # viser greets on stdout, which belongs to --json
+        ws.serve = serve  # type: ignore[assignment,misc]
+        try:
+            server = viser.ViserServer(**settings)
+        finally:
+            ws.serve = original  # type: ignore[misc]
+        if not seen.is_set():
+            server.stop()
+            raise InputError(f"viser {viser.__version__}: its server cannot be guarded; install viser 1.1")
+    return server
+
+
+def _process_request(guard: Guard, inner: Callable[[Any, Any], Any] | None) -> Callable[[Any, Any], Any]:
+    def process_request(connection: Any, request: Any) -> Any:
+        answer = guard(request)
+        if answer is None:
+            answer = inner(connection, request) if inner is not None else None
+        if answer is not None:
+            host = _only(request, "Host") or ""
+            for name, value in _HEADERS.items():
+                answer.headers[name] = value.format(host=host)
+        return answer
+
+    return process_request
