@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.safe_names import safe_name
 from perception.masks.labels import read_labels, read_png_header
 from perception.masks.source import GeometryMaskSource, MaskSource
 from perception.types import View
@@ -80,7 +81,7 @@ def compute_masks(
 
 def label_file(folder: Path, view: View) -> Path:
     """Where a view's label image lies. The photo's suffix is kept: `a.jpg` and `a.png` may both exist."""
-    return folder / f"{view.name}.png"
+    return folder / f"{safe_name(view.name, view.photo)}.png"
 
 
 def load_labels(folder: Path, view: View) -> np.ndarray:

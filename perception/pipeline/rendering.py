@@ -15,6 +15,7 @@ from perception.gaussians.render import render
 from perception.gaussians.train import depth_image
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.recentre import map_origin, moved
+from perception.io.safe_names import safe_name
 from perception.io.store import GaussianMap, read_map
 from perception.types import OrientedBox, View
 
@@ -37,11 +38,12 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     gmap = read_map(map_path)
     origin = map_origin(map_path, gmap.info)
     views = map_views(gmap) if cameras is None else [moved(view, origin) for view in _cameras(cameras)]
+    names = [safe_name(view.name, cameras or map_path) for view in views]  # whoever wrote them: nothing leaves `output`
     gaussians = as_gaussians(gmap)
     for kind in what:
         folder = output if len(what) == 1 else output / kind
-        for view in views:
-            path = (folder / view.name).with_suffix(".png")
+        for name, view in zip(names, views, strict=True):
+            path = (folder / name).with_suffix(".png")
             path.parent.mkdir(parents=True, exist_ok=True)
             _write(path, _through_lens(kind, gaussians, gmap, view))
     facts = {"output": str(output), "views": len(views), "what": what}
@@ -81,7 +83,10 @@ def _cameras(path: Path) -> list[View]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a transforms.json with the cameras to render")
     frames = read_frames(path)
-    folder = os.path.commonpath([str(PurePosixPath(name).parent) for name, _, _ in frames]) if frames else ""
+    try:
+        folder = os.path.commonpath([str(PurePosixPath(name).parent) for name, _, _ in frames]) if frames else ""
+    except ValueError as error:
+        raise InputError(f"{path}: some file_path are absolute, others relative; write all of one kind") from error
     views = []
     for name, camera_from_world, lens in frames:
         (fx, fy, cx, cy), width, height = pinhole_from_lens(lens)
