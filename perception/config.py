@@ -1,219 +1,203 @@
-"""The mapper's settings: typed, defaults need no file; a TOML file or KEY=VALUE pairs override single fields."""
+"""The mapper's settings: typed and checked; defaults need no file, a TOML file or KEY=VALUE pairs override single ones.
+
+What the user has no reason to change is a named constant beside its use.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import types
-import typing
-from dataclasses import dataclass, field
+import difflib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import Any, Literal, TypeVar, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic.fields import FieldInfo
 
 from perception.errors import InputError
 
-
-@dataclass(frozen=True)
-class PhotoConfig:
-    """What is read: long side in pixels at which the map is trained, and every `holdout`-th view kept for scoring.
-
-    held_out: a text file of photo names (with or without suffix), one a line, that are kept for scoring instead.
-    """
-
-    max_side: int = 800
-    holdout: int = 8
-    held_out: str | None = None
-    camera: str | None = None
+LARGEST_SEED = 2**31 - 1
+"""COLMAP's generator takes 32-bit signed seeds."""
 
 
-@dataclass(frozen=True)
-class TrainConfig:
-    """Length and step sizes of the optimisation (Kerbl et al. 2023, shortened: progress drives every schedule).
+class Settings(BaseModel):
+    """Base of all settings: immutable; unknown names, NaN and infinities are refused."""
 
-    Rates of scales and colours are twice theirs, that of the higher harmonics eight times, and that of the means falls
-    to a third instead of a hundredth: a tenth of their iterations leaves no time for small steps.
-    exchange_db: dB of held-out PSNR that 10 % more time must buy, else growth or training ends. stop_psnr: dB at which
-    training ends. cooldown: last share of the course, over which all rates fall.
-    """
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    iterations: int = 3000
-    time_limit: float | None = None
-    stop_psnr: float | None = None
-    exchange_db: float = 0.03
-    cooldown: float = 0.1
-    budget: int = 100_000
-    lr_means: float = 1.6e-4
-    lr_means_final: float = 5e-5
-    lr_quats: float = 1e-3
-    lr_scales: float = 1e-2
-    lr_opacities: float = 0.05
-    lr_colors: float = 5e-3
-    lr_harmonics: float = 1e-3
-    lr_features: float = 1e-2
-    ssim_weight: float = 0.2
-    sh_degree: int = 3
-    sh_min_gain_db: float = 0.05
-    coarse_until: float = 0.15
-    random_background: bool = True
-    checkpoint_seconds: float = 20.0
+    @field_validator("*", mode="before")
+    @classmethod
+    def _plain(cls, value: Any, info: ValidationInfo) -> Any:
+        """The texts that mean None; and no truth value passes as a number."""
+        kinds = _kinds(cls.model_fields[str(info.field_name)])
+        if NoneType in kinds and isinstance(value, str) and value in ("none", "null", ""):
+            return None
+        if isinstance(value, bool) and bool not in kinds:
+            raise ValueError("a truth value")
+        return value
 
 
-@dataclass(frozen=True)
-class DensifyConfig:
-    """Growth by screen-space gradient up to the budget, and pruning of what no photo needs.
-
-    Every `fill_every`-th time (0: never) places that the photos show and the map leaves empty get Gaussians first.
-    """
-
-    start: float = 0.05
-    stop: float = 0.6
-    every: int = 100
-    grad_threshold: float = 2e-4
-    percent_dense: float = 0.01
-    prune_opacity: float = 0.005
-    opacity_decay: float = 1e-2
-    fill_every: int = 5
+class PhotoConfig(Settings):
+    max_side: int = Field(800, ge=16, le=65536, description="pixels of the long side at which the map is trained")
+    holdout: int = Field(
+        8, ge=0, le=10**6, description="every N-th photo is kept out of training for scoring; 0: all are trained on"
+    )
+    held_out: str | None = Field(None, description="text file of the photos kept for scoring instead, a name a line")
+    camera: str | None = Field(None, description="ROS camera_info YAML: the intrinsics of all photos, kept fixed")
 
 
-@dataclass(frozen=True)
-class LossConfig:
-    """Instance losses of OpenSplat3D; variants as its authors' tool computes them are selectable.
-
-    Masks that begin from the map's own depth (the built-in ones) are made at progress `geometry_start`.
-    From progress `start` on, every `every`-th iteration renders features too, at half the resolution if so set:
-    features with their variance cost 2.5 times what colour does, and labels are smooth where photos are not.
-    """
-
-    feature_dim: int = 8
-    instance_weight: float = 0.1
-    variance_weight: float = 0.5
-    positive_weight: float = 1.0
-    negative_weight: float = 1.0
-    margin: float = 1.0
-    positive: str = "per-mask"
-    negative: str = "squared"
-    start: float = 0.3
-    geometry_start: float = 0.3
-    every: int = 2
-    half_resolution: bool = True
+class TrainConfig(Settings):
+    iterations: int = Field(3000, ge=1, le=10**8, description="iterations of training; all schedules scale with them")
+    time_limit: float | None = Field(None, gt=0, description="seconds of training; all schedules shrink to fit")
+    stop_psnr: float | None = Field(None, gt=0, le=100, description="dB of held-out PSNR at which training ends")
+    exchange_db: float = Field(
+        0.03,
+        ge=0,
+        le=1000,
+        description="dB of held-out PSNR that 10 % more time must gain, else growth or training ends; 0: never",
+    )
+    budget: int = Field(100_000, ge=100, le=10**8, description="most Gaussians the map may have")
+    sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics that is tried")
 
 
-@dataclass(frozen=True)
-class InstanceConfig:
-    """Gaussians into instances and what is kept of them.
-
-    method "consensus": segments of like feature and place, merged as the masks of all photos agree. "hdbscan": the
-    paper's clustering of features alone, then split where space does.
-    """
-
-    method: str = "consensus"
-    max_segments: int = 1000
-    min_cluster_size: int = 32
-    min_samples: int = 16
-    min_opacity: float = 0.1
-    max_clustered: int = 60_000
+class DensifyConfig(Settings):
+    every: int = Field(100, ge=1, le=10**8, description="iterations between two steps of growth and pruning")
+    grad_threshold: float = Field(
+        2e-4, ge=0, description="gradient of the 2D mean from which a Gaussian grows; units of half the long side"
+    )
 
 
-@dataclass(frozen=True)
-class LanguageConfig:
-    """Encoder and view choice (paper: K = 5 views, L = 3 zooms, expansion 0.3). zooms 0: as suits the encoder.
+class LossConfig(Settings):
+    feature_dim: int = Field(8, ge=1, le=64, description="dimensions D of the instance features")
+    variance_weight: float = Field(0.5, ge=0, le=1000, description="weight λ_var of the variance loss (eq. 13)")
+    margin: float = Field(1.0, gt=0, le=1000, description="margin γ of L_neg (eq. 8), in units of ‖z‖²")
+    positive: Literal["per-mask", "per-pixel"] = Field(
+        "per-mask", description="L_pos averaged over masks as in the paper, or over pixels as in the authors' code"
+    )
+    negative: Literal["squared", "unsquared"] = Field(
+        "squared", description="distance in L_neg: squared as in the paper, unsquared as in the authors' code"
+    )
+    start: float = Field(0.3, ge=0, le=1, description="share of the training after which features are trained")
+    every: int = Field(2, ge=1, le=10**8, description="features are trained in every N-th iteration")
+    half_resolution: bool = Field(True, description="features are trained at half the resolution of the photos")
 
-    background of the crops: plain, dim, blur or fill; plain measured best at top-3 on two rendered scenes.
-    """
 
-    encoder: str = "auto"
-    views: int = 5
-    zooms: int = 0
-    expansion: float = 0.3
-    background: str = "plain"
+class InstanceConfig(Settings):
+    method: Literal["consensus", "hdbscan"] = Field(
+        "consensus",
+        description="segments merged as the masks of all photos agree, or the paper's clustering of features alone",
+    )
+    min_cluster_size: int = Field(32, ge=2, le=10**6, description="Gaussians of the smallest instance")
+    min_samples: int = Field(16, ge=1, le=10_000, description="neighbours that define a density (HDBSCAN)")
 
 
-@dataclass(frozen=True)
-class MapConfig:
-    """All settings of `perception map`."""
+class LanguageConfig(Settings):
+    encoder: str = Field("auto", description="auto, none, conse or clip:FOLDER: what describes the instances")
+    views: int = Field(5, ge=1, le=1000, description="best views K that describe an instance (paper: 5)")
+    zooms: int = Field(0, ge=0, le=20, description="crops L of each view (paper: 3); 0: as suits the encoder")
 
-    seed: int = 0
-    device: str = "auto"
-    masks: str = "auto"
-    photos: PhotoConfig = field(default_factory=PhotoConfig)
-    train: TrainConfig = field(default_factory=TrainConfig)
-    densify: DensifyConfig = field(default_factory=DensifyConfig)
-    losses: LossConfig = field(default_factory=LossConfig)
-    instances: InstanceConfig = field(default_factory=InstanceConfig)
-    language: LanguageConfig = field(default_factory=LanguageConfig)
+
+class MapConfig(Settings):
+    """All settings of `perception map`. The descriptions and ranges are what `perception map --help` prints."""
+
+    seed: int = Field(0, ge=0, le=LARGEST_SEED, description="of all random choices")
+    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="what computes; there is no CUDA build yet")
+    masks: str = Field("auto", description="auto, builtin, sam:PATH or labels:DIR: where object masks come from")
+    photos: PhotoConfig = PhotoConfig()
+    train: TrainConfig = TrainConfig()
+    densify: DensifyConfig = DensifyConfig()
+    losses: LossConfig = LossConfig()
+    instances: InstanceConfig = InstanceConfig()
+    language: LanguageConfig = LanguageConfig()
 
     def to_json(self) -> dict[str, Any]:
-        return dataclasses.asdict(self)
+        return self.model_dump()
 
 
-BACKGROUNDS = ("plain", "dim", "blur", "fill")
-
-PRESETS: dict[str, list[str]] = {
-    "default": [],
-    "fast": ["train.iterations=1200", "train.budget=40000", "train.exchange_db=0.1"],
-    "quality": ["train.iterations=6000", "train.budget=300000", "train.exchange_db=0.005", "photos.max_side=1280"],
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "fast": {"train.iterations": 1200, "train.budget": 40_000, "train.exchange_db": 0.1},
+    "quality": {
+        "train.iterations": 6000,
+        "train.budget": 300_000,
+        "train.exchange_db": 0.005,
+        "photos.max_side": 1280,
+    },
 }
 
+METHOD = ("densify.", "losses.", "instances.min_", "train.sh_degree", "language.views", "language.zooms")
+"""Beginnings of the settings that vary the method, for experiments; the others are for users."""
 
-def _parse(text: str, kind: Any, where: str) -> Any:
-    """`text` (or a TOML value) as the field's type; raises InputError naming the field."""
-    options = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
-    if type(None) in options and text in (None, "none", "null", ""):
-        return None
-    for option in options:
-        try:
-            if option is bool and isinstance(text, str) and text.lower() in ("true", "false"):
-                return text.lower() == "true"
-            if option is bool and isinstance(text, bool):
-                return text
-            if option in (int, float) and not isinstance(text, bool):
-                value = option(text)
-                if option is int and float(text) != value:
-                    continue
-                return value
-            if option is str and isinstance(text, str):
-                return text
-        except (TypeError, ValueError, OverflowError):  # the last: inf as a whole number
-            continue
-    names = " or ".join(getattr(option, "__name__", str(option)) for option in options)
-    raise InputError(f"{where}: found {text!r}, expected {names}")
-
-
-def set_value(config: Any, key: str, value: Any, where: str = "--set", prefix: str = "") -> Any:
-    """A copy of a config dataclass with one dotted `key` ("train.iterations") replaced."""
-    head, _, rest = key.partition(".")
-    hints = typing.get_type_hints(type(config))
-    if head not in hints:
-        raise InputError(f"{where}: unknown setting '{prefix}{head}', expected one of: {', '.join(hints)}")
-    current = getattr(config, head)
-    if dataclasses.is_dataclass(current):
-        if isinstance(value, dict):
-            for name, inner in value.items():
-                current = set_value(current, name, inner, where, f"{head}.")
-        elif not rest:
-            raise InputError(f"{where}: '{head}' is a group of settings, write {head}.NAME=VALUE")
-        else:
-            current = set_value(current, rest, value, where, f"{head}.")
-        return dataclasses.replace(config, **{head: current})
-    if rest:
-        raise InputError(f"{where}: '{head}' has no setting '{rest}'")
-    return dataclasses.replace(config, **{head: _parse(value, hints[head], f"{where} {prefix}{key}")})
+AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
 def load_config(file: Path | None = None, pairs: list[str] | None = None, preset: str = "default") -> MapConfig:
-    """Defaults, then the preset, then the TOML file, then KEY=VALUE pairs; checked as a whole."""
+    """Defaults, then the preset, then the TOML file, then KEY=VALUE pairs. Raises InputError for the first mistake."""
     if preset not in PRESETS:
         raise InputError(f"--preset: found '{preset}', expected one of: {', '.join(PRESETS)}")
-    config = MapConfig()
-    for pair in PRESETS[preset]:
-        key, _, value = pair.partition("=")
-        config = set_value(config, key, value)
+    given = {key: (value, "--preset") for key, value in PRESETS[preset].items()}
     if file is not None:
-        for key, value in _read_toml(file).items():
-            config = set_value(config, key, value, str(file))
-    for key, text in read_pairs(pairs or []).items():
-        config = set_value(config, key, text)
-    check(config)
-    return config
+        given |= {key: (value, str(file)) for key, value in flat(_read_toml(file))}
+    given |= {key: (text, "--set") for key, text in read_pairs(pairs or []).items()}
+    return settings_from(MapConfig, given)
+
+
+def settings_from(model: type[AnySettings], given: Mapping[str, tuple[Any, str]]) -> AnySettings:
+    """The model with the given settings: dotted key -> (value, where it was read, for the error message).
+
+    Raises InputError with the key, the value and the range for the first that is unknown, of another type or outside
+    its range.
+    """
+    known = dict(fields(model))
+    nested: dict[str, Any] = {}
+    for key, (value, where) in given.items():
+        if key not in known:
+            raise InputError(f"{where}: {_unknown(key, list(known))}")
+        group, _, name = key.rpartition(".")
+        (nested.setdefault(group, {}) if group else nested)[name] = value
+    try:
+        return model.model_validate(nested)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        key = next(key for key in known if key.split(".") == list(first["loc"])[: key.count(".") + 1])
+        value, where = given[key]
+        raise InputError(f"{where} {key}: found {_short(value)}, expected {expected(known[key])}") from None
+
+
+def fields(model: type[Settings]) -> Iterator[tuple[str, FieldInfo]]:
+    """(dotted key, field) of all settings of a model."""
+    for name, field in model.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, Settings):
+            yield from ((f"{name}.{key}", value) for key, value in fields(inner))
+        else:
+            yield name, field
+
+
+def expected(field: FieldInfo) -> str:
+    """The type and range of a setting in words; a field's `title` says it where its constraints cannot."""
+    kinds = _kinds(field)
+    if field.title:
+        words = field.title
+    elif isinstance(kinds[0], str):  # a Literal
+        words = ", ".join(kinds[:-1]) + f" or {kinds[-1]}"
+    else:
+        words = {bool: "true or false", str: "text", int: "a whole number", float: "a number"}[kinds[0]]
+        for name, word in (("gt", "above"), ("ge", "from"), ("le", "to")):
+            bounds = [getattr(item, name) for item in field.metadata if hasattr(item, name)]
+            words += "".join(f" {word} {bound}" for bound in bounds)
+    return f"{words} or none" if NoneType in kinds else words
+
+
+def settings_text(model: type[Settings] = MapConfig, method: tuple[str, ...] = METHOD) -> str:
+    """All settings with default, range and effect, those for users first, for `--help`."""
+    lines: dict[bool, list[str]] = {False: [], True: []}
+    for key, field in fields(model):
+        default = field.default
+        default = "none" if default is None else str(default).lower() if isinstance(default, bool) else default
+        lines[key.startswith(method)] += [f"  {key}={default}  ({expected(field)})", f"      {field.description}"]
+    head = "settings, for --set KEY=VALUE and --config FILE.toml:"
+    return "\n".join([head, *lines[False], "settings that vary the method, for experiments:", *lines[True]])
 
 
 def read_pairs(pairs: list[str]) -> dict[str, Any]:
@@ -227,6 +211,37 @@ def read_pairs(pairs: list[str]) -> dict[str, Any]:
     return values
 
 
+def _kinds(field: FieldInfo) -> tuple[Any, ...]:
+    """The types a field may have, or the values of a Literal."""
+    return get_args(field.annotation) or (field.annotation,)
+
+
+def _unknown(key: str, known: list[str]) -> str:
+    if any(name.startswith(f"{key}.") for name in known):
+        return f"'{key}' is a group of settings, write {key}.NAME=VALUE"
+    last = {name: name.rpartition(".")[2] for name in known}
+    near = difflib.get_close_matches(key.rpartition(".")[2], set(last.values()), 1, 0.6)
+    named = [name for name in known if last[name] in near] or difflib.get_close_matches(key, known, 1, 0.8)
+    if named:
+        return f"unknown setting '{key}', did you mean {' or '.join(named)}?"
+    group = [name for name in known if name.startswith(f"{key.partition('.')[0]}.")] or known
+    return f"unknown setting '{_short(key)[1:-1]}', expected one of: {', '.join(group)}"
+
+
+def _short(value: Any, most: int = 80) -> str:
+    text = repr(value)
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
+def flat(table: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """(dotted key, value) of a TOML table of settings and groups of them."""
+    for name, value in table.items():
+        if isinstance(value, dict):
+            yield from ((f"{name}.{key}", inner) for key, inner in value.items())
+        else:
+            yield name, value
+
+
 def _read_toml(file: Path) -> dict[str, Any]:
     try:
         import tomllib
@@ -238,59 +253,3 @@ def _read_toml(file: Path) -> dict[str, Any]:
         raise InputError(f"{file}: cannot be read ({error.strerror}); give an existing TOML file") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file}: not valid TOML ({error})") from error
-
-
-def check(config: MapConfig) -> None:
-    """Raises InputError for a value outside its meaning."""
-    rules: list[tuple[str, Any, bool, str]] = [
-        ("photos.max_side", config.photos.max_side, config.photos.max_side >= 16, "at least 16"),
-        ("photos.holdout", config.photos.holdout, config.photos.holdout >= 0, "0 (train on all) or more"),
-        ("train.iterations", config.train.iterations, config.train.iterations >= 1, "at least 1"),
-        ("train.budget", config.train.budget, config.train.budget >= 100, "at least 100 Gaussians"),
-        ("train.sh_degree", config.train.sh_degree, 0 <= config.train.sh_degree <= 3, "0 to 3"),
-        ("train.ssim_weight", config.train.ssim_weight, 0 <= config.train.ssim_weight <= 1, "0 to 1"),
-        ("losses.feature_dim", config.losses.feature_dim, 1 <= config.losses.feature_dim <= 64, "1 to 64"),
-        ("losses.margin", config.losses.margin, config.losses.margin > 0, "above 0"),
-        (
-            "instances.min_cluster_size",
-            config.instances.min_cluster_size,
-            config.instances.min_cluster_size >= 2,
-            ">= 2",
-        ),
-        ("seed", config.seed, config.seed >= 0, "0 or more"),
-        ("device", config.device, config.device in ("auto", "cpu", "cuda"), "auto, cpu or cuda"),
-        (
-            "losses.positive",
-            config.losses.positive,
-            config.losses.positive in ("per-mask", "per-pixel"),
-            "per-mask or per-pixel",
-        ),
-        (
-            "instances.method",
-            config.instances.method,
-            config.instances.method in ("consensus", "hdbscan"),
-            "consensus or hdbscan",
-        ),
-        ("instances.max_segments", config.instances.max_segments, config.instances.max_segments >= 2, ">= 2"),
-        (
-            "losses.negative",
-            config.losses.negative,
-            config.losses.negative in ("squared", "unsquared"),
-            "squared or unsquared",
-        ),
-    ]
-    words = config.language
-    rules += [
-        ("language.views", words.views, words.views >= 1, "at least 1"),
-        ("language.zooms", words.zooms, words.zooms >= 0, "0 (as suits the encoder) or more"),
-        ("language.expansion", words.expansion, words.expansion >= 0, "0 or more"),
-        ("language.background", words.background, words.background in BACKGROUNDS, ", ".join(BACKGROUNDS)),
-    ]
-    limit = config.train.time_limit
-    train = config.train
-    rules.append(("train.cooldown", train.cooldown, 0 <= train.cooldown <= 0.5, "0 to 0.5"))
-    rules.append(("train.stop_psnr", train.stop_psnr, train.stop_psnr is None or train.stop_psnr > 0, "dB above 0"))
-    rules.append(("train.time_limit", limit, limit is None or limit > 0, "seconds above 0"))
-    for name, value, fine, expected in rules:
-        if not fine:
-            raise InputError(f"{name}: found {value!r}, expected {expected}")

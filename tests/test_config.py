@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import math
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from perception.config import load_config
+from perception.cli import main
+from perception.config import MapConfig, expected, fields, load_config
 from perception.errors import InputError
 
 
@@ -15,41 +22,101 @@ def test_pairs_override_file_overrides_preset(tmp_path: Path) -> None:
     file.write_text("seed = 3\n[train]\niterations = 77\nbudget = 1000\n")
     config = load_config(file, ["train.budget=2000"], "fast")
     assert (config.seed, config.train.iterations, config.train.budget) == (3, 77, 2000)
-    assert config.densify == load_config().densify
+    assert config.train.exchange_db == 0.1 and config.densify == load_config().densify
 
 
 def test_values_take_their_field_type() -> None:
-    config = load_config(None, ["train.time_limit=30", "train.random_background=false", "train.lr_means=1"])
-    assert config.train.time_limit == 30 and isinstance(config.train.lr_means, float)
-    assert config.train.random_background is False
+    config = load_config(None, ["train.time_limit=30", "losses.half_resolution=false", "losses.margin=1"])
+    assert config.train.time_limit == 30 and isinstance(config.losses.margin, float)
+    assert config.losses.half_resolution is False
     assert load_config(None, ["train.time_limit=none"]).train.time_limit is None
+    assert load_config(None, ["language.encoder=none"]).language.encoder == "none"  # a name here, no absent value
 
 
 @pytest.mark.parametrize(
     ("pair", "told"),
     [
-        ("train.iterations=many", "train.iterations"),
-        ("train.iterations=1.5", "expected int"),
-        ("train.speed=3", "speed"),
-        ("speed=3", "unknown setting"),
-        ("train=3", "group of settings"),
-        ("seed.x=3", "has no setting"),
-        ("seed", "KEY=VALUE"),
-        ("train.budget=3", "at least 100"),
+        ("train.iterations=many", "--set train.iterations: found 'many', expected a whole number from 1 to 100000000"),
+        ("train.iterations=1.5", "train.iterations: found '1.5'"),
+        ("train.budget=3", "a whole number from 100 to"),
+        ("train.time_limit=-1", "train.time_limit: found '-1', expected a number above 0 or none"),
+        ("train.time_limit=inf", "found 'inf'"),
+        ("train.stop_psnr=inf", "found 'inf'"),
+        ("train.stop_psnr=nan", "found 'nan'"),
+        ("densify.every=0", "densify.every: found '0'"),
+        ("losses.every=0", "losses.every: found '0'"),
         ("losses.positive=mean", "per-mask or per-pixel"),
-        ("train.time_limit=-1", "above 0"),
+        ("losses.half_resolution=perhaps", "true or false"),
+        ("instances.min_samples=0", "instances.min_samples: found '0'"),
         ("device=tpu", "auto, cpu or cuda"),
+        ("train.lr_means=0", "unknown setting 'train.lr_means', expected one of: train.iterations, "),
+        ("train.lr_scales=nan", "unknown setting 'train.lr_scales'"),
+        ("losses.geometry_start=2", "unknown setting 'losses.geometry_start'"),
+        ("train.iteratons=3", "did you mean train.iterations?"),
+        ("min_cluster=3", "did you mean instances.min_cluster_size?"),
+        ("train=3", "group of settings"),
+        ("seed.x=3", "unknown setting 'seed.x'"),
+        ("seed", "KEY=VALUE"),
     ],
 )
-def test_mistakes_are_named(pair: str, told: str) -> None:
-    with pytest.raises(InputError, match=told):
-        load_config(None, [pair])
+def test_a_mistake_is_one_line_and_exit_code_2(
+    pair: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["map", str(tmp_path), "-o", str(tmp_path / "m.gsmap"), "--set", pair]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: --set") and told in lines[0]
+    assert not list(tmp_path.iterdir())
 
 
-def test_bad_files_are_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[train\n", "not valid TOML"),
+        ("seed = true\n", "seed: found True, expected a whole number"),
+        ("masks = 3\n", "masks: found 3, expected text"),
+        ("[train]\nbudget = [1]\n", r"train.budget: found \[1\]"),
+        ("train = 3\n", "group of settings"),
+        ("[train.budget]\nx = 3\n", "train.budget: found {'x': 3}"),
+    ],
+)
+def test_bad_files_are_named(text: str, told: str, tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=rf"c\.toml.*{told}"):
+        load_config(file)
     with pytest.raises(InputError, match=r"none\.toml"):
         load_config(tmp_path / "none.toml")
-    broken = tmp_path / "broken.toml"
-    broken.write_text("[train\n")
-    with pytest.raises(InputError, match="not valid TOML"):
-        load_config(broken)
+
+
+KEYS = dict(fields(MapConfig))
+NUMBERS = st.one_of(st.integers(-5, 200_000), st.floats(), st.integers())
+VALUES = st.one_of(NUMBERS.map(str), st.text(max_size=8), st.sampled_from(["none", "true", "1e3", "-0", "0x1", "1_0"]))
+
+
+@given(pairs=st.lists(st.tuples(st.sampled_from(sorted(KEYS)) | st.text(max_size=12), VALUES), max_size=4))
+def test_any_pairs_are_settings_in_range_or_one_line(pairs: list[tuple[str, str]]) -> None:
+    config: MapConfig | None = None
+    with contextlib.suppress(InputError):
+        config = load_config(None, [f"{key}={value}" for key, value in pairs])
+    if config is not None:
+        stored = json.loads(json.dumps(config.to_json(), allow_nan=False))
+        assert MapConfig.model_validate(stored) == config
+        values = {key: _value(stored, key) for key in KEYS}
+        assert all(math.isfinite(value) for value in values.values() if isinstance(value, float))
+        assert values["densify.every"] >= 1 and values["losses.every"] >= 1 and values["instances.min_samples"] >= 1
+        assert values["train.time_limit"] is None or values["train.time_limit"] > 0
+        assert values["losses.margin"] > 0 and 0 <= values["losses.start"] <= 1
+
+
+def _value(stored: dict[str, Any], key: str) -> Any:
+    for name in key.split("."):
+        stored = stored[name]
+    return stored
+
+
+def test_help_of_map_lists_every_setting(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["map", "--help"])
+    shown = capsys.readouterr().out
+    for key, field in KEYS.items():
+        assert f"  {key}=" in shown and f"({expected(field)})" in shown and str(field.description) in shown

@@ -68,7 +68,7 @@ class Terminal:
 
 def test_a_live_line_then_ctrl_c_then_the_printed_command_goes_on(small_scene: Path, tmp_path: Path) -> None:
     words = ["map", str(small_scene / "transforms.json"), "-o", "k.gsmap", "--masks", f"labels:{small_scene}/labels"]
-    words += ["--iterations", "600", "--budget", "1500", "--set", "train.checkpoint_seconds=0.1"]
+    words += ["--iterations", "600", "--budget", "1500"]
     words += ["--set", "language.encoder=none", "--set", "train.exchange_db=0"]
     first = Terminal(words, tmp_path)
     try:

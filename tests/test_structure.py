@@ -74,7 +74,7 @@ def test_help_imports_nothing_heavy() -> None:
     code = (
         "import sys, perception.cli as c\n"
         "try:\n    c.main(['--help'])\nexcept SystemExit:\n    pass\n"
-        "print(sorted({'torch', 'open3d', 'pycolmap', 'onnxruntime', 'cv2', 'scipy', 'numpy'} & set(sys.modules)))"
+        "print(sorted({'torch', 'pydantic', 'pycolmap', 'onnxruntime', 'cv2', 'scipy', 'numpy'} & set(sys.modules)))"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip().endswith("[]")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -28,11 +28,14 @@ Masks = Mapping[tuple[str, str], np.ndarray]
 
 @dataclass(frozen=True)
 class Workplace:
-    """Folders and settings of one bench run. maps: <scene>.gsmap, reused when there; config: by scene name."""
+    """Folders and settings of one bench run. maps: <scene>.gsmap, reused when there.
+
+    config: the settings for a scene's name and further KEY=VALUE pairs.
+    """
 
     work: Path
     maps: Path
-    config: Callable[[str], MapConfig]
+    config: Callable[..., MapConfig]
     progress: Progress
 
     def map(self, scene: str, source: Path, held_out: list[str] | None = None) -> GaussianMap:
@@ -44,22 +47,15 @@ class Workplace:
         if path.exists():
             self.progress.log(f"{scene}: using {path}")
             return read_map(path)
-        config = self.config(scene)
+        more = []
         if held_out is not None:
             listed = self.work / "held_out" / f"{scene}.txt"
             with atomic_file(listed) as aside:
                 aside.write_text("".join(f"{name}\n" for name in held_out), encoding="utf-8")
-            config = load_config_with(config, "photos.held_out", str(listed))
+            more = [f"photos.held_out={listed}"]
         path.parent.mkdir(parents=True, exist_ok=True)
         self.progress.log(f"{scene}: mapping {source}")
-        return build_map(source, path, config, resume=True, progress=self.progress)
-
-
-def load_config_with(config: MapConfig, key: str, value: str) -> MapConfig:
-    """The same settings with one value changed."""
-    from perception.config import set_value
-
-    return set_value(config, key, value, "--set")
+        return build_map(source, path, self.config(scene, more), resume=True, progress=self.progress)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,8 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def workplace(args: argparse.Namespace) -> Workplace:
     """Folders and settings as the arguments say."""
 
-    def config(scene: str) -> MapConfig:
-        pairs = [*args.pairs, f"masks={args.masks.replace('{scene}', scene)}"]
+    def config(scene: str, more: Sequence[str] = ()) -> MapConfig:
+        pairs = [*args.pairs, f"masks={args.masks.replace('{scene}', scene)}", *more]
         return load_config(args.config, pairs, args.preset)
 
     config("scene")  # bad settings are told before the first scene

@@ -39,7 +39,7 @@ def variants(masks: str | None) -> list[Variant]:
         *(Variant("preset", name, (), masks, preset=name) for name in PRESET_NAMES),
         *(one("budget", n, f"train.budget={n}") for n in BUDGETS),
         *(one("iterations", n, f"train.iterations={n}") for n in ITERATIONS),
-        *(one("harmonics", d, f"train.sh_degree={d}", "train.sh_min_gain_db=-100") for d in range(4)),
+        *(one("harmonics", d, f"train.sh_degree={d}") for d in range(4)),
         *(one("max_side", n, f"photos.max_side={n}") for n in SIDES),
         *(one("d", n, f"losses.feature_dim={n}") for n in (4, 16) if masks is not None),
     ]

@@ -19,7 +19,7 @@ PIXELS = (1, 2, 4)
 
 def variants(masks: str | None, long_side: int, threads: Sequence[int]) -> list[Variant]:
     """Budgets at `long_side`, pixels at 50 k Gaussians (the most being those of `long_side`), numbers of threads."""
-    fill = ("densify.grad_threshold=0", "densify.opacity_decay=0", "train.exchange_db=-1000")
+    fill = ("densify.grad_threshold=0", "train.exchange_db=0")
 
     def one(group: str, name: str, budget: int, side: float, n: int = 0) -> Variant:
         pairs = (*fill, f"train.budget={budget}", f"photos.max_side={round(side)}")

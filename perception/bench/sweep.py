@@ -11,7 +11,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -57,13 +57,13 @@ class Limits:
         """The variant's settings within these limits. Growth keeps its number of steps as a run gets shorter."""
         pairs = [*self.settings, *variant.settings, "language.encoder=none"]
         config = load_config(None, pairs, variant.preset)
-        train, photos = config.train, config.photos
-        iterations = self.iterations or train.iterations
-        iterations = max(1, round(iterations / self.shorten))
+        train, side = config.train, config.photos.max_side
+        iterations = max(1, round((self.iterations or train.iterations) / self.shorten))
         every = max(20, round(config.densify.every * min(1.0, iterations / train.iterations)))
-        train = replace(train, iterations=iterations, budget=min(train.budget, self.budget or train.budget))
-        photos = replace(photos, max_side=min(photos.max_side, self.max_side or photos.max_side))
-        return replace(config, train=train, photos=photos, densify=replace(config.densify, every=every))
+        pairs += [f"train.iterations={iterations}", f"densify.every={every}"]
+        pairs += [f"train.budget={min(train.budget, self.budget or train.budget)}"]
+        pairs += [f"photos.max_side={min(side, self.max_side or side)}"]
+        return load_config(None, pairs, variant.preset)
 
 
 @dataclass

@@ -19,6 +19,7 @@ def register(commands: Any) -> None:
 
 def _add_map(commands: Any) -> None:
     p = command(commands, "map", _map, "build a map from photos, a COLMAP workspace or a transforms.json")
+    p.formatter_class, p.late_epilog = argparse.RawDescriptionHelpFormatter, _settings
     p.add_argument("input", type=Path, metavar="INPUT")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="MAP")
     p.add_argument("--masks", metavar="SOURCE", help="auto, builtin, sam:PATH or labels:DIR")
@@ -37,6 +38,12 @@ def _add_map(commands: Any) -> None:
     p.add_argument("--labels-from", type=Path, metavar="OLD.gsmap", help="carry over the names given to its instances")
     p.add_argument("--profile", action="store_true", help="print where the time went")
     p.add_argument("--resume", action="store_true", help="go on with an interrupted run")
+
+
+def _settings() -> str:
+    from perception.config import settings_text
+
+    return settings_text()
 
 
 _SHORTCUTS = {

@@ -10,18 +10,25 @@ from perception.errors import InputError
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse with one clear line and exit code 2 on bad usage."""
+    """argparse with one clear line and exit code 2 on bad usage; late_epilog makes the epilog when help is printed."""
+
+    late_epilog: Callable[[], str] | None = None
 
     def error(self, message: str) -> Any:  # type: ignore[override]
         raise InputError(f"{self.prog}: {message} (see {self.prog} --help)")
+
+    def format_help(self) -> str:
+        if self.late_epilog is not None:
+            self.epilog = self.late_epilog()
+        return super().format_help()
 
 
 Run = Callable[[argparse.Namespace], tuple[dict[str, Any], str]]
 
 
-def command(commands: Any, name: str, run: Run, summary: str) -> argparse.ArgumentParser:
+def command(commands: Any, name: str, run: Run, summary: str) -> Parser:
     """A new subcommand. `run` takes the parsed arguments and returns (what --json prints, the words for people)."""
-    parser: argparse.ArgumentParser = commands.add_parser(name, help=summary, description=summary)
+    parser: Parser = commands.add_parser(name, help=summary, description=summary)
     parser.set_defaults(run=run)
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else there")
     return parser

@@ -335,7 +335,7 @@ class Editor:
             own = gmap.parts["ids"][rows]
             known = np.unique(own[np.isin(own, [part["id"] for part in entry["parts"]])])
             return np.where(np.isin(own, known), np.searchsorted(known, own), -1)
-        finer = dataclasses.replace(InstanceConfig(), min_cluster_size=max(8, len(rows) // 20), min_samples=8)
+        finer = InstanceConfig(min_cluster_size=max(8, len(rows) // 20), min_samples=8)
         return cluster_gaussians(
             gmap.means[rows], gmap.scales[rows], gmap.opacities[rows], gmap.features[rows], finer
         ).ids

@@ -11,9 +11,15 @@ from dataclasses import dataclass
 
 import torch
 
-from perception.config import DensifyConfig
 from perception.gaussians.model import Gaussians, sigmoid
 
+START, STOP = 0.05, 0.6
+"""Progress between which the number of Gaussians grows."""
+PERCENT_DENSE = 0.01
+"""Share of the scene's extent above which a Gaussian is split, below which it is cloned (Kerbl et al. 2023)."""
+PRUNE_OPACITY = 0.005
+OPACITY_DECAY = 1e-2
+"""Share of every opacity that is taken off before each densification."""
 SPLIT_SHRINK = 1.6
 """Scales of the two halves of a split Gaussian are divided by this (Kerbl et al. 2023)."""
 
@@ -49,9 +55,9 @@ class Change:
     born: Gaussians
 
 
-def target_count(progress: float, initial: int, budget: int, config: DensifyConfig) -> int:
+def target_count(progress: float, initial: int, budget: int) -> int:
     """Gaussians allowed at `progress` in [0, 1]: a straight ramp from the initial count to the budget."""
-    share = (progress - config.start) / max(config.stop - config.start, 1e-9)
+    share = (progress - START) / (STOP - START)
     return int(initial + (budget - initial) * min(1.0, max(0.0, share)))
 
 
@@ -60,22 +66,23 @@ def densify(
     statistics: Statistics,
     allowed: int,
     extent: float,
-    config: DensifyConfig,
+    grad_threshold: float,
     seed: int,
 ) -> Change:
     """Prunes, then clones or splits the best candidates while there are at most `allowed` Gaussians.
 
-    extent: scene size in world units. The result depends on the arguments alone, not on global random state.
+    extent: scene size in world units. grad_threshold: mean gradient (see Statistics) from which one grows. The result
+    depends on the arguments alone, not on global random state.
     """
-    needed = _needed(gaussians, statistics, config)
+    needed = _needed(gaussians, statistics)
     room = max(0, allowed - int(needed.sum()))
     score = statistics.mean_gradient()
-    wanted = needed & (score > config.grad_threshold)
+    wanted = needed & (score > grad_threshold)
     candidates = torch.nonzero(wanted).flatten()
     if len(candidates) > room:
         best = torch.argsort(score[candidates], descending=True, stable=True)[:room]
         candidates = candidates[best].sort().values
-    large = gaussians.log_scales[candidates].max(dim=1).values.exp() > config.percent_dense * extent
+    large = gaussians.log_scales[candidates].max(dim=1).values.exp() > PERCENT_DENSE * extent
     split, clone = candidates[large], candidates[~large]
 
     # A clone and its original share the light: o' = 1 − sqrt(1 − o) keeps what both show together.
@@ -87,18 +94,18 @@ def densify(
     return Change(torch.nonzero(needed).flatten(), born)
 
 
-def decay_opacities(gaussians: Gaussians, share: float) -> None:
-    """Multiplies every opacity by 1 − share: what no photo holds up fades and is pruned."""
-    opacities = gaussians.opacities * (1 - share)
+def decay_opacities(gaussians: Gaussians) -> None:
+    """Multiplies every opacity by 1 − OPACITY_DECAY: what no photo holds up fades and is pruned."""
+    opacities = gaussians.opacities * (1 - OPACITY_DECAY)
     gaussians.opacity_logits.copy_(torch.logit(opacities.clamp(1e-6, 1 - 1e-6)))
 
 
-def _needed(gaussians: Gaussians, statistics: Statistics, config: DensifyConfig) -> torch.Tensor:
+def _needed(gaussians: Gaussians, statistics: Statistics) -> torch.Tensor:
     unseen = statistics.seen == 0
     if bool(unseen.all()):  # no statistics yet
         unseen = torch.zeros_like(unseen)
     finite = torch.isfinite(gaussians.means).all(dim=1) & torch.isfinite(gaussians.log_scales).all(dim=1)
-    return (gaussians.opacities >= config.prune_opacity) & ~unseen & finite
+    return (gaussians.opacities >= PRUNE_OPACITY) & ~unseen & finite
 
 
 def _halved_logit(logits: torch.Tensor) -> torch.Tensor:

@@ -19,6 +19,8 @@ CEILING = 45.0
 """dB beyond which nothing is gained: errors of 1.4 grey levels of 255, less than a photo's own noise."""
 COST_EXPONENT = 0.6
 """An iteration's time grows like the number of Gaussians to this power (`perception bench scaling`)."""
+HARMONICS_GAIN = 0.05
+"""dB of held-out PSNR that the highest degree of harmonics must be worth to stay."""
 
 
 @dataclass
@@ -88,16 +90,15 @@ class Economy:
         """The degree to go on with after a trial, and what was decided, if anything.
 
         A trial adds a degree. One trial after the last, `score` tells the held-out PSNR with the colours cut to a
-        degree, and the highest degree goes when it is worth less than `sh_min_gain_db`; then the next is looked at.
+        degree, and the highest degree goes when it is worth less than HARMONICS_GAIN; then the next is looked at.
         What a degree gains in its own first trial says little: harmonics learn slowly, and the others make room.
         """
-        train = self.config.train
-        if degree < train.sh_degree:
+        if degree < self.config.train.sh_degree:
             return degree + 1, None
         self.settled = True
         worth = [score(d) for d in range(degree + 1)]
         kept = degree
-        while kept and worth[kept] - worth[kept - 1] < train.sh_min_gain_db:
+        while kept and worth[kept] - worth[kept - 1] < HARMONICS_GAIN:
             kept -= 1
         told = ", ".join(f"{psnr:.2f}" for psnr in worth)
         return kept, f"harmonics: degree {kept} kept; cut to 0 to {degree}, held-out PSNR is {told} dB"

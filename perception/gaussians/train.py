@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from perception.config import MapConfig
-from perception.gaussians.densify import Statistics, decay_opacities, densify, target_count
+from perception.gaussians.densify import START, STOP, Statistics, decay_opacities, densify, target_count
 from perception.gaussians.economy import TRIAL, Economy
 from perception.gaussians.holes import fill_holes
 from perception.gaussians.losses import instance_loss, photometric, photometric_loss, variance_loss
@@ -24,10 +24,20 @@ from perception.gaussians.model import Gaussians, sigmoid
 from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.profile import Profile
 from perception.gaussians.rasterize import Rasterization, rasterize
+from perception.gaussians.rates import COOLDOWN, learning_rates
 from perception.gaussians.record import TrainRecord
-from perception.gaussians.views import TrainingView, cooling, depth_image, psnr, render_view, scene_extent, visible_in
+from perception.gaussians.views import TrainingView, depth_image, psnr, render_view, scene_extent, visible_in
 
 __all__ = ["TrainRecord", "Trainer", "TrainingView", "depth_image", "psnr", "render_view", "scene_extent"]
+
+COARSE_UNTIL = 0.15
+"""Progress until which photos of half the resolution are trained on: cheaper, and large structures come first."""
+SSIM_WEIGHT = 0.2
+"""β of the photometric loss (eq. 4), as in Kerbl et al. 2023."""
+INSTANCE_WEIGHT = 0.1
+"""λ_inst2d of eq. 14; w_p = w_n = 1 in eq. 9."""
+FILL_EVERY = 5
+"""In every so many-th densification, places that the photos show and the map leaves empty get Gaussians."""
 
 
 class Trainer:
@@ -58,25 +68,12 @@ class Trainer:
         """Trains on `views` from here on: the same photos, whose masks may have come since."""
         self.views = views
         self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
-        halves = self.config.train.coarse_until > 0 or (self.has_labels and self.config.losses.half_resolution)
-        self.coarse = [view.halved() for view in views] if halves else []
+        self.coarse = [view.halved() for view in views]
 
     # ------------------------------------------------------------------ state
 
     def _rates(self, progress: float) -> dict[str, float | torch.Tensor]:
-        train = self.config.train
-        decay = (train.lr_means_final / train.lr_means) ** progress
-        cool = cooling(progress, train.cooldown)
-        sh = torch.full((self.gaussians.sh.shape[1], 3), cool * train.lr_harmonics)
-        sh[0] = cool * train.lr_colors
-        return {
-            "means": cool * train.lr_means * decay * self.extent,
-            "quats": cool * train.lr_quats,
-            "log_scales": cool * train.lr_scales,
-            "opacity_logits": cool * train.lr_opacities,
-            "sh": sh,
-            "features": cool * train.lr_features,
-        }
+        return learning_rates(progress, self.extent, self.gaussians.sh.shape[1])
 
     @property
     def elapsed(self) -> float:
@@ -153,7 +150,7 @@ class Trainer:
         with_features = (
             self.has_labels and progress >= losses_config.start and self.iteration % losses_config.every == 0
         )
-        coarse = progress < self.config.train.coarse_until or (with_features and losses_config.half_resolution)
+        coarse = progress < COARSE_UNTIL or (with_features and losses_config.half_resolution)
         view = self._pick(coarse)
         losses = self._descend(view, progress, with_features)
         self.iteration += 1
@@ -162,7 +159,7 @@ class Trainer:
             due = self.progress >= self.economy.due and not self.economy.finished
             # Before densification, which sets the picture back for a while: a score taken then says nothing of growth.
             reached = self.score(limit=8)["psnr"] if due else None
-            if self.config.densify.start <= progress < self.config.densify.stop:
+            if START <= progress < STOP:
                 self._densify(progress)
             if reached is not None:
                 self._end_trial(reached)
@@ -179,12 +176,11 @@ class Trainer:
         return (self.coarse if coarse else self.views)[self._order[place]]
 
     def _descend(self, view: TrainingView, progress: float, with_features: bool) -> dict[str, float]:
-        config = self.config
         params = {name: tensor.detach().requires_grad_() for name, tensor in vars(self.gaussians).items()}
         with self.profile("rasterizer forward"):
             out = self._render(params, view, with_features)
         with self.profile("losses"):
-            loss = photometric_loss(out.colors[0], view.photo, config.train.ssim_weight)
+            loss = photometric_loss(out.colors[0], view.photo, SSIM_WEIGHT)
             figures = {"rgb": float(loss.detach())}
             if with_features:
                 loss = loss + self._feature_losses(view, out, figures)
@@ -198,7 +194,7 @@ class Trainer:
             gradients = {name: tensor.grad for name, tensor in params.items() if tensor.grad is not None}
             self.optimiser.rates = self._rates(progress)
             self.record.skipped_gradients += sum(self.optimiser.step(visible, gradients).skipped.values())
-        if self.economy.growing and progress < config.densify.stop and out.stats.mean2d_grad is not None:
+        if self.economy.growing and progress < STOP and out.stats.mean2d_grad is not None:
             with self.profile("densification"):
                 self._watch(view, out)
         self.record.pairs += out.stats.contributing_pairs
@@ -207,10 +203,7 @@ class Trainer:
 
     def _render(self, params: dict[str, torch.Tensor], view: TrainingView, with_features: bool) -> Rasterization:
         height, width = view.photo.shape[:2]
-        background = None
-        if self.config.train.random_background:
-            colors = np.random.default_rng([self.config.seed, self.iteration, 1]).random(3, dtype=np.float32)
-            background = torch.from_numpy(colors)
+        colors = np.random.default_rng([self.config.seed, self.iteration, 1]).random(3, dtype=np.float32)
         return rasterize(
             params["means"],
             params["quats"],
@@ -223,7 +216,7 @@ class Trainer:
             height,
             sh_degree=self.gaussians.sh_degree,
             features=params["features"] if with_features else None,
-            background=background,
+            background=torch.from_numpy(colors),
             depth=False,
             eps2d=view.eps2d,
         )
@@ -244,18 +237,16 @@ class Trainer:
             out.features[0],
             view.labels,
             margin=losses.margin,
-            w_pos=losses.positive_weight,
-            w_neg=losses.negative_weight,
             per_pixel=losses.positive == "per-pixel",
             squared=losses.negative == "squared",
         )
         figures["inst"] = float(instance.value.detach())
-        return total + losses.instance_weight * instance.value
+        return total + INSTANCE_WEIGHT * instance.value
 
     # ------------------------------------------------------- size of the model
 
     def _allowed(self, progress: float) -> int:
-        return target_count(progress, self.initial_count, self.config.train.budget, self.config.densify)
+        return target_count(progress, self.initial_count, self.config.train.budget)
 
     def _densify(self, progress: float) -> None:
         """Growth while it pays; holes are filled all the same."""
@@ -264,14 +255,16 @@ class Trainer:
             seed = int(np.random.default_rng([config.seed, self.iteration, 2]).integers(2**31))
             if self.economy.growing:
                 self._grow(self._allowed(progress), seed)
-            turn = round((progress - config.densify.start) * config.train.iterations / config.densify.every)
-            if config.densify.fill_every and turn % config.densify.fill_every == 0:
+            turn = round((progress - START) * config.train.iterations / config.densify.every)
+            if turn % FILL_EVERY == 0:
                 self._fill(seed)
             self.statistics = Statistics.zeros(len(self.gaussians))
 
     def _grow(self, allowed: int, seed: int) -> None:
-        decay_opacities(self.gaussians, self.config.densify.opacity_decay)
-        change = densify(self.gaussians, self.statistics, allowed, self.extent, self.config.densify, seed)
+        decay_opacities(self.gaussians)
+        change = densify(
+            self.gaussians, self.statistics, allowed, self.extent, self.config.densify.grad_threshold, seed
+        )
         self.optimiser.keep(change.keep)
         self.optimiser.append(vars(change.born))
         self._sync()
@@ -279,7 +272,7 @@ class Trainer:
     def _fill(self, seed: int) -> None:
         room = self.config.train.budget - len(self.gaussians)
         if room > 0:
-            born, empty = fill_holes(self.gaussians, self.coarse or self.views, room, seed)
+            born, empty = fill_holes(self.gaussians, self.coarse, room, seed)
             self.optimiser.append(vars(born))
             self._sync()
             if len(born):
@@ -306,8 +299,8 @@ class Trainer:
         count = len(self.gaussians)
         economy.scores.append(reached)
         economy.counts.append(count)
-        if progress < self.config.densify.stop and economy.growing:
-            if progress > self.config.train.coarse_until + 2 * TRIAL:
+        if progress < STOP and economy.growing:
+            if progress > COARSE_UNTIL + 2 * TRIAL:
                 self._decide(economy.growth_pays(self._allowed(progress + TRIAL)))
             return
         if economy.growing:
@@ -329,18 +322,18 @@ class Trainer:
         target, reason = self.config.train.stop_psnr, None
         if target is not None and economy.scores and economy.scores[-1] >= target:
             reason = f"stop: held-out PSNR {economy.scores[-1]:.2f} dB, {target:g} were asked"
-        elif economy.settled and progress >= self.config.densify.stop:
+        elif economy.settled and progress >= STOP:
             reason = economy.plateau(progress)
         if reason is not None:
             economy.finished, economy.growing = True, False
-            left = 1.0 - self.config.train.cooldown - progress
+            left = 1.0 - COOLDOWN - progress
             self._jump += left
             self._decide(f"{reason}; {left:.0%} of the course left out")
 
     def _may_stop(self, progress: float) -> bool:
         """Not when the end is near anyway, nor before the features have had their time."""
         needed = self.config.losses.start + 0.35 if self.has_labels else 0.0
-        return needed <= progress < 1.0 - self.config.train.cooldown - TRIAL
+        return needed <= progress < 1.0 - COOLDOWN - TRIAL
 
     def _decide(self, told: str | None) -> None:
         if told is not None:

@@ -80,11 +80,3 @@ def psnr(image: torch.Tensor, photo: torch.Tensor) -> float:
     # In numpy: torch adds up in as many parts as it has threads, and decisions about growth hang on these bits.
     error = float(np.square(image.detach().numpy() - photo.numpy() / np.float64(255)).mean())
     return float("inf") if error == 0 else -10 * float(np.log10(error))
-
-
-def cooling(progress: float, share: float) -> float:
-    """Factor of all learning rates at `progress`: 1, and over the last `share` of the course down to .05 (half a
-    cosine)."""
-    if share <= 0 or progress <= 1 - share:
-        return 1.0
-    return 0.05 + 0.95 * 0.5 * (1 + float(np.cos(np.pi * (progress - 1 + share) / share)))

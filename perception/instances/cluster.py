@@ -11,6 +11,11 @@ import numpy as np
 
 from perception.config import InstanceConfig
 
+MIN_OPACITY = 0.1
+"""Opacity from which a Gaussian votes; fainter ones are haze between things."""
+MAX_CLUSTERED = 60_000
+"""Rows that HDBSCAN clusters exactly: its time and memory grow faster than their number."""
+
 
 @dataclass(frozen=True)
 class Clusters:
@@ -34,13 +39,13 @@ def cluster_gaussians(
 ) -> Clusters:
     """Instance ids of N Gaussians.
 
-    means [N, 3], scales [N, 3], opacities [N], features [N, D] float. Gaussians fainter than `min_opacity` do not
+    means [N, 3], scales [N, 3], opacities [N], features [N, D] float. Gaussians fainter than MIN_OPACITY do not
     vote: they take the id of the nearest voter in space whose feature is close, else stay noise.
     """
     count = len(means)
     ids = np.full(count, -1, np.int32)
     membership = np.zeros(count, np.float32)
-    solid = np.flatnonzero((opacities >= config.min_opacity) & np.isfinite(features).all(axis=1))
+    solid = np.flatnonzero((opacities >= MIN_OPACITY) & np.isfinite(features).all(axis=1))
     if len(solid) < config.min_cluster_size:
         return Clusters(ids, membership)
     found, strength = cluster_features(features[solid], config, seed)
@@ -51,15 +56,15 @@ def cluster_gaussians(
 
 
 def cluster_features(features: np.ndarray, config: InstanceConfig, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Labels and membership strengths of rows [N, D]; above `max_clustered` of them a sample speaks for the rest."""
+    """Labels and membership strengths of rows [N, D]; above MAX_CLUSTERED of them a sample speaks for the rest."""
     import hdbscan
 
     # Equal rows make zero distances, which HDBSCAN turns into infinite densities: all features equal = one cluster.
     if np.ptp(features, axis=0).max() < 1e-6:
         return np.zeros(len(features), np.int64), np.ones(len(features), np.float32)
     chosen = np.arange(len(features))
-    if len(features) > config.max_clustered:
-        chosen = np.sort(np.random.default_rng(seed).choice(len(features), config.max_clustered, replace=False))
+    if len(features) > MAX_CLUSTERED:
+        chosen = np.sort(np.random.default_rng(seed).choice(len(features), MAX_CLUSTERED, replace=False))
     share = len(chosen) / len(features)
     model = hdbscan.HDBSCAN(
         min_cluster_size=max(2, round(config.min_cluster_size * share)),

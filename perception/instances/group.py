@@ -8,7 +8,7 @@ import numpy as np
 
 from perception.config import InstanceConfig
 from perception.instances.assign import memberships, settle
-from perception.instances.cluster import by_falling_size, cluster_gaussians
+from perception.instances.cluster import MIN_OPACITY, by_falling_size, cluster_gaussians
 from perception.instances.confidence import calibrated, raw_scores
 from perception.instances.consensus import (
     Evidence,
@@ -23,6 +23,7 @@ from perception.instances.segments import over_segment, touching
 from perception.instances.votes import MaskVotes
 
 PER_SEGMENT = 16  # Gaussians; fewer make segments that photos say little about
+MAX_SEGMENTS = 1000  # the merge tree compares all pairs of them
 LEAST = 4  # Gaussians; below that an instance is a speck even if masks single it out
 
 
@@ -71,9 +72,9 @@ def group(
         parents = np.zeros(0, np.int64)
     else:
         ids, parts, parents = _by_consensus(means, opacities, features, votes, config, seed)
-    ids = settle(ids, means, opacities, votes, config.min_opacity)
+    ids = settle(ids, means, opacities, votes, MIN_OPACITY)
     ids = _without_specks(ids, votes, config)
-    ids = settle(ids, means, opacities, votes, config.min_opacity)
+    ids = settle(ids, means, opacities, votes, MIN_OPACITY)
     return _judged(ids, parts, parents, votes)
 
 
@@ -87,10 +88,10 @@ def _by_consensus(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """ids [N] int32, parts [N] int64 (−1 = none, both) and the instance of each part."""
     ids, parts = np.full(len(means), -1, np.int32), np.full(len(means), -1, np.int64)
-    solid = np.flatnonzero((opacities >= config.min_opacity) & np.isfinite(means).all(axis=1))
+    solid = np.flatnonzero((opacities >= MIN_OPACITY) & np.isfinite(means).all(axis=1))
     if len(solid) == 0:
         return ids, parts, np.zeros(0, np.int64)
-    wanted = int(np.clip(len(solid) // PER_SEGMENT, min(32, len(solid)), config.max_segments))
+    wanted = int(np.clip(len(solid) // PER_SEGMENT, min(32, len(solid)), MAX_SEGMENTS))
     segments = over_segment(means[solid], features[solid], wanted, seed)
     count = int(segments.max()) + 1
     everywhere = np.full(len(means), -1, np.int64)

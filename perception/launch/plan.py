@@ -2,44 +2,42 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from perception.config import PRESETS, MapConfig, check, set_value
+from pydantic import Field
+
+from perception.config import PRESETS, MapConfig, Settings, flat, settings_from
 from perception.errors import InputError
 from perception.node.config import NodeConfig
 
 
-@dataclass(frozen=True)
-class MapperPart:
+class MapperPart(Settings):
     """`perception map`: input and output paths, a preset, any of its settings; again: although the map is there."""
 
     input: str = ""
     output: str = ""
     preset: str = "default"
     again: bool = False
-    settings: MapConfig = field(default_factory=MapConfig)
+    settings: dict[str, Any] = Field({})
 
 
-@dataclass(frozen=True)
-class NodePart:
+class NodePart(Settings):
     """`perception node`: the map, default what the mapper makes, and its settings."""
 
     map: str = ""
-    settings: NodeConfig = field(default_factory=NodeConfig)
+    settings: dict[str, Any] = Field({})
 
 
-@dataclass(frozen=True)
-class ViewerPart:
+class ViewerPart(Settings):
     """`perception view`: the map, default what the mapper makes, and where its page is."""
 
     map: str = ""
     host: str = "127.0.0.1"
-    port: int = 8090
+    port: int = Field(8090, ge=0, le=65535)
 
 
 PARTS: dict[str, type[MapperPart] | type[NodePart] | type[ViewerPart]] = {
@@ -99,37 +97,19 @@ def _read_yaml(file: Path) -> dict[str, Any]:
 
 
 def _read_part(name: str, values: Any, where: str) -> Any:
-    """A part's dataclass, checked as its command checks it."""
-    values = _mapping(values, where, name)
-    part: Any = PARTS[name]()
-    if isinstance(part, MapperPart):
-        part = dataclasses.replace(part, settings=_preset(values, where))
-    for key, value in values.items():
-        if key == "settings":
-            if not hasattr(part, "settings"):
-                raise InputError(f"{where}: {name} has no 'settings', expected {', '.join(vars(part))}")
-            settings = part.settings
-            for inner, chosen in _mapping(value, where, f"{name}.settings").items():
-                settings = set_value(settings, str(inner), chosen, f"{where}: {name}.settings")
-            part = dataclasses.replace(part, settings=settings)
-        else:
-            part = set_value(part, str(key), value, f"{where}: {name}")
-    if isinstance(part, MapperPart):
-        check(part.settings)
-    if isinstance(part, ViewerPart) and not 0 <= part.port <= 65535:
-        raise InputError(f"{where}: viewer.port: found {part.port}, expected 0 to 65535")
+    """A part's settings, checked as its command checks them."""
+    values = dict(_mapping(values, where, name))
+    if "settings" in values and "settings" not in PARTS[name].model_fields:
+        raise InputError(f"{where}: {name} has no 'settings', expected {', '.join(PARTS[name].model_fields)}")
+    inner = dict(flat(_mapping(values.pop("settings", None), where, f"{name}.settings")))
+    part: Any = settings_from(PARTS[name], {key: (value, f"{where}: {name}") for key, value in values.items()})
+    model: Any = {"mapper": MapConfig, "node": NodeConfig}.get(name)
+    if model is not None:
+        settings_from(model, {key: (value, f"{where}: {name}.settings") for key, value in inner.items()})
+        part = part.model_copy(update={"settings": inner})
+    if isinstance(part, MapperPart) and part.preset not in PRESETS:
+        raise InputError(f"{where}: mapper.preset: found {part.preset!r}, expected one of: {', '.join(PRESETS)}")
     return part
-
-
-def _preset(values: Mapping[str, Any], where: str) -> MapConfig:
-    preset = values.get("preset", "default")
-    if preset not in PRESETS:
-        raise InputError(f"{where}: mapper.preset: found {preset!r}, expected one of: {', '.join(PRESETS)}")
-    config = MapConfig()
-    for pair in PRESETS[preset]:
-        key, _, value = pair.partition("=")
-        config = set_value(config, key, value, where)
-    return config
 
 
 def _mapping(value: Any, where: str, name: str) -> dict[str, Any]:
@@ -157,23 +137,20 @@ def _job(name: str, part: Any, file: Path, made: Path | None) -> Job:
         if not part.input or not part.output:
             raise InputError(f"{file}: mapper: input and output are needed")
         paths = (str(_path(file, part.input)), "-o", str(_path(file, part.output)))
-        settings = _differences(part.settings, _preset({"preset": part.preset}, str(file)))
-        return Job(name, (*run, "map", *paths, "--preset", part.preset, "--resume", *settings), once=True)
+        return Job(name, (*run, "map", *paths, "--preset", part.preset, "--resume", *_pairs(part.settings)), once=True)
     held = _path(file, part.map) if part.map else made
     if held is None:
         raise InputError(f"{file}: {name}: no map given, and no mapper that makes one")
     if isinstance(part, NodePart):
-        return Job(name, (*run, "node", str(held), *_differences(part.settings, NodeConfig())), held)
+        return Job(name, (*run, "node", str(held), *_pairs(part.settings)), held)
     return Job(name, (*run, "view", str(held), "--host", part.host, "--port", str(part.port)), held)
 
 
-def _differences(settings: Any, default: Any, prefix: str = "") -> list[str]:
-    """`--set KEY=VALUE` for each setting that is not the default."""
-    pairs: list[str] = []
-    for item in dataclasses.fields(settings):
-        value, usual = getattr(settings, item.name), getattr(default, item.name)
-        if dataclasses.is_dataclass(value):
-            pairs += _differences(value, usual, f"{prefix}{item.name}.")
-        elif value != usual:
-            pairs += ["--set", f"{prefix}{item.name}={'none' if value is None else value}"]
-    return pairs
+def _pairs(settings: dict[str, Any]) -> list[str]:
+    """`--set KEY=VALUE` for each setting."""
+    texts = {True: "true", False: "false", None: "none"}
+    return [
+        word
+        for key, value in settings.items()
+        for word in ("--set", f"{key}={texts[value] if value is None or isinstance(value, bool) else value}")
+    ]

@@ -17,7 +17,7 @@ from perception.io.atomic import atomic_file
 def fingerprint(source: Path, config: MapConfig) -> str:
     """What a checkpoint depends on. When to stop is left out: giving more time to a stopped run is the point."""
     settings = config.to_json()
-    for name in ("time_limit", "stop_psnr", "checkpoint_seconds"):
+    for name in ("time_limit", "stop_psnr"):
         del settings["train"][name]
     text = json.dumps([str(source.resolve()), settings], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

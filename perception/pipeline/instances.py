@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -48,8 +48,10 @@ def find_instances(
     grouped = group_gaussians(gaussians, views, config, progress)
     seen = _silhouettes(gaussians, grouped.ids, views, "silhouettes", progress) if grouped.count else []
     instances = _entries(grouped, means, opacities, seen)
-    encoder = _encoder(config, progress) if grouped.count else None
-    language = _embed(encoder, grouped.ids, seen, views, config, progress) if encoder is not None else {}
+    words, encoder = config.language, _encoder(config, progress) if grouped.count else None
+    language = {}
+    if encoder is not None:
+        language = _embed(encoder, grouped.ids, seen, views, words.views, words.zooms, progress)
     report = {
         "count": grouped.count,
         "parts": len(grouped.parents),
@@ -120,8 +122,7 @@ def _parts(
     language: dict[str, np.ndarray] = {}
     if encoder is not None:
         seen = _silhouettes(gaussians, local, views, "silhouettes of parts", progress)
-        thrifty = replace(config, language=replace(config.language, views=min(2, config.language.views), zooms=1))
-        language = _embed(encoder, local, seen, views, thrifty, progress)
+        language = _embed(encoder, local, seen, views, min(2, config.language.views), 1, progress)
     return {"ids": grouped.part_ids, **{f"language_{name}": array for name, array in language.items()}}
 
 
@@ -167,10 +168,11 @@ def _embed(
     ids: np.ndarray,
     seen: list[Silhouettes],
     views: list[TrainingView],
-    config: MapConfig,
+    best: int,
+    zooms: int,
     progress: Progress,
 ) -> dict[str, np.ndarray]:
-    """Language arrays of all instances from their best views (paper eq. 8)."""
+    """Language arrays of all instances from their `best` views (eq. 11), `zooms` crops of each (0: as suits)."""
     from perception.instances.crops import choose_views, view_scores
     from perception.instances.describe import describe_instances
     from perception.language.base import reading_of
@@ -180,15 +182,13 @@ def _embed(
     total = np.maximum(np.bincount(ids[ids >= 0], minlength=len(pixels)), 1)
     visible = np.stack([view.visible for view in seen], axis=1) / total[:, None]
     sizes = np.array([view.photo.shape[0] * view.photo.shape[1] for view in views])
-    chosen = choose_views(view_scores(pixels, sizes, visible), config.language.views)
+    chosen = choose_views(view_scores(pixels, sizes, visible), best)
     descriptions = describe_instances(
         encoder,
         chosen,
         lambda index: (views[index].photo.numpy(), seen[index].ids),
         [view.name for view in views],
-        levels=config.language.zooms or reading_of(encoder).zooms,
-        expansion=config.language.expansion,
-        background=config.language.background,  # type: ignore[arg-type]  # config.check knows them all
+        levels=zooms or reading_of(encoder).zooms,
         progress=lambda done, of: progress.update("language", done, of),
     )
     return to_arrays(descriptions, encoder.identity)

@@ -34,6 +34,10 @@ from perception.types import Scene, View
 
 WORK_SUFFIX = ".work"
 CHECKPOINT = "checkpoint.pt"
+GEOMETRY_START = 0.3
+"""Progress at which masks that begin from the map's own depth (the built-in ones) are made."""
+CHECKPOINT_SECONDS = 20.0
+"""Between two checkpoints; so much work is lost at most."""
 LEAST_DISK = 256 << 20
 """Bytes a small run writes to its work folder: features, masks, checkpoint, map."""
 
@@ -111,7 +115,7 @@ def _build(
     depth = None
     if isinstance(source_of_masks, GeometryMaskSource):  # its masks wait for the map's own geometry
         with stages("train"):
-            session.train(until=config.losses.geometry_start)
+            session.train(until=GEOMETRY_START)
         depth = trainer.depth
     with stages("masks"):
         mask_report = _masks(training, source_of_masks, work, config, depth, progress)
@@ -209,7 +213,7 @@ def _masks(
         work / "masks",
         _stage(progress, f"masks ({source.name})"),
         load_depth=None if depth is None else lambda view: depth(view.name),
-        depth_key="" if depth is None else f"progress {config.losses.geometry_start}",
+        depth_key="" if depth is None else f"progress {GEOMETRY_START}",
     )
     for warning in report["warnings"]:
         progress.log(f"warning: {warning}")
@@ -285,7 +289,7 @@ class _Watch:
         if self.on_note is not None and len(trainer.record.curve) > self.noted:
             self.noted = len(trainer.record.curve)
             self.on_note(trainer)
-        if now - self.saved > self.config.train.checkpoint_seconds:
+        if now - self.saved > CHECKPOINT_SECONDS:
             save_checkpoint(self.path, trainer.state(), self.mark)
             self.saved = time.monotonic()
 

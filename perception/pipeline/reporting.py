@@ -66,7 +66,7 @@ def rerun_command(info: dict[str, Any], path: Path) -> str:
     usual = _flat(MapConfig().to_json())
     words = ["perception", "map", str(info["source"]), "-o", str(path), "--seed", str(info["seed"])]
     for key, value in _flat(info["config"]).items():
-        if key == "seed" or (key in usual and usual[key] == value):
+        if key == "seed" or key not in usual or usual[key] == value:  # an older map has settings that are no more
             continue
         text = "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
         words += ["--masks", text] if key == "masks" else ["--set", f"{key}={text}"]

@@ -8,11 +8,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from perception.config import DensifyConfig
-from perception.gaussians.densify import Statistics, densify, rotation_matrices, target_count
+from perception.gaussians.densify import START, STOP, Statistics, densify, rotation_matrices, target_count
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import depth_image
 
-CONFIG = DensifyConfig()
+THRESHOLD = DensifyConfig().grad_threshold
 
 
 def cloud(count: int = 50, seed: int = 0) -> Gaussians:
@@ -28,19 +28,19 @@ def statistics(count: int, gradient: float = 1.0) -> Statistics:
 @pytest.mark.parametrize("allowed", [0, 10, 50, 51, 70, 1000])
 @pytest.mark.parametrize("extent", [1e-6, 1e6])  # all are split, all are cloned
 def test_the_budget_holds(allowed: int, extent: float) -> None:
-    change = densify(cloud(), statistics(50), allowed, extent, CONFIG, seed=1)
+    change = densify(cloud(), statistics(50), allowed, extent, THRESHOLD, seed=1)
     assert len(change.keep) + len(change.born) == min(100, max(50, allowed))
 
 
 def test_nothing_grows_below_the_threshold() -> None:
-    change = densify(cloud(), statistics(50, CONFIG.grad_threshold / 2), 1000, 1.0, CONFIG, seed=1)
+    change = densify(cloud(), statistics(50, THRESHOLD / 2), 1000, 1.0, THRESHOLD, seed=1)
     assert change.keep.tolist() == list(range(50)) and len(change.born) == 0
 
 
 def test_a_clone_and_its_original_hide_as_much_as_before() -> None:
     gaussians = cloud()
     before = gaussians.opacities.clone()
-    densify(gaussians, statistics(50), 1000, 1e6, CONFIG, seed=1)
+    densify(gaussians, statistics(50), 1000, 1e6, THRESHOLD, seed=1)
     torch.testing.assert_close(1 - (1 - gaussians.opacities) ** 2, before)
 
 
@@ -49,7 +49,7 @@ def test_the_halves_of_a_split_lie_about_its_place() -> None:
     gaussians.means.zero_()
     gaussians.log_scales.copy_(torch.log(torch.tensor([0.3, 0.2, 0.1])).expand(2000, 3))
     gaussians.quats.copy_(torch.tensor([0.3, -0.5, 0.1, 2.0]).expand(2000, 4))
-    born = densify(gaussians, statistics(2000), 10**6, 1e-6, CONFIG, seed=5).born
+    born = densify(gaussians, statistics(2000), 10**6, 1e-6, THRESHOLD, seed=5).born
     turn = Rotation.from_quat([-0.5, 0.1, 2.0, 0.3]).as_matrix()
     expected = turn @ np.diag([0.09, 0.04, 0.01]) @ turn.T
     # 4000 draws: the relative error of a variance is about sqrt(2 / 4000) = 2 %; 4 of those, of the largest.
@@ -62,12 +62,12 @@ def test_the_faint_the_unseen_and_the_broken_are_pruned() -> None:
     gaussians.opacity_logits[3] = -9.0
     seen.seen[7] = 0
     gaussians.means[11, 1] = float("nan")
-    kept = densify(gaussians, seen, 1000, 1.0, CONFIG, seed=1).keep.tolist()
+    kept = densify(gaussians, seen, 1000, 1.0, THRESHOLD, seed=1).keep.tolist()
     assert kept == [i for i in range(50) if i not in (3, 7, 11)]
 
 
 def test_growth_is_a_ramp() -> None:
-    counts = [target_count(p, 100, 1100, CONFIG) for p in (0.0, CONFIG.start, 0.325, CONFIG.stop, 1.0)]
+    counts = [target_count(p, 100, 1100) for p in (0.0, START, 0.325, STOP, 1.0)]
     assert counts == [100, 100, 600, 1100, 1100]
 
 

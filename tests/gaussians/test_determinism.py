@@ -17,7 +17,7 @@ from perception.io.store import read_map
 from perception.pipeline.mapping import build_map
 from perception.types import PointCloud
 
-PAIRS = ["train.iterations=100", "train.budget=3000", "densify.every=20", "densify.fill_every=2", "photos.holdout=6"]
+PAIRS = ["train.iterations=100", "train.budget=3000", "densify.every=10", "photos.holdout=6"]
 PAIRS += ["instances.min_cluster_size=15", "instances.min_samples=5", "language.encoder=none"]
 U = 2.0**-24
 FILES = ("gaussians.ply", "features.npy", "instance_ids.npy", "membership.npy", "instances.json")

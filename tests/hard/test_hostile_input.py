@@ -354,7 +354,7 @@ def test_an_infinite_whole_number_in_a_settings_file(tmp_path: Path) -> None:
     """OverflowError: cannot convert float infinity to integer."""
     file = tmp_path / "c.toml"
     file.write_text("[train]\niterations = inf\n")
-    refused(load_config, file, match=r"train\.iterations.*found inf, expected int")
+    refused(load_config, file, match=r"train\.iterations.*found inf, expected a whole number")
 
 
 def test_settings_nested_without_end(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from perception.types import Scene, View
 
 ORIGIN = np.array([367_000.0, 5_790_000.0, 40.0])  # UTM 33N, metres
 QUICK = ["train.iterations=60", "train.budget=3000", "language.encoder=none", "densify.every=20", "photos.holdout=6"]
-QUICK += ["instances.min_cluster_size=15", "instances.min_samples=5", "train.random_background=false"]
+QUICK += ["instances.min_cluster_size=15", "instances.min_samples=5"]
 
 
 def scene_at(place: np.ndarray, path: float = 1.0) -> Scene:

@@ -97,7 +97,6 @@ class Mapping(Case):
     name = "mapping"
     settings = (
         "train.budget=1500",
-        "train.checkpoint_seconds=0.2",
         "densify.every=20",
         "instances.min_cluster_size=15",
         "instances.min_samples=5",
@@ -120,6 +119,9 @@ class Mapping(Case):
         return words if earlier is None else [*words, "--labels-from", str(earlier)]
 
     def work(self, place: Path, trial: int) -> int:
+        from perception.pipeline import mapping
+
+        mapping.CHECKPOINT_SECONDS = 0.2
         return command(*self.words(place / "out.gsmap", place / "earlier.gsmap"))
 
     def again(self, place: Path, trial: int) -> int:

@@ -166,8 +166,17 @@ def test_the_same_seed_gives_the_same_map_whatever_the_threads(
 
 def test_killed_and_resumed_is_the_run_that_was_never_killed(finished: Path, small_scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "killed.gsmap"
-    pairs = [f"--set={pair}" for pair in [*SETTINGS, "train.checkpoint_seconds=0.01"]]
-    command = [sys.executable, "-m", "perception.cli", "map", str(small_scene / "transforms.json"), "-o", str(out)]
+    pairs = [f"--set={pair}" for pair in SETTINGS]
+    often = "import sys, perception.cli, perception.pipeline.mapping as m; m.CHECKPOINT_SECONDS = .01; "
+    command = [
+        sys.executable,
+        "-c",
+        f"{often}sys.exit(perception.cli.main(sys.argv[1:]))",
+        "map",
+        str(small_scene / "transforms.json"),
+        "-o",
+        str(out),
+    ]
     command += ["--masks", f"labels:{small_scene / 'labels'}", *pairs]
     # Not in the repository's root, where the sources without their compiled core would be found first.
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, cwd=tmp_path)

@@ -19,8 +19,8 @@ from perception.pipeline.reporting import _left_out, rerun_command
     "pairs",
     [
         [],
-        ["masks=labels:my labels", "train.time_limit=60", "train.random_background=false", "seed=7"],
-        ["photos.holdout=0", "instances.method=hdbscan", "train.lr_means=1e-5"],
+        ["masks=labels:my labels", "train.time_limit=60", "losses.half_resolution=false", "seed=7"],
+        ["photos.holdout=0", "instances.method=hdbscan", "densify.grad_threshold=1e-5"],
     ],
 )
 @pytest.mark.parametrize("preset", ["default", "quality"])
