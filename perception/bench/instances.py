@@ -55,12 +55,12 @@ def write_pictures(map_path: Path, folder: Path) -> list[str]:
     from perception.instances.silhouettes import render_silhouettes
     from perception.io.store import read_map
     from perception.pictures import colorize_instances
-    from perception.pipeline.above import instances_from_above
     from perception.pipeline.rendering import as_gaussians, map_views
+    from perception.pipeline.top_view import instances_top_view
 
     gmap = read_map(map_path)
     gaussians = as_gaussians(gmap)
-    pictures = {"above": instances_from_above(gmap, 720)}
+    pictures = {"above": instances_top_view(gmap, 720)}
     views = map_views(gmap)
     for view in (views[0], views[len(views) // 2]):
         pose = torch.from_numpy(view.camera_from_world.astype(np.float32))

@@ -19,9 +19,9 @@ from perception.io.photos import load_photo, scaled_K
 from perception.io.scene_cache import view_from_json
 from perception.io.store import GaussianMap
 from perception.pictures import features_to_rgb, montage, outline, overlay
-from perception.pipeline.above import instances_from_above
-from perception.pipeline.coverage import weak_coverage
 from perception.pipeline.rendering import as_gaussians
+from perception.pipeline.top_view import instances_top_view
+from perception.pipeline.view_coverage import weak_coverage
 from perception.query import LoadedMap
 from perception.report import InstanceRow, QueryRow, ReportData, ViewRow, write_report
 from perception.types import View
@@ -53,7 +53,7 @@ def write_map_report(
         queries=[_query_row(opened, text, album, (expected or {}).get(text)) for text in queries],
         warnings=_warnings(info, gaussians, list(album.views.values())),
         settings=_flat(info["config"]),
-        rerun=rerun_command(info, opened.path or Path("MAP")),
+        command=rerun_command(info, opened.path or Path("MAP")),
     )
     try:
         return write_report(path, data)
@@ -197,7 +197,7 @@ def _overview(gmap: GaussianMap, album: _Album) -> dict[str, np.ndarray]:
         return {}
     return {
         f"instances in {name}": overlay(photo, album.ids(name, photo)),
-        "instances from above": instances_from_above(gmap),
+        "instances, top view": instances_top_view(gmap),
         "instance features (main components)": feature_picture(album, name, photo),
     }
 

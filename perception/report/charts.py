@@ -1,14 +1,15 @@
-"""Small inline SVG charts: a curve, and horizontal or vertical bars. Colours come from the page's style
-sheet."""
+"""Small inline SVG charts: a curve and columns. Colours come from the page's style sheet; text is escaped."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from html import escape
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from markupsafe import Markup
 
-WIDTH, HEIGHT, LEFT, BOTTOM = 320, 170, 40, 22
+WIDTH, HEIGHT = 320, 170
+LEFT, RIGHT, TOP, BASE = 40, WIDTH - 12, 12, HEIGHT - 22
+"""The plotted area in pixels; tick labels stand outside it."""
 
 
 def ticks(low: float, high: float, count: int = 4) -> list[float]:
@@ -30,77 +31,6 @@ def short(value: float) -> str:
     return f"{value:.3g}"
 
 
-def curve(points: Sequence[tuple[float, float]], label: str, unit: str = "") -> str:
-    """A line through (x, y); points that are not finite are left out, none at all gives an empty string."""
-    kept = np.array([p for p in points if np.isfinite(p).all()], float).reshape(-1, 2)
-    if len(kept) < 2:
-        return ""
-    (x0, y0), (x1, y1) = kept.min(0), kept.max(0)
-    y0, y1 = (y0 - 0.5, y1 + 0.5) if y1 == y0 else (y0, y1)
-    x1 = x1 if x1 > x0 else x0 + 1
-    right, top, base = WIDTH - 12, 12, HEIGHT - BOTTOM
-
-    def at(x: float, y: float) -> tuple[float, float]:
-        return LEFT + (x - x0) / (x1 - x0) * (right - LEFT), base - (y - y0) / (y1 - y0) * (base - top)
-
-    parts = []
-    for y in ticks(y0, y1):
-        py = at(x0, y)[1]
-        parts.append(f'<line class="grid" x1="{LEFT}" x2="{right}" y1="{py:.1f}" y2="{py:.1f}"/>')
-        parts.append(f'<text x="{LEFT - 8}" y="{py + 4:.1f}" text-anchor="end">{short(y)}</text>')
-    for x in ticks(x0, x1):
-        parts.append(f'<text x="{at(x, y0)[0]:.1f}" y="{HEIGHT - 6}" text-anchor="middle">{short(x)}</text>')
-    path = " ".join(f"{px:.1f},{py:.1f}" for px, py in (at(x, y) for x, y in kept))
-    parts.append(f'<polyline class="line" points="{path}"/>')
-    last = at(*kept[-1])
-    parts.append(f'<circle class="dot" cx="{last[0]:.1f}" cy="{last[1]:.1f}" r="4"/>')
-    title = f"{escape(label)}: {short(kept[-1, 1])}{' ' + escape(unit) if unit else ''} at the end"
-    return _svg(WIDTH, HEIGHT, title, parts)
-
-
-def columns(values: Mapping[str, float], label: str, unit: str) -> str:
-    """One upright bar per name, written below where there is room, and the mean; what is not finite is left out."""
-    kept = {name: value for name, value in values.items() if np.isfinite(value)}
-    if not kept:
-        return ""
-    high = max(*kept.values(), 1e-9)
-    top, base, right = 12, HEIGHT - BOTTOM, WIDTH - 12
-    pitch = (right - LEFT) / len(kept)
-    stems = [name.rsplit("/", 1)[-1].rsplit(".", 1)[0] for name in kept]
-    parts = []
-    for y in ticks(0, high):
-        py = base - y / high * (base - top)
-        parts.append(f'<line class="grid" x1="{LEFT}" x2="{right}" y1="{py:.1f}" y2="{py:.1f}"/>')
-        parts.append(f'<text x="{LEFT - 8}" y="{py + 4:.1f}" text-anchor="end">{short(y)}</text>')
-    for i, (name, value) in enumerate(kept.items()):
-        tall = max(value, 0) / high * (base - top)
-        parts.append(
-            f'<rect class="bar" x="{LEFT + (i + 0.15) * pitch:.1f}" y="{base - tall:.1f}" '
-            f'width="{0.7 * pitch:.1f}" height="{tall:.1f}" rx="2">'
-            f"<title>{escape(name)}: {value:.3g} {escape(unit)}</title></rect>"
-        )
-        if 6 * max(map(len, stems)) <= pitch:
-            middle = LEFT + (i + 0.5) * pitch
-            parts.append(f'<text x="{middle:.1f}" y="{HEIGHT - 7}" text-anchor="middle">{escape(stems[i])}</text>')
-    mean = base - float(np.mean(list(kept.values()))) / high * (base - top)
-    parts.append(f'<line class="mean" x1="{LEFT}" x2="{right}" y1="{mean:.1f}" y2="{mean:.1f}"/>')
-    return _svg(WIDTH, HEIGHT, f"{label}, mean {np.mean(list(kept.values())):.3g} {unit}", parts)
-
-
-def stages(seconds: Mapping[str, float]) -> str:
-    """One strip divided among the stages in proportion to their seconds, with a legend beneath."""
-    kept = {name: value for name, value in seconds.items() if np.isfinite(value) and value > 0}
-    total = sum(kept.values())
-    if not total:
-        return ""
-    strip, legend = [], []
-    for i, (name, value) in enumerate(kept.items()):
-        tone = f"--tone:{i % 8}"
-        strip.append(f'<span style="{tone};flex-grow:{value / total:.4f}" title="{escape(name)}"></span>')
-        legend.append(f'<li style="{tone}"><b>{escape(name)}</b> {clock(value)}</li>')
-    return f'<div class="strip">{"".join(strip)}</div><ul class="legend">{"".join(legend)}</ul>'
-
-
 def clock(seconds: float) -> str:
     """42.3 -> 42 s, 95 -> 1 min 35 s."""
     if seconds < 9.95:
@@ -109,5 +39,59 @@ def clock(seconds: float) -> str:
     return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60:02d} s"
 
 
-def _svg(width: int, height: int, label: str, parts: list[str]) -> str:
-    return f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(label)}">{"".join(parts)}</svg>'
+def curve(points: Sequence[tuple[float, float]], label: str, unit: str = "") -> Markup:
+    """A line through (x, y); points that are not finite are left out; empty for fewer than two."""
+    kept = np.array([p for p in points if np.isfinite(p).all()], float).reshape(-1, 2)
+    if len(kept) < 2:
+        return Markup()
+    (x0, y0), (x1, y1) = kept.min(0), kept.max(0)
+    y0, y1 = (y0 - 0.5, y1 + 0.5) if y1 == y0 else (y0, y1)
+    across, up = _scale(x0, x1 if x1 > x0 else x0 + 1, LEFT, RIGHT), _scale(y0, y1, BASE, TOP)
+    parts = [_gridline(up(y), short(y)) for y in ticks(y0, y1)]
+    parts += [_text(across(x), HEIGHT - 6, "middle", short(x)) for x in ticks(x0, x1)]
+    path = " ".join(f"{across(x):.1f},{up(y):.1f}" for x, y in kept)
+    parts.append(Markup('<polyline class="line" points="{}"/>').format(path))
+    end = Markup('<circle class="dot" cx="{:.1f}" cy="{:.1f}" r="4"/>')
+    parts.append(end.format(across(kept[-1, 0]), up(kept[-1, 1])))
+    return _svg(f"{label}: {short(kept[-1, 1])} {unit}".rstrip() + " at the end", parts)
+
+
+def columns(values: Mapping[str, float], label: str, unit: str) -> Markup:
+    """One upright bar per name, written below where there is room, and the mean; what is not finite is left out."""
+    kept = {name: value for name, value in values.items() if np.isfinite(value)}
+    if not kept:
+        return Markup()
+    high, mean = max(*kept.values(), 1e-9), float(np.mean(list(kept.values())))
+    up, pitch = _scale(0, high, BASE, TOP), (RIGHT - LEFT) / len(kept)
+    stems = [name.rsplit("/", 1)[-1].rsplit(".", 1)[0] for name in kept]
+    rect = Markup('<rect class="bar" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" rx="2">')
+    title = Markup("<title>{}: {:.3g} {}</title></rect>")
+    parts = [_gridline(up(y), short(y)) for y in ticks(0, high)]
+    for i, (name, value) in enumerate(kept.items()):
+        top = up(max(value, 0))
+        parts.append(rect.format(LEFT + (i + 0.15) * pitch, top, 0.7 * pitch, BASE - top))
+        parts.append(title.format(name, value, unit))
+        if 6 * max(map(len, stems)) <= pitch:
+            parts.append(_text(LEFT + (i + 0.5) * pitch, HEIGHT - 7, "middle", stems[i]))
+    line = Markup('<line class="mean" x1="{}" x2="{}" y1="{:.1f}" y2="{:.1f}"/>')
+    parts.append(line.format(LEFT, RIGHT, up(mean), up(mean)))
+    return _svg(f"{label}, mean {mean:.3g} {unit}", parts)
+
+
+def _scale(low: float, high: float, start: float, end: float) -> Callable[[float], float]:
+    """The linear map that takes low to start and high to end."""
+    return lambda value: start + (value - low) / (high - low) * (end - start)
+
+
+def _gridline(y: float, words: str) -> Markup:
+    line = Markup('<line class="grid" x1="{}" x2="{}" y1="{:.1f}" y2="{:.1f}"/>').format(LEFT, RIGHT, y, y)
+    return line + _text(LEFT - 8, y + 4, "end", words)
+
+
+def _text(x: float, y: float, anchor: str, words: str) -> Markup:
+    return Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(x, y, anchor, words)
+
+
+def _svg(label: str, parts: Sequence[Markup]) -> Markup:
+    head = Markup('<svg viewBox="0 0 {} {}" role="img" aria-label="{}">').format(WIDTH, HEIGHT, label)
+    return head + Markup().join(parts) + Markup("</svg>")

@@ -11,8 +11,8 @@ import pytest
 from perception.colors import instance_palette
 from perception.config import load_config
 from perception.io.store import GaussianMap
-from perception.pipeline.above import instances_from_above
 from perception.pipeline.reporting import _left_out, rerun_command
+from perception.pipeline.top_view import instances_top_view
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def plan(ceiling: bool) -> GaussianMap:
 @pytest.mark.parametrize("ceiling", [False, True])
 def test_from_above_things_lie_where_they_are_and_the_ceiling_is_lifted_off(ceiling: bool) -> None:
     side = 240
-    picture = instances_from_above(plan(ceiling), side).astype(int)
+    picture = instances_top_view(plan(ceiling), side).astype(int)
     colors = instance_palette(np.arange(3)).astype(int)
     found = [np.argwhere(np.abs(picture - color).max(axis=2) < 12) for color in colors]
     (row0, column0), (row1, column1) = (spots.mean(axis=0).tolist() for spots in found[:2])
@@ -94,4 +94,4 @@ def test_from_above_things_lie_where_they_are_and_the_ceiling_is_lifted_off(ceil
 def test_a_map_without_solid_instances_is_a_white_plan() -> None:
     gmap = plan(False)
     gmap.instance_ids[:] = -1
-    assert (instances_from_above(gmap, 50) == 255).all()
+    assert (instances_top_view(gmap, 50) == 255).all()

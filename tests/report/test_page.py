@@ -6,6 +6,8 @@ from __future__ import annotations
 import base64
 import io
 import re
+from dataclasses import replace
+from html.parser import HTMLParser
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -39,7 +41,7 @@ def _full(side: int = 64) -> ReportData:
         queries=[QueryRow(NASTY, True, [(3, 0.7)], picture(), [3]), QueryRow("laptop", False, expected=[])],
         warnings=[NASTY],
         settings={NASTY: NASTY},
-        rerun=NASTY,
+        command=NASTY,
     )
 
 
@@ -68,6 +70,40 @@ def test_user_text_is_text(tmp_path: Path) -> None:
     shown = "".join(tree.itertext())
     assert shown.count("<script>alert('x')</script>") >= 12
     assert tree.find("head/title").text == NASTY  # type: ignore[union-attr]
+
+
+def test_markup_in_names_is_shown_and_never_parsed(tmp_path: Path) -> None:
+    """An HTML parser finds the page's own elements only, whatever labels, prompts and photo names hold."""
+    evil = "<img src=x onerror=alert(1)>\"'&{{ 7 * 7 }}{% raw %}\ud800"
+    plain = np.zeros((8, 8, 3), np.uint8)
+    data = ReportData(
+        evil,
+        views=[ViewRow(evil, 20.0, 0.5, plain, plain, evil)],
+        instances=[InstanceRow(1, plain, evil), InstanceRow(2, plain, None, [evil]), InstanceRow(evil, None)],  # type: ignore[arg-type]
+        queries=[QueryRow(evil, True, [(1, 0.5)], plain)],
+    )
+    with pytest.raises((ValueError, TypeError)):  # a received map's id is a number or the page is refused
+        write_report(tmp_path / "r.html", data)
+    write_report(tmp_path / "r.html", replace(data, instances=data.instances[:2]))
+
+    class Parser(HTMLParser):
+        def __init__(self) -> None:
+            super().__init__()
+            self.seen: list[tuple[str, set[str]]] = []
+            self.text = ""
+
+        def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+            self.seen.append((tag, {name for name, _ in attrs}))
+
+        def handle_data(self, data: str) -> None:
+            self.text += data
+
+    parser = Parser()
+    parser.feed((tmp_path / "r.html").read_text(encoding="utf-8"))
+    assert sum(tag == "img" for tag, _ in parser.seen) == 3 + 2 + 1
+    assert not [names for _, names in parser.seen if any(name.startswith("on") for name in names)]
+    assert {tag for tag, _ in parser.seen}.isdisjoint({"script", "iframe", "object", "link", "base", "form"})
+    assert parser.text.count("<img src=x onerror=alert(1)>\"'&{{ 7 * 7 }}{% raw %}?") >= 6
 
 
 def test_what_is_right_and_what_is_wrong(tmp_path: Path) -> None:

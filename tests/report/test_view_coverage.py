@@ -9,7 +9,7 @@ import torch
 
 from perception.gaussians.model import Gaussians
 from perception.geometry import look_at
-from perception.pipeline.coverage import views_of_each, weak_coverage
+from perception.pipeline.view_coverage import views_of_each, weak_coverage
 from perception.types import View
 
 K = np.array([[200.0, 0, 100], [0, 200.0, 75], [0, 0, 1]])

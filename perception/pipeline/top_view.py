@@ -19,7 +19,7 @@ INK = (70, 70, 70)
 
 
 @torch.no_grad()
-def instances_from_above(gmap: GaussianMap, side: int = 480) -> np.ndarray:
+def instances_top_view(gmap: GaussianMap, side: int = 480) -> np.ndarray:
     """[side, side, 3] uint8: the instances in their colours, cameras as dots, a scale bar.
 
     "Down" is the mean of the cameras' downward axes. What lies above every camera, as ceilings do, is left out.
