@@ -1,5 +1,9 @@
-// The compiled core: no torch, no I/O. Each concept binds itself in its own file.
+// The compiled core: no torch, no I/O. Each component binds itself in a file of its own.
 #include <nanobind/nanobind.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include "common/levels.h"
 
 namespace nb = nanobind;
 
@@ -9,13 +13,8 @@ void bind_graph(nb::module_ &m);
 
 NB_MODULE(_core, m) {
   m.doc() = "Compiled kernels of perception.";
-#ifdef PERCEPTION_HAVE_rasterizer
+  m.def("simd_levels", &perception::level_names, "SIMD levels that this processor has, best first.");
   bind_rasterizer(m);
-#endif
-#ifdef PERCEPTION_HAVE_training
   bind_training(m);
-#endif
-#ifdef PERCEPTION_HAVE_graph
   bind_graph(m);
-#endif
 }

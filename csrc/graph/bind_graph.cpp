@@ -6,12 +6,11 @@
 #include <cmath>
 #include <stdexcept>
 
-#include "../arguments.h"
-#include "density.hpp"
-#include "felzenszwalb.hpp"
-#include "kdtree.hpp"
-#include "neighborhood.hpp"
-#include "parallel.hpp"
+#include "../common/arguments.h"
+#include "density.h"
+#include "felzenszwalb.h"
+#include "kdtree.h"
+#include "neighborhood.h"
 
 namespace nb = nanobind;
 using perception::require_aligned;
@@ -32,7 +31,7 @@ KdTree *make_tree(Points points, int threads) {
     throw nb::value_error("points: all coordinates must be finite");
   }
   nb::gil_scoped_release release;
-  return new KdTree(data, count, perception::graph::sane_threads(threads));
+  return new KdTree(data, count, threads);
 }
 
 void knn(const KdTree &tree, Points queries, Array<std::int32_t, nb::shape<-1, -1>> indices,
@@ -44,8 +43,7 @@ void knn(const KdTree &tree, Points queries, Array<std::int32_t, nb::shape<-1, -
   }
   if (!(max_distance >= 0)) throw nb::value_error("max_distance must not be negative");
   nb::gil_scoped_release release;
-  tree.knn(queries.data(), count, static_cast<int>(k), max_distance, perception::graph::sane_threads(threads), indices.data(),
-           squared.data());
+  tree.knn(queries.data(), count, static_cast<int>(k), max_distance, threads, indices.data(), squared.data());
 }
 
 std::size_t segment(Array<const std::int32_t, nb::shape<-1, 2>> edges, Array<const float, nb::shape<-1>> weights,
@@ -84,8 +82,8 @@ void plane_normals(Points points, Lists neighbors, Array<float, nb::shape<-1, 3>
   if (normals.shape(0) != neighbors.shape(0)) throw nb::value_error("normals must be [Q, 3] for neighbors [Q, k]");
   if (!within(neighbors, points.shape(0))) throw nb::value_error("neighbors: an index lies outside the points");
   nb::gil_scoped_release release;
-  perception::graph::plane_normals(points.data(), neighbors.data(), neighbors.shape(0), neighbors.shape(1),
-                                   perception::graph::sane_threads(threads), normals.data());
+  perception::graph::plane_normals(points.data(), neighbors.data(), neighbors.shape(0), neighbors.shape(1), threads,
+                                   normals.data());
 }
 
 void densest(Points points, Points means, Array<const float, nb::shape<-1, 6>> precisions,
@@ -103,8 +101,8 @@ void densest(Points points, Points means, Array<const float, nb::shape<-1, 6>> p
   if (!within(candidates, n)) throw nb::value_error("candidates: an index lies outside the Gaussians");
   const perception::graph::Gaussians gaussians{means.data(), precisions.data(), opacities.data(), instances.data()};
   nb::gil_scoped_release release;
-  perception::graph::densest(gaussians, points.data(), candidates.data(), count, candidates.shape(1),
-                             perception::graph::sane_threads(threads), labels.data());
+  perception::graph::densest(gaussians, points.data(), candidates.data(), count, candidates.shape(1), threads,
+                             labels.data());
 }
 
 }  // namespace
@@ -112,8 +110,8 @@ void densest(Points points, Points means, Array<const float, nb::shape<-1, 6>> p
 void bind_graph(nb::module_ &m) {
   nb::class_<KdTree>(m, "KdTree", "Exact nearest neighbours in 3D; see perception.export.neighbors.")
       .def(nb::new_(&make_tree), nb::arg("points").noconvert(), nb::arg("threads") = 1)
-      .def("knn", &knn, nb::arg("queries").noconvert(), nb::arg("indices").noconvert(),
-           nb::arg("squared").noconvert(), nb::arg("max_distance"), nb::arg("threads") = 1)
+      .def("knn", &knn, nb::arg("queries").noconvert(), nb::arg("indices").noconvert(), nb::arg("squared").noconvert(),
+           nb::arg("max_distance"), nb::arg("threads") = 1)
       .def("__len__", &KdTree::size);
   m.def("felzenszwalb", &segment, nb::arg("edges").noconvert(), nb::arg("weights").noconvert(), nb::arg("k"),
         nb::arg("min_size"), nb::arg("labels").noconvert(),

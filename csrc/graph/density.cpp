@@ -1,10 +1,10 @@
-#include "density.hpp"
+#include "density.h"
 
 #include <algorithm>
 #include <cmath>
 #include <vector>
 
-#include "parallel.hpp"
+#include "../common/parallel.h"
 
 namespace perception::graph {
 namespace {
@@ -45,14 +45,12 @@ std::int32_t winner(const Gaussians &g, const float *point, const std::int32_t *
 
 void densest(const Gaussians &gaussians, const float *points, const std::int32_t *candidates, std::size_t count,
              std::size_t k, int threads, std::int32_t *labels) {
-  const auto work = [&](std::size_t begin, std::size_t end) {
+  parallel_pieces(threads, Pieces(count, 1024, 256), [&](std::size_t begin, std::size_t end) {
     std::vector<Sum> sums;
     for (std::size_t i = begin; i < end; ++i) {
       labels[i] = winner(gaussians, points + 3 * i, candidates + i * k, k, sums);
     }
-  };
-  const std::size_t share = count / static_cast<std::size_t>(sane_threads(threads)) + 1;
-  parallel_blocks(count, share, threads, work);
+  });
 }
 
 }  // namespace perception::graph

@@ -1,10 +1,10 @@
-#include "felzenszwalb.hpp"
+#include "felzenszwalb.h"
 
 #include <algorithm>
 #include <utility>
 #include <vector>
 
-#include "parallel.hpp"
+#include "../common/parallel.h"
 
 namespace perception::graph {
 namespace {
@@ -47,7 +47,9 @@ std::vector<Edge> sorted_edges(const std::int32_t *edges, const float *weights, 
     sorted[i] = {weights[i], a, b};
   }
   const auto middle = sorted.begin() + static_cast<std::ptrdiff_t>(count / 2);
-  both([&] { std::sort(sorted.begin(), middle); }, [&] { std::sort(middle, sorted.end()); });
+  parallel_for(2, 2, [&](std::size_t half, int) {
+    std::sort(half == 0 ? sorted.begin() : middle, half == 0 ? middle : sorted.end());
+  });
   std::inplace_merge(sorted.begin(), middle, sorted.end());
   return sorted;
 }

@@ -1,16 +1,18 @@
-#include "kdtree.hpp"
+#include "kdtree.h"
 
 #include <algorithm>
 #include <cmath>
 
-#include "parallel.hpp"
+#include "../common/levels.h"
+#include "../common/parallel.h"
 
 namespace perception::graph {
 namespace {
 
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
 constexpr std::int32_t kNone = std::numeric_limits<std::int32_t>::max();  // sorts behind every index
-constexpr std::size_t kBlock = 1 << 17;                                   // queries a thread takes at a time
+constexpr int64_t kBlock = 1 << 17;                                       // queries a thread takes at a time, at most
+constexpr std::size_t kWorthSplitting = 4096;                             // points of a subtree
 constexpr int kDepth = 64;
 
 std::size_t leaves(std::size_t points) { return (points + KdTree::kBucket - 1) / KdTree::kBucket; }
@@ -20,8 +22,8 @@ std::size_t left_size(std::size_t points) { return (leaves(points) / 2) * KdTree
 
 struct Pending {
   std::uint32_t node;
-  float squared;     // distance from the query to the node's cell
-  float offset[3];   // by axis
+  float squared;    // distance from the query to the node's cell
+  float offset[3];  // by axis
 };
 
 // Squared distances of the query to one bucket; the loop is a fixed number of lanes.
@@ -87,7 +89,7 @@ struct Task {
   KdTree::View tree;
   const float *queries;
   int k;
-  float limit;  // squared
+  float limit;             // squared
   float low[3], cells[3];  // corner of the tree's box, Morton cells per unit length
   std::int32_t *indices;
   float *squared;
@@ -153,7 +155,7 @@ using Answer = void (*)(const Task &, std::size_t, std::size_t);
 
 Answer pick() {
 #if defined(__x86_64__)
-  if (__builtin_cpu_supports("avx2")) return answer_avx2;
+  if (level_supported(Level::avx2)) return answer_avx2;
 #endif
   return answer_plain;
 }
@@ -175,7 +177,16 @@ KdTree::KdTree(const float *points, std::size_t count, int threads) : size_(coun
       high_[a] = std::max(high_[a], e.at[a]);
     }
   }
-  build(entries, 0, count, 0, threads);
+  std::vector<Subtree> open = {{0, count, 0}};
+  while (static_cast<int>(open.size()) < threads && count / open.size() > kWorthSplitting) {
+    std::vector<Subtree> children(2 * open.size());
+    parallel_for(threads, open.size(), [&](std::size_t i, int) {
+      const auto [left, right] = split(entries, open[i]);
+      children[2 * i] = left, children[2 * i + 1] = right;
+    });
+    open.swap(children);
+  }
+  parallel_for(threads, open.size(), [&](std::size_t i, int) { build(entries, open[i]); });
   x_.assign(slots, kInfinity);
   y_.assign(slots, kInfinity);
   z_.assign(slots, kInfinity);
@@ -188,12 +199,9 @@ KdTree::KdTree(const float *points, std::size_t count, int threads) : size_(coun
   }
 }
 
-void KdTree::build(std::vector<Entry> &entries, std::size_t begin, std::size_t end, std::size_t node, int threads) {
-  const std::size_t left = left_size(end - begin);
-  if (left == 0) {
-    nodes_[node] = {0.f, -1, static_cast<std::uint32_t>(begin)};
-    return;
-  }
+std::pair<KdTree::Subtree, KdTree::Subtree> KdTree::split(std::vector<Entry> &entries, const Subtree &tree) {
+  const auto [begin, end, node] = tree;
+  const std::size_t middle = begin + left_size(end - begin);
   float low[3] = {kInfinity, kInfinity, kInfinity}, high[3] = {-kInfinity, -kInfinity, -kInfinity};
   for (std::size_t i = begin; i < end; ++i) {
     for (int a = 0; a < 3; ++a) {
@@ -205,23 +213,26 @@ void KdTree::build(std::vector<Entry> &entries, std::size_t begin, std::size_t e
   for (int a = 1; a < 3; ++a) {
     if (high[a] - low[a] > high[axis] - low[axis]) axis = a;
   }
-  const auto first = entries.begin();
-  const auto at = [&](std::size_t i) { return first + static_cast<std::ptrdiff_t>(i); };
-  std::nth_element(at(begin), at(begin + left), at(end),
+  Entry *first = entries.data();
+  std::nth_element(first + begin, first + middle, first + end,
                    [axis](const Entry &a, const Entry &b) { return a.at[axis] < b.at[axis]; });
-  const std::size_t right = node + 2 * leaves(left);  // a subtree of n leaves has 2n - 1 nodes
-  nodes_[node] = {entries[begin + left].at[axis], axis, static_cast<std::uint32_t>(right)};
-  if (threads > 1 && end - begin > 4096) {
-    both([&] { build(entries, begin, begin + left, node + 1, threads / 2); },
-         [&] { build(entries, begin + left, end, right, threads - threads / 2); });
-  } else {
-    build(entries, begin, begin + left, node + 1, 1);
-    build(entries, begin + left, end, right, 1);
-  }
+  const std::size_t right = node + 2 * leaves(middle - begin);  // a subtree of n leaves has 2n - 1 nodes
+  nodes_[node] = {entries[middle].at[axis], axis, static_cast<std::uint32_t>(right)};
+  return {{begin, middle, node + 1}, {middle, end, right}};
 }
 
-void KdTree::knn(const float *queries, std::size_t count, int k, float max_distance, int threads,
-                 std::int32_t *indices, float *squared) const {
+void KdTree::build(std::vector<Entry> &entries, const Subtree &tree) {
+  if (leaves(tree.end - tree.begin) <= 1) {
+    nodes_[tree.node] = {0.f, -1, static_cast<std::uint32_t>(tree.begin)};
+    return;
+  }
+  const auto [left, right] = split(entries, tree);
+  build(entries, left);
+  build(entries, right);
+}
+
+void KdTree::knn(const float *queries, std::size_t count, int k, float max_distance, int threads, std::int32_t *indices,
+                 float *squared) const {
   const View view{nodes_.data(), x_.data(), y_.data(), z_.data(), index_.data()};
   // Without a limit, what is farther than a float can hold squared is left out like everything beyond a limit.
   const float limit = max_distance < kInfinity ? max_distance * max_distance : std::numeric_limits<float>::max();
@@ -231,8 +242,8 @@ void KdTree::knn(const float *queries, std::size_t count, int k, float max_dista
     task.cells[a] = high_[a] > low_[a] ? 1024.f / (high_[a] - low_[a]) : 0.f;
   }
   const Answer run = pick();
-  const std::size_t block = std::min(kBlock, count / (4 * static_cast<std::size_t>(threads)) + 1);
-  parallel_blocks(count, block, threads, [&](std::size_t begin, std::size_t end) { run(task, begin, end); });
+  const int64_t n = static_cast<int64_t>(count), blocks = std::max<int64_t>(4 * int64_t{threads}, n / kBlock + 1);
+  parallel_pieces(threads, Pieces(n, 1, blocks), [&](std::size_t begin, std::size_t end) { run(task, begin, end); });
 }
 
 }  // namespace perception::graph

@@ -1,9 +1,9 @@
-#include "neighborhood.hpp"
+#include "neighborhood.h"
 
 #include <algorithm>
 #include <cmath>
 
-#include "parallel.hpp"
+#include "../common/parallel.h"
 
 namespace perception::graph {
 namespace {
@@ -93,11 +93,9 @@ std::size_t undirected(const std::int32_t *neighbors, std::size_t count, std::si
 
 void plane_normals(const float *points, const std::int32_t *neighbors, std::size_t count, std::size_t k, int threads,
                    float *normals) {
-  const auto work = [&](std::size_t begin, std::size_t end) {
+  parallel_pieces(threads, Pieces(count, 1024, 256), [&](std::size_t begin, std::size_t end) {
     for (std::size_t i = begin; i < end; ++i) plane_normal(points, neighbors + i * k, k, normals + 3 * i);
-  };
-  const std::size_t share = count / static_cast<std::size_t>(sane_threads(threads)) + 1;
-  parallel_blocks(count, share, threads, work);
+  });
 }
 
 }  // namespace perception::graph

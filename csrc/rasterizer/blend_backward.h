@@ -13,8 +13,8 @@
 namespace perception::PERCEPTION_LEVEL {
 
 // A record is what one splat gathers over one 64x64 tile:
-// [0] Σ h, [1] Σ h u, [2] Σ h dy, [3] Σ h u², [4] Σ h u dy, [5] Σ h dy² (h = dL/d ln alpha), [6..8] Σ w g_rgb, [9] Σ w g_z,
-// then from kGeometry on Σ w g' and, with the variance, Σ w v for every feature channel.
+// [0] Σ h, [1] Σ h u, [2] Σ h dy, [3] Σ h u², [4] Σ h u dy, [5] Σ h dy² (h = dL/d ln alpha), [6..8] Σ w g_rgb, [9] Σ w
+// g_z, then from kGeometry on Σ w g' and, with the variance, Σ w v for every feature channel.
 constexpr int kGeometry = 16;
 
 template <class T, int NF, bool VAR, bool DEPTH>
@@ -22,16 +22,17 @@ struct BackwardTile {
   static constexpr int kChunk = NF ? 64 : 128, kBase = DEPTH ? 4 : 3, kFeatures = NF * (VAR ? 2 : 1);
   static constexpr int kRow = kFeatureRow<T, NF, VAR>, kRecord = kGeometry + kRow;
   alignas(64) T px[16][16], py[16][16], transmittance[16][16];
-  alignas(64) T behind[16][16];                                // R
-  alignas(64) T cotangent[16][kBase][16];                      // of red, green, blue, depth
-  alignas(64) T by_channel[16][NF ? kRow : 1][16];             // cotangents of e, e²: a row of pixels a channel
-  alignas(64) T by_pixel[16][16][NF ? kRow : 1];               // the same, a row of channels a pixel
-  alignas(64) T products[NF ? 16 : 1][NF ? kChunk + 32 : 1][16];  // per granule and splat: first Σ_c e g, then the weights
-  uint32_t open;                                               // granules with a pixel that takes light
-  uint32_t counts[16], done[16];                               // splats listed, splats blended
+  alignas(64) T behind[16][16];                     // R
+  alignas(64) T cotangent[16][kBase][16];           // of red, green, blue, depth
+  alignas(64) T by_channel[16][NF ? kRow : 1][16];  // cotangents of e, e²: a row of pixels a channel
+  alignas(64) T by_pixel[16][16][NF ? kRow : 1];    // the same, a row of channels a pixel
+  alignas(
+      64) T products[NF ? 16 : 1][NF ? kChunk + 32 : 1][16];  // per granule and splat: first Σ_c e g, then the weights
+  uint32_t open;                                              // granules with a pixel that takes light
+  uint32_t counts[16], done[16];                              // splats listed, splats blended
   uint32_t lists[16][kChunk + 64];
-  uint32_t splats[kChunk];                                     // of the chunk, those that touch a granule
-  uint16_t masks[kChunk + 16];                                 // and which
+  uint32_t splats[kChunk];      // of the chunk, those that touch a granule
+  uint16_t masks[kChunk + 16];  // and which
 };
 
 // Sum of NF (a power of two) numbers, in pairs; overwrites them.
@@ -70,7 +71,8 @@ inline T load_pixel_features(int64_t at, Count count, const T *shift, T a, const
   return pairwise_sum<NF>(behind);
 }
 
-// Cotangents and R before the first splat of row `row`, `columns` of it inside the image (a constant 16 but at the edge).
+// Cotangents and R before the first splat of row `row`, `columns` of it inside the image (a constant 16 but at the
+// edge).
 template <class T, int NF, bool VAR, bool DEPTH, class Columns, class Count>
 inline void load_row(const Inputs<T> &in, const T *background, int64_t pixel, int row, Columns columns, Slice slice,
                      Count count, const T *shift, const Outputs<T> &out, const Cotangents<T> &grad,
@@ -133,7 +135,8 @@ void load_tile(const Inputs<T> &in, int camera, int x0, int y0, int x, int y, Sl
       load_row(in, background, pixel, row, std::min(16, in.width - x0 - x), slice, slice.count, shift, out, grad, tile);
   }
   if constexpr (NF > 0)
-    for (int g = 0; g < 16; ++g) transpose<16, BackwardTile<T, NF, VAR, DEPTH>::kRow>(tile.by_pixel[g][0], tile.by_channel[g][0]);
+    for (int g = 0; g < 16; ++g)
+      transpose<16, BackwardTile<T, NF, VAR, DEPTH>::kRow>(tile.by_pixel[g][0], tile.by_channel[g][0]);
 }
 
 // The sums over pixels that one splat gathers, a lane a pixel.
@@ -220,7 +223,8 @@ inline void feature_products(const Worker<T> &w, int n, BackwardTile<T, NF, VAR,
   std::memset(tile.counts, 0, sizeof tile.counts), std::memset(tile.done, 0, sizeof tile.done);
   std::memset(tile.masks + n, 0, 16 * sizeof *tile.masks);
   for (int i = 0; i < n; i += 16)
-    append_to_lists(tile.masks + i, tile.splats + i, tile.lists[0], sizeof tile.lists[0] / sizeof(uint32_t), tile.counts);
+    append_to_lists(tile.masks + i, tile.splats + i, tile.lists[0], sizeof tile.lists[0] / sizeof(uint32_t),
+                    tile.counts);
   for (uint32_t rest = tile.open; rest; rest &= rest - 1) {
     const int g = __builtin_ctz(rest);
     uint32_t *list = tile.lists[g];
@@ -309,7 +313,8 @@ void store_records(const Frame<T> &f, int index, const Worker<T> &w, Scratch<T> 
     const uint64_t place = static_cast<uint64_t>(ty - s.y0) * (s.x1 - s.x0 + 1) + (tx - s.x0);
     slot = scratch.slots[w.source[j]] + place - box_tiles_before(s, f.tiles_x, scratch.first_tile);
     const T *record = scratch.records.data() + slot * kSize;
-    __builtin_prefetch(record, 1), __builtin_prefetch(record + kSize - 1, 1), __builtin_prefetch(&scratch.touched[slot], 1);
+    __builtin_prefetch(record, 1), __builtin_prefetch(record + kSize - 1, 1),
+        __builtin_prefetch(&scratch.touched[slot], 1);
   }
 }
 

@@ -15,7 +15,7 @@ template <class T, int NF, bool VAR, bool DEPTH>
 struct ForwardTile {
   static constexpr int kChunk = NF ? 128 : 256, kColors = DEPTH ? 4 : 3, kRow = kFeatureRow<T, NF, VAR>;
   alignas(64) T px[16][16], py[16][16], transmittance[16][16];
-  alignas(64) T colors[16][kColors][16];                  // red, green, blue, depth
+  alignas(64) T colors[16][kColors][16];                     // red, green, blue, depth
   alignas(64) T features[16][NF ? 16 : 1][kRow ? kRow : 1];  // a row a pixel
   T shift[16][NF ? NF : 1];
   uint32_t counts[16];
@@ -86,8 +86,8 @@ inline void blend_features(const T *features, int n, int g, ForwardTile<T, NF, V
 
 // Masks of the granules that splats [begin, end) of the list touch, appended to the granules' lists.
 template <class T>
-void list_granules(const Worker<T> &w, int x, int y, const uint32_t *list, int begin, int end, uint32_t *lists, int stride,
-                   uint32_t *counts) {
+void list_granules(const Worker<T> &w, int x, int y, const uint32_t *list, int begin, int end, uint32_t *lists,
+                   int stride, uint32_t *counts) {
   std::memset(counts, 0, 16 * sizeof *counts);
   for (int i = begin; i < end; i += 16) {
     uint16_t masks[16] = {};
@@ -106,7 +106,8 @@ void forward_tile(Worker<T> &w, int x, int y, const uint32_t *list, int n, uint3
   constexpr int kChunk = ForwardTile<T, NF, VAR, DEPTH>::kChunk;
   uint32_t fresh = 0xffff;  // granules that have no shift yet
   for (int begin = 0; begin < n && open; begin += kChunk) {
-    list_granules(w, x, y, list, begin, n < begin + kChunk ? n : begin + kChunk, tile.lists[0], kChunk + 32, tile.counts);
+    list_granules(w, x, y, list, begin, n < begin + kChunk ? n : begin + kChunk, tile.lists[0], kChunk + 32,
+                  tile.counts);
     for (uint32_t rest = open; rest; rest &= rest - 1) {
       const int g = __builtin_ctz(rest), count = static_cast<int>(tile.counts[g]);
       if (!count) continue;
@@ -114,7 +115,8 @@ void forward_tile(Worker<T> &w, int x, int y, const uint32_t *list, int n, uint3
       for (int lane = 0; lane < 16; lane += Pack<T>::kLanes) still_open |= blend_list(w, count, g, lane, tile);
       if constexpr (NF > 0) {
         if (fresh >> g & 1)
-          std::memcpy(tile.shift[g], w.features.data() + static_cast<std::size_t>(tile.lists[g][0]) * NF, NF * sizeof(T));
+          std::memcpy(tile.shift[g], w.features.data() + static_cast<std::size_t>(tile.lists[g][0]) * NF,
+                      NF * sizeof(T));
         fresh &= ~(1u << g);
         blend_features(w.features.data(), count, g, tile);
       }

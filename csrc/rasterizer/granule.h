@@ -27,10 +27,12 @@ template <class T, int LEVEL>
 inline uint32_t boxes_touched(const Splat<T> &s, T x, T y) {
   using V = Vec<T>;
   constexpr T kExtent = LEVEL == 0 ? 15 : 3;  // from the first to the last pixel centre
-  const V zero(T(0)), extent(kExtent), mx(x), my(y), a(s.a), d(s.d), k(s.k), minus_k(-s.k), slope(s.slope), limit(-s.reach);
+  const V zero(T(0)), extent(kExtent), mx(x), my(y), a(s.a), d(s.d), k(s.k), minus_k(-s.k), slope(s.slope),
+      limit(-s.reach);
   uint32_t mask = 0;
   for (int p = 0; p < kParts<T>; ++p) {
-    const V x0 = V::load(kGrid<T>.box_x[LEVEL] + p * V::kLanes) - mx, y0 = V::load(kGrid<T>.box_y[LEVEL] + p * V::kLanes) - my;
+    const V x0 = V::load(kGrid<T>.box_x[LEVEL] + p * V::kLanes) - mx,
+            y0 = V::load(kGrid<T>.box_y[LEVEL] + p * V::kLanes) - my;
     const V x1 = x0 + extent, y1 = y0 + extent;
     const V near_x = min(x1, max(x0, zero)), near_y = min(y1, max(y0, zero));
     const V best_y = min(y1, max(y0, near_x * slope)), best_x = min(x1, max(x0, near_y * minus_k));
@@ -48,10 +50,10 @@ constexpr T kFar = T(1e18);
 // One splat over some pixels: everything the two passes must compute alike.
 template <class T>
 struct Blend {
-  Pack<T> u, dy;       // px
-  Pack<T> raw;         // alpha before the clamp
-  Pack<T> weight;      // alpha T, 0 where the splat does not contribute
-  Pack<T> next;        // transmittance behind
+  Pack<T> u, dy;   // px
+  Pack<T> raw;     // alpha before the clamp
+  Pack<T> weight;  // alpha T, 0 where the splat does not contribute
+  Pack<T> next;    // transmittance behind
 };
 
 // Pixels that would fall under the least transmittance stop before: px moves to kFar, `stopped` becomes true.

@@ -21,14 +21,12 @@ void timed(Stats &stats, Stage stage, Body &&body) {
 template <class T>
 NonFinite prepare(const Inputs<T> &in, int camera, const Options &opt, Frame<T> &f, Scratch<T> &scratch,
                   const Outputs<T> &out, Stats &stats) {
-  f.camera = make_camera(in.viewmats + 16 * camera, in.Ks + 9 * camera, in.width, in.height, in.near_plane,
-                         in.eps2d);
+  f.camera = make_camera(in.viewmats + 16 * camera, in.Ks + 9 * camera, in.width, in.height, in.near_plane, in.eps2d);
   f.tiles_x = (in.width + 63) / 64, f.tiles_y = (in.height + 63) / 64;
   f.count = 0;
   NonFinite bad;
-  timed(stats, kProject, [&] {
-    bad = project_all(in, opt, f, scratch, camera == 0, out.radii ? out.radii + in.n * camera : nullptr);
-  });
+  timed(stats, kProject,
+        [&] { bad = project_all(in, opt, f, scratch, camera == 0, out.radii ? out.radii + in.n * camera : nullptr); });
   if (bad.argument) return bad;
   timed(stats, kSort, [&] { sort_by_depth(opt, f.count, scratch); });
   timed(stats, kBin, [&] { bin_splats(opt, f, scratch); });
@@ -71,7 +69,8 @@ void forward(const Inputs<T> &in, int camera, const Options &opt, const Frame<T>
     using S = decltype(shape);
     timed(stats, kBlend, [&] {
       parallel_for(opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
-        forward_supertile<T, S::NF, S::VAR, S::DEPTH>(in, camera, f, f.tile_order[i], slice, scratch.workers[worker], out);
+        forward_supertile<T, S::NF, S::VAR, S::DEPTH>(in, camera, f, f.tile_order[i], slice, scratch.workers[worker],
+                                                      out);
       });
     });
     if (slice.begin > 0) return;  // the other slices blend the same pairs again

@@ -21,8 +21,10 @@ void transpose(const T *from, T *to) {
       const Four a0 = *in(r, c), a1 = *in(r + 1, c), a2 = *in(r + 2, c), a3 = *in(r + 3, c);
       const Four b0 = __builtin_shufflevector(a0, a1, 0, 4, 1, 5), b1 = __builtin_shufflevector(a0, a1, 2, 6, 3, 7);
       const Four b2 = __builtin_shufflevector(a2, a3, 0, 4, 1, 5), b3 = __builtin_shufflevector(a2, a3, 2, 6, 3, 7);
-      *out(c, r) = __builtin_shufflevector(b0, b2, 0, 1, 4, 5), *out(c + 1, r) = __builtin_shufflevector(b0, b2, 2, 3, 6, 7);
-      *out(c + 2, r) = __builtin_shufflevector(b1, b3, 0, 1, 4, 5), *out(c + 3, r) = __builtin_shufflevector(b1, b3, 2, 3, 6, 7);
+      *out(c, r) = __builtin_shufflevector(b0, b2, 0, 1, 4, 5),
+              *out(c + 1, r) = __builtin_shufflevector(b0, b2, 2, 3, 6, 7);
+      *out(c + 2, r) = __builtin_shufflevector(b1, b3, 0, 1, 4, 5),
+                  *out(c + 3, r) = __builtin_shufflevector(b1, b3, 2, 3, 6, 7);
     }
 }
 

@@ -3,7 +3,7 @@
 #include <cstring>
 #include <limits>
 
-#include "parallel.h"
+#include "../common/parallel.h"
 #include "scratch.h"
 #include "simd.h"
 #include "spherical_harmonics.h"
@@ -150,8 +150,8 @@ bool attributes_finite(const Inputs<T> &in, int64_t i0, int n) {
 
 // Gaussians [begin, end) into splats[begin...]; returns how many, or the first bad index through `bad`.
 template <class T>
-uint32_t project_range(const Inputs<T> &in, const Frame<T> &f, int64_t begin, int64_t end, bool check, DepthKey<T> *keys,
-                       T *radii, int64_t &bad) {
+uint32_t project_range(const Inputs<T> &in, const Frame<T> &f, int64_t begin, int64_t end, bool check,
+                       DepthKey<T> *keys, T *radii, int64_t &bad) {
   ProjectionBlock<T> b;
   uint32_t out = static_cast<uint32_t>(begin);
   for (int64_t i0 = begin; i0 < end; i0 += kBlock) {
@@ -185,8 +185,11 @@ NonFinite find_non_finite(const Inputs<T> &in, int64_t from) {
     const char *name;
     const T *data;
     int width;
-  } arguments[] = {{"means", in.means, 3}, {"quats", in.quats, 4}, {"scales", in.scales, 3},
-                   {"opacities", in.opacities, 1}, {"colors", in.colors, color_width(in)},
+  } arguments[] = {{"means", in.means, 3},
+                   {"quats", in.quats, 4},
+                   {"scales", in.scales, 3},
+                   {"opacities", in.opacities, 1},
+                   {"colors", in.colors, color_width(in)},
                    {"features", in.features, in.features ? in.dims : 0}};
   for (int64_t i = from; i < in.n; ++i)
     for (const Argument &a : arguments)
@@ -197,8 +200,7 @@ NonFinite find_non_finite(const Inputs<T> &in, int64_t from) {
 
 // Contiguous ranges, one a thread, then closed up: the result does not depend on the number of threads.
 template <class T>
-NonFinite project_all(const Inputs<T> &in, const Options &opt, Frame<T> &f, Scratch<T> &scratch, bool check,
-                      T *radii) {
+NonFinite project_all(const Inputs<T> &in, const Options &opt, Frame<T> &f, Scratch<T> &scratch, bool check, T *radii) {
   f.splats.reserve(in.n);
   DepthKey<T> *keys = scratch.keys[0].reserve(in.n);
   const int64_t blocks = (in.n + kBlock - 1) / kBlock;

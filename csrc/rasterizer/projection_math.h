@@ -1,8 +1,9 @@
 // One Gaussian through one pinhole camera, and the vector-Jacobian product. Scalar and branch-free, shared by every
 // device; the CPU kernels loop over structure-of-array blocks so that the compiler vectorises it.
 //
-// camera frame: p = R m + t; mean: x = fx p0/p2 + cx. Covariance (EWA splatting, 3DGS eq. 5): J R Q S S Qᵀ Rᵀ Jᵀ + eps2d I,
-// with p0/p2 and p1/p2 in J clamped to 1.3 times the field of view (the gradient through a clamped value is zero).
+// camera frame: p = R m + t; mean: x = fx p0/p2 + cx. Covariance (EWA splatting, 3DGS eq. 5): J R Q S S Qᵀ Rᵀ Jᵀ +
+// eps2d I, with p0/p2 and p1/p2 in J clamped to 1.3 times the field of view (the gradient through a clamped value is
+// zero).
 #pragma once
 #include <cmath>
 
@@ -67,9 +68,9 @@ struct UnitQuaternion {
 // whose terms never cancel, however thin the ellipse.
 template <class T>
 struct Projected {
-  T x, y, z;              // px, px, depth
-  T var_x, k, var_y;      // px², -, px²   (var_y = c)
-  T cov_xx, cov_xy;       // px²
+  T x, y, z;          // px, px, depth
+  T var_x, k, var_y;  // px², -, px²   (var_y = c)
+  T cov_xx, cov_xy;   // px²
 };
 
 template <class T>
@@ -136,7 +137,8 @@ PERCEPTION_HD void project_vjp(const Camera<T> &cam, const T *m, const T *q, con
   T Q[9], e[3], f[3], ge[3], gf[3], gQ[9];
   h.rotation(Q);
   const T sx = cam.fx * iz, sy = cam.fy * iz;
-  for (int i = 0; i < 3; ++i) e[i] = sx * (R[i] - tx * R[6 + i]), f[i] = sy * (R[3 + i] - ty * R[6 + i]), ge[i] = gf[i] = 0;
+  for (int i = 0; i < 3; ++i)
+    e[i] = sx * (R[i] - tx * R[6 + i]), f[i] = sy * (R[3 + i] - ty * R[6 + i]), ge[i] = gf[i] = 0;
   for (int j = 0; j < 3; ++j) {
     const T eq = e[0] * Q[j] + e[1] * Q[3 + j] + e[2] * Q[6 + j], fq = f[0] * Q[j] + f[1] * Q[3 + j] + f[2] * Q[6 + j];
     const T u = s[j] * eq, w = s[j] * fq;

@@ -3,14 +3,30 @@
 
 #include <cmath>
 #include <mutex>
+#include <type_traits>
 
 #include "frames.h"
-#include "parallel.h"
 #include "scratch.h"
 
 namespace perception {
 
+PERCEPTION_DECLARE_LEVELS(extern const Kernels<float> float_kernels; extern const Kernels<double> double_kernels)
+
+void *aligned_allocate(std::size_t bytes) {
+  void *p = nullptr;
+  if (posix_memalign(&p, 64, (bytes + 63) & ~std::size_t{63}) != 0) throw std::bad_alloc();
+  return p;
+}
+
 namespace {
+
+template <class T>
+const Kernels<T> &kernels(Level level) {
+  if constexpr (std::is_same_v<T, float>)
+    return PERCEPTION_AT_LEVEL(level, float_kernels);
+  else
+    return PERCEPTION_AT_LEVEL(level, double_kernels);
+}
 
 // Objects whose buffers are worth keeping between calls. Never destroyed, so it is safe at exit.
 template <class Object>
@@ -48,7 +64,8 @@ NonFinite check_cameras(const Inputs<T> &in) {
     const char *name;
     const T *data;
     int width;
-  } arguments[] = {{"viewmats", in.viewmats, 16}, {"Ks", in.Ks, 9}, {"background", in.background, in.background ? 3 : 0}};
+  } arguments[] = {
+      {"viewmats", in.viewmats, 16}, {"Ks", in.Ks, 9}, {"background", in.background, in.background ? 3 : 0}};
   for (const Argument &a : arguments)
     for (int64_t i = 0; i < in.cameras * a.width; ++i)
       if (!std::isfinite(a.data[i])) return {a.name, i / a.width};
@@ -109,12 +126,11 @@ void release_memory() {
   ObjectPool<Frame<double>>::get().clear();
 }
 
-#define INSTANTIATE(T)                                                                                      \
-  template struct ScratchDelete<T>;                                                                         \
-  template struct FramesDelete<T>;                                                                          \
-  template FramesPtr<T> rasterize_forward(const Inputs<T> &, const Options &, Level, const Outputs<T> &,    \
-                                          NonFinite &);                                                     \
-  template void rasterize_backward(const Inputs<T> &, const Options &, Frames<T> &, const Outputs<T> &,     \
+#define INSTANTIATE(T)                                                                                                 \
+  template struct ScratchDelete<T>;                                                                                    \
+  template struct FramesDelete<T>;                                                                                     \
+  template FramesPtr<T> rasterize_forward(const Inputs<T> &, const Options &, Level, const Outputs<T> &, NonFinite &); \
+  template void rasterize_backward(const Inputs<T> &, const Options &, Frames<T> &, const Outputs<T> &,                \
                                    const Cotangents<T> &, const Gradients<T> &);
 INSTANTIATE(float)
 INSTANTIATE(double)

@@ -5,6 +5,7 @@
 #include <memory>
 #include <string>
 
+#include "../common/levels.h"
 #include "buffer.h"
 #include "projection_math.h"
 
@@ -14,29 +15,29 @@ namespace perception {
 template <class T>
 struct Inputs {
   int64_t n, cameras;
-  const T *means;      // [N,3] world
-  const T *quats;      // [N,4] wxyz, any norm
-  const T *scales;     // [N,3]
-  const T *opacities;  // [N]
-  const T *colors;     // [N,3], or [N,K,3] when sh_degree >= 0
+  const T *means;            // [N,3] world
+  const T *quats;            // [N,4] wxyz, any norm
+  const T *scales;           // [N,3]
+  const T *opacities;        // [N]
+  const T *colors;           // [N,3], or [N,K,3] when sh_degree >= 0
   int sh_degree, sh_stride;  // -1: colours; K
-  const T *features;   // [N,D] or null
-  int dims;            // D
-  const T *viewmats;   // [C,4,4] camera_from_world
-  const T *Ks;         // [C,3,3]
-  const T *background; // [C,3] or null
+  const T *features;         // [N,D] or null
+  int dims;                  // D
+  const T *viewmats;         // [C,4,4] camera_from_world
+  const T *Ks;               // [C,3,3]
+  const T *background;       // [C,3] or null
   int width, height;
   T near_plane;
-  T eps2d;             // px², > 0
+  T eps2d;  // px², > 0
 };
 
 template <class T>
 struct Outputs {
-  T *colors;    // [C,H,W,3]
-  T *alphas;    // [C,H,W]
-  T *depths;    // [C,H,W] or null
-  T *features;  // [C,H,W,D] or null
-  T *variance;  // [C,H,W,D] or null
+  T *colors;         // [C,H,W,3]
+  T *alphas;         // [C,H,W]
+  T *depths;         // [C,H,W] or null
+  T *features;       // [C,H,W,D] or null
+  T *variance;       // [C,H,W,D] or null
   uint8_t *visible;  // [C,N], zero on entry
   T *radii;          // [C,N] px, three standard deviations along the long axis; zero on entry, or null
 };
@@ -51,18 +52,18 @@ struct Cotangents {
 template <class T>
 struct Gradients {
   T *means, *quats, *scales, *opacities, *colors, *features, *viewmats;
-  T *mean2d;      // [C,N,2] px
+  T *mean2d;  // [C,N,2] px
 };
 
 // A Gaussian as one camera sees it. exponent in base 2: log2(alpha) = log_opacity + a (dx + k dy)² + d dy².
 template <class T>
 struct alignas(64) Splat {
-  T x, y;         // px
+  T x, y;  // px
   T a, k, d, log_opacity;
   T r, g, b, z;
-  T reach;        // log_opacity - log2(1/255) + slack: how far the exponent may fall
-  T slope;        // dy/dx of the line on which the exponent is largest for a given dx
-  int32_t id;     // index of the Gaussian
+  T reach;                  // log_opacity - log2(1/255) + slack: how far the exponent may fall
+  T slope;                  // dy/dx of the line on which the exponent is largest for a given dx
+  int32_t id;               // index of the Gaussian
   uint16_t x0, y0, x1, y1;  // 64-pixel tiles touched, inclusive
 };
 
@@ -71,11 +72,11 @@ template <class T>
 struct Frame {
   Camera<T> camera;
   int tiles_x = 0, tiles_y = 0;
-  uint32_t count = 0;            // visible splats
-  Buffer<Splat<T>> splats;       // in order of the Gaussians' index
+  uint32_t count = 0;       // visible splats
+  Buffer<Splat<T>> splats;  // in order of the Gaussians' index
   Buffer<uint32_t> list;
-  Buffer<uint32_t> offsets;      // [tiles + 1]
-  Buffer<uint32_t> tile_order;   // tiles by falling list length
+  Buffer<uint32_t> offsets;     // [tiles + 1]
+  Buffer<uint32_t> tile_order;  // tiles by falling list length
 };
 
 enum Stage { kProject, kSort, kBin, kBlend, kBlendBackward, kReduce, kStages };
@@ -89,8 +90,8 @@ struct Stats {
 
 struct Options {
   int threads;
-  bool depth;     // blend the depth channel
-  bool variance;  // blend the variance channels
+  bool depth;               // blend the depth channel
+  bool variance;            // blend the variance channels
   int64_t max_records = 0;  // gradient records held at once; 0: 4 a splat, at least 2^20
 };
 
@@ -121,12 +122,6 @@ struct Kernels {
                    const Cotangents<T> &, const Gradients<T> &, Stats &);
 };
 
-enum class Level { baseline, avx2, avx512 };
-Level best_level();
-bool level_supported(Level);
-template <class T>
-const Kernels<T> &kernels(Level);
-
 // What a forward call keeps for its backward call: one frame a camera. Returned to a pool when destroyed.
 template <class T>
 struct Frames;
@@ -143,9 +138,9 @@ template <class T>
 void rasterize_backward(const Inputs<T> &, const Options &, Frames<T> &, const Outputs<T> &, const Cotangents<T> &,
                         const Gradients<T> &);
 
-// Memory beyond the arrays passed in, all of it kept and reused: a splat takes 64 bytes and 4 for every 64x64-pixel tile
-// its box touches, of which there may be kMaxListed; a backward pass adds max_records records of 4 (16 + features) bytes;
-// every thread the splats of its current tile, some 400 bytes each.
+// Memory beyond the arrays passed in, all of it kept and reused: a splat takes 64 bytes and 4 for every 64x64-pixel
+// tile its box touches, of which there may be kMaxListed; a backward pass adds max_records records of 4 (16 + features)
+// bytes; every thread the splats of its current tile, some 400 bytes each.
 constexpr uint64_t kMaxListed = uint64_t{1} << 29;
 
 // Frees what the pools keep between calls.

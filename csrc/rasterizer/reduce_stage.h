@@ -116,15 +116,15 @@ ProjectedGrad<T> picture_gradient(const Splat<T> &s, const T *r) {
   const T gu = -r[1] * precision_x;
   ProjectedGrad<T> g;
   g.x = gu, g.y = s.k * gu - r[2] * precision_y, g.z = r[9];
-  factored_vjp(T(0.5) * r[3] * precision_x * precision_x, -r[4] * precision_x, T(0.5) * r[5] * precision_y * precision_y,
-               s.k, 1 / precision_y, g);
+  factored_vjp(T(0.5) * r[3] * precision_x * precision_x, -r[4] * precision_x,
+               T(0.5) * r[5] * precision_y * precision_y, s.k, 1 / precision_y, g);
   return g;
 }
 
 // Colours, or SH coefficients and the direction they are seen from (which moves the mean and the camera).
 template <class T>
-void color_gradient(const Inputs<T> &in, const Camera<T> &cam, const Splat<T> &s, const T *g_rgb, const Gradients<T> &out,
-                    T *g_mean, T *g_R, T *g_t) {
+void color_gradient(const Inputs<T> &in, const Camera<T> &cam, const Splat<T> &s, const T *g_rgb,
+                    const Gradients<T> &out, T *g_mean, T *g_R, T *g_t) {
   const int64_t i = s.id;
   if (in.sh_degree < 0) {
     if (out.colors)

@@ -48,8 +48,8 @@ inline MF operator|(MF a, MF b) { return {_mm256_or_ps(a.m, b.m)}; }
 inline MF and_not(MF a, MF b) { return {_mm256_andnot_ps(b.m, a.m)}; }  // a and not b
 inline uint32_t bits(MF a) { return _mm256_movemask_ps(a.m); }
 inline bool any(MF a) { return !_mm256_testz_ps(a.m, a.m); }
-inline VF keep(MF m, VF a) { return _mm256_and_ps(m.m, a.v); }                           // m ? a : 0
-inline VF select(MF m, VF a, VF b) { return _mm256_blendv_ps(b.v, a.v, m.m); }           // m ? a : b
+inline VF keep(MF m, VF a) { return _mm256_and_ps(m.m, a.v); }                  // m ? a : 0
+inline VF select(MF m, VF a, VF b) { return _mm256_blendv_ps(b.v, a.v, m.m); }  // m ? a : b
 inline float sum(VF a) {
   __m128 s = _mm_add_ps(_mm256_castps256_ps128(a.v), _mm256_extractf128_ps(a.v, 1));
   s = _mm_add_ps(s, _mm_movehl_ps(s, s));
@@ -134,15 +134,14 @@ struct CompressTable {
 alignas(64) inline constexpr CompressTable kCompress;
 
 // masks[j] bit g set: append ids[j] to list g. Writes up to 16 entries past each list's end.
-inline void append_to_lists(const uint16_t *masks, const uint32_t *ids, uint32_t *lists, int stride,
-                            uint32_t *counts) {
+inline void append_to_lists(const uint16_t *masks, const uint32_t *ids, uint32_t *lists, int stride, uint32_t *counts) {
   __m256i rows = _mm256_loadu_si256(reinterpret_cast<const __m256i *>(masks));
   __m256i id0 = _mm256_loadu_si256(reinterpret_cast<const __m256i *>(ids));
   __m256i id1 = _mm256_loadu_si256(reinterpret_cast<const __m256i *>(ids + 8));
   for (int g = 0; g < 16; ++g) {
     __m256i shifted = _mm256_sll_epi16(rows, _mm_cvtsi32_si128(15 - g));
-    uint32_t column = _mm_movemask_epi8(
-        _mm_packs_epi16(_mm256_castsi256_si128(shifted), _mm256_extracti128_si256(shifted, 1)));
+    uint32_t column =
+        _mm_movemask_epi8(_mm_packs_epi16(_mm256_castsi256_si128(shifted), _mm256_extracti128_si256(shifted, 1)));
     if (!column) continue;
     uint32_t *out = lists + g * static_cast<std::size_t>(stride) + counts[g];
     uint32_t low = column & 255, high = column >> 8;

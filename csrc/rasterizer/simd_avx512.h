@@ -31,7 +31,9 @@ inline VF fma(VF a, VF b, VF c) { return _mm512_fmadd_ps(a.v, b.v, c.v); }
 inline VF fnma(VF a, VF b, VF c) { return _mm512_fnmadd_ps(a.v, b.v, c.v); }
 inline VF min(VF a, VF b) { return _mm512_min_ps(a.v, b.v); }
 inline VF max(VF a, VF b) { return _mm512_max_ps(a.v, b.v); }
-inline VF fraction(VF a, VF &whole) { return whole = a, _mm512_reduce_ps(a.v, _MM_FROUND_TO_NEG_INF); }  // scalef floors
+inline VF fraction(VF a, VF &whole) {
+  return whole = a, _mm512_reduce_ps(a.v, _MM_FROUND_TO_NEG_INF);
+}  // scalef floors
 inline VF scale_by_power_of_two(VF p, VF whole) { return _mm512_scalef_ps(p.v, whole.v); }
 inline VF reciprocal(VF a) {  // one Newton step: relative error below 2e-7
   __m512 r = _mm512_rcp14_ps(a.v);
@@ -44,8 +46,8 @@ inline MF operator|(MF a, MF b) { return {static_cast<__mmask16>(a.m | b.m)}; }
 inline MF and_not(MF a, MF b) { return {static_cast<__mmask16>(a.m & ~b.m)}; }  // a and not b
 inline uint32_t bits(MF a) { return a.m; }
 inline bool any(MF a) { return a.m != 0; }
-inline VF keep(MF m, VF a) { return _mm512_maskz_mov_ps(m.m, a.v); }               // m ? a : 0
-inline VF select(MF m, VF a, VF b) { return _mm512_mask_mov_ps(b.v, m.m, a.v); }   // m ? a : b
+inline VF keep(MF m, VF a) { return _mm512_maskz_mov_ps(m.m, a.v); }              // m ? a : 0
+inline VF select(MF m, VF a, VF b) { return _mm512_mask_mov_ps(b.v, m.m, a.v); }  // m ? a : b
 inline float sum(VF a) { return _mm512_reduce_add_ps(a.v); }
 // lane j of the result is the sum over the lanes of v[j]
 inline VF transpose_sum(const VF *in) {
@@ -111,8 +113,7 @@ Mask<T> mask_from_bits(uint32_t b) {
 }
 
 // masks[j] bit g set: append ids[j] to list g. Writes up to 16 entries past each list's end.
-inline void append_to_lists(const uint16_t *masks, const uint32_t *ids, uint32_t *lists, int stride,
-                            uint32_t *counts) {
+inline void append_to_lists(const uint16_t *masks, const uint32_t *ids, uint32_t *lists, int stride, uint32_t *counts) {
   __m256i rows = _mm256_loadu_si256(reinterpret_cast<const __m256i *>(masks));
   __m512i id = _mm512_loadu_si512(ids);
   for (int g = 0; g < 16; ++g) {

@@ -117,8 +117,7 @@ Vec<T> transpose_sum(const Vec<T> *v) {
 }
 
 // masks[j] bit g set: append ids[j] to list g.
-inline void append_to_lists(const uint16_t *masks, const uint32_t *ids, uint32_t *lists, int stride,
-                            uint32_t *counts) {
+inline void append_to_lists(const uint16_t *masks, const uint32_t *ids, uint32_t *lists, int stride, uint32_t *counts) {
   for (int j = 0; j < 16; ++j)
     for (uint32_t m = masks[j]; m; m &= m - 1) {
       int g = __builtin_ctz(m);

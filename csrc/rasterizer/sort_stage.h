@@ -11,7 +11,8 @@ void sort_by_depth(const Options &opt, uint32_t n, Scratch<T> &scratch) {
   using Key = DepthKey<T>;
   constexpr int kDigit = 11, kBins = 1 << kDigit, kPasses = (8 * sizeof(Key) + kDigit - 1) / kDigit;
   constexpr uint32_t kMinPart = 1 << 15;  // smaller parts cost more to hand out than to sort
-  const int parts = static_cast<int>(n / kMinPart + 1 < static_cast<uint32_t>(opt.threads) ? n / kMinPart + 1 : opt.threads);
+  const int parts =
+      static_cast<int>(n / kMinPart + 1 < static_cast<uint32_t>(opt.threads) ? n / kMinPart + 1 : opt.threads);
   scratch.keys[1].reserve(n);
   for (auto &o : scratch.order) o.reserve(n);
   uint32_t *histograms = scratch.histograms.reserve(static_cast<std::size_t>(parts) * kBins);

@@ -41,8 +41,8 @@ PERCEPTION_HD void sh_basis_vjp(int degree, T x, T y, T z, const T *w, T *g) {
   if (degree < 3) return;
   const T xx = x * x, yy = y * y, zz = z * z;
   const T k9 = T(-0.5900435899266435) * w[9], k10 = T(2.890611442640554) * w[10], k11 = T(-0.4570457994644658) * w[11],
-          k12 = T(0.3731763325901154) * w[12], k13 = T(-0.4570457994644658) * w[13],
-          k14 = T(1.445305721320277) * w[14], k15 = T(-0.5900435899266435) * w[15];
+          k12 = T(0.3731763325901154) * w[12], k13 = T(-0.4570457994644658) * w[13], k14 = T(1.445305721320277) * w[14],
+          k15 = T(-0.5900435899266435) * w[15];
   g[0] += 6 * k9 * x * y + k10 * y * z - 2 * k11 * x * y - 6 * k12 * x * z + k13 * (4 * zz - 3 * xx - yy) +
           2 * k14 * x * z + 3 * k15 * (xx - yy);
   g[1] += 3 * k9 * (xx - yy) + k10 * x * z + k11 * (4 * zz - xx - 3 * yy) - 6 * k12 * y * z - 2 * k13 * x * y -
@@ -98,9 +98,10 @@ PERCEPTION_HD void sh_color(int degree, const T *v, const T *coefficients, T *rg
                 : sh_color_of<3>(v, coefficients, rgb);
 }
 
-// g_coefficients is added to (null: not wanted); gv is written. g_rgb must be zero already where the colour was clamped.
+// Adds to g_coefficients (null: not wanted) and writes gv. g_rgb must be zero where the colour was clamped.
 template <class T>
-PERCEPTION_HD void sh_color_vjp(int degree, const T *v, const T *coefficients, const T *g_rgb, T *g_coefficients, T *gv) {
+PERCEPTION_HD void sh_color_vjp(int degree, const T *v, const T *coefficients, const T *g_rgb, T *g_coefficients,
+                                T *gv) {
   degree == 0   ? sh_color_vjp_of<0>(v, coefficients, g_rgb, g_coefficients, gv)
   : degree == 1 ? sh_color_vjp_of<1>(v, coefficients, g_rgb, g_coefficients, gv)
   : degree == 2 ? sh_color_vjp_of<2>(v, coefficients, g_rgb, g_coefficients, gv)

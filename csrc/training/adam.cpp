@@ -1,7 +1,7 @@
 #include <cmath>
 
-#include "levels.h"
-#include "parallel.h"
+#include "../common/parallel.h"
+#include "kernels/table.h"
 #include "training.h"
 
 namespace perception::training {
@@ -16,13 +16,22 @@ AdamResult adam(const AdamArguments<T> &a, const Execution &how) {
     rate[k] = T(a.rate[k] / correction1);
     uniform = uniform && a.rate[k] == a.rate[0];
   }
-  const AdamRows<T> rows{a.param, a.first, a.second, a.grad, a.visible, rate.data(), a.width, T(a.beta1), T(a.beta2),
-                         T(a.eps), T(1 / std::sqrt(correction2)), uniform};
+  const AdamRows<T> rows{a.param,
+                         a.first,
+                         a.second,
+                         a.grad,
+                         a.visible,
+                         rate.data(),
+                         a.width,
+                         T(a.beta1),
+                         T(a.beta2),
+                         T(a.eps),
+                         T(1 / std::sqrt(correction2)),
+                         uniform};
   const Pieces pieces(a.rows, std::max<int64_t>(256, 32768 / std::max<int64_t>(1, a.width)), 64);
   std::vector<int64_t> updated(pieces.count), skipped(pieces.count);
-  parallel_for(pieces.count, how.threads, [&](int64_t i, int) {
-    skipped[i] = table.adam(rows, pieces.begin(i), pieces.end(i), &updated[i]);
-  });
+  parallel_for(resolve_threads(how.threads), pieces.count,
+               [&](std::size_t i, int) { skipped[i] = table.adam(rows, pieces.begin(i), pieces.end(i), &updated[i]); });
   AdamResult result{0, 0};
   for (int64_t i = 0; i < pieces.count; ++i) {
     result.updated += updated[i];

@@ -1,8 +1,8 @@
 #include <cmath>
 #include <stdexcept>
 
-#include "levels.h"
-#include "parallel.h"
+#include "../common/parallel.h"
+#include "kernels/table.h"
 #include "training.h"
 
 namespace perception::training {
@@ -58,8 +58,10 @@ Assignment assign(const int32_t *labels, int64_t pixels, double fraction, uint64
   for (int64_t p = 0; p < pixels; ++p) {
     const int32_t label = slots[p];
     int32_t slot = -1;
-    if (label && !table.empty()) slot = table[label];
-    else if (label) slot = static_cast<int32_t>(std::lower_bound(out.ids.begin(), out.ids.end(), label) - out.ids.begin());
+    if (label && !table.empty())
+      slot = table[label];
+    else if (label)
+      slot = static_cast<int32_t>(std::lower_bound(out.ids.begin(), out.ids.end(), label) - out.ids.begin());
     slots[p] = slot;
     if (slot >= 0 && out.counts[slot]++ == 0) out.first[slot] = p;
   }
@@ -73,12 +75,11 @@ void prototypes(const T *features, const int32_t *slots, int64_t pixels, int64_t
   const auto &table = kernels<T>(how.level);
   // Sums are taken about a pixel of the label itself, so that features far from zero do not cancel.
   std::vector<T> reference(labels * width);
-  for (int64_t i = 0; i < labels; ++i)
-    std::copy_n(features + first[i] * width, width, reference.begin() + i * width);
+  for (int64_t i = 0; i < labels; ++i) std::copy_n(features + first[i] * width, width, reference.begin() + i * width);
   const Pieces pieces(pixels, 8192, labels * width > 100000 ? 4 : 16);
   const int64_t stride = labels * 2 * width;
   std::vector<double> sums(pieces.count * stride);
-  parallel_for(pieces.count, how.threads, [&](int64_t i, int) {
+  parallel_for(resolve_threads(how.threads), pieces.count, [&](std::size_t i, int) {
     table.accumulate(features, slots, reference.data(), pieces.begin(i), pieces.end(i), width, &sums[i * stride]);
   });
   for (int64_t i = 1; i < pieces.count; ++i)
@@ -98,7 +99,7 @@ void spread(const T *features, const int32_t *slots, int64_t pixels, int64_t wid
             const double *pull, const double *push, T *out, const Execution &how) {
   const auto &table = kernels<T>(how.level);
   const Pieces pieces(pixels);
-  parallel_for(pieces.count, how.threads, [&](int64_t i, int) {
+  parallel_for(resolve_threads(how.threads), pieces.count, [&](std::size_t i, int) {
     table.spread(features, slots, means, pull, push, pieces.begin(i), pieces.end(i), width, out);
   });
 }

@@ -3,8 +3,8 @@
 #include <memory>
 #include <stdexcept>
 
-#include "levels.h"
-#include "parallel.h"
+#include "../common/parallel.h"
+#include "kernels/table.h"
 #include "training.h"
 
 namespace perception::training {
@@ -34,11 +34,11 @@ void run_tiles(const Photo<T> &photo, const Execution &how, int strips, double *
   std::vector<std::unique_ptr<T[]>> scratch(std::min<int64_t>(tiles, threads));
   for (auto &memory : scratch) memory.reset(new T[kPhotometricScratch]);
   auto cut = [](int64_t n, int64_t parts, int64_t i) { return static_cast<int>(n * i / parts); };
-  parallel_for(tiles, threads, [&](int64_t i, int worker) {
+  parallel_for(threads, tiles, [&](std::size_t i, int worker) {
     const int64_t strip = i % strips, band = i / strips;
-    const Tile tile{cut(photo.height, bands, band), cut(photo.height, bands, band + 1),
+    const Tile tile{cut(photo.height, bands, band),  cut(photo.height, bands, band + 1),
                     cut(photo.width, strips, strip), cut(photo.width, strips, strip + 1),
-                    l1 + strip * photo.height, ssim + strip * photo.height};
+                    l1 + strip * photo.height,       ssim + strip * photo.height};
     table.photometric_tile(photo, tile, scratch[worker].get());
   });
 }
@@ -63,7 +63,7 @@ PhotometricResult photometric(const PhotometricArguments<T> &a, const Execution 
   if (a.beta == 0) {
     std::vector<double> l1(a.height);
     const Pieces rows(a.height, 16, 64);
-    parallel_for(rows.count, how.threads, [&](int64_t i, int) {
+    parallel_for(resolve_threads(how.threads), rows.count, [&](std::size_t i, int) {
       for (int64_t r = rows.begin(i); r < rows.end(i); ++r) l1[r] = table.absolute_row(photo, static_cast<int>(r));
     });
     const double mean = ordered_sum(l1) * per_element;

@@ -1,32 +1,31 @@
 // Losses with their gradients, and Adam. Every function gives the same bits for any number of threads.
-// threads 0: as set_default_threads says. level: see levels.h. Invalid arguments throw std::invalid_argument.
+// threads 0: as common/parallel.h says. Invalid arguments throw std::invalid_argument.
 #pragma once
 #include <cstdint>
-#include <string>
 #include <vector>
+
+#include "../common/levels.h"
 
 namespace perception::training {
 
-void set_default_threads(int threads);  // 0, the initial value: all processors
-
 struct Execution {
-  int threads = 0;
-  std::string level = "auto";
+  int threads;
+  Level level;
 };
 
 template <class T>
 struct PhotometricArguments {
-  const T *render;           // [height, width, channels]
-  const T *target;           // same shape; null when target8 is given
-  const uint8_t *target8;    // same shape, unit 1/255
-  const T *weight;           // [height, width] >= 0 or null
-  T *gradient;               // out [height, width, channels]: d loss / d render
+  const T *render;         // [height, width, channels]
+  const T *target;         // same shape; null when target8 is given
+  const uint8_t *target8;  // same shape, unit 1/255
+  const T *weight;         // [height, width] >= 0 or null
+  T *gradient;             // out [height, width, channels]: d loss / d render
   int height, width, channels;
   double beta;
 };
 
 struct PhotometricResult {
-  double loss, l1, ssim;     // ssim is NaN when beta == 0: it is not computed
+  double loss, l1, ssim;  // ssim is NaN when beta == 0: it is not computed
 };
 
 template <class T>
@@ -50,8 +49,8 @@ template <class T>
 void spread(const T *features, const int32_t *slots, int64_t pixels, int64_t width, const double *means,
             const double *pull, const double *push, T *out, const Execution &);
 
-// Mean over pairs of relu(margin - distance), distance = |a - b|^2 or |a - b|; pairs i < j within a (others < 0), or all
-// pairs of a and b. Gradients are written; that of |a - b| at 0 is taken as 0. No pair: value 0.
+// Mean over pairs of relu(margin - distance), distance = |a - b|^2 or |a - b|; pairs i < j within a (others < 0), or
+// all pairs of a and b. Gradients are written; that of |a - b| at 0 is taken as 0. No pair: value 0.
 double separation(const double *a, int64_t rows, const double *b, int64_t others, int64_t width, double margin,
                   bool squared, double *grad_a, double *grad_b);
 

@@ -78,7 +78,7 @@ def simd_levels() -> list[str]:
     """The SIMD levels this processor supports, best first."""
     from perception import _core
 
-    return list(_core.rasterizer_simd_levels())
+    return _core.simd_levels()
 
 
 def set_simd(level: str) -> None:

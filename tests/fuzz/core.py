@@ -96,7 +96,7 @@ def _rasterize(dice: Dice, spoil: Callable[[dict[str, Any]], None]) -> list[Call
     inputs = _called(make, arguments)
     visible, radii = guarded((cameras, n), np.uint8), guarded((cameras, n), dtype)
     images = _images(cameras, size, dims, dtype)
-    simd = dice.pick(("auto", "baseline", *_core.rasterizer_simd_levels()))
+    simd = dice.pick(("auto", "baseline", *_core.simd_levels()))
     forward = {"inputs": inputs, **images, "visible": visible, "radii": radii, "simd": simd}
     if where == 1:
         spoil(forward)
@@ -357,7 +357,7 @@ class CoreTarget:
                 if FUNCTIONS[which] in _LEVELLED:
                     arguments |= {
                         "threads": 1 + dice.below(2),
-                        "level": dice.pick(("auto", "base", *_core.training.levels())),
+                        "level": dice.pick(("auto", "baseline", *_core.simd_levels())),
                     }
                 spoil(arguments)
                 _called(function, arguments)

@@ -161,8 +161,8 @@ def run_kernel(threads, level, width):
 
 @pytest.mark.parametrize("width", [1, 3, 48])
 def test_threads_same_bits_and_instruction_sets_agree(width):
-    reference = run_kernel(1, "base", width)
-    for level in _core.training.levels():
+    reference = run_kernel(1, "baseline", width)
+    for level in _core.simd_levels():
         one = run_kernel(1, level, width)
         for threads in (2, 16):
             assert all(torch.equal(a, b) for a, b in zip(one, run_kernel(threads, level, width), strict=True))

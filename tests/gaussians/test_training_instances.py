@@ -165,7 +165,7 @@ def test_instruction_sets_agree():
     features = features.detach().float().reshape(-1, 8)
     a = assign_labels(labels)
     reference = None
-    for level in _core.training.levels():
+    for level in _core.simd_levels():
         means, scatter = torch.empty(5, 8, dtype=torch.float64), torch.empty(5, dtype=torch.float64)
         _core.training.prototypes(features, a.slots, a.counts, a.first, means, scatter, 1, level)
         reference = reference or (means, scatter)

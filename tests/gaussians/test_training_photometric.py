@@ -129,7 +129,7 @@ def run_kernel(x, y, threads, level, beta=0.2):
 
 
 @pytest.mark.parametrize("beta", [0.0, 0.2])
-@pytest.mark.parametrize("level", _core.training.levels())
+@pytest.mark.parametrize("level", _core.simd_levels())
 def test_same_bits_for_any_thread_count(level, beta):
     x, y = (t.detach() for t in images(203, 555, dtype=torch.float32))
     parts, gradient = run_kernel(x, y, 1, level, beta)
@@ -140,8 +140,8 @@ def test_same_bits_for_any_thread_count(level, beta):
 
 def test_instruction_sets_agree():
     x, y = (t.detach() for t in images(70, 311, dtype=torch.float32))
-    parts, gradient = run_kernel(x, y, 1, "base")
-    for level in _core.training.levels():
+    parts, gradient = run_kernel(x, y, 1, "baseline")
+    for level in _core.simd_levels():
         other_parts, other = run_kernel(x, y, 1, level)
         assert abs(parts[0] - other_parts[0]) < 2e-7
         assert (gradient - other).abs().max() < 2e-5 * gradient.abs().max()
@@ -167,5 +167,5 @@ def test_bad_input_is_told():
         photometric_loss(x, y, 0.2, torch.ones(3, 3))
     with pytest.raises(InputError, match="render"):
         photometric_loss(x.half(), y.half())
-    with pytest.raises(ValueError, match="not supported"):
+    with pytest.raises(ValueError, match="expected auto"):
         run_kernel(x.detach(), y, 1, "avx99")

@@ -71,8 +71,11 @@ template <class T>
 void update_selected(const AdamRows<T> &a, int64_t from, int64_t to) {
   alignas(64) T select[kBlockElements];
   const int64_t w = a.width;
-  (w == 1 ? repeat<T, 1> : w == 3 ? repeat<T, 3> : w == 4 ? repeat<T, 4> : w == 8 ? repeat<T, 8> : repeat<T, 0>)(
-      a.visible + from, to - from, w, select);
+  (w == 1   ? repeat<T, 1>
+   : w == 3 ? repeat<T, 3>
+   : w == 4 ? repeat<T, 4>
+   : w == 8 ? repeat<T, 8>
+            : repeat<T, 0>)(a.visible + from, to - from, w, select);
   update<T, 0, true>(a, from * w, (to - from) * w, select);
 }
 
@@ -94,8 +97,10 @@ int64_t adam(const AdamRows<T> &a, int64_t begin, int64_t end, int64_t *updated)
       update_each(a, from, to, updated, &skipped);
       continue;
     }
-    if (chosen == rows) update<T, 0>(a, from * width, rows * width);
-    else update_selected(a, from, to);
+    if (chosen == rows)
+      update<T, 0>(a, from * width, rows * width);
+    else
+      update_selected(a, from, to);
     *updated += chosen;
   }
   return skipped;

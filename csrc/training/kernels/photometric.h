@@ -114,7 +114,7 @@ struct Sweep {
   void enter(int r) const;                // row r sideways into ring 1
   void differentiate_rows(int q0) const;  // rows q0 to q0 + kBlock of P, Q, R sideways into ring 2
   void differentiate_row(int q, T *moments) const;
-  void finish_rows(int p0) const;         // rows p0 to p0 + kBlock of the gradient
+  void finish_rows(int p0) const;  // rows p0 to p0 + kBlock of the gradient
   void finish(int p, const T *blurred) const;
 };
 
@@ -207,8 +207,8 @@ void Sweep<T>::finish(int p, const T *blurred) const {
   T *y = row + kRowCapacity;
   load_target(photo, from, columns, y);
   const bool weighted = load_weight(photo, pixel, columns, weights);
-  (weighted ? combine<T, true> : combine<T, false>)(photo.render + from, y, weights, blurred, columns,
-                                                    photo.l1_scale, photo.ssim_scale, photo.gradient + from, row);
+  (weighted ? combine<T, true> : combine<T, false>)(photo.render + from, y, weights, blurred, columns, photo.l1_scale,
+                                                    photo.ssim_scale, photo.gradient + from, row);
   tile.l1[p] = sum_row<T, false>(row, columns);
 }
 
@@ -219,7 +219,10 @@ void photometric_tile(const Photo<T> &photo, const Tile &tile, T *scratch) {
   T *inputs = ring2 + kRing * kGradientMaps * kRowCapacity;
   T *blurred = inputs + kInputMaps * kRowCapacity;
   T *weights = blurred + kBlock * kInputMaps * kRowCapacity;
-  const Sweep<T> sweep{photo,   tile,    scratch, ring2, inputs, blurred, weights, weights + kRowCapacity,
+  const Sweep<T> sweep{photo,          tile,
+                       scratch,        ring2,
+                       inputs,         blurred,
+                       weights,        weights + kRowCapacity,
                        photo.channels, (tile.col1 - tile.col0) * photo.channels};
   for (int r = tile.row0 - 2 * kRadius; r < tile.row1 + 2 * kRadius + kBlock - 1; r += kBlock) {
     for (int o = 0; o < kBlock; ++o) sweep.enter(r + o);

@@ -9,10 +9,12 @@
 namespace perception::training::PERCEPTION_LEVEL {
 
 template <class T>
-constexpr Kernels<T> kTable = {photometric_tile<T>, absolute_row<T>,   accumulate<T>,    spread<T>,
+constexpr Kernels<T> kTable = {photometric_tile<T>, absolute_row<T>,  accumulate<T>, spread<T>,
                                sum_row<T, false>,   sum_row<T, true>, adam<T>};
 
-const Kernels<float> *table_float() { return &kTable<float>; }
-const Kernels<double> *table_double() { return &kTable<double>; }
+extern const Kernels<float> float_kernels;
+extern const Kernels<double> double_kernels;
+const Kernels<float> float_kernels = kTable<float>;
+const Kernels<double> double_kernels = kTable<double>;
 
 }  // namespace perception::training::PERCEPTION_LEVEL

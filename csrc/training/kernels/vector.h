@@ -3,20 +3,28 @@
 
 namespace perception::training::PERCEPTION_LEVEL {
 
+#if defined(PERCEPTION_LEVEL_avx512)
+constexpr int kVectorBytes = 64;
+#elif defined(PERCEPTION_LEVEL_avx2)
+constexpr int kVectorBytes = 32;
+#else
+constexpr int kVectorBytes = 16;
+#endif
+
 template <class T>
 struct Pack;
 
 template <>
 struct Pack<float> {
-  static constexpr int size = PERCEPTION_VECTOR_BYTES / sizeof(float);
-  typedef float type __attribute__((vector_size(PERCEPTION_VECTOR_BYTES), aligned(4), may_alias));
-  typedef float half __attribute__((vector_size(PERCEPTION_VECTOR_BYTES / 2), aligned(4), may_alias));
+  static constexpr int size = kVectorBytes / sizeof(float);
+  typedef float type __attribute__((vector_size(kVectorBytes), aligned(4), may_alias));
+  typedef float half __attribute__((vector_size(kVectorBytes / 2), aligned(4), may_alias));
 };
 
 template <>
 struct Pack<double> {
-  static constexpr int size = PERCEPTION_VECTOR_BYTES / sizeof(double);
-  typedef double type __attribute__((vector_size(PERCEPTION_VECTOR_BYTES), aligned(8), may_alias));
+  static constexpr int size = kVectorBytes / sizeof(double);
+  typedef double type __attribute__((vector_size(kVectorBytes), aligned(8), may_alias));
   typedef type half;
 };
 
@@ -24,7 +32,7 @@ struct Pack<double> {
 #define PERCEPTION_STORE(T, p) (*reinterpret_cast<typename Pack<T>::type *>(p))
 
 // As many doubles as fit a register, converted from values (GCC takes wider conversions to pieces).
-typedef double Doubles __attribute__((vector_size(PERCEPTION_VECTOR_BYTES)));
+typedef double Doubles __attribute__((vector_size(kVectorBytes)));
 
 template <class T>
 Doubles load_doubles(const T *values) {
@@ -34,7 +42,7 @@ Doubles load_doubles(const T *values) {
 // Sum in double in four interleaved series, added up in one order.
 template <class T, bool Squared>
 double sum_row(const T *values, int64_t n) {
-  constexpr int size = PERCEPTION_VECTOR_BYTES / sizeof(double);
+  constexpr int size = kVectorBytes / sizeof(double);
   Doubles lanes[4] = {};
   int64_t i = 0;
   for (; i + 4 * size <= n; i += 4 * size)

@@ -3,6 +3,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <limits>
+#include <utility>
 #include <vector>
 
 namespace perception::graph {
@@ -24,7 +25,7 @@ class KdTree {
 
   struct Node {
     float split;
-    std::int32_t axis;  // 0..2; -1 for a leaf
+    std::int32_t axis;   // 0..2; -1 for a leaf
     std::uint32_t next;  // inner node: the right child (the left one follows directly); leaf: its first slot
   };
   // What a search reads: nodes in preorder, slots of points in structure-of-arrays form.
@@ -39,7 +40,12 @@ class KdTree {
     float at[3];
     std::int32_t index;
   };
-  void build(std::vector<Entry> &entries, std::size_t begin, std::size_t end, std::size_t node, int threads);
+  struct Subtree {
+    std::size_t begin, end, node;  // its entries and its root
+  };
+  // Writes the root of a subtree of more than one leaf and returns its children.
+  std::pair<Subtree, Subtree> split(std::vector<Entry> &entries, const Subtree &tree);
+  void build(std::vector<Entry> &entries, const Subtree &tree);
 
   std::size_t size_;
   float low_[3], high_[3];

@@ -1,5 +1,5 @@
-#include "levels.h"
-#include "parallel.h"
+#include "../common/parallel.h"
+#include "kernels/table.h"
 #include "training.h"
 
 namespace perception::training {
@@ -10,7 +10,7 @@ double sum(const T *values, int64_t n, bool squared, const Execution &how) {
   const auto run = squared ? table.sum_squares : table.sum;
   const Pieces pieces(n, 65536);
   std::vector<double> partial(pieces.count);
-  parallel_for(pieces.count, how.threads, [&](int64_t i, int) {
+  parallel_for(resolve_threads(how.threads), pieces.count, [&](std::size_t i, int) {
     partial[i] = run(values + pieces.begin(i), pieces.end(i) - pieces.begin(i));
   });
   double total = 0;
@@ -22,7 +22,7 @@ template <class T>
 void scale(const T *values, int64_t n, double factor, T *out, const Execution &how) {
   const Pieces pieces(n, 65536);
   const T f = T(factor);
-  parallel_for(pieces.count, how.threads, [&](int64_t piece, int) {
+  parallel_for(resolve_threads(how.threads), pieces.count, [&](std::size_t piece, int) {
     const T *from = values + pieces.begin(piece);
     T *to = out + pieces.begin(piece);
     const int64_t m = pieces.end(piece) - pieces.begin(piece);

@@ -10,7 +10,7 @@ namespace perception::graph {
 //
 // Two components join over an edge when its weight is at most the internal threshold of both, which for a component
 // is the weight that last joined it plus k / size. Then every component under `min_size` joins a neighbour, again in
-// sorted order. Equal weights are taken in the order of their (smaller, larger) node, so the edges' order is irrelevant.
+// sorted order. Equal weights are taken in the order of their (smaller, larger) node: the order of edges is irrelevant.
 std::size_t segment(const std::int32_t *edges, const float *weights, std::size_t num_edges, std::size_t nodes, float k,
                     std::size_t min_size, std::int32_t *labels);
 

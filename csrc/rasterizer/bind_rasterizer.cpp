@@ -9,9 +9,8 @@
 #include <optional>
 #include <stdexcept>
 
-#include "../arguments.h"
+#include "../common/arguments.h"
 #include "frames.h"
-#include "parallel.h"
 #include "rasterizer.h"
 
 namespace nb = nanobind;
@@ -37,7 +36,8 @@ auto *checked(const char *name, A &array, const std::vector<int64_t> &expected) 
   std::vector<int64_t> found;
   for (std::size_t i = 0; i < array.ndim(); ++i) found.push_back(static_cast<int64_t>(array.shape(i)));
   if (found != expected)
-    throw std::invalid_argument(std::string(name) + ": shape " + shape_text(found) + ", expected " + shape_text(expected));
+    throw std::invalid_argument(std::string(name) + ": shape " + shape_text(found) + ", expected " +
+                                shape_text(expected));
   perception::require_aligned(name, array);
   return array.data();
 }
@@ -46,27 +46,6 @@ template <class A>
 auto checked(const char *name, std::optional<A> &array, const std::vector<int64_t> &expected)
     -> decltype(array->data()) {
   return array ? checked(name, *array, expected) : nullptr;
-}
-
-Level parse_level(const std::string &name) {
-  Level level = Level::baseline;
-  if (name == "auto") return perception::best_level();
-  if (name == "avx512")
-    level = Level::avx512;
-  else if (name == "avx2")
-    level = Level::avx2;
-  else if (name != "baseline")
-    throw std::invalid_argument("simd: '" + name + "', expected auto, avx512, avx2 or baseline");
-  if (!perception::level_supported(level)) throw std::invalid_argument("simd: this processor has no " + name);
-  return level;
-}
-
-std::vector<std::string> simd_levels() {
-  std::vector<std::string> names;
-  if (perception::level_supported(Level::avx512)) names.push_back("avx512");
-  if (perception::level_supported(Level::avx2)) names.push_back("avx2");
-  names.push_back("baseline");
-  return names;
 }
 
 nb::dict stage_seconds(const perception::Stats &stats) {
@@ -97,7 +76,8 @@ struct Arguments {
     perception::Inputs<T> in{};
     if (means.ndim() != 2) throw std::invalid_argument("means: expected 2 dimensions [N, 3]");
     if (viewmats.ndim() != 3) throw std::invalid_argument("viewmats: expected 3 dimensions [C, 4, 4]");
-    const int64_t n = in.n = static_cast<int64_t>(means.shape(0)), c = in.cameras = static_cast<int64_t>(viewmats.shape(0));
+    const int64_t n = in.n = static_cast<int64_t>(means.shape(0)),
+                  c = in.cameras = static_cast<int64_t>(viewmats.shape(0));
     if (n >= INT32_MAX) throw std::invalid_argument("means: too many Gaussians");
     if (width < 1 || height < 1 || width > 1 << 20 || height > 1 << 20)
       throw std::invalid_argument("width, height: expected 1 to 1048576 pixels");
@@ -115,7 +95,8 @@ struct Arguments {
       in.colors = checked("colors", colors, {n, in.sh_stride, 3});
     }
     if (features) {
-      if (features->ndim() != 2 || features->shape(1) > 1 << 16) throw std::invalid_argument("features: expected [N, D]");
+      if (features->ndim() != 2 || features->shape(1) > 1 << 16)
+        throw std::invalid_argument("features: expected [N, D]");
       in.dims = static_cast<int>(features->shape(1));
       in.features = checked("features", features, {n, in.dims});
     }
@@ -154,7 +135,7 @@ std::unique_ptr<Handle<T>> forward(Arguments<T> &a, Images<T> images, Array<uint
                                    const std::string &simd) {
   const perception::Inputs<T> in = a.inputs();
   const perception::Options opt = a.options(in);
-  const Level level = parse_level(simd);
+  const Level level = perception::parse_level(simd);
   perception::Outputs<T> out{};
   images.fill(in, opt, out);
   out.visible = checked("out visible", visible, {in.cameras, in.n});
@@ -219,38 +200,55 @@ void bind(nb::module_ &m, const char *suffix) {
              Array<const T> opacities, Array<const T> colors, Optional<const T> features, Array<const T> viewmats,
              Array<const T> Ks, Optional<const T> background, int width, int height, int sh_degree, double near_plane,
              double eps2d, int threads, bool depth, bool variance, int64_t max_records) {
-            new (self) Arguments<T>{means, quats, scales, opacities, colors, features, viewmats, Ks, background,
-                                    width, height, sh_degree, static_cast<T>(near_plane), static_cast<T>(eps2d),
-                                    threads, depth, variance, max_records};
+            new (self) Arguments<T>{means,
+                                    quats,
+                                    scales,
+                                    opacities,
+                                    colors,
+                                    features,
+                                    viewmats,
+                                    Ks,
+                                    background,
+                                    width,
+                                    height,
+                                    sh_degree,
+                                    static_cast<T>(near_plane),
+                                    static_cast<T>(eps2d),
+                                    threads,
+                                    depth,
+                                    variance,
+                                    max_records};
           },
           "means"_a.noconvert(), "quats"_a.noconvert(), "scales"_a.noconvert(), "opacities"_a.noconvert(),
           "colors"_a.noconvert(), "features"_a.noconvert().none(), "viewmats"_a.noconvert(), "Ks"_a.noconvert(),
           "background"_a.noconvert().none(), "width"_a, "height"_a, "sh_degree"_a, "near_plane"_a, "eps2d"_a,
           "threads"_a, "depth"_a, "variance"_a, "max_records"_a);
-  m.def(name("rasterize_forward").c_str(),
-        [](Arguments<T> &inputs, Array<T> colors, Array<T> alphas, Optional<T> depths, Optional<T> features,
-           Optional<T> variance, Array<uint8_t> visible, Optional<T> radii, const std::string &simd) {
-          return forward<T>(inputs, {colors, alphas, depths, features, variance}, visible, radii, simd);
-        },
-        "inputs"_a, "colors"_a.noconvert(), "alphas"_a.noconvert(), "depths"_a.noconvert().none(),
-        "features"_a.noconvert().none(), "variance"_a.noconvert().none(), "visible"_a.noconvert(),
-        "radii"_a.noconvert().none(), "simd"_a);
-  m.def(name("rasterize_backward").c_str(),
-        [](Arguments<T> &inputs, Handle<T> &frames, Array<T> colors, Array<T> alphas, Optional<T> depths,
-           Optional<T> features, Optional<T> variance, Optional<const T> g_colors, Optional<const T> g_alphas,
-           Optional<const T> g_depths, Optional<const T> g_features, Optional<const T> g_variance, Optional<T> d_means,
-           Optional<T> d_quats, Optional<T> d_scales, Optional<T> d_opacities, Optional<T> d_colors,
-           Optional<T> d_features, Optional<T> d_viewmats, Optional<T> d_mean2d) {
-          backward<T>(inputs, frames, {colors, alphas, depths, features, variance}, g_colors, g_alphas, g_depths,
-                      g_features, g_variance, d_means, d_quats, d_scales, d_opacities, d_colors, d_features, d_viewmats,
-                      d_mean2d);
-        },
-        "inputs"_a, "frames"_a, "colors"_a.noconvert(), "alphas"_a.noconvert(), "depths"_a.noconvert().none(),
-        "features"_a.noconvert().none(), "variance"_a.noconvert().none(), "g_colors"_a.noconvert().none(),
-        "g_alphas"_a.noconvert().none(), "g_depths"_a.noconvert().none(), "g_features"_a.noconvert().none(),
-        "g_variance"_a.noconvert().none(), "d_means"_a.noconvert().none(), "d_quats"_a.noconvert().none(),
-        "d_scales"_a.noconvert().none(), "d_opacities"_a.noconvert().none(), "d_colors"_a.noconvert().none(),
-        "d_features"_a.noconvert().none(), "d_viewmats"_a.noconvert().none(), "d_mean2d"_a.noconvert().none());
+  m.def(
+      name("rasterize_forward").c_str(),
+      [](Arguments<T> &inputs, Array<T> colors, Array<T> alphas, Optional<T> depths, Optional<T> features,
+         Optional<T> variance, Array<uint8_t> visible, Optional<T> radii, const std::string &simd) {
+        return forward<T>(inputs, {colors, alphas, depths, features, variance}, visible, radii, simd);
+      },
+      "inputs"_a, "colors"_a.noconvert(), "alphas"_a.noconvert(), "depths"_a.noconvert().none(),
+      "features"_a.noconvert().none(), "variance"_a.noconvert().none(), "visible"_a.noconvert(),
+      "radii"_a.noconvert().none(), "simd"_a);
+  m.def(
+      name("rasterize_backward").c_str(),
+      [](Arguments<T> &inputs, Handle<T> &frames, Array<T> colors, Array<T> alphas, Optional<T> depths,
+         Optional<T> features, Optional<T> variance, Optional<const T> g_colors, Optional<const T> g_alphas,
+         Optional<const T> g_depths, Optional<const T> g_features, Optional<const T> g_variance, Optional<T> d_means,
+         Optional<T> d_quats, Optional<T> d_scales, Optional<T> d_opacities, Optional<T> d_colors,
+         Optional<T> d_features, Optional<T> d_viewmats, Optional<T> d_mean2d) {
+        backward<T>(inputs, frames, {colors, alphas, depths, features, variance}, g_colors, g_alphas, g_depths,
+                    g_features, g_variance, d_means, d_quats, d_scales, d_opacities, d_colors, d_features, d_viewmats,
+                    d_mean2d);
+      },
+      "inputs"_a, "frames"_a, "colors"_a.noconvert(), "alphas"_a.noconvert(), "depths"_a.noconvert().none(),
+      "features"_a.noconvert().none(), "variance"_a.noconvert().none(), "g_colors"_a.noconvert().none(),
+      "g_alphas"_a.noconvert().none(), "g_depths"_a.noconvert().none(), "g_features"_a.noconvert().none(),
+      "g_variance"_a.noconvert().none(), "d_means"_a.noconvert().none(), "d_quats"_a.noconvert().none(),
+      "d_scales"_a.noconvert().none(), "d_opacities"_a.noconvert().none(), "d_colors"_a.noconvert().none(),
+      "d_features"_a.noconvert().none(), "d_viewmats"_a.noconvert().none(), "d_mean2d"_a.noconvert().none());
 }
 
 }  // namespace
@@ -259,7 +257,5 @@ void bind_rasterizer(nb::module_ &m) {
   nb::set_leak_warnings(false);  // a graph still alive at exit legitimately holds its frames
   bind<float>(m, "_f32");
   bind<double>(m, "_f64");
-  m.def("rasterizer_simd_levels", &simd_levels, "SIMD levels this processor supports, best first.");
   m.def("rasterizer_release_memory", &perception::release_memory, "Frees the buffers kept between calls.");
-  m.def("hardware_threads", &perception::hardware_threads);
 }

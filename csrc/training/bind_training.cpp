@@ -8,13 +8,15 @@
 #include <optional>
 #include <stdexcept>
 
-#include "../arguments.h"
-#include "levels.h"
+#include "../common/arguments.h"
+#include "../common/parallel.h"
 #include "training.h"
 
 namespace nb = nanobind;
 namespace pt = perception::training;
 using namespace nb::literals;
+using perception::Level;
+using perception::parse_level;
 using perception::require_aligned;
 
 namespace {
@@ -37,8 +39,8 @@ bool same_shape(const A &a, const B &b) {
 }
 
 template <class T, class Target>
-auto photometric(In<T, 3> render, In<Target, 3> target, std::optional<In<T, 2>> weight, Out<T, 3> gradient,
-                 double beta, int threads, const std::string &level) {
+auto photometric(In<T, 3> render, In<Target, 3> target, std::optional<In<T, 2>> weight, Out<T, 3> gradient, double beta,
+                 int threads, const std::string &level) {
   require_aligned("render", render, "target", target, "weight", weight, "gradient", gradient);
   for (size_t side = 0; side < 3; ++side)
     require(render.shape(side) < size_t(1) << 31, "render: expected sides under 2^31");
@@ -48,8 +50,10 @@ auto photometric(In<T, 3> render, In<Target, 3> target, std::optional<In<T, 2>> 
           "weight: expected [H, W] of render [H, W, C]");
   pt::PhotometricArguments<T> a{};
   a.render = render.data();
-  if constexpr (std::is_same_v<Target, uint8_t>) a.target8 = target.data();
-  else a.target = target.data();
+  if constexpr (std::is_same_v<Target, uint8_t>)
+    a.target8 = target.data();
+  else
+    a.target = target.data();
   a.weight = weight ? weight->data() : nullptr;
   a.gradient = gradient.data();
   a.height = static_cast<int>(render.shape(0));
@@ -59,7 +63,7 @@ auto photometric(In<T, 3> render, In<Target, 3> target, std::optional<In<T, 2>> 
   pt::PhotometricResult result;
   {
     nb::gil_scoped_release release;
-    result = pt::photometric(a, {threads, level});
+    result = pt::photometric(a, {threads, parse_level(level)});
   }
   return nb::make_tuple(result.loss, result.l1, result.ssim);
 }
@@ -84,17 +88,19 @@ template <class T>
 void prototypes(In<T, 2> features, In<int32_t, 1> slots, In<int64_t, 1> counts, In<int64_t, 1> first,
                 Out<double, 2> means, Out<double, 1> scatter, int threads, const std::string &level) {
   const size_t labels = counts.shape(0);
-  require_aligned("features", features, "slots", slots, "counts", counts, "first", first, "means", means, "scatter", scatter);
+  require_aligned("features", features, "slots", slots, "counts", counts, "first", first, "means", means, "scatter",
+                  scatter);
   require(features.shape(0) == slots.shape(0), "slots: expected [P] of features [P, D]");
   require(first.shape(0) == labels && scatter.shape(0) == labels && means.shape(0) == labels &&
-              means.shape(1) == features.shape(1), "first, means, scatter: expected [L], [L, D], [L] of counts [L] and features [P, D]");
+              means.shape(1) == features.shape(1),
+          "first, means, scatter: expected [L], [L, D], [L] of counts [L] and features [P, D]");
   nb::gil_scoped_release release;
   check_slots(slots.data(), slots.shape(0), labels);
   for (size_t i = 0; i < labels; ++i)
     require(first.data()[i] >= 0 && first.data()[i] < static_cast<int64_t>(features.shape(0)) && counts.data()[i] > 0,
             "first, counts: every label needs a pixel");
   pt::prototypes(features.data(), slots.data(), features.shape(0), features.shape(1), counts.data(), first.data(),
-                 labels, means.data(), scatter.data(), {threads, level});
+                 labels, means.data(), scatter.data(), {threads, parse_level(level)});
 }
 
 template <class T>
@@ -108,24 +114,25 @@ void spread(In<T, 2> features, In<int32_t, 1> slots, In<double, 2> means, In<dou
   nb::gil_scoped_release release;
   check_slots(slots.data(), slots.shape(0), means.shape(0));
   pt::spread(features.data(), slots.data(), features.shape(0), features.shape(1), means.data(), pull.data(),
-             push.data(), out.data(), {threads, level});
+             push.data(), out.data(), {threads, parse_level(level)});
 }
 
 double separation(In<double, 2> a, std::optional<In<double, 2>> b, double margin, bool squared, Out<double, 2> grad_a,
                   std::optional<Out<double, 2>> grad_b) {
   require_aligned("a", a, "b", b, "grad_a", grad_a, "grad_b", grad_b);
-  require(same_shape(a, grad_a) && b.has_value() == grad_b.has_value(), "grad_a, grad_b: expected the shape of a, and an array exactly where b is one");
+  require(same_shape(a, grad_a) && b.has_value() == grad_b.has_value(),
+          "grad_a, grad_b: expected the shape of a, and an array exactly where b is one");
   require(!b || (same_shape(*b, *grad_b) && b->shape(1) == a.shape(1)), "b, grad_b: expected one shape, as wide as a");
   nb::gil_scoped_release release;
-  return pt::separation(a.data(), a.shape(0), b ? b->data() : nullptr, b ? static_cast<int64_t>(b->shape(0)) : -1, a.shape(1), margin,
-                        squared, grad_a.data(), grad_b ? grad_b->data() : nullptr);
+  return pt::separation(a.data(), a.shape(0), b ? b->data() : nullptr, b ? static_cast<int64_t>(b->shape(0)) : -1,
+                        a.shape(1), margin, squared, grad_a.data(), grad_b ? grad_b->data() : nullptr);
 }
 
 template <class T>
 double sum(In<T, 1> values, bool squared, int threads, const std::string &level) {
   require_aligned("values", values);
   nb::gil_scoped_release release;
-  return pt::sum(values.data(), static_cast<int64_t>(values.size()), squared, {threads, level});
+  return pt::sum(values.data(), static_cast<int64_t>(values.size()), squared, {threads, parse_level(level)});
 }
 
 template <class T>
@@ -133,25 +140,26 @@ void scale(In<T, 1> values, double factor, Out<T, 1> out, int threads) {
   require_aligned("values", values, "out", out);
   require(same_shape(values, out), "out: expected the shape of values");
   nb::gil_scoped_release release;
-  pt::scale(values.data(), static_cast<int64_t>(values.size()), factor, out.data(), {threads, "auto"});
+  pt::scale(values.data(), static_cast<int64_t>(values.size()), factor, out.data(), {threads, Level::baseline});
 }
 
 template <class T>
-auto adam(Out<T, 2> param, In<T, 2> grad, Out<T, 2> first, Out<T, 2> second,
-          std::optional<In<uint8_t, 1>> visible, In<double, 1> rate, int64_t step, double beta1, double beta2,
-          double eps, int threads, const std::string &level) {
+auto adam(Out<T, 2> param, In<T, 2> grad, Out<T, 2> first, Out<T, 2> second, std::optional<In<uint8_t, 1>> visible,
+          In<double, 1> rate, int64_t step, double beta1, double beta2, double eps, int threads,
+          const std::string &level) {
   require_aligned("param", param, "grad", grad, "first", first, "second", second, "rate", rate);
-  require(same_shape(param, grad) && same_shape(param, first) && same_shape(param, second), "grad, first, second: expected the shape of param");
+  require(same_shape(param, grad) && same_shape(param, first) && same_shape(param, second),
+          "grad, first, second: expected the shape of param");
   require(!visible || visible->shape(0) == param.shape(0), "visible: expected [N] of param [N, K]");
   require(rate.shape(0) == param.shape(1) && step >= 1, "rate, step: expected [K] of param [N, K], and 1 or more");
   pt::AdamResult result;
   {
     nb::gil_scoped_release release;
-    result = pt::adam(pt::AdamArguments<T>{param.data(), first.data(), second.data(), grad.data(),
-                                           visible ? visible->data() : nullptr, rate.data(),
-                                           static_cast<int64_t>(param.shape(0)), static_cast<int64_t>(param.shape(1)),
-                                           step, beta1, beta2, eps},
-                      {threads, level});
+    result = pt::adam(
+        pt::AdamArguments<T>{param.data(), first.data(), second.data(), grad.data(),
+                             visible ? visible->data() : nullptr, rate.data(), static_cast<int64_t>(param.shape(0)),
+                             static_cast<int64_t>(param.shape(1)), step, beta1, beta2, eps},
+        {threads, parse_level(level)});
   }
   return nb::make_tuple(result.updated, result.skipped);
 }
@@ -159,8 +167,8 @@ auto adam(Out<T, 2> param, In<T, 2> grad, Out<T, 2> first, Out<T, 2> second,
 template <class T>
 void bind_precision(nb::module_ &m) {
   const auto arg = [](const char *name) { return nb::arg(name).noconvert(); };
-  m.def("photometric", &photometric<T, T>, arg("render"), arg("target"), arg("weight").none(), arg("gradient"), "beta"_a,
-        "threads"_a = 0, "level"_a = "auto");
+  m.def("photometric", &photometric<T, T>, arg("render"), arg("target"), arg("weight").none(), arg("gradient"),
+        "beta"_a, "threads"_a = 0, "level"_a = "auto");
   m.def("photometric", &photometric<T, uint8_t>, arg("render"), arg("target"), arg("weight").none(), arg("gradient"),
         "beta"_a, "threads"_a = 0, "level"_a = "auto",
         "(loss, l1, ssim) of images [H, W, C] and d loss / d render into gradient.");
@@ -180,8 +188,7 @@ void bind_precision(nb::module_ &m) {
 
 void bind_training(nb::module_ &parent) {
   nb::module_ m = parent.def_submodule("training", "Fused losses and the optimiser; float32 and float64.");
-  m.def("levels", &pt::supported_levels, "Instruction sets this processor supports, narrowest first.");
-  m.def("set_threads", &pt::set_default_threads, "threads"_a,
+  m.def("set_threads", &perception::set_default_threads, "threads"_a,
         "Threads of calls that name none; 0 means all processors. Results do not depend on it.");
   m.def("assign", &assign, nb::arg("labels").noconvert(), "fraction"_a, "seed"_a, nb::arg("slots").noconvert(),
         "(ids, counts, first pixel) of the labels in use; slots gets each pixel's index into ids, or -1.");

@@ -2,22 +2,16 @@
 
 #include <pthread.h>
 
+#include <algorithm>
 #include <atomic>
 #include <condition_variable>
 #include <exception>
+#include <memory>
 #include <mutex>
 #include <system_error>
 #include <thread>
 
-#include "buffer.h"
-
 namespace perception {
-
-void *aligned_allocate(std::size_t bytes) {
-  void *p = nullptr;
-  if (posix_memalign(&p, 64, (bytes + 63) & ~std::size_t{63}) != 0) throw std::bad_alloc();
-  return p;
-}
 
 namespace {
 
@@ -60,7 +54,7 @@ class Pool {
     job_ = nullptr;
   }
 
-  std::mutex busy;  // one job at a time; a second caller runs alone
+  std::atomic<bool> busy{false};  // one job at a time; a second caller, or a task that asks for tasks, runs alone
 
  private:
   void loop(int worker) {
@@ -100,11 +94,12 @@ Pool &pool() {
 
 void parallel_for(int threads, std::size_t tasks, Task run, void *context) {
   Job job{run, context, tasks, {}, {}, {}};
-  if (static_cast<std::size_t>(threads) > tasks) threads = static_cast<int>(tasks);
-  Pool *shared = threads > 1 ? &pool() : nullptr;
-  if (shared && shared->busy.try_lock()) {
-    std::lock_guard<std::mutex> hold(shared->busy, std::adopt_lock);
-    shared->run(job, threads - 1);
+  const int useful = static_cast<int>(std::min<std::size_t>(std::clamp(threads, 1, kMaxThreads), tasks));
+  Pool *shared = useful > 1 ? &pool() : nullptr;
+  if (shared && !shared->busy.exchange(true)) {
+    const std::unique_ptr<std::atomic<bool>, void (*)(std::atomic<bool> *)> release(
+        &shared->busy, [](std::atomic<bool> *busy) { *busy = false; });
+    shared->run(job, useful - 1);
   } else {
     job.work(0);
   }
@@ -114,6 +109,17 @@ void parallel_for(int threads, std::size_t tasks, Task run, void *context) {
 int hardware_threads() {
   unsigned n = std::thread::hardware_concurrency();
   return n ? static_cast<int>(n) : 1;
+}
+
+namespace {
+std::atomic<int> default_threads{0};
+}
+
+void set_default_threads(int threads) { default_threads = std::max(0, threads); }
+
+int resolve_threads(int threads) {
+  if (threads <= 0) threads = default_threads;
+  return threads > 0 ? threads : hardware_threads();
 }
 
 }  // namespace perception
