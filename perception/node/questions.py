@@ -9,7 +9,7 @@ from typing import Any
 
 from perception.errors import InputError
 from perception.query import AnswerTimeout, EngineBusy, EngineClosed, Request
-from perception.query.requests import requests_from_json
+from perception.query.bodies import QueryBody, parse
 
 MOST_BYTES = 64 * 1024
 """Of one prompt, JSON included; longer ones are refused unread."""
@@ -42,7 +42,7 @@ def read_questions(data: str) -> list[Question]:
         raise InputError("prompt: id is to be a text of at most 200 characters")
     if want not in ("hits", "points"):
         raise InputError(f"prompt: want is {str(want)[:_SHOWN]!r}, expected hits or points")
-    return [Question(request, identity, want == "points") for request in requests_from_json(value)]
+    return [Question(request, identity, want == "points") for request in parse(QueryBody, value).requests()]
 
 
 def identity_of(data: str) -> str | None:

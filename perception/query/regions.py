@@ -63,22 +63,6 @@ def move_region(a_from_b: np.ndarray, region: Region) -> Region:
     return Prism(region.polygon, region.low, region.high, a_from_b @ region.from_prism)
 
 
-def region_from_json(value: Any) -> Region:
-    """{"min", "max"}, {"center", "extent", "rotation"?} or {"polygon", "low"?, "high"?} as a region."""
-    keys = set(value) if isinstance(value, dict) else set()
-    if keys == {"min", "max"}:
-        return axis_box(value["min"], value["max"])
-    if {"center", "extent"} <= keys <= {"center", "extent", "rotation"}:
-        return check_box(OrientedBox(value["center"], value.get("rotation", np.eye(3)), value["extent"]))
-    if "polygon" in keys and keys <= {"polygon", "low", "high"}:
-        low, high = (float(_numbers(value.get(k, d), f"region: {k}")) for k, d in (("low", -1e300), ("high", 1e300)))
-        return Prism(np.array(_numbers(value["polygon"], "region: polygon")), low, high)
-    raise InputError(
-        f"region: found {sorted(keys) or type(value).__name__}, expected min and max, or center and extent "
-        "(and rotation), or polygon (and low, high)"
-    )
-
-
 def check_region(region: Any) -> Region:
     """`region` itself when it is a sound one, else InputError."""
     if isinstance(region, Prism):

@@ -1,4 +1,4 @@
-"""What servers ask and answer, as JSON. One place for HTTP and ROS, so that both speak the same words."""
+"""A prompt with its filters, and the answer to it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.query.frames import Frame
-from perception.query.where import Where, where_from_json
+from perception.query.where import Where
 
 if TYPE_CHECKING:
     from perception.query.hit import Hit
@@ -18,7 +18,6 @@ MAX_TEXT = 1000
 """Characters of a prompt; no encoder reads more, and a server should not be made to."""
 MAX_TOP = 1000
 MAX_TEXTS = 32
-_KEYS = ("text", "top_k", "min_score", "where", "frame")
 
 
 @dataclass(frozen=True)
@@ -69,31 +68,3 @@ def check_text(text: Any) -> str:
     if len(text) > MAX_TEXT:
         raise InputError(f"query: the text has {len(text)} characters, expected at most {MAX_TEXT}")
     return text
-
-
-def requests_from_json(value: Any) -> list[Request]:
-    """{"text": text or list of texts, "top_k"?, "min_score"?, "where"?, "frame"?} → a request a text.
-
-    "frame" is {"name", "from_map"} with a 4 × 4 list of rows.
-    """
-    if not isinstance(value, dict):
-        raise InputError(f"query: found {type(value).__name__}, expected an object with {', '.join(_KEYS)}")
-    for key in value:
-        if key not in _KEYS:
-            raise InputError(f"query: found '{str(key)[:40]}', expected one of {', '.join(_KEYS)}")
-    if "text" not in value:
-        raise InputError('query: "text" is missing; ask for a thing, such as "red mug"')
-    texts = value["text"] if isinstance(value["text"], list) else [value["text"]]
-    if not 1 <= len(texts) <= MAX_TEXTS:
-        raise InputError(f"query: {len(texts)} texts, expected 1 to {MAX_TEXTS}")
-    where = None if value.get("where") is None else where_from_json(value["where"])
-    frame = None if value.get("frame") is None else frame_from_json(value["frame"])
-    top_k = 3 if value.get("top_k") is None else value["top_k"]
-    return [Request(text, top_k, value.get("min_score"), where, frame) for text in texts]
-
-
-def frame_from_json(value: Any) -> Frame:
-    """{"name": text, "from_map": 4 × 4 rows} as a frame."""
-    if not isinstance(value, dict) or set(value) != {"name", "from_map"} or not isinstance(value["name"], str):
-        raise InputError('frame: expected {"name": text, "from_map": 4 rows of 4 numbers}')
-    return Frame(value["name"], value["from_map"])

@@ -10,9 +10,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.query.frames import Frame, check_similarity, move_points, scale_of
-from perception.query.regions import Region, check_region, move_region, region_from_json
-
-_KEYS = ("region", "share", "near", "within", "min_size", "max_size", "labels")
+from perception.query.regions import Region, check_region, move_region
 
 
 @dataclass(frozen=True)
@@ -87,19 +85,3 @@ def place(point_or_pose: Any) -> np.ndarray:
 def tidy(text: str) -> str:
     """A label for comparison: white space and case do not count."""
     return " ".join(text.casefold().split())
-
-
-def where_from_json(value: Any) -> Where:
-    """A filter from JSON with the keys of `Where`; unknown keys are an InputError."""
-    if not isinstance(value, dict):
-        raise InputError(f"where: found {type(value).__name__}, expected an object with {', '.join(_KEYS)}")
-    for key in value:
-        if key not in _KEYS:
-            raise InputError(f"where: found '{str(key)[:40]}', expected one of {', '.join(_KEYS)}")
-    known = {key: item for key, item in value.items() if item is not None}
-    if "region" in known:
-        known["region"] = region_from_json(known["region"])
-    labels = known.get("labels")
-    if labels is not None and not isinstance(labels, (str, list)):
-        raise InputError(f"where: labels is {type(labels).__name__}, expected a list of texts")
-    return Where(**known)

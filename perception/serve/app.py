@@ -3,61 +3,70 @@
 from __future__ import annotations
 
 import io
-import json
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, TypeVar
+from pathlib import Path as FilePath
+from typing import Annotated, Any, Literal, TypeVar
 
-from starlette.applications import Starlette
+import numpy as np
+from fastapi import FastAPI, Path, Query, Request
+from fastapi.responses import JSONResponse, Response
 from starlette.concurrency import run_in_threadpool
-from starlette.middleware import Middleware
-from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
-from starlette.routing import Route
 
-from perception.errors import InputError
+from perception import __version__
+from perception.query.bodies import AtBody, FindBody, NearestBody, QueryBody
 from perception.query.crops import best_crop
 from perception.query.engine import QueryEngine
 from perception.query.frames import Frame
 from perception.query.opened import LoadedMap, UnknownInstance
-from perception.query.requests import frame_from_json, requests_from_json
-from perception.query.where import where_from_json
+from perception.serve import answers
 from perception.serve.errors import HANDLERS, OtherMap
 from perception.serve.guard import Guard
-from perception.serve.openapi import document
 from perception.serve.points import FORMATS, encode
 from perception.serve.settings import ServeSettings
 
 T = TypeVar("T")
-_MOST_CROPS = 256
-_SIDES = (16, 1024)
+MapId = Annotated[str | None, Query(description="answer only from this very map, else 409")]
+Id = Annotated[int, Path(alias="id", ge=0, lt=10**9)]
+_ABOUT = (
+    "Text prompts and places in, 3D instances of a map out. Lengths are in the unit of the map's frame, metres when "
+    "`metric`. With `frame`, everything in a request and its answer is in that frame."
+)
+_MAX_CROPS = 256
+_PAGE = {"/": "html", "/page.js": "javascript", "/page.css": "css"}
+"""The page for people: path → kind of text."""
 
 
-def build_app(engine: QueryEngine, settings: ServeSettings) -> Starlette:
+def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
     """The ASGI application that serves `engine`; who starts the engine closes it."""
-    handlers = _Handlers(engine)
-    routes = [
-        Route("/", _static("page.html", "text/html")),
-        Route("/page.js", _static("page.js", "text/javascript")),
-        Route("/page.css", _static("page.css", "text/css")),
-        Route("/openapi.json", handlers.openapi),
-        Route("/health", handlers.health),
-        Route("/query", handlers.query, methods=["POST"]),
-        Route("/find", handlers.find, methods=["POST"]),
-        Route("/nearest", handlers.nearest, methods=["POST"]),
-        Route("/at", handlers.at, methods=["POST"]),
-        Route("/reload", handlers.reload, methods=["POST"]),
-        Route("/instances", handlers.instances),
-        Route("/instances/{id}", handlers.describe),
-        Route("/instances/{id}/points", handlers.points),
-        Route("/instances/{id}/crop.jpg", handlers.crop),
-    ]
-    return Starlette(routes=routes, middleware=[Middleware(Guard, settings=settings)], exception_handlers=HANDLERS)
+    app = FastAPI(
+        title="perception",
+        version=__version__,
+        description=_ABOUT,
+        docs_url=None,  # these pages load scripts from elsewhere
+        redoc_url=None,
+        responses={"default": {"model": answers.Problem}},
+        exception_handlers=HANDLERS,
+    )
+    app.add_middleware(Guard, settings=settings)
+    for path, kind in _PAGE.items():
+        app.add_api_route(path, _static(path[1:] or "page.html", f"text/{kind}"), include_in_schema=False)
+    routes = _Routes(engine)
+    app.get("/health", response_model=answers.Health)(routes.health)
+    app.post("/query", response_model=answers.Results)(routes.query)
+    app.post("/find", response_model=answers.Hits)(routes.find)
+    app.post("/nearest", response_model=answers.Hits)(routes.nearest)
+    app.post("/at", response_model=answers.Hits)(routes.at)
+    app.post("/reload", response_model=answers.Reload)(routes.reload)
+    app.get("/instances", response_model=answers.Hits)(routes.instances)
+    app.get("/instances/{id}", response_model=answers.Description)(routes.describe)
+    app.get("/instances/{id}/points", response_class=Response, responses=_binary(*FORMATS.values()))(routes.points)
+    app.get("/instances/{id}/crop.jpg", response_class=Response, responses=_binary("image/jpeg"))(routes.crop)
+    return app
 
 
-class _Handlers:
+class _Routes:
     """One method a route. Each answer is made by one map, named in `map_id` or in the header X-Map-Id."""
 
     def __init__(self, engine: QueryEngine) -> None:
@@ -65,16 +74,15 @@ class _Handlers:
         self._crops: OrderedDict[tuple[str, int, int], bytes | None] = OrderedDict()
         self._lock = threading.Lock()
 
-    async def openapi(self, request: Request) -> Response:
-        return JSONResponse(document())
-
     async def health(self, request: Request) -> Response:
+        """How the server is; without the token its status only."""
         health = self.engine.health()
         shown = health if request.state.trusted else {"status": health["status"]}
         return JSONResponse(shown, 200 if health["status"] != "closed" else 503)
 
-    async def query(self, request: Request) -> Response:
-        questions = requests_from_json(await _json(request))
+    async def query(self, body: QueryBody, map_id: MapId = None) -> Response:
+        """The instances that answer each text, ranked."""
+        questions = body.requests()
 
         def work(gmap: LoadedMap) -> dict[str, Any]:
             results = []
@@ -83,71 +91,63 @@ class _Handlers:
                 results.append({"text": q.text, "present": bool(hits), "hits": [hit.to_json() for hit in hits]})
             return {"results": results, **_source(gmap, questions[0].frame)}
 
-        return JSONResponse(await self._answer(request, work))
+        return JSONResponse(await self._answer(map_id, work))
 
-    async def find(self, request: Request) -> Response:
-        body = _fields(await _json(request), "where", "frame")
-        where, frame = where_from_json(body.get("where") or {}), _frame(body)
-        return await self._hits(request, lambda gmap: gmap.find(where, frame=frame), frame)
+    async def find(self, body: FindBody, map_id: MapId = None) -> Response:
+        """All instances that fulfil a filter."""
+        where, frame = body.asked_where(), body.asked_frame()
+        return await self._hits(map_id, lambda gmap: gmap.find(where, frame=frame), frame)
 
-    async def nearest(self, request: Request) -> Response:
-        body = _fields(await _json(request), "near", "top_k", "where", "frame")
-        if "near" not in body:
-            raise InputError('nearest: "near" is missing, the point [3] or pose [4, 4] to measure from')
-        where, frame, top_k = where_from_json(body.get("where") or {}), _frame(body), body.get("top_k", 1)
-        if isinstance(top_k, bool) or not isinstance(top_k, int):
-            raise InputError(f"nearest: top_k is {top_k!r}, expected a whole number")
+    async def nearest(self, body: NearestBody, map_id: MapId = None) -> Response:
+        """The instances nearest to a point or pose."""
+        where, frame, top_k = body.asked_where(), body.asked_frame(), body.top_k or 1
         return await self._hits(
-            request, lambda gmap: gmap.nearest(body["near"], top_k, where=where, frame=frame), frame
+            map_id, lambda gmap: gmap.nearest(np.array(body.near), top_k, where=where, frame=frame), frame
         )
 
-    async def at(self, request: Request) -> Response:
-        body = _fields(await _json(request), "point", "max_distance", "frame")
-        if "point" not in body:
-            raise InputError('at: "point" is missing, the point [3] asked about')
-        frame, most = _frame(body), body.get("max_distance")
-        if most is not None and (isinstance(most, bool) or not isinstance(most, (int, float))):
-            raise InputError(f"at: max_distance is {most!r}, expected a number")
+    async def at(self, body: AtBody, map_id: MapId = None) -> Response:
+        """The instance that a point lies on."""
+        frame = body.asked_frame()
 
         def work(gmap: LoadedMap) -> list[Any]:
-            hit = gmap.instance_at(body["point"], max_distance=most, frame=frame)
+            hit = gmap.instance_at(np.array(body.point), max_distance=body.max_distance, frame=frame)
             return [] if hit is None else [hit]
 
-        return await self._hits(request, work, frame)
+        return await self._hits(map_id, work, frame)
 
-    async def instances(self, request: Request) -> Response:
-        return await self._hits(request, lambda gmap: gmap.find(), None)
+    async def instances(self, map_id: MapId = None) -> Response:
+        """All instances."""
+        return await self._hits(map_id, lambda gmap: gmap.find(), None)
 
-    async def describe(self, request: Request) -> Response:
-        number = _id(request)
-        return JSONResponse(
-            await self._answer(request, lambda gmap: {**gmap.describe(number).to_json(), **_source(gmap, None)})
-        )
+    async def describe(self, number: Id, map_id: MapId = None) -> Response:
+        """One instance."""
+        described = await self._answer(map_id, lambda gmap: {**gmap.describe(number).to_json(), **_source(gmap, None)})
+        return JSONResponse(described)
 
-    async def points(self, request: Request) -> Response:
-        number, kind = _id(request), request.query_params.get("format", "npz")
-        if kind not in FORMATS:
-            raise InputError(f"format: found '{kind[:20]}', expected {' or '.join(FORMATS)}")
-        map_id, data = await self._answer(request, lambda gmap: (gmap.map_id, encode(gmap, number, kind)))
-        name = f'attachment; filename="instance_{number}.{kind}"'
-        return Response(data, media_type=FORMATS[kind], headers={"X-Map-Id": map_id, "Content-Disposition": name})
+    async def points(self, number: Id, map_id: MapId = None, format: Literal["npz", "ply"] = "npz") -> Response:
+        """The instance's points, float32, in the map's frame; the header X-Map-Id names the map."""
+        made_by, data = await self._answer(map_id, lambda gmap: (gmap.map_id, encode(gmap, number, format)))
+        name = f'attachment; filename="instance_{number}.{format}"'
+        return Response(data, media_type=FORMATS[format], headers={"X-Map-Id": made_by, "Content-Disposition": name})
 
-    async def crop(self, request: Request) -> Response:
-        number, side = _id(request), _side(request)
-        map_id, data = await self._answer(request, lambda gmap: (gmap.map_id, self._jpeg(gmap, number, side)))
+    async def crop(
+        self, number: Id, map_id: MapId = None, side: Annotated[int, Query(ge=16, le=1024)] = 256
+    ) -> Response:
+        """The photo that shows the instance best, cut out, longer side at most `side` pixels."""
+        made_by, data = await self._answer(map_id, lambda gmap: (gmap.map_id, self._jpeg(gmap, number, side)))
         if data is None:
             raise UnknownInstance(f"instance {number}: no photo of it can be read")
-        return Response(data, media_type="image/jpeg", headers={"X-Map-Id": map_id})
+        return Response(data, media_type="image/jpeg", headers={"X-Map-Id": made_by})
 
-    async def reload(self, request: Request) -> Response:
+    async def reload(self) -> Response:
+        """Takes over the map that lies on disk now."""
         changed = await run_in_threadpool(self.engine.reload)
         return JSONResponse({"changed": changed, "map_id": self.engine.current.map_id})
 
     # ------------------------------------------------------------------ shared
 
-    async def _answer(self, request: Request, work: Callable[[LoadedMap], T]) -> T:
-        """`work` done by the engine, on the map that the client means if it says so by ?map_id=…"""
-        wanted = request.query_params.get("map_id")
+    async def _answer(self, wanted: str | None, work: Callable[[LoadedMap], T]) -> T:
+        """`work` done by the engine, on the map `wanted` if the client named one."""
 
         def checked(gmap: LoadedMap) -> T:
             if wanted is not None and wanted != gmap.map_id:
@@ -156,11 +156,11 @@ class _Handlers:
 
         return await self.engine.awaited(self.engine.run(checked))
 
-    async def _hits(self, request: Request, work: Callable[[LoadedMap], list[Any]], frame: Frame | None) -> Response:
+    async def _hits(self, wanted: str | None, work: Callable[[LoadedMap], list[Any]], frame: Frame | None) -> Response:
         def answer(gmap: LoadedMap) -> dict[str, Any]:
             return {"hits": [hit.to_json() for hit in work(gmap)], **_source(gmap, frame)}
 
-        return JSONResponse(await self._answer(request, answer))
+        return JSONResponse(await self._answer(wanted, answer))
 
     def _jpeg(self, gmap: LoadedMap, number: int, side: int) -> bytes | None:
         key = (gmap.map_id, number, side)
@@ -170,50 +170,13 @@ class _Handlers:
         data = _encode_jpeg(best_crop(gmap, number, side))
         with self._lock:
             self._crops[key] = data
-            if len(self._crops) > _MOST_CROPS:
+            if len(self._crops) > _MAX_CROPS:
                 self._crops.popitem(last=False)
         return data
 
 
 def _source(gmap: LoadedMap, frame: Frame | None) -> dict[str, Any]:
     return {"frame": frame.name if frame else gmap.frame, "metric": gmap.metric, "map_id": gmap.map_id}
-
-
-async def _json(request: Request) -> Any:
-    try:
-        return json.loads(await request.body(), parse_constant=_no_constant)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"the request is no JSON ({str(error)[:120]})") from error
-
-
-def _no_constant(name: str) -> Any:
-    raise ValueError(f"{name} is no JSON number")
-
-
-def _fields(value: Any, *known: str) -> dict[str, Any]:
-    if not isinstance(value, dict) or not set(value) <= set(known):
-        found = sorted(value)[:5] if isinstance(value, dict) else type(value).__name__
-        raise InputError(f"found {found}, expected an object with {', '.join(known)}")
-    return value
-
-
-def _frame(body: dict[str, Any]) -> Frame | None:
-    return None if body.get("frame") is None else frame_from_json(body["frame"])
-
-
-def _id(request: Request) -> int:
-    text = request.path_params["id"]
-    if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise UnknownInstance(f"instance '{text[:20]}': expected a whole number")
-    return int(text)
-
-
-def _side(request: Request) -> int:
-    text = request.query_params.get("side", "256")
-    side = int(text) if text.isascii() and text.isdigit() and len(text) < 6 else 0
-    if not _SIDES[0] <= side <= _SIDES[1]:
-        raise InputError(f"side: found '{text[:20]}', expected {_SIDES[0]} to {_SIDES[1]} pixels")
-    return side
 
 
 def _encode_jpeg(picture: Any) -> bytes | None:
@@ -226,10 +189,14 @@ def _encode_jpeg(picture: Any) -> bytes | None:
     return buffer.getvalue()
 
 
-def _static(name: str, kind: str) -> Any:
-    content = (Path(__file__).parent / name).read_bytes()
+def _binary(*kinds: str) -> dict[int | str, dict[str, Any]]:
+    return {200: {"description": "bytes; the header X-Map-Id names the map", "content": {kind: {} for kind in kinds}}}
 
-    async def serve(request: Request) -> Response:
+
+def _static(name: str, kind: str) -> Any:
+    content = (FilePath(__file__).parent / name).read_bytes()
+
+    async def file() -> Response:
         return Response(content, media_type=kind)
 
-    return serve
+    return file

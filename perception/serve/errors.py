@@ -6,11 +6,13 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
+from fastapi import Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
-from starlette.responses import JSONResponse
 
 from perception.errors import InputError
+from perception.query.bodies import problem_line
 from perception.query.engine import AnswerTimeout, EngineBusy, EngineClosed
 from perception.query.opened import UnknownInstance
 
@@ -23,7 +25,8 @@ class OtherMap(Exception):
 
 def problem(status: int, line: str, headers: Mapping[str, str] | None = None) -> JSONResponse:
     """An error as JSON."""
-    return JSONResponse({"error": " ".join(line.split()), "status": status}, status, headers)
+    told = " ".join(line.encode("utf-8", "backslashreplace").decode().split())
+    return JSONResponse({"error": told, "status": status}, status, headers)
 
 
 async def told(request: Request, error: Exception) -> JSONResponse:
@@ -32,6 +35,8 @@ async def told(request: Request, error: Exception) -> JSONResponse:
         return problem(404, str(error))
     if isinstance(error, InputError):
         return problem(400, str(error))
+    if isinstance(error, RequestValidationError):
+        return _bad_request(error)
     if isinstance(error, OtherMap):
         return problem(409, str(error))
     if isinstance(error, (EngineBusy, EngineClosed)):
@@ -39,12 +44,24 @@ async def told(request: Request, error: Exception) -> JSONResponse:
     if isinstance(error, AnswerTimeout):
         return problem(504, str(error))
     if isinstance(error, HTTPException):
+        if error.status_code == 400:
+            return problem(400, "the request is no JSON")
         known = {404: f"{request.url.path}: no such page; see /openapi.json", 405: f"{request.method} is not allowed"}
         return problem(error.status_code, known.get(error.status_code, error.detail), error.headers)
     _log.error("%s %s failed", request.method, request.url.path, exc_info=error)
     return problem(500, "the server failed on this request; its log says why")
 
 
-HANDLERS: dict[Any, Any] = dict.fromkeys(
-    (InputError, OtherMap, EngineBusy, EngineClosed, AnswerTimeout, HTTPException, Exception), told
-)
+def _bad_request(error: RequestValidationError) -> JSONResponse:
+    first = error.errors()[0]
+    if first["type"] == "json_invalid":
+        return problem(400, f"the request is no JSON ({first['ctx']['error']})")
+    if first["loc"] == ("body",) and first["type"] == "missing":
+        return problem(400, "the request is empty, expected a JSON object")
+    if first["loc"][0] == "path":
+        return problem(404, f"instance {first['input'][:20]!r}: expected a whole number")
+    return problem(400, problem_line(error.errors()))
+
+
+_OURS = (InputError, OtherMap, EngineBusy, EngineClosed, AnswerTimeout)
+HANDLERS: dict[Any, Any] = dict.fromkeys((RequestValidationError, *_OURS, HTTPException, Exception), told)

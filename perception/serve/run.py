@@ -27,7 +27,7 @@ def serve(
     InputError when the map cannot be opened, the port is taken, or the packages of the extra `serve` are missing.
     say: told the address in one line once requests are accepted; by default standard error.
     """
-    for package in ("starlette", "uvicorn"):
+    for package in ("fastapi", "uvicorn"):
         if importlib.util.find_spec(package) is None:
             raise missing_extra(package, "serve")
     import uvicorn

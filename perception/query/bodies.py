@@ -1,0 +1,212 @@
+"""The JSON that servers are asked with, HTTP and DDS alike: pydantic models, and how each becomes a question.
+
+Numbers are finite and at most MAX_NUMBER in size, so that squares and products of lengths stay finite. Texts are
+Unicode; a lone surrogate is refused. What is null counts as not given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
+
+from perception.errors import InputError
+from perception.query.frames import Frame, scale_of
+from perception.query.regions import Prism, Region, axis_box
+from perception.query.requests import MAX_TEXT, MAX_TEXTS, MAX_TOP, Request
+from perception.query.where import Where
+from perception.types import OrientedBox
+
+MAX_NUMBER = 1e12
+"""Larger than any coordinate in millimetres on the earth."""
+MAX_SCALE = 1e9
+"""Of a frame against the map's, and its inverse the least."""
+_MAX_CORNERS = 1000
+
+Number = Annotated[float, Field(ge=-MAX_NUMBER, le=MAX_NUMBER)]
+Length = Annotated[float, Field(ge=0, le=MAX_NUMBER)]
+Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Rotation = Annotated[list[Point], Field(min_length=3, max_length=3)]
+Matrix = Annotated[list[Annotated[list[Number], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)]
+Text = Annotated[str, Field(max_length=MAX_TEXT)]  # the bound makes pydantic look at the characters: no lone surrogate
+Prompt = Annotated[str, Field(min_length=1, max_length=MAX_TEXT)]
+
+
+def _of_lists(value: Any) -> str:
+    """Which of the alternatives below a value is meant to be, so that the error is about that one."""
+    if isinstance(value, list):
+        return "nested" if value and isinstance(value[0], list) else "list"
+    return "single"
+
+
+Place = Annotated[
+    Annotated[Point, Tag("list")] | Annotated[Matrix, Tag("nested")],
+    Discriminator(lambda value: "nested" if _of_lists(value) == "nested" else "list"),
+]
+"""A point [3], or a pose [4, 4] whose origin counts."""
+Prompts = Annotated[
+    Annotated[Prompt, Tag("single")] | Annotated[list[Prompt], Field(min_length=1, max_length=MAX_TEXTS), Tag("list")],
+    Discriminator(lambda value: "list" if isinstance(value, list) else "single"),
+]
+Labels = Annotated[
+    Annotated[Text, Tag("single")] | Annotated[list[Text], Tag("list")],
+    Discriminator(lambda value: "list" if isinstance(value, list) else "single"),
+]
+
+
+class Body(BaseModel):
+    """No further fields, no conversions, no NaN and no infinity."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class CornersBody(Body):
+    """A box along the axes, by its lowest and highest corner."""
+
+    min: Point
+    max: Point
+
+    def region(self) -> Region:
+        return axis_box(self.min, self.max)
+
+
+class BoxBody(Body):
+    """A box of any orientation: the rows of `rotation` are its axes, `extent` its full side lengths."""
+
+    center: Point
+    extent: Annotated[list[Length], Field(min_length=3, max_length=3)]
+    rotation: Rotation | None = None
+
+    def region(self) -> Region:
+        rotation = np.eye(3) if self.rotation is None else np.array(self.rotation)
+        return OrientedBox(np.array(self.center), rotation, np.array(self.extent))
+
+
+class PrismBody(Body):
+    """The space over a polygon of x and y, between two heights."""
+
+    polygon: Annotated[
+        list[Annotated[list[Number], Field(min_length=2, max_length=2)]],
+        Field(min_length=3, max_length=_MAX_CORNERS),
+    ]
+    low: Number | None = None
+    high: Number | None = None
+
+    def region(self) -> Region:
+        low, high = (-np.inf if self.low is None else self.low), (np.inf if self.high is None else self.high)
+        return Prism(np.array(self.polygon), low, high)
+
+
+def _region_kind(value: Any) -> str:
+    keys = value if isinstance(value, dict) else ()
+    return "prism" if "polygon" in keys else "box" if "center" in keys or "extent" in keys else "corners"
+
+
+AnyRegion = Annotated[
+    Annotated[CornersBody, Tag("corners")] | Annotated[BoxBody, Tag("box")] | Annotated[PrismBody, Tag("prism")],
+    Discriminator(_region_kind),
+]
+
+
+class WhereBody(Body):
+    """The fields of `perception.query.Where`."""
+
+    region: AnyRegion | None = None
+    share: Annotated[float, Field(gt=0, le=1)] | None = None
+    near: Place | None = None
+    within: Length | None = None
+    min_size: Length | None = None
+    max_size: Length | None = None
+    labels: Labels | None = None
+
+    def where(self) -> Where:
+        """The filter; InputError for what only its parts together show, such as `within` without `near`."""
+        region = None if self.region is None else self.region.region()
+        share = 0.5 if self.share is None else self.share
+        near = None if self.near is None else np.array(self.near)
+        return Where(region, share, near, self.within, self.min_size, self.max_size, self.labels)
+
+
+class FrameBody(Body):
+    """A frame's name and its transform frame_from_map: a rotation, a scale and a translation."""
+
+    name: Text
+    from_map: Matrix
+
+    def frame(self) -> Frame:
+        frame = Frame(self.name, np.array(self.from_map))
+        if not 1 / MAX_SCALE <= scale_of(frame.from_map) <= MAX_SCALE:
+            raise InputError(f"frame: its scale is {scale_of(frame.from_map):g}, expected 1e-9 to 1e9")
+        return frame
+
+
+class FilteredBody(Body):
+    """What all questions share: a filter, and the frame that the question and its answer are in."""
+
+    where: WhereBody | None = None
+    frame: FrameBody | None = None
+
+    def asked_where(self) -> Where | None:
+        return None if self.where is None else self.where.where()
+
+    def asked_frame(self) -> Frame | None:
+        return None if self.frame is None else self.frame.frame()
+
+
+class QueryBody(FilteredBody):
+    """One prompt or several."""
+
+    text: Prompts
+    top_k: Annotated[int, Field(ge=1, le=MAX_TOP)] | None = None
+    min_score: Number | None = None
+
+    def requests(self) -> list[Request]:
+        """One a prompt."""
+        texts = self.text if isinstance(self.text, list) else [self.text]
+        where, frame, top_k = self.asked_where(), self.asked_frame(), self.top_k or 3
+        return [Request(text, top_k, self.min_score, where, frame) for text in texts]
+
+
+class FindBody(FilteredBody):
+    """All instances that fulfil a filter."""
+
+
+class NearestBody(FilteredBody):
+    """The instances nearest to a point, or to the origin of a pose."""
+
+    near: Place
+    top_k: Annotated[int, Field(ge=1, le=MAX_TOP)] | None = None
+
+
+class AtBody(Body):
+    """The instance that a point lies on."""
+
+    point: Point
+    max_distance: Length | None = None
+    frame: FrameBody | None = None
+
+    def asked_frame(self) -> Frame | None:
+        return None if self.frame is None else self.frame.frame()
+
+
+Model = TypeVar("Model", bound=Body)
+
+
+def parse(model: type[Model], value: Any) -> Model:
+    """`value`, which came as JSON, as a model; InputError with one line when it is none."""
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        raise InputError(problem_line(error.errors())) from error
+
+
+def problem_line(errors: Sequence[Any]) -> str:
+    """One of pydantic's errors as a line: where, what was expected, what was found. A misspelt field comes first."""
+    first = next((error for error in errors if error["type"] == "extra_forbidden"), errors[0])
+    tags = {"body", "query", "list", "nested", "single", "corners", "box", "prism"}
+    place = ".".join(str(part) for part in first["loc"] if part not in tags)
+    found = repr(first.get("input"))
+    expected = str(first["msg"]).removeprefix("Value error, ")
+    return f"{place[:80] or 'request'}: {expected[0].lower()}{expected[1:]}, found {found[:60]}"
