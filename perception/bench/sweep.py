@@ -126,7 +126,7 @@ class SweepScene:
 
         views, _ = split_views(self.scene().views, self.held_out_every)
         folder = self.work / f"{masks}-{max_side}"
-        source = make_source(f"labels:{self.root / masks}", cache_dir=self.work)
+        source = make_source(f"labels:{self.root / masks}")
         compute_masks(views, source, lambda view: load_photo(view, max_side), folder)
         decoded = self.photos(max_side)[0]
         return [with_labels(view, of, folder) for view, of in zip(decoded, views, strict=True)]

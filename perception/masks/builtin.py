@@ -1,4 +1,7 @@
-"""The segmentation that needs no weights: `builtin`, from the photo alone, or from all photos and their geometry."""
+"""`builtin`, the segmentation that needs no weights: depth by stereo, one surface out of it, its patches merged.
+
+Label ids agree between photos, since every photo shows the same segments of one surface.
+"""
 
 from __future__ import annotations
 
@@ -6,36 +9,39 @@ from collections.abc import Callable
 
 import numpy as np
 
-from perception.masks.regions import segment_photo
-from perception.masks.scene import SceneSegmentation
+from perception.errors import InputError
+from perception.masks.merging import segments
+from perception.masks.stereo import measure_depths
+from perception.masks.stereo_views import StereoView, make_stereo_view
+from perception.masks.surface import Surface, SurfaceBuilder, to_world, voxel_side
+from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.types import View
 
-VERSION = 6  # raised whenever the label images change, so that cached ones are made anew
+VERSION = 7  # raised whenever the label images change, so that cached ones are made anew
+_SMOOTH = 0.03  # of the depth: a pixel over which the surface jumps farther shows no surface
+_LEAST_VOXELS = 100
 
 
-class PhotoSegmentation:
-    """Regions that look like one object, each photo by itself: what the second round is measured against."""
-
-    def __init__(self) -> None:
-        self.name = "builtin:photos"
-        self.identity = f"builtin photos {VERSION}"
-
-    def check(self, views: list[View]) -> list[str]:
-        """Nothing can be wrong up front."""
-        return []
-
-    def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
-        """photo: [h, w, 3] uint8 RGB. Returns [h, w] int32, 0 = unlabelled."""
-        return segment_photo(photo)
-
-
-class BuiltinSegmentation(PhotoSegmentation):
-    """Once the map can say how far things are: whole objects in all photos together."""
+class BuiltinSegmentation:
+    """Whole objects in all photos together, once the map can tell about how far away things are."""
 
     def __init__(self) -> None:
+        import cv2
+
+        if not hasattr(cv2, "ximgproc"):
+            raise InputError(
+                f"--masks builtin: OpenCV {cv2.__version__} has no ximgproc, so another OpenCV package hides "
+                "opencv-contrib-python-headless; uninstall the other and install that one again"
+            )
         self.name = "builtin"
         self.identity = f"builtin {VERSION}"
-        self._scene: SceneSegmentation | None = None
+        self._views: dict[str, StereoView] = {}
+        self._surface: Surface | None = None
+        self._segment = np.zeros(0, np.int32)
+
+    def check(self, views: list[View]) -> list[str]:
+        """Nothing is known of the views before the survey."""
+        return []
 
     def survey(
         self,
@@ -44,10 +50,61 @@ class BuiltinSegmentation(PhotoSegmentation):
         load_depth: Callable[[View], np.ndarray],
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
-        """Segments the surface that all photos show together; load_depth gives [h, w] z-depths, 0 = none."""
-        self._scene = SceneSegmentation.of(views, load_photo, load_depth, progress)
+        """Segments the surface that all photos show together; load_depth gives [h, w] z-depths, 0 = none.
 
-    def label_image_with_geometry(self, view: View, photo: np.ndarray) -> np.ndarray:
-        """As label_image, after `survey`: ids agree between photos. A photo without depth is judged alone."""
-        labels = None if self._scene is None else self._scene.label_image(view, photo)
-        return segment_photo(photo) if labels is None else labels
+        Nothing is segmented where fewer than two photos have depth, or none agree on it.
+        """
+        made = [make_stereo_view(view, load_photo(view), load_depth(view)) for view in views]
+        found = [view for view in made if view is not None]
+        if len(found) < 2:
+            return
+        measure_depths(found, progress)
+        surface = fuse(found)
+        if len(surface) < _LEAST_VOXELS:
+            return
+        self._surface, self._segment = surface, segments(surface_graph(found, surface))
+        self._views = {view.name: view for view in found}
+
+    def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
+        """[H, W] int32 labels of `photo` [H, W, 3] after `survey`; all 0 for a photo that shows none of the surface."""
+        import cv2
+
+        if self._surface is None or view.name not in self._views:
+            return np.zeros(photo.shape[:2], np.int32)
+        labels = label_view(self._views[view.name], self._surface, self._segment)
+        return cv2.resize(labels, photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+
+
+def fuse(views: list[StereoView]) -> Surface:
+    """The surface that the confirmed pixels of all photos show."""
+    footprints = np.concatenate([(view.depth[::4, ::4] / view.K[0, 0]).ravel() for view in views])
+    builder = SurfaceBuilder(voxel_side(footprints))
+    for view in views:
+        photo, depth = view.cues()
+        builder.add(photo, depth, view.confirmed & (depth.step.max(axis=0) < _SMOOTH), view.world_from_camera)
+    return builder.build()
+
+
+def surface_graph(views: list[StereoView], surface: Surface) -> SurfaceGraph:
+    """Patches of the surface and what all photos say about their borders."""
+    edges = voxel_edges(surface)
+    graph = SurfaceGraph(surface, patches(surface, edges), edges)
+    for view in views:
+        photo, depth = view.cues()
+        voxel = surface.voxel_of(to_world(depth.points, view.world_from_camera))
+        graph.add(np.where(voxel >= 0, graph.patch[voxel], -1), photo, depth)
+    graph.link()
+    return graph
+
+
+def label_view(view: StereoView, surface: Surface, segment: np.ndarray) -> np.ndarray:
+    """[h, w] int32 segment of each pixel; pixels off the surface take the nearest segment in the image."""
+    from scipy.ndimage import distance_transform_edt
+
+    _, depth = view.cues()
+    voxel = surface.voxel_of(to_world(depth.points, view.world_from_camera))
+    labels = np.where(voxel >= 0, segment[voxel], 0)
+    if not labels.any():
+        return labels
+    nearest = distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
+    return labels[tuple(nearest)]

@@ -34,7 +34,7 @@ class MaskSource(Protocol):
 
 @runtime_checkable
 class GeometryMaskSource(MaskSource, Protocol):
-    """A source that does better once the map can say about how far away each pixel is."""
+    """A source that needs to know about how far away each pixel is: `survey` comes before `label_image`."""
 
     def survey(
         self,
@@ -46,28 +46,23 @@ class GeometryMaskSource(MaskSource, Protocol):
         """Looks at all photos together, once; load_depth: view -> [h, w] z-depth, 0 = none."""
         ...
 
-    def label_image_with_geometry(self, view: View, photo: np.ndarray) -> np.ndarray:
-        """As label_image, for one of the views surveyed."""
-        ...
 
-
-def make_source(spec: str, *, cache_dir: Path | None = None) -> MaskSource:
-    """`auto`, `builtin`, `builtin:photos`, `labels:DIR`, or `sam:PATH` (folder, encoder file, or `ENCODER,DECODER`).
+def make_source(spec: str) -> MaskSource:
+    """`auto`, `builtin`, `labels:DIR`, or `sam:PATH` (folder, encoder file, or `ENCODER,DECODER`).
 
     `auto` takes the SAM named by the environment variable PERCEPTION_SAM or by `masks.sam` in the user's
     configuration (`perception/config.toml` under XDG_CONFIG_HOME), or made the default by `perception models add
     --default`; else the built-in segmentation.
-    `builtin:photos` stops at the built-in segmentation's first round: every photo by itself, no geometry.
-    cache_dir: where a source may keep derived files; no source needs it today.
+    Files, signatures and packages are checked here, before any work; InputError names what is missing or wrong.
     """
     kind, _, argument = spec.partition(":")
     if kind == "auto" and not argument:
         configured = configured_sam()
         kind, argument = ("builtin", "") if configured is None else ("sam", configured)
-    if kind == "builtin" and argument in ("", "photos"):
-        from perception.masks.builtin import BuiltinSegmentation, PhotoSegmentation
+    if kind == "builtin" and not argument:
+        from perception.masks.builtin import BuiltinSegmentation
 
-        return PhotoSegmentation() if argument else BuiltinSegmentation()
+        return BuiltinSegmentation()
     if kind == "labels" and argument:
         from perception.masks.labels import LabelFolder
 
@@ -76,7 +71,7 @@ def make_source(spec: str, *, cache_dir: Path | None = None) -> MaskSource:
         from perception.masks.sam import SamSource
 
         return SamSource(argument)
-    raise InputError(f"--masks {spec}: expected auto, builtin, builtin:photos, sam:PATH or labels:DIR")
+    raise InputError(f"--masks {spec}: expected auto, builtin, sam:PATH or labels:DIR")
 
 
 def configured_sam() -> str | None:

@@ -1,70 +1,80 @@
-"""Depth of every photo from its neighbours: a plane sweep (Collins 1996) made whole by semi-global matching.
+"""Depth of every photo from its neighbours: a plane sweep (Collins 1996), smoothed by semi-global matching.
 
-A map half trained renders depth that explains colours, not surfaces: a wooden table becomes a thicket. Photos with
-known poses say more. Planes across the optical axis, evenly spaced in inverse depth, carry neighbouring photos into
-this one; zero-mean correlation says where they agree; Hirschmüller's (2008) recurrence along four directions chooses
-a smooth depth among the planes; what no neighbour confirms is left out.
+The depth that a half-trained map renders explains colours, not surfaces, so it serves as a prior only. Planes across
+the optical axis, evenly spaced in inverse depth, carry neighbouring photos into this one; zero-mean correlation says
+where they agree; Hirschmüller's (2008) recurrence along four directions chooses a smooth depth among the planes; depths
+that no neighbour confirms are left out.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from perception.masks.stereo_views import StereoView
+
 PLANES = 96
-SIDE = 320  # pixels of the long side, at which depth is matched
 NEIGHBOURS = 6
 _WINDOW = 7  # pixels a side, of the correlation
 _BEST = 2  # neighbours that must agree with a plane; the others may be hidden from what it shows
 _LITTLE, _LARGE = 0.06, 0.6  # cost of a step to the next plane, and to any other, where the photo is even
 _DOUBT = (0.02, 0.16)  # cost of every plane away from the depth known so far, and its limit
+_CONFIRMED = 2  # photos that must agree with a depth for it to shape the surface
 _AGREE = 0.03  # relative difference of depths that confirm each other
 
 
-@dataclass(frozen=True)
-class Eye:
-    """One photo at matching size. grey: [h, w] float32; K: [3, 3]; camera_from_world: [4, 4]; coarse: [h, w] the
-    depth known so far, 0 = none."""
+def measure_depths(views: list[StereoView], progress: Callable[[int, int], None] | None = None) -> None:
+    """Replaces the depths of all views by those of stereo, and says where other views confirm them."""
+    chosen = choose_neighbours(views)
 
-    grey: np.ndarray
-    K: np.ndarray
-    camera_from_world: np.ndarray
-    coarse: np.ndarray
+    def depth_of(i: int) -> np.ndarray:
+        return sweep(views[i], [views[j] for j in chosen[i]]) if chosen[i] else views[i].depth
 
-    @property
-    def center(self) -> np.ndarray:
-        """Where the camera is, [3] in the world."""
-        return -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
+    depths = []
+    pool = ThreadPoolExecutor(os.cpu_count())
+    try:
+        for done, depth in enumerate(pool.map(depth_of, range(len(views))), start=1):
+            depths.append(depth)
+            if progress is not None:
+                progress(done, len(views))
+    finally:
+        pool.shutdown(cancel_futures=True)  # Ctrl-C waits for the photos begun, not for all
+    for view, depth, near in zip(views, depths, chosen, strict=True):
+        if near:
+            agreeing, mean = confirmed(depth, view, [views[j] for j in near], [depths[j] for j in near])
+            view.depth, view.confirmed = mean, agreeing >= min(_CONFIRMED, len(near))
 
 
-def sweep(eye: Eye, others: list[Eye]) -> np.ndarray:
-    """[h, w] float32 depth of `eye` by its neighbours `others`; every pixel gets one."""
-    inverse = plane_depths(eye.coarse)
-    volume = matching_cost(eye, others, inverse)
-    expected = (1 / np.where(eye.coarse > 0, eye.coarse, np.inf) - inverse[0]) / (inverse[1] - inverse[0])
+def sweep(view: StereoView, others: list[StereoView]) -> np.ndarray:
+    """[h, w] float32 depth of `view` by its neighbours `others`; every pixel gets one."""
+    inverse = plane_depths(view.prior)
+    volume = matching_cost(view, others, inverse)
+    expected = (1 / np.where(view.prior > 0, view.prior, np.inf) - inverse[0]) / (inverse[1] - inverse[0])
     away = np.abs(expected[..., None] - np.arange(PLANES)).astype(np.float32)
-    volume += np.where(eye.coarse[..., None] > 0, np.minimum(_DOUBT[0] * away, _DOUBT[1]), 0).astype(np.float32)
-    total = semi_global(volume, eye.grey)
+    volume += np.where(view.prior[..., None] > 0, np.minimum(_DOUBT[0] * away, _DOUBT[1]), 0).astype(np.float32)
+    total = semi_global(volume, view.grey)
     return 1 / _between_planes(total, inverse)
 
 
-def plane_depths(coarse: np.ndarray) -> np.ndarray:
+def plane_depths(prior: np.ndarray) -> np.ndarray:
     """[PLANES] inverse depths, near to far, that cover the depths known so far with a margin."""
-    near, far = np.percentile(coarse[coarse > 0], [1, 99])
+    near, far = np.percentile(prior[prior > 0], [1, 99])
     return np.linspace(1 / (0.75 * near), 1 / (1.35 * far), PLANES).astype(np.float32)
 
 
-def matching_cost(eye: Eye, others: list[Eye], inverse: np.ndarray) -> np.ndarray:
+def matching_cost(view: StereoView, others: list[StereoView], inverse: np.ndarray) -> np.ndarray:
     """[h, w, PLANES] float32 in [0, 1]: half of one minus the mean of the best correlations with `others`."""
     import cv2
 
-    h, w = eye.grey.shape
+    h, w = view.grey.shape
     volume = np.empty((h, w, len(inverse)), np.float32)
     box = (_WINDOW, _WINDOW)
-    mean = cv2.blur(eye.grey, box)
-    deviation = np.sqrt(np.maximum(cv2.blur(eye.grey * eye.grey, box) - mean * mean, 0)) + 1.0
-    warps = [homographies(eye, other) for other in others]
+    mean = cv2.blur(view.grey, box)
+    deviation = np.sqrt(np.maximum(cv2.blur(view.grey * view.grey, box) - mean * mean, 0)) + 1.0
+    warps = [homographies(view, other) for other in others]
     for plane, one_over_z in enumerate(inverse):
         scores = np.empty((len(others), h, w), np.float32)
         for score, other, (still, moving) in zip(scores, others, warps, strict=True):
@@ -74,7 +84,7 @@ def matching_cost(eye: Eye, others: list[Eye], inverse: np.ndarray) -> np.ndarra
             )  # fmt: skip
             seen_mean = cv2.blur(seen, box)
             spread = np.sqrt(np.maximum(cv2.blur(seen * seen, box) - seen_mean * seen_mean, 0)) + 1.0
-            score[:] = (cv2.blur(seen * eye.grey, box) - seen_mean * mean) / (spread * deviation)
+            score[:] = (cv2.blur(seen * view.grey, box) - seen_mean * mean) / (spread * deviation)
             score[seen_mean < 0] = 0.0  # beyond the picture: no word either way
         best = min(_BEST, len(others))
         chosen = np.partition(scores, len(others) - best, axis=0)[-best:]
@@ -82,13 +92,13 @@ def matching_cost(eye: Eye, others: list[Eye], inverse: np.ndarray) -> np.ndarra
     return volume
 
 
-def homographies(eye: Eye, other: Eye) -> tuple[np.ndarray, np.ndarray]:
-    """(A, B) such that A + B / z carries pixels of `eye` to `other` for the plane at depth z; pixel centres at +0.5."""
-    other_from_eye = other.camera_from_world @ np.linalg.inv(eye.camera_from_world)
+def homographies(view: StereoView, other: StereoView) -> tuple[np.ndarray, np.ndarray]:
+    """(A, B): A + B / z carries pixels of `view` to `other` for the plane at depth z; pixel centres at +0.5."""
+    other_from_view = other.camera_from_world @ np.linalg.inv(view.camera_from_world)
     half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])  # OpenCV counts pixel centres from 0
-    inverse_K = np.linalg.inv(half @ eye.K)
-    still = half @ other.K @ other_from_eye[:3, :3] @ inverse_K
-    moving = half @ other.K @ np.outer(other_from_eye[:3, 3], [0, 0, 1.0]) @ inverse_K
+    inverse_K = np.linalg.inv(half @ view.K)
+    still = half @ other.K @ other_from_view[:3, :3] @ inverse_K
+    moving = half @ other.K @ np.outer(other_from_view[:3, 3], [0, 0, 1.0]) @ inverse_K
     return still, moving
 
 
@@ -122,16 +132,16 @@ def _between_planes(total: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     return inverse[best[..., 0]] + shift * (inverse[1] - inverse[0])
 
 
-def choose_neighbours(eyes: list[Eye]) -> list[list[int]]:
+def choose_neighbours(views: list[StereoView]) -> list[list[int]]:
     """Of each photo, up to NEIGHBOURS others that together see what it sees, from helpful angles (5° to 25°)."""
     chosen: list[list[int]] = []
-    for i, eye in enumerate(eyes):
-        points = _sample(eye)
-        useful = np.stack([_usefulness(eye, other, points) for other in eyes])
+    for i, view in enumerate(views):
+        points = _sample(view)
+        useful = np.stack([_usefulness(view, other, points) for other in views])
         useful[i] = 0
         first = second = np.zeros(len(points))  # how well the best two so far serve each point
         found: list[int] = []
-        while len(found) < min(NEIGHBOURS, len(eyes) - 1):
+        while len(found) < min(NEIGHBOURS, len(views) - 1):
             gain = np.maximum(useful, first) + np.clip(np.minimum(useful, first), second, None) - first - second
             gain = gain.mean(axis=1)
             gain[found] = -1
@@ -145,23 +155,23 @@ def choose_neighbours(eyes: list[Eye]) -> list[list[int]]:
     return chosen
 
 
-def _sample(eye: Eye, every: int = 24) -> np.ndarray:
+def _sample(view: StereoView, every: int = 24) -> np.ndarray:
     """[P, 3] world points of a coarse grid of pixels."""
-    y, x = np.mgrid[every // 2 : eye.coarse.shape[0] : every, every // 2 : eye.coarse.shape[1] : every]
-    z = eye.coarse[y, x]
-    rays = np.stack([x + 0.5, y + 0.5, np.ones(x.shape)], axis=-1) @ np.linalg.inv(eye.K).T
+    y, x = np.mgrid[every // 2 : view.prior.shape[0] : every, every // 2 : view.prior.shape[1] : every]
+    z = view.prior[y, x]
+    rays = np.stack([x + 0.5, y + 0.5, np.ones(x.shape)], axis=-1) @ np.linalg.inv(view.K).T
     points = (rays * z[..., None])[z > 0]
-    return (points - eye.camera_from_world[:3, 3]) @ eye.camera_from_world[:3, :3]
+    return (points - view.camera_from_world[:3, 3]) @ view.camera_from_world[:3, :3]
 
 
-def _usefulness(eye: Eye, other: Eye, points: np.ndarray) -> np.ndarray:
+def _usefulness(view: StereoView, other: StereoView, points: np.ndarray) -> np.ndarray:
     """[P] in [0, 1]: whether `other` sees each of `points`, weighted by how well the angle between the rays suits."""
     local = points @ other.camera_from_world[:3, :3].T + other.camera_from_world[:3, 3]
     z = np.maximum(local[:, 2], 1e-9)
     pixel = local @ other.K.T / z[:, None]
     h, w = other.grey.shape
     inside = (local[:, 2] > 0) & (pixel[:, 0] > 0) & (pixel[:, 1] > 0) & (pixel[:, 0] < w) & (pixel[:, 1] < h)
-    a, b = points - eye.center, points - other.center
+    a, b = points - view.center, points - other.center
     cosine = (a * b).sum(axis=1) / np.maximum(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1), 1e-12)
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     width = np.where(angle < 12, 5.0, 10.0)
@@ -171,13 +181,13 @@ def _usefulness(eye: Eye, other: Eye, points: np.ndarray) -> np.ndarray:
 
 
 def confirmed(
-    depth: np.ndarray, eye: Eye, others: list[Eye], their_depths: list[np.ndarray]
+    depth: np.ndarray, view: StereoView, others: list[StereoView], their_depths: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """How many of `others` agree with each depth, [h, w] int32, and the mean [h, w] of what those and it say."""
     h, w = depth.shape
     y, x = np.mgrid[:h, :w]
-    rays = np.stack([x + 0.5, y + 0.5, np.ones((h, w))], axis=-1) @ np.linalg.inv(eye.K).T
-    world = (rays * depth[..., None] - eye.camera_from_world[:3, 3]) @ eye.camera_from_world[:3, :3]
+    rays = np.stack([x + 0.5, y + 0.5, np.ones((h, w))], axis=-1) @ np.linalg.inv(view.K).T
+    world = (rays * depth[..., None] - view.camera_from_world[:3, 3]) @ view.camera_from_world[:3, :3]
     count, ratios = np.zeros((h, w), np.int32), np.ones((h, w))
     for other, theirs in zip(others, their_depths, strict=True):
         local = world @ other.camera_from_world[:3, :3].T + other.camera_from_world[:3, 3]

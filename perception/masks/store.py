@@ -37,25 +37,24 @@ def compute_masks(
     """Writes the label image of every view below `folder`, skipping those already there; returns a report.
 
     load_photo: view -> [h, w, 3] uint8 RGB, undistorted. progress(done, total) is called after every photo.
-    load_depth: view -> [h, w] z-depth, 0 = none: the second round, for sources that know what to do with it
-    (GeometryMaskSource; others are asked as before). depth_key: changes whenever the depth does.
+    load_depth: view -> [h, w] z-depth, 0 = none, needed by a GeometryMaskSource. depth_key: changes whenever the depth
+    does.
     Report: source, identity, photos, skipped, seconds, masks (mean per photo), empty (names), warnings.
     """
     warnings = source.check(views)
     start, skipped, empty, counts = perf_counter(), 0, [], []
-    seen: GeometryMaskSource | None = None
-    if load_depth is not None and isinstance(source, GeometryMaskSource):
-        seen = source
+    if isinstance(source, GeometryMaskSource):
+        if load_depth is None:
+            raise ValueError(f"masks from {source.name} need load_depth")
         if any(stored_key(label_file(folder, view)) != _key(view, source, depth_key) for view in views):
-            seen.survey(views, load_photo, load_depth, progress)
+            source.survey(views, load_photo, load_depth, progress)
     for done, view in enumerate(views, start=1):
         key, file = _key(view, source, depth_key), label_file(folder, view)
         if stored_key(file) == key:
             labels = load_labels(folder, view)
             skipped += 1
         else:
-            photo = load_photo(view)
-            labels = source.label_image(view, photo) if seen is None else seen.label_image_with_geometry(view, photo)
+            labels = source.label_image(view, load_photo(view))
             write_labels(file, labels, key)
         counts.append(len(np.setdiff1d(labels, [0])))
         if not labels.any():

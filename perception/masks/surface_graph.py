@@ -1,7 +1,7 @@
 """A graph of patches of the scene's surface, with the evidence of all photos for and against their being one object.
 
-Everything a decision needs is a sum over pixels, border pixels or voxels, so a merged patch's evidence is the sum of
-its parts' and never goes stale. The convexity of patches follows Stein et al. 2014; what the shape of two together
+Everything a decision needs is a sum over pixels, border pixels or voxels, so the evidence of a merged patch is the sum
+of that of its parts. The convexity of patches follows Stein et al. 2014; what the shape of two together
 tells (two mugs side by side are longer than either, a box's side and its top are not) is our own.
 """
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from perception import _core
 from perception.masks.cues import COLOUR_WORDS, DepthCues, PhotoCues
-from perception.masks.region_graph import join, neighbours
 from perception.masks.surface import Surface
 
 FEATURES = 35
@@ -108,7 +107,7 @@ class SurfaceGraph:
         self.contacts = np.array([sum(row[_CONTACT] for row in links.values()) for links in self.borders])
 
     def size(self, patch: int) -> float:
-        """For choosing which of two survives."""
+        """Voxels."""
         return float(self.sums[patch, _VOXELS])
 
     def features(self, a: int, others: list[int]) -> np.ndarray:
@@ -165,7 +164,7 @@ class SurfaceGraph:
         """Mean depth at which the photos show it."""
         return float(self.sums[a, _DEPTH] / max(self.sums[a, _AREA], 1))
 
-    def share(self, a: int) -> float:
+    def area(self, a: int) -> float:
         """Area in squared distances that it was photographed from."""
         return float(self.sums[a, _VOXELS] * self.unit / max(self.depth(a), 1e-9) ** 2)
 
@@ -188,14 +187,21 @@ class SurfaceGraph:
         words = (self.sums[i, _WORDS] / max(self.sums[i, _AREA], 1) for i in (a, b))
         return bool(np.minimum(*words).sum() > _ALIKE)
 
-    def negligible(self, a: int, smallest: float) -> bool:
-        """Smaller than `smallest`, in shares of the squared distance it was photographed from."""
-        return self.share(a) < smallest
-
     def merge(self, a: int, b: int) -> None:
-        """b becomes part of a."""
+        """Patch b becomes part of patch a: sums and borders of b are added to those of a, in place."""
         self.contacts[a] += self.contacts[b] - 2 * self.borders[a].pop(b)[_CONTACT]
-        join(self.sums, self.borders, a, b)
+        self.sums[a] += self.sums[b]
+        for other, row in self.borders[b].items():
+            if other != a:
+                del self.borders[other][b]
+                total = self.borders[a][other] + row if other in self.borders[a] else row
+                self.borders[a][other] = self.borders[other][a] = total
+        self.borders[b] = {}
+
+
+def neighbours(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Each pixel and its right (axis 0) or lower (axis 1) neighbour."""
+    return (image[:, :-1], image[:, 1:]) if axis == 0 else (image[:-1], image[1:])
 
 
 def _surface_features(shape_a: np.ndarray, shape_b: np.ndarray, depth: np.ndarray) -> list[np.ndarray]:

@@ -105,7 +105,7 @@ def _build(
     _tell_scene(scene, progress)
     training, held_out = split_views(scene.views, config.photos.holdout, config.photos.held_out)
 
-    source_of_masks = make_source(config.masks, cache_dir=work)
+    source_of_masks = make_source(config.masks)
     with stages("photos"):
         views = _photos(training, config, progress)
         held = _photos(held_out, config, progress)

@@ -1,77 +1,335 @@
-"""The built-in segmentation on known pictures."""
+"""The built-in segmentation of whole scenes, on surfaces whose depth, normals and parts are known exactly."""
 
 from __future__ import annotations
+
+import functools
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from perception.errors import InputError
-from perception.masks import make_source
-from perception.masks.cues import photo_cues
-from perception.masks.region_graph import RegionGraph
-from perception.masks.regions import segment_photo
-from perception.masks.source import GeometryMaskSource
+from perception.masks import GeometryMaskSource, compute_masks, load_labels, make_source
+from perception.masks.builtin import fuse, surface_graph
+from perception.masks.cues import depth_cues
+from perception.masks.stereo import confirmed, homographies, measure_depths, plane_depths, semi_global
+from perception.masks.stereo_views import StereoView, make_stereo_view
+from perception.masks.surface import joined, parted, to_world, voxel_keys
+from perception.masks.surface_graph import SurfaceGraph, voxel_edges
+from perception.types import View
 from support.mask_scores import best_ious
 
-
-def disc_and_box(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """A red disc and a blue box on grey, with noise: [120, 160, 3] uint8 and the truth [120, 160]."""
-    y, x = np.mgrid[:120, :160]
-    truth = np.zeros((120, 160), int)
-    truth[(x - 45) ** 2 + (y - 60) ** 2 < 30**2] = 1
-    truth[30:90, 95:140] = 2
-    colours = np.array([[150, 150, 150], [190, 40, 40], [40, 60, 180]])
-    noisy = colours[truth] + np.random.default_rng(seed).normal(0, 4, (120, 160, 3))
-    return noisy.clip(0, 255).astype(np.uint8), truth
+K = np.array([[150.0, 0.0, 80.0], [0.0, 150.0, 60.0], [0.0, 0.0, 1.0]])
+LOW, HIGH = np.array([-0.3, 1.0, 0.0]), np.array([0.3, 1.5, 0.45])  # the box
+WALL = 2.4  # y of the wall; the floor is z = 0
+EYES = [
+    (x, y, z) for z in (0.9, 1.15) for x, y in ((-0.5, -0.25), (-0.25, 0.0), (0.0, -0.1), (0.25, 0.0), (0.5, -0.25))
+]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_flat_objects_are_found_whole(seed):
-    photo, truth = disc_and_box(seed)
-    labels = segment_photo(photo)
-    assert labels.dtype == np.int32 and labels.shape == truth.shape
-    assert (best_ious(labels, truth + 1) > 0.9).all() and len(np.unique(labels)) <= 8
+@pytest.fixture(autouse=True)
+def matched_as_they_are(monkeypatch):
+    """The photos are small; making them larger for stereo would only cost time."""
+    monkeypatch.setattr("perception.masks.stereo_views.SIDE", 160)
 
 
-def test_an_even_photo_is_one_region():
-    labels = segment_photo(np.full((60, 80, 3), 128, np.uint8))
-    assert len(np.unique(labels)) == 1
+def camera_from_world(eye: np.ndarray) -> np.ndarray:
+    """A camera at `eye` that looks at the box, z up."""
+    forward = np.array([0.0, 1.4, 0.2]) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
+    return pose
 
 
-def test_the_same_photo_gives_the_same_labels():
-    photo, _ = disc_and_box(3)
-    np.testing.assert_array_equal(segment_photo(photo), segment_photo(photo.copy()))
+def cast(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """z-depth [120, 160], ids (1 floor, 2 wall, 3 box) and world points [120, 160, 3] by ray casting."""
+    y, x = np.mgrid[:120, :160] + 0.5
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1) @ pose[:3, :3]
+    eye = -pose[:3, :3].T @ pose[:3, 3]
+    with np.errstate(divide="ignore"):
+        floor = np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], np.inf)
+        wall = (WALL - eye[1]) / rays[..., 1]
+        sides = np.stack([(LOW - eye) / rays, (HIGH - eye) / rays])
+    enter, leave = sides.min(axis=0).max(axis=-1), sides.max(axis=0).min(axis=-1)
+    depths = np.stack([floor, wall, np.where((enter < leave) & (enter > 0), enter, np.inf)])
+    z = depths.min(axis=0)
+    return z, depths.argmin(axis=0) + 1, eye + rays * z[..., None]
 
 
-def test_merging_keeps_the_evidence_exact():
-    """After merging, all sums equal those of a graph built from the merged picture."""
-    rng = np.random.default_rng(0)
-    regions = np.kron(np.arange(30).reshape(5, 6), np.ones((24, 27), int))[:120, :160]
-    photo = photo_cues(rng.integers(0, 256, (120, 160, 3)).astype(np.uint8))
-    graph = RegionGraph(regions, photo)
-    for _ in range(15):
-        a = int(rng.choice([i for i in range(30) if graph.borders[i]]))
-        b = int(rng.choice(list(graph.borders[a])))
-        graph.merge(a, b)
-        regions = np.where(regions == b, a, regions)
-    kept, dense = np.unique(regions, return_inverse=True)
-    fresh = RegionGraph(dense.reshape(regions.shape), photo)
-    np.testing.assert_allclose(graph.sums[kept], fresh.sums)
+def painted(points: np.ndarray, ids: np.ndarray) -> np.ndarray:
+    """Photo [h, w, 3] uint8: a speckle fixed to the surface, and for each part a tint of its own."""
+    waves = np.random.default_rng(5).normal(0, 1, (40, 3)) * np.geomspace(15, 110, 40)[:, None]
+    speckle = np.cos(points @ waves.T + np.arange(40)).sum(axis=-1) * 6
+    tint = np.array([[0, 0, 0], [150, 140, 120], [120, 140, 150], [150, 90, 80]])[ids]
+    return (tint + speckle[..., None]).clip(0, 255).astype(np.uint8)
+
+
+@functools.cache
+def world() -> list[tuple[View, np.ndarray, np.ndarray, np.ndarray]]:
+    """(view, photo, depth, ids) of ten photos of a speckled box before a wall, on a floor."""
+    photos = []
+    for i, eye in enumerate(EYES):
+        pose = camera_from_world(np.array(eye))
+        depth, ids, points = cast(pose)
+        photos.append((View(f"{i}.jpg", Path(f"{i}.jpg"), K, 160, 120, pose), painted(points, ids), depth, ids))
+    return photos
+
+
+def rough(depth: np.ndarray, seed: int) -> np.ndarray:
+    """A depth that is wrong by 8 % everywhere, in waves."""
+    y, x = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    return depth * (1 + 0.08 * np.sign(np.sin(x / 7 + seed) * np.cos(y / 9)))
+
+
+def stereo_views() -> list[StereoView]:
+    made = [make_stereo_view(view, photo, rough(depth, i)) for i, (view, photo, depth, _) in enumerate(world())]
+    return [shown for shown in made if shown is not None]
+
+
+def test_stereo_finds_the_depth_that_the_map_has_wrong():
+    found = stereo_views()
+    measure_depths(found)
+    errors, sure = [], []
+    for shown, (_, _, depth, _) in zip(found, world(), strict=True):
+        error = np.abs(shown.depth / depth - 1)
+        errors.append(error[shown.confirmed])
+        sure.append(shown.confirmed.mean())
+    error = np.concatenate(errors)
+    assert np.mean(sure) > 0.6
+    assert np.median(error) < 0.01 and np.quantile(error, 0.9) < 0.03  # it began at 0.08
+
+
+def bare_view(pose: np.ndarray) -> StereoView:
+    """A camera without a photo."""
+    none = np.zeros((120, 160), np.float32)
+    return StereoView("", none, none, K, pose, none, none, none > 0)
+
+
+def test_homography_carries_points_of_its_plane():
+    a, b = (np.array(EYES[i]) for i in (0, 3))
+    eyes = [bare_view(camera_from_world(e)) for e in (a, b)]
+    still, moving = homographies(*eyes)
+    pixel, z = np.array([33.5, 71.5, 1.0]), 1.7
+    local = np.linalg.inv(K) @ pixel * z
+    world_point = eyes[0].camera_from_world[:3, :3].T @ (local - eyes[0].camera_from_world[:3, 3])
+    seen = K @ (eyes[1].camera_from_world[:3, :3] @ world_point + eyes[1].camera_from_world[:3, 3])
+    carried = (still + moving / z) @ (pixel - [0.5, 0.5, 0])
+    np.testing.assert_allclose(carried[:2] / carried[2] + 0.5, seen[:2] / seen[2])
+
+
+def test_semi_global_costs_against_brute_force():
+    """One row of pixels, all ways through it tried: the cheapest way that ends in each pixel at each plane."""
+    rng = np.random.default_rng(2)
+    volume = rng.random((1, 5, 4)).astype(np.float32)
+    total = semi_global(volume, np.zeros((1, 5), np.float32))
+    little, large = 0.06, 0.6
+
+    def cheapest(costs: np.ndarray) -> np.ndarray:
+        steps = np.abs(np.arange(4)[:, None] - np.arange(4))
+        price = np.where(steps == 0, 0, np.where(steps == 1, little, large))
+        way, ways = costs[0].astype(float), [costs[0]]
+        for cost in costs[1:]:
+            way = cost + (way[None] + price).min(axis=1) - way.min()
+            ways.append(way)
+        return np.stack(ways)
+
+    row = volume[0]
+    expected = cheapest(row) + cheapest(row[::-1])[::-1] + 2 * row  # up and down there is nothing but the pixel itself
+    np.testing.assert_allclose(total[0], expected, atol=1e-5)
+
+
+def test_depths_confirm_each_other_only_where_they_agree():
+    view, _, depth, _ = world()[2]
+    other, _, theirs, _ = world()[3]
+    eyes = [bare_view(v.camera_from_world) for v in (view, other)]
+    count, mean = confirmed(depth, eyes[0], eyes[1:], [theirs])
+    assert count.max() == 1 and count.mean() > 0.8
+    np.testing.assert_allclose(mean[count == 1], depth[count == 1], rtol=0.031)
+    assert confirmed(depth * 1.2, eyes[0], eyes[1:], [theirs])[0].mean() < 0.1
+
+
+def test_planes_cover_the_depths_known():
+    inverse = plane_depths(np.array([[0.0, 1.0], [2.0, 4.0]]))
+    assert 1 / inverse[0] < 1 and 1 / inverse[-1] > 4 and (np.diff(inverse) < 0).all()
+
+
+def test_voxel_keys_tell_voxels_apart():
+    points = np.random.default_rng(0).normal(0, 3, (500, 3))
+    cells = np.floor(points / 0.25).astype(np.int64)
+    keys = voxel_keys(points, 0.25)
+    np.testing.assert_array_equal(parted(keys), cells)
+    np.testing.assert_array_equal(joined(cells), keys)
+    assert len(np.unique(keys)) == len(np.unique(cells, axis=0))
+
+
+def true_views() -> list[StereoView]:
+    """As stereo_views(), but with true depth."""
+    made = [make_stereo_view(view, photo, depth) for view, photo, depth, _ in world()]
+    return [shown for shown in made if shown is not None]
+
+
+def test_fused_surface_lies_on_the_parts():
+    surface = fuse(true_views())
+    p = surface.points.astype(float)
+    outside = np.maximum(np.maximum(LOW - p, p - HIGH), 0)
+    within = np.minimum(p - LOW, HIGH - p).min(axis=1)
+    box = np.where(within > 0, within, np.linalg.norm(outside, axis=1))
+    distance = np.minimum(np.minimum(np.abs(p[:, 2]), np.abs(p[:, 1] - WALL)), box)
+    assert np.quantile(distance, 0.95) < surface.size
+    floor = (np.abs(p[:, 2]) < 0.01) & (box > 0.1) & (p[:, 1] < WALL - 0.1)
+    assert (surface.normals[floor] @ [0, 0, 1] > 0.98).mean() > 0.95
+    np.testing.assert_array_equal(surface.voxel_of(p[:50]), np.arange(50))
+    assert surface.voxel_of(np.array([[50.0, 50, 50]])).tolist() == [-1]
+
+
+def test_merging_patches_keeps_the_evidence_exact():
+    """After merging, all sums equal those of a graph built from the merged patches."""
+    seen = true_views()[:3]
+    surface = fuse(seen)
+    edges = voxel_edges(surface)
+    first = surface_graph(seen, surface)
+
+    def graph_of(patch: np.ndarray) -> SurfaceGraph:
+        graph = SurfaceGraph(surface, patch, edges)
+        for shown in seen:
+            photo, depth = shown.cues()
+            voxel = surface.voxel_of(to_world(depth.points, shown.world_from_camera))
+            graph.add(np.where(voxel >= 0, patch[voxel], -1), photo, depth)
+        graph.link()
+        return graph
+
+    rng, patch = np.random.default_rng(1), first.patch.copy()
+    for _ in range(first.count // 2):
+        a = int(rng.choice([i for i in range(first.count) if first.borders[i]]))
+        b = int(rng.choice(list(first.borders[a])))
+        first.merge(a, b)
+        patch[patch == b] = a
+    kept, dense = np.unique(patch, return_inverse=True)
+    fresh = graph_of(dense.astype(np.int32))
+    np.testing.assert_allclose(first.sums[kept], fresh.sums, atol=1e-6)
+    compared = 0
     for i, a in enumerate(kept):
-        others = [int(kept[j]) for j in fresh.borders[i]]
-        assert sorted(others) == sorted(graph.borders[a])
-        if others:
-            expected = fresh.features(i, list(fresh.borders[i]))
-            np.testing.assert_allclose(graph.features(int(a), others), expected, atol=1e-9)
+        for j in fresh.borders[i]:
+            old, new = (g.features(*pair)[0] for g, pair in ((first, (int(a), [int(kept[j])])), (fresh, (i, [j]))))
+            contact = [9, 10]  # contacts that no photo shows are forgotten
+            np.testing.assert_allclose(np.delete(old, contact), np.delete(new, contact), atol=1e-6)
+            np.testing.assert_allclose(old[contact], new[contact], atol=0.1)
+            compared += 1
+    assert compared > 3
 
 
-def test_the_first_round_alone_judges_each_photo_by_itself() -> None:
-    """`builtin:photos` never asks for geometry, and labels a photo as the default does before there is any."""
-    first, both = make_source("builtin:photos"), make_source("builtin")
-    assert not isinstance(first, GeometryMaskSource) and isinstance(both, GeometryMaskSource)
-    assert first.identity != both.identity
-    photo = np.zeros((60, 80, 3), np.uint8)
-    photo[:, 40:] = 200
-    np.testing.assert_array_equal(first.label_image(None, photo), both.label_image(None, photo))  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="builtin:photos"):
-        make_source("builtin:other")
+def test_growth_of_a_union_against_its_voxels():
+    """The last features of a pair, from the voxels themselves: extents by singular values, not from sums of squares."""
+    seen = true_views()[:3]
+    surface = fuse(seen)
+    graph = surface_graph(seen, surface)
+    compared = 0
+    for a, links in enumerate(graph.borders):
+        for b in links:
+            one, two = (surface.points[graph.patch == i].astype(np.float64) for i in (a, b))
+            larger, smaller = (one, two) if len(one) > len(two) else (two, one)
+            if len(smaller) < 12:
+                continue
+            pixels, depths = graph.sums[[a, b], 0], graph.sums[[a, b], 5]
+            depth, least = depths.sum() / pixels.sum(), surface.size / 4
+
+            def extent(points: np.ndarray, least: float = least) -> np.ndarray:
+                centred = points - points.mean(axis=0)
+                spread = np.linalg.svd(centred, compute_uv=False)[::-1] / np.sqrt(len(points))
+                return np.maximum(spread, least)
+
+            chord = two.mean(axis=0) - one.mean(axis=0)
+            chord /= (distance := np.linalg.norm(chord))
+            along = max((one @ chord).std(), least) + max((two @ chord).std(), least)
+            union, big, small = (extent(points) for points in (np.concatenate([one, two]), larger, smaller))
+            expected = [
+                distance / along,
+                *np.log(union / big),
+                *np.log(big / depth),
+                *np.log(small / depth),
+                np.log(union.prod() / (big.prod() + small.prod())),
+            ]
+            np.testing.assert_allclose(graph.features(a, [b])[0, -11:], expected, atol=1e-4)  # points are float32
+            compared += 1
+    assert compared > 20
+
+
+def test_box_floor_and_wall_are_one_segment_each_in_all_photos(tmp_path):
+    """Through the store, with rough depth, in millimetres: whole parts, and the same ids in every photo."""
+    unit = 1000.0
+    source = make_source("builtin")
+    assert isinstance(source, GeometryMaskSource)
+    photos, depths, views = {}, {}, []
+    for i, (view, photo, depth, _) in enumerate(world()):
+        pose = view.camera_from_world.copy()
+        pose[:3, 3] *= unit
+        views.append(View(view.name, view.photo, K, 160, 120, pose))
+        photos[view.name], depths[view.name] = photo, unit * rough(depth, i)
+    report = compute_masks(
+        views, source, lambda v: photos[v.name], tmp_path, load_depth=lambda v: depths[v.name], depth_key="rough"
+    )
+    assert report["empty"] == [] and report["masks"] <= 8
+    names = []
+    for view, (_, _, _, ids) in zip(views, world(), strict=True):
+        labels = load_labels(tmp_path, view)
+        assert best_ious(labels, ids).mean() > 0.8
+        names.append([np.bincount(labels[ids == part]).argmax() for part in (1, 2, 3)])
+    assert len({tuple(n) for n in names}) == 1 and len(set(names[0])) == 3
+
+
+def test_photos_without_depth_stay_unlabelled(tmp_path):
+    views = [world()[0][0]]
+    report = compute_masks(
+        views,
+        make_source("builtin"),
+        lambda v: world()[0][1],
+        tmp_path,
+        load_depth=lambda v: np.zeros((120, 160)),
+        depth_key="0",
+    )
+    assert report["empty"] == ["0.jpg"] and not load_labels(tmp_path, views[0]).any()
+
+
+def test_an_opencv_without_ximgproc_is_told_at_once(monkeypatch):
+    import cv2
+
+    monkeypatch.delattr(cv2, "ximgproc")
+    with pytest.raises(InputError, match="opencv-contrib-python-headless"):
+        make_source("builtin")
+
+
+def test_a_photo_that_sees_another_place_spoils_no_other(tmp_path):
+    views = [view for view, *_ in world()]
+    away = np.eye(4)
+    away[:3, 3] = 500.0
+    views[4] = View("4.jpg", Path("4.jpg"), K, 160, 120, away)
+    photos, depths = ({v.name: x[i] for v, x in zip(views, world(), strict=True)} for i in (1, 2))
+    report = compute_masks(
+        views,
+        make_source("builtin"),
+        lambda v: photos[v.name],
+        tmp_path,
+        load_depth=lambda v: depths[v.name],
+        depth_key="1",
+    )
+    assert report["photos"] == 10 and report["empty"] == []
+    assert best_ious(load_labels(tmp_path, views[0]), world()[0][3]).mean() > 0.6
+
+
+def test_normals_and_creases_of_known_surfaces():
+    pose = camera_from_world(np.array(EYES[2]))
+    depth, ids, points = cast(pose)
+    cues = depth_cues(depth, K)
+    far = np.maximum(LOW - points, points - HIGH).max(axis=-1) > 0.1  # from the box
+    floor = cues.normals[(ids == 1) & far & (points[..., 1] < WALL - 0.3)] @ pose[:3, :3]
+    np.testing.assert_allclose(np.median(floor, axis=0), [0, 0, 1], atol=0.02)
+    column = 5
+    crease = int(np.argmax(ids[:, column] == 1))  # where the wall meets the floor, concave
+    assert cues.bend[1, crease, column] < -0.5 and abs(cues.bend[1, crease + 20, column]) < 0.05
+    box = np.flatnonzero(ids[:, 80] == 3)[8:-8]
+    bent = box[np.abs(cues.bend[1, box, 80]) > 0.5]
+    assert len(bent) and (cues.bend[1, bent, 80] > 0).all()  # top and front of the box, convex

@@ -130,7 +130,9 @@ def test_subfolders_keep_equal_stems_apart(tmp_path):
     assert [source.label_image(v, photo(v))[0, 0] for v in views] == [1, 2]
 
 
-@pytest.mark.parametrize("spec", ["", "labels:", "sam:", "builtin:x", "auto:x", "nonsense", "labels:/no/such/folder"])
+@pytest.mark.parametrize(
+    "spec", ["", "labels:", "sam:", "builtin:photos", "auto:x", "nonsense", "labels:/no/such/folder"]
+)
 def test_bad_specifications(spec):
     with pytest.raises(InputError):
         make_source(spec)

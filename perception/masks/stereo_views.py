@@ -1,0 +1,63 @@
+"""Photos at the size at which depth is matched, with their cameras and their depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perception.masks.cues import DepthCues, PhotoCues, depth_cues, filled_depth, photo_cues
+from perception.types import View
+
+SIDE = 320  # pixels of the long side, at which depth is matched
+_LEAST_DEPTH = 0.05  # share of a photo's pixels that must have depth for it to take part
+
+
+@dataclass
+class StereoView:
+    """One photo. photo: [h, w, 3] uint8 RGB; grey: [h, w] float32; K: [3, 3]; camera_from_world: [4, 4] float64.
+
+    prior: [h, w] the depth known before stereo, 0 = none. depth: [h, w] the best depth so far; confirmed: [h, w] bool,
+    pixels whose depth other photos agree with.
+    """
+
+    name: str
+    photo: np.ndarray
+    grey: np.ndarray
+    K: np.ndarray
+    camera_from_world: np.ndarray
+    prior: np.ndarray
+    depth: np.ndarray
+    confirmed: np.ndarray
+
+    @property
+    def center(self) -> np.ndarray:
+        """[3] the camera's position in the world."""
+        return -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
+
+    @property
+    def world_from_camera(self) -> np.ndarray:
+        """[4, 4]."""
+        return np.asarray(np.linalg.inv(self.camera_from_world))
+
+    def cues(self) -> tuple[PhotoCues, DepthCues]:
+        """Of photo and depth, computed at every call: keeping them would cost 20 times the photo's memory."""
+        return photo_cues(self.photo), depth_cues(self.depth, self.K)
+
+
+def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray) -> StereoView | None:
+    """photo: [H, W, 3] uint8 RGB; depth: [H, W] as known so far, 0 = none. None for a photo with too little depth."""
+    import cv2
+
+    height, width = photo.shape[:2]
+    ratio = SIDE / max(height, width)
+    size = (max(1, round(width * ratio)), max(1, round(height * ratio)))
+    known = np.isfinite(depth) & (depth > 0)
+    if known.mean() < _LEAST_DEPTH:
+        return None
+    small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA if ratio < 1 else cv2.INTER_LINEAR)
+    prior = cv2.resize(np.where(known, depth, 0).astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
+    K = np.diag([size[0] / view.width, size[1] / view.height, 1.0]) @ view.K
+    grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    pose = np.asarray(view.camera_from_world, np.float64)
+    return StereoView(view.name, small, grey, K, pose, prior, filled_depth(prior), prior > 0)
