@@ -18,7 +18,7 @@ def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
     """AP (protocol scannet, class-agnostic, exported with smoothing) and rendered mIoU of a map of a truth scene."""
     from perception.evaluate.instances import evaluate
     from perception.evaluate.rendered import rendered_miou
-    from perception.export.labels import export_labels
+    from perception.export.transfer import export_labels
     from perception.io.cloud import read_cloud
     from perception.io.store import read_map
     from perception.pipeline.rendering import as_gaussians, map_views

@@ -78,7 +78,7 @@ def read_words(scene: Path) -> set[str]:
 
 def true_objects(opened: LoadedMap, scene: Path) -> list[int]:
     """The true id under most exported points of each instance, −1 where none lies."""
-    from perception.export.labels import check_overlap, export_labels
+    from perception.export.transfer import check_overlap, export_labels
     from perception.io.cloud import read_cloud
 
     cloud = read_cloud(scene / "gt_points.ply")

@@ -189,7 +189,7 @@ def _instance_scores(scene: SweepScene, gaussians: Any, found: Any, held: Sequen
     """
     from perception.evaluate.instances import evaluate
     from perception.evaluate.rendered import rendered_miou
-    from perception.export.labels import export_labels
+    from perception.export.transfer import export_labels
     from perception.io.cloud import read_cloud
 
     file = scene.root / TRUTH_CLOUD

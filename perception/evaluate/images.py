@@ -12,8 +12,7 @@ import numpy as np
 from perception.errors import InputError
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
-_C1, _C2 = 0.01**2, 0.03**2  # Wang et al. 2004, for a data range of 1
-_WINDOW, _SIGMA = 11, 1.5
+_WINDOW = 11  # pixels a side
 
 PROTOCOL = {
     "psnr": "10 log10(1 / mean squared error), RGB in [0, 1], all pixels",
@@ -30,29 +29,21 @@ def psnr(prediction: np.ndarray, truth: np.ndarray) -> float:
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
-def ssim(prediction: np.ndarray, truth: np.ndarray, padding: str = "valid") -> float:
-    """Structural similarity of pictures [H, W, 3] in [0, 1] (Wang et al. 2004, equation 13), mean over
-    channels.
+def ssim(prediction: np.ndarray, truth: np.ndarray) -> float:
+    """Structural similarity of pictures [H, W, 3] in [0, 1] (Wang et al. 2004, equation 13), mean over channels.
 
-    padding "valid": only windows inside the picture; "same": zeros beyond the border, as 3DGS trains and
-    reports.
+    scikit-image's, in the paper's variant: Gaussian window of 11 × 11 pixels, σ = 1.5, K1 = 0.01, K2 = 0.03, biased
+    covariances, mean over the windows that lie wholly inside the picture. The loss and its curve in training take
+    zeros beyond the border instead, as 3DGS does. InputError for pictures smaller than the window.
     """
-    x, y = (np.asarray(image, np.float64) for image in (prediction, truth))
-    if min(x.shape[:2]) < _WINDOW:
-        raise InputError(f"pictures are {x.shape[1]}x{x.shape[0]} pixels; SSIM needs at least {_WINDOW} a side")
-    border = {"valid": cv2.BORDER_REFLECT, "same": cv2.BORDER_CONSTANT}[padding]
-    taps = cv2.getGaussianKernel(_WINDOW, _SIGMA, cv2.CV_64F)
+    from skimage.metrics import structural_similarity
 
-    def blur(image: np.ndarray) -> np.ndarray:
-        return cv2.sepFilter2D(image, cv2.CV_64F, taps, taps, borderType=border)
-
-    mx, my = blur(x), blur(y)
-    vx, vy, vxy = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
-    value = (2 * mx * my + _C1) * (2 * vxy + _C2) / ((mx * mx + my * my + _C1) * (vx + vy + _C2))
-    if padding == "valid":
-        half = _WINDOW // 2
-        value = value[half:-half, half:-half]
-    return float(value.mean())
+    if min(prediction.shape[:2]) < _WINDOW:
+        height, width = prediction.shape[:2]
+        raise InputError(f"pictures are {width}x{height} pixels; SSIM needs at least {_WINDOW} a side")
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "K1": 0.01, "K2": 0.03}
+    pictures64 = [np.asarray(image, np.float64) for image in (prediction, truth)]
+    return float(structural_similarity(*pictures64, data_range=1.0, channel_axis=2, **options))
 
 
 def read_rgb(path: Path) -> np.ndarray:
@@ -111,3 +102,15 @@ def evaluate_images(prediction_dir: str | Path, truth_dir: str | Path) -> dict[s
         "without_truth": sorted(predictions.keys() - truths.keys()),
         "protocol": PROTOCOL | {"psnr_of_equal_pictures": 100.0},
     }
+
+
+def run_images(prediction_dir: str | Path, truth_dir: str | Path) -> tuple[dict[str, Any], str]:
+    """PSNR and SSIM of a folder of renders against the true pictures: (result, table)."""
+    result = evaluate_images(prediction_dir, truth_dir)
+    width = max([len(name) for name in result["views"]] + [4]) + 2
+    lines = [f"{'view':<{width}}{'PSNR':>8}{'SSIM':>8}"]
+    for name, view in result["views"].items():
+        note = "  missing" if view["missing"] else ""
+        lines.append(f"{name:<{width}}{view['psnr']:>8.2f}{view['ssim']:>8.4f}{note}")
+    lines.append(f"{'mean':<{width}}{result['psnr']:>8.2f}{result['ssim']:>8.4f}")
+    return result, "\n".join(lines)

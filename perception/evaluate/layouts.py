@@ -133,7 +133,7 @@ def run_scannet(
     masks, or <scene>.json with run-length masks. A scene without a prediction has none and is counted with
     its misses.
     """
-    from perception.evaluate.run import instances_table
+    from perception.evaluate.labelled_clouds import instances_table
 
     rules = get_protocol(protocol, **changes)
     files = sorted(Path(truth).glob("*.txt"))

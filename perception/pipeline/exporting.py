@@ -12,7 +12,7 @@ import numpy as np
 from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
 from perception.export.formats import sidecar_of, write_boxes, write_export, write_scannet, write_split
-from perception.export.labels import ExportOptions, check_overlap, export_labels, resolved
+from perception.export.transfer import ExportOptions, check_overlap, export_labels, resolved
 from perception.io.cloud import read_cloud
 from perception.io.recentre import map_origin
 from perception.io.scene_cache import view_from_json

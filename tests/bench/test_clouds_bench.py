@@ -12,7 +12,7 @@ from perception.bench import clouds
 from perception.cli import main
 from perception.errors import InputError
 from perception.export.assign import auto_distance
-from perception.export.labels import ExportOptions, export_labels
+from perception.export.transfer import ExportOptions, export_labels
 from perception.io.cloud import read_cloud, write_cloud
 from perception.types import PointCloud
 

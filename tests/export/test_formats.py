@@ -10,8 +10,8 @@ import pytest
 from perception.boxes import instance_boxes, oriented_box
 from perception.errors import InputError
 from perception.export.formats import write_boxes, write_export, write_scannet, write_split
-from perception.export.labels import ExportOptions, check_overlap, export_labels
 from perception.export.smooth import SmoothOptions
+from perception.export.transfer import ExportOptions, check_overlap, export_labels
 from perception.io.cloud import read_cloud, write_cloud
 from perception.types import PointCloud
 

@@ -1,4 +1,4 @@
-"""From paths to a JSON-able result and a table to print; the command line calls these."""
+"""`perception eval instances`: average precision of a labelled cloud against a true one, from files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from perception.errors import InputError
-from perception.evaluate.images import evaluate_images
 from perception.evaluate.instances import evaluate, get_protocol
 from perception.io.cloud import read_cloud
 from perception.types import PointCloud
@@ -98,15 +97,3 @@ def instances_table(result: dict[str, Any]) -> str:
 def _row(name: str, row: dict[str, Any]) -> str:
     cells = ["-" if row[key] is None else f"{row[key]:.4f}" for key in ("ap", "ap50", "ap25")]
     return f"{name:<12}" + "".join(f"{cell:>8}" for cell in cells)
-
-
-def run_images(prediction_dir: str | Path, truth_dir: str | Path) -> tuple[dict[str, Any], str]:
-    """PSNR and SSIM of a folder of renders against the true pictures: (result, table)."""
-    result = evaluate_images(prediction_dir, truth_dir)
-    width = max([len(name) for name in result["views"]] + [4]) + 2
-    lines = [f"{'view':<{width}}{'PSNR':>8}{'SSIM':>8}"]
-    for name, view in result["views"].items():
-        note = "  missing" if view["missing"] else ""
-        lines.append(f"{name:<{width}}{view['psnr']:>8.2f}{view['ssim']:>8.4f}{note}")
-    lines.append(f"{'mean':<{width}}{result['psnr']:>8.2f}{result['ssim']:>8.4f}")
-    return result, "\n".join(lines)
