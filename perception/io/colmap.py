@@ -11,6 +11,8 @@ from perception.errors import InputError
 from perception.io.colmap_check import check_binary_model
 from perception.io.features import Progress
 from perception.io.lens import lens_from_camera, load_pycolmap
+from perception.io.photos import photo_damage
+from perception.io.safe_names import safe_name
 from perception.io.triangulate import MIN_POINTS, cloud_of, triangulated_cloud
 from perception.io.views import fit_lens, make_view
 from perception.types import Lens, Scene, View
@@ -21,13 +23,17 @@ def is_workspace(folder: Path) -> bool:
     return (folder / "images").is_dir() and bool(_models(folder))
 
 
-def read_workspace(folder: Path, workdir: Path, seed: int, progress: Progress) -> Scene:
-    """The largest sparse model of a workspace as a Scene, in COLMAP's world. Photos that are missing are reported."""
+def read_workspace(folder: Path, workdir: Path, seed: int, progress: Progress, strict: bool = False) -> Scene:
+    """The largest sparse model of a workspace as a Scene, in COLMAP's world.
+
+    Photos that are missing or damaged are left out and reported; strict: damaged ones raise InputError. Image names
+    that leave the photo folder are refused.
+    """
     found = {path: _read_model(path) for path in _models(folder)}
     path, model = max(found.items(), key=lambda item: item[1].num_reg_images())
     if model.num_reg_images() == 0:
         raise InputError(f"{path}: the sparse model is empty (no registered photo); run structure from motion again")
-    views, missing, notes = views_of_model(model, folder / "images", path)
+    views, missing, notes = views_of_model(model, _located(model, folder / "images", path), path, strict)
     if not views:
         raise InputError(f"{folder / 'images'}: none of the {model.num_reg_images()} photos of {path} is there")
     report: dict[str, Any] = {
@@ -46,27 +52,42 @@ def read_workspace(folder: Path, workdir: Path, seed: int, progress: Progress) -
     points, colors = cloud_of(model)
     if len(points) < MIN_POINTS:
         notes.append(f"{path}: the sparse model holds {len(points)} points; new ones are triangulated")
-        points, colors, facts = triangulated_cloud(views, folder / "images", workdir, seed, progress)
+        points, colors, facts = triangulated_cloud(views, workdir, seed, progress)
         notes += facts.pop("warnings")
         report.update(facts)
     report["points"] = len(points)
     return Scene(views, points, colors, report=report)
 
 
-def views_of_model(model: Any, images: Path, source: Path) -> tuple[list[View], list[dict[str, str]], list[str]]:
-    """Views sorted by name, photos left out with the reason, notes."""
+def _located(model: Any, images: Path, source: Path) -> dict[int, tuple[str, Path]]:
+    names = {image_id: safe_name(model.images[image_id].name, source) for image_id in model.reg_image_ids()}
+    return {image_id: (name, images / name) for image_id, name in names.items()}
+
+
+def views_of_model(
+    model: Any, located: dict[int, tuple[str, Path]], source: Path, strict: bool = False
+) -> tuple[list[View], list[dict[str, str]], list[str]]:
+    """Views sorted by name, photos left out with the reason, notes. located: image id to view name and photo.
+
+    strict: a damaged photo is raised as InputError, not left out.
+    """
     views, missing, notes = [], [], set()
     lenses = {camera_id: lens_from_camera(camera) for camera_id, camera in model.cameras.items()}
-    for image_id in model.reg_image_ids():
+    for image_id, (name, photo) in located.items():
         image = model.images[image_id]
-        photo = images / image.name
         if not photo.is_file():
-            missing.append({"name": image.name, "why": "in the sparse model, but the photo is missing"})
+            missing.append({"name": name, "why": "in the sparse model, but the photo is missing"})
+            continue
+        damage = photo_damage(photo)
+        if damage is not None:
+            if strict:
+                raise damage
+            missing.append({"name": name, "why": str(damage)})
             continue
         lens, note = fit_lens(lenses[image.camera_id], photo, source)
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().matrix()
-        views.append(make_view(image.name, photo, lens, pose, source))
+        views.append(make_view(name, photo, lens, pose, source))
         if note:
             notes.add(note)
     views.sort(key=lambda view: view.name)

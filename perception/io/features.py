@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from perception.io.atomic import atomic_directory, recover
 from perception.io.lens import load_pycolmap
-from perception.io.photos import exif_of, photo_size, read_photo, upright
+from perception.io.photos import exif_of, open_photo, photo_size
+from perception.io.staging import stage_photos
 from perception.types import Lens
 
 Progress = Callable[[str, float], None]
@@ -38,13 +38,13 @@ PARTNERS best pairs so that the set stays connected."""
 
 
 class FeatureStore:
-    """A folder with `database.db` and, when photos had to be converted, `photos/`.
+    """A folder with `database.db` and `photos/`, where the photos lie under numbered names (see staging).
 
-    names[i] is the photo's name in the database, in the order of the photos given.
+    names[i] is the i-th photo's name there and in the database.
     """
 
-    def __init__(self, folder: Path, image_root: Path, names: list[str], facts: dict[str, Any]) -> None:
-        self.folder, self.image_root, self.names, self.facts = folder, image_root, names, facts
+    def __init__(self, folder: Path, names: list[str], facts: dict[str, Any]) -> None:
+        self.folder, self.image_root, self.names, self.facts = folder, folder / "photos", names, facts
 
     @property
     def database(self) -> Path:
@@ -52,7 +52,7 @@ class FeatureStore:
 
 
 def build_features(
-    root: Path, photos: list[Path], lenses: list[Lens | None], workdir: Path, seed: int, progress: Progress
+    photos: list[Path], lenses: list[Lens | None], workdir: Path, seed: int, progress: Progress
 ) -> FeatureStore:
     """Extract and match; skipped when `workdir` holds the result for the same photos, lenses, seed and options.
 
@@ -64,22 +64,21 @@ def build_features(
     facts_file = folder / "facts.json"
     if not facts_file.exists():
         with atomic_directory(folder) as new:
-            facts = _build(new, root, photos, lenses, seed, progress)
+            facts = _build(new, photos, lenses, seed, progress)
             (new / "facts.json").write_text(json.dumps(facts))
     facts = json.loads(facts_file.read_text())
-    staged = folder / "photos"
-    return FeatureStore(folder, staged if staged.is_dir() else root, facts.pop("names"), facts)
+    return FeatureStore(folder, facts.pop("names"), facts)
 
 
 def _build(
-    folder: Path, root: Path, photos: list[Path], lenses: list[Lens | None], seed: int, progress: Progress
+    folder: Path, photos: list[Path], lenses: list[Lens | None], seed: int, progress: Progress
 ) -> dict[str, Any]:
     pycolmap = load_pycolmap()
     pycolmap.set_random_seed(seed)
     started = time.perf_counter()
-    image_root, names = _stage(folder / "photos", root, photos)
+    names = stage_photos(folder / "photos", photos, progress)
     database = folder / "database.db"
-    _extract(database, image_root, photos, names, lenses, progress)
+    _extract(database, folder / "photos", photos, names, lenses, progress)
     extracted = time.perf_counter()
     count, total = _match(database, folder / "pairs.txt", names, seed, progress)
     return {
@@ -88,32 +87,6 @@ def _build(
         "pairs_possible": total,
         "seconds": {"features": extracted - started, "matching": time.perf_counter() - extracted},
     }
-
-
-def _stage(staged: Path, root: Path, photos: list[Path]) -> tuple[Path, list[str]]:
-    """pycolmap ignores EXIF rotation and reads few formats: if any photo needs it, all are laid out anew."""
-    names = [photo.relative_to(root).as_posix() for photo in photos]
-    if all(_is_plain(photo) for photo in photos) and not any(" " in name for name in names):
-        return root, names  # pair lists separate names by blanks
-    names = []
-    for index, photo in enumerate(photos):
-        plain = _is_plain(photo)
-        names.append(f"{index:06d}{photo.suffix.lower() if plain else '.jpg'}")
-        target = staged / names[-1]
-        target.parent.mkdir(exist_ok=True)
-        if plain:
-            target.symlink_to(photo.resolve())
-            continue
-        with Image.open(photo) as image:
-            exif = upright(image, photo).getexif()
-        Image.fromarray(read_photo(photo)).save(target, quality=98, subsampling=0, exif=exif)
-    return staged, names
-
-
-def _is_plain(photo: Path) -> bool:
-    with Image.open(photo) as image:
-        stored_upright = exif_of(image, photo).get(0x0112, 1) == 1
-        return stored_upright and image.mode in ("RGB", "L") and image.format in ("JPEG", "PNG")
 
 
 def _extract(
@@ -169,7 +142,7 @@ def _forget_poor(database: Path, names: list[str]) -> list[str]:
 
 def _camera_key(photo: Path) -> tuple[Any, ...]:
     """Photos with the same key share one camera: size, EXIF maker, model, focal length, zoom."""
-    with Image.open(photo) as image:
+    with open_photo(photo) as image:
         exif = exif_of(image, photo)
         details = exif.get_ifd(0x8769)
     return (*photo_size(photo), exif.get(0x010F), exif.get(0x0110), details.get(0x920A), details.get(0xA404))

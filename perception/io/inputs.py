@@ -1,13 +1,17 @@
-"""Reading any input as a Scene: a transforms.json, a COLMAP workspace or a folder of photos."""
+"""Reading any input as a Scene: a transforms.json, a COLMAP workspace, a folder of photos or a video."""
 
 from __future__ import annotations
 
+import shutil
 import time
 from pathlib import Path
 
 from perception.errors import InputError
+from perception.io.camera_file import read_camera
 from perception.io.features import Progress
 from perception.types import Lens, Scene
+
+EXPECTED = "a folder of photos, a video, a COLMAP workspace or a transforms.json"
 
 
 def load_scene(
@@ -17,45 +21,63 @@ def load_scene(
     camera_file: Path | None = None,
     progress: Progress | None = None,
     seed: int = 0,
+    strict: bool = False,
+    frames: Path | None = None,
 ) -> Scene:
-    """Read `source` as what it is and return posed views, sorted by name, with a sparse cloud.
+    """Posed views of `source`, sorted by name, with a sparse cloud.
 
     A folder that is a COLMAP workspace is read as one even if it holds more; then a folder with a transforms.json; any
     other folder is photos, posed by structure from motion. `workdir` keeps features and models so that a second call
-    is quick. camera_file: ROS camera_info with the intrinsics of all photos, for a folder of photos only.
-    progress(stage, fraction) is called as stages advance ("features", "matching", "mapping").
+    is quick. camera_file: ROS camera_info with the intrinsics of all photos, for photos and videos only. strict: a
+    damaged photo is an InputError, else it is left out. frames: folder for the frames of a video (None:
+    workdir/frames); it must last as long as the map. progress(stage, fraction) is called as stages advance.
     """
     from perception.io.colmap import is_workspace, read_workspace
+    from perception.io.photo_folder import VIDEO_SUFFIXES
     from perception.io.sfm import reconstruct
     from perception.io.transforms import read_transforms
 
     source, workdir = Path(source), Path(workdir)
-    tell = progress or _silent
+    tell = progress or (lambda stage, fraction: None)
     started = time.perf_counter()
     if not source.exists():
-        raise InputError(f"{source}: no such file or folder; expected photos, a COLMAP workspace or transforms.json")
+        raise InputError(f"{source}: no such file or folder; expected {EXPECTED}")
     file = source / "transforms.json" if source.is_dir() else source
-    photos_only = source.is_dir() and not is_workspace(source) and not file.is_file()
-    if camera_file is not None and not photos_only:
-        raise InputError(f"{camera_file}: a camera file goes with a folder of photos; {source} brings its own cameras")
+    workspace = source.is_dir() and is_workspace(source)
+    is_video = file.suffix.lower() in VIDEO_SUFFIXES
+    unposed = is_video or (source.is_dir() and not workspace and not file.is_file())
+    if camera_file is not None and not unposed:
+        raise InputError(f"{camera_file}: a camera file goes with photos or a video; {source} brings its own cameras")
+    lens = None if camera_file is None else read_camera(camera_file)
     workdir.mkdir(parents=True, exist_ok=True)
-    if photos_only:
-        scene = reconstruct(source, workdir, _lens(camera_file), seed, tell)
-    elif source.is_dir() and is_workspace(source):
-        scene = read_workspace(source, workdir, seed, tell)
+    if is_video:
+        scene = _scene_of_video(source, frames or workdir / "frames", workdir, lens, seed, tell)
+    elif unposed:
+        scene = reconstruct(source, workdir, lens, seed, tell, strict)
+    elif workspace:
+        scene = read_workspace(source, workdir, seed, tell, strict)
     elif file.suffix.lower() == ".json":
-        scene = read_transforms(file, workdir, seed, tell)
+        scene = read_transforms(file, workdir, seed, tell, strict)
     else:
-        raise InputError(f"{source}: expected a folder of photos, a COLMAP workspace or a transforms.json")
+        raise InputError(f"{source}: expected {EXPECTED}")
     scene.report["seconds"]["total"] = time.perf_counter() - started
     return scene
 
 
-def _lens(camera_file: Path | None) -> Lens | None:
-    from perception.io.camera_file import read_camera
+def _scene_of_video(
+    video: Path, folder: Path, workdir: Path, lens: Lens | None, seed: int, progress: Progress
+) -> Scene:
+    from perception.io.sfm import reconstruct
+    from perception.io.video import video_frames
 
-    return None if camera_file is None else read_camera(camera_file)
-
-
-def _silent(stage: str, fraction: float) -> None:
-    """Reports to nobody."""
+    new = not folder.exists()
+    record = video_frames(video, folder, progress)
+    try:
+        scene = reconstruct(folder, workdir, lens, seed, progress)
+    except InputError:
+        if new:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+    taken = f"{record['chosen']} of {record['frames']} frames of {video.name}"
+    scene.report["notes"].insert(0, f"{folder}: {taken}; they are the map's photos, keep them")
+    return scene

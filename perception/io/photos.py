@@ -1,8 +1,9 @@
-"""Photos: finding them, decoding them upright as 8-bit RGB, undistorting and shrinking them to a view's pinhole."""
+"""Photos: decoding them upright as 8-bit RGB, undistorting and shrinking them to a view's pinhole."""
 
 from __future__ import annotations
 
 import struct
+import threading
 import zlib
 from pathlib import Path
 
@@ -10,11 +11,16 @@ import cv2
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-from perception.errors import InputError
+from perception.errors import InputError, missing_extra
 from perception.io.lens import warp_grid
 from perception.types import View
 
-SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
+HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
+SUFFIXES = HEIF_SUFFIXES | {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+LARGE_PIXELS = 200_000_000
+"""Photos of more pixels are read at 1/2, 1/4 or 1/8 of their size, and have that size for every caller."""
+MOST_DECODED = 400_000_000
+"""Most pixels that are decoded at once; JPEG is decoded at the smaller size directly, other formats in full."""
 DECODE_ERRORS = (
     OSError,
     SyntaxError,
@@ -35,23 +41,32 @@ DECODE_ERRORS = (
 """What Pillow raises on bytes that are no picture, or only the beginning of one."""
 
 
-def list_photos(folder: Path) -> list[Path]:
-    """All photos under `folder`, sorted by their path relative to it; hidden files and folders are skipped."""
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder of photos")
-    found = [p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file()]
-    relative = sorted(p.relative_to(folder) for p in found)
-    return [folder / p for p in relative if not any(part.startswith(".") for part in p.parts)]
-
-
 def photo_size(path: Path) -> tuple[int, int]:
-    """(width, height) of a photo after EXIF rotation, from its header."""
-    with _open(path) as image:
+    """(width, height) of what read_photo returns, from the header: EXIF rotation applied, large photos reduced."""
+    with open_photo(path) as image:
         tags = getattr(image, "tag_v2", {})  # Pillow has turned the size of a TIFF already, or not, by its version
-        width, height = int(tags.get(0x0100, image.width)), int(tags.get(0x0101, image.height))
+        size = reduced_size(int(tags.get(0x0100, image.width)), int(tags.get(0x0101, image.height)), _reduction(image))
         turned = exif_of(image, path).get(0x0112) in (5, 6, 7, 8)  # other values mean nothing
-        return (height, width) if turned else (width, height)
+        return size[::-1] if turned else size
+
+
+def stored_size(path: Path) -> tuple[int, int]:
+    """(width, height) in the file's header: without EXIF rotation, not reduced."""
+    with open_photo(path) as image:
+        return image.size
+
+
+def reduced_size(width: int, height: int, factor: int) -> tuple[int, int]:
+    """The size of a photo read at 1 / factor: rounded up, as Pillow's JPEG decoder and `reduce` do."""
+    return -(-width // factor), -(-height // factor)
+
+
+def _reduction(image: Image.Image) -> int:
+    """1, or the power of two that brings a photo of more than LARGE_PIXELS down to them."""
+    factor = 1
+    while image.width * image.height > LARGE_PIXELS * factor**2:
+        factor *= 2
+    return factor
 
 
 def exif_of(image: Image.Image, path: Path) -> Image.Exif:
@@ -74,22 +89,38 @@ def _bad_exif(path: Path) -> InputError:
     return InputError(f"{path}: the photo's EXIF data are damaged; save it anew without them, or remove it")
 
 
-def check_photo(path: Path) -> None:
-    """Raise InputError when the photo cannot be decoded to its last byte (JPEG: at 1/8 size, which reads them all)."""
-    with _open(path) as image:
-        image.draft("RGB", (max(1, image.width // 8), max(1, image.height // 8)))
-        _decode(image, path)
+def photo_damage(path: Path) -> InputError | None:
+    """The error that reading the whole photo raises (JPEG: at 1/8 size, which reads every byte), or None."""
+    try:
+        with open_photo(path) as image:
+            image.draft("RGB", reduced_size(*image.size, 8))
+            decode(image, path)
+    except InputError as error:
+        return error
+    return None
 
 
 def read_photo(path: Path) -> np.ndarray:
-    """The photo as uint8 [h, w, 3] RGB, rotated as EXIF says.
+    """The photo as uint8 [h, w, 3] RGB, rotated as EXIF says; (w, h) = photo_size(path).
 
     Grey is repeated to three channels, 16 bits become 8 (v / 257 rounded), palettes are expanded; transparent pixels
-    are composited on black. Floating-point images are refused.
+    are composited on black. Floating-point images are refused. HEIC needs pillow-heif (extra "heic").
     """
-    with _open(path) as image:
-        _decode(image, path)
-        return _rgb(upright(image, path), path)
+    with open_photo(path) as image:
+        factor = _draft(image)
+        decode(image, path)
+        photo = to_rgb(upright(image, path), path)
+    return photo if factor == 1 else np.array(Image.fromarray(photo).reduce(factor))
+
+
+def _draft(image: Image.Image) -> int:
+    """Prepares an open photo to be decoded at its reduced size if its format can; returns the factor that remains."""
+    factor = _reduction(image)
+    if factor > 1:
+        width, height = image.size
+        image.draft(None, (width // factor, height // factor))
+        factor = max(1, round(factor * image.width / width))
+    return factor
 
 
 def scaled_size(view: View, max_side: int | None) -> tuple[int, int]:
@@ -157,11 +188,10 @@ def _oriented(view: View) -> np.ndarray:
     size = (view.width, view.height) if view.lens is None else (view.lens.width, view.lens.height)
     photo = read_photo(view.photo)
     if photo.shape[1::-1] != size:
-        with _open(view.photo) as image:
-            stored = image.size
-            if stored == size:
-                _decode(image, view.photo)
-                return _rgb(image, view.photo)
+        if stored_size(view.photo) == size:
+            with open_photo(view.photo) as image:
+                decode(image, view.photo)
+                return to_rgb(image, view.photo)
         found = "×".join(map(str, photo.shape[1::-1]))
         raise InputError(f"{view.photo}: the photo is {found}, its camera expects {size[0]}×{size[1]}")
     return photo
@@ -173,23 +203,49 @@ def _shrink(photo: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
 
 
-def _open(path: Path) -> Image.Image:
+_OPENING = threading.Lock()
+
+
+def open_photo(path: Path) -> Image.Image:
+    """The photo opened by Pillow, not decoded. Raises InputError where there is none, or nothing that Pillow reads."""
+    if path.suffix.lower() in HEIF_SUFFIXES:
+        register_heif()
     try:
-        return Image.open(path)
+        with _OPENING:  # Pillow's limit is global and lies below LARGE_PIXELS; MOST_DECODED is checked instead
+            limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+            try:
+                return Image.open(path)
+            finally:
+                Image.MAX_IMAGE_PIXELS = limit
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such photo") from error
     except (UnidentifiedImageError, *DECODE_ERRORS) as error:
         raise InputError(f"{path}: not a readable image; replace or remove it") from error
 
 
-def _decode(image: Image.Image, path: Path) -> None:
+def register_heif() -> None:
+    """Lets Pillow read HEIC. Raises InputError with the line that installs pillow-heif where it is missing."""
+    try:
+        import pillow_heif
+    except ImportError as error:
+        raise missing_extra("pillow-heif", "heic") from error
+    pillow_heif.register_heif_opener(thumbnails=False)
+
+
+def decode(image: Image.Image, path: Path) -> None:
+    """Reads the pixels of an open photo. Raises InputError where the file is damaged or more than MOST_DECODED."""
+    if image.width * image.height > MOST_DECODED:
+        raise InputError(
+            f"{path}: {image.width}×{image.height} pixels, at most {MOST_DECODED} can be decoded; make it smaller"
+        )
     try:
         image.load()
     except DECODE_ERRORS as error:
         raise InputError(f"{path}: the photo is truncated or damaged; replace or remove it") from error
 
 
-def _rgb(image: Image.Image, path: Path) -> np.ndarray:
+def to_rgb(image: Image.Image, path: Path) -> np.ndarray:
+    """A decoded photo as uint8 [h, w, 3]; see read_photo."""
     if image.mode.startswith("I"):  # 16-bit grey, as "I;16" or widened to "I"
         grey = np.clip(np.asarray(image).astype(np.float64), 0, 65535)
         eight = (grey / 257 + 0.5).astype(np.uint8)

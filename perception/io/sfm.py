@@ -17,7 +17,8 @@ from perception.io.colmap import views_of_model
 from perception.io.features import FeatureStore, Progress, build_features
 from perception.io.incremental_sfm import map_photos
 from perception.io.lens import lens_from_camera, load_pycolmap
-from perception.io.photos import check_photo, list_photos, photo_size
+from perception.io.photo_folder import PhotoSet, choose_photos
+from perception.io.photos import photo_size
 from perception.io.sfm_checks import model_warnings
 from perception.io.triangulate import cloud_of
 from perception.types import Lens, Scene
@@ -25,47 +26,60 @@ from perception.types import Lens, Scene
 MIN_PHOTOS = 3
 
 
-def reconstruct(folder: Path, workdir: Path, lens: Lens | None, seed: int, progress: Progress) -> Scene:
+def reconstruct(
+    folder: Path, workdir: Path, lens: Lens | None, seed: int, progress: Progress, strict: bool = False
+) -> Scene:
     """Poses and a sparse cloud of the photos in `folder`, from the largest model; unit and orientation are arbitrary.
 
     lens: known intrinsics shared by all photos, kept fixed; None finds focal length and radial distortion. Finished
-    work in `workdir` is used again for unchanged photos, lens and seed.
+    work in `workdir` is used again for unchanged photos, lens and seed. Which photos are left out: choose_photos.
+    strict: damaged photos are refused.
     """
-    photos = list_photos(folder)
-    if not photos:
-        raise InputError(f"{folder}: no photos found; expected .jpg, .png, .tif, .bmp or .webp files")
+    chosen = choose_photos(folder, strict, progress)
+    photos = chosen.photos
     if len(photos) < MIN_PHOTOS:
-        raise InputError(f"{folder}: {len(photos)} photo(s) found, at least {MIN_PHOTOS} are needed (20 or more serve)")
+        raise _too_few(folder, chosen)
     for photo in photos:
-        check_photo(photo)
         if lens and photo_size(photo) != (lens.width, lens.height):
             found = "×".join(map(str, photo_size(photo)))
             raise InputError(f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}")
-    store = build_features(folder, photos, [lens] * len(photos), workdir, seed, progress)
-    model, report = _map(store, photos, folder, lens is not None, seed, progress)
-    for image in model.images.values():
-        image.name = photos[store.names.index(image.name)].relative_to(folder).as_posix()
-    views, _, _ = views_of_model(model, folder, folder)
+    store = build_features(photos, [lens] * len(photos), workdir, seed, progress)
+    model, report = _map(store, chosen, folder, lens is not None, seed, progress)
+    number = {name: index for index, name in enumerate(store.names)}
+    indices = {image_id: number[model.images[image_id].name] for image_id in model.reg_image_ids()}
+    located = {image_id: (chosen.names[index], photos[index]) for image_id, index in indices.items()}
+    views, _, _ = views_of_model(model, located, folder, strict)
     points, colors = cloud_of(model)
-    return Scene(views, points, colors, report=report)
+    report["left_out"] = sorted([*chosen.left_out, *report["left_out"]], key=lambda entry: entry["name"])
+    return Scene(views, points, colors, report={**report, "notes": chosen.notes})
+
+
+def _too_few(folder: Path, chosen: PhotoSet) -> InputError:
+    found = f"{folder}: no photos found" if not chosen.photos else f"{folder}: {len(chosen.photos)} photo(s) found"
+    if chosen.left_out:
+        first = chosen.left_out[0]
+        found += f" that can be used ({len(chosen.left_out)} left out: {first['name']}: {first['why']})"
+    elif not chosen.photos:
+        return InputError(f"{found}; expected .jpg, .heic, .png, .tif, .bmp or .webp files" + "".join(chosen.notes[:1]))
+    return InputError(f"{found}; at least {MIN_PHOTOS} are needed, 20 or more give good maps")
 
 
 def _map(
-    store: FeatureStore, photos: list[Path], folder: Path, fixed: bool, seed: int, progress: Progress
+    store: FeatureStore, chosen: PhotoSet, folder: Path, fixed: bool, seed: int, progress: Progress
 ) -> tuple[Any, dict[str, Any]]:
     pycolmap = load_pycolmap()
     done = store.folder / "model"
     recover(done)
     if not done.is_dir():
         started = time.perf_counter()
-        models, contradicted = map_photos(store, fixed, seed, len(photos), progress)
+        models, contradicted = map_photos(store, fixed, seed, len(chosen.photos), progress)
         if not models:
             raise InputError(
-                f"{folder}: none of the {len(photos)} photos could be registered; take sharp, overlapping photos of a "
-                "textured scene from different places"
+                f"{folder}: none of the {len(chosen.photos)} photos could be registered; take sharp, overlapping "
+                "photos of a textured scene from different places"
             )
         seconds = {**store.facts["seconds"], "mapping": time.perf_counter() - started}
-        report = _report(models, contradicted, store, photos, folder, seconds)
+        report = _report(models, contradicted, store, chosen.names, seconds)
         with atomic_directory(done) as new:
             models[0].write(new)
             (new / "report.json").write_text(json.dumps(report))
@@ -76,22 +90,20 @@ def _report(
     models: list[Any],
     contradicted: set[str],
     store: FeatureStore,
-    photos: list[Path],
-    folder: Path,
+    shown: list[str],
     seconds: dict[str, float],
 ) -> dict[str, Any]:
     best = models[0]
     inside = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
     matches = _verified_matches(store)
     left_out = []
-    for name, photo in zip(store.names, photos, strict=True):
+    for name, photo in zip(store.names, shown, strict=True):
         if name not in inside[0]:
-            shown = photo.relative_to(folder).as_posix()
-            left_out.append({"name": shown, "why": _reason(name, contradicted, inside[1:], matches)})
+            left_out.append({"name": photo, "why": _reason(name, contradicted, inside[1:], matches)})
     cameras = [lens_from_camera(best.cameras[key]) for key in sorted(best.cameras)]
     return {
         "input": "photos",
-        "photos": len(photos),
+        "photos": len(shown),
         "registered": len(inside[0]),
         "left_out": left_out,
         "models": [len(names) for names in inside],
@@ -102,7 +114,7 @@ def _report(
         "pairs_matched": store.facts["pairs_matched"],
         "pairs_possible": store.facts["pairs_possible"],
         "seconds": seconds,
-        "warnings": model_warnings(models, store.database, len(photos)),
+        "warnings": model_warnings(models, store.database, len(shown)),
     }
 
 

@@ -14,7 +14,8 @@ from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.documents import brief, read_json
 from perception.io.features import Progress
-from perception.io.photos import SUFFIXES, photo_size
+from perception.io.photos import SUFFIXES, photo_damage, photo_size
+from perception.io.safe_names import safe_name
 from perception.io.triangulate import triangulated_cloud
 from perception.io.views import fit_lens, make_view, rigid_pose
 from perception.types import Lens, Scene, View
@@ -31,20 +32,22 @@ _PERSPECTIVE = (
 )
 
 
-def read_transforms(file: Path, workdir: Path, seed: int, progress: Progress) -> Scene:
+def read_transforms(file: Path, workdir: Path, seed: int, progress: Progress, strict: bool = False) -> Scene:
     """The frames of a transforms.json whose photos exist, as a Scene in the file's own world.
 
     Intrinsics per frame win over global ones; without fl_x, camera_angle_x gives the focal length; without w, h the
     photo does. Points come from `ply_file_path`, else they are triangulated with the given poses. The unit is never
-    trusted to be the metre. Views are named by their path below the folder that holds all photos.
+    trusted to be the metre. Views are named by their path below the folder that holds all photos. Photos that are
+    missing or damaged are left out and reported; strict: damaged ones raise InputError.
     """
     data = _load(file)
     frames = data["frames"]
     if not frames:
         raise InputError(f"{file}: 'frames' is empty; expected at least one posed photo")
-    photos, missing = _photos(file, frames)
+    photos, missing = _photos(file, frames, strict)
     if not photos:
-        raise InputError(f"{file}: none of the {len(frames)} photos it lists exists (first: {missing[0]['name']})")
+        first = f"{missing[0]['name']}: {missing[0]['why']}"
+        raise InputError(f"{file}: none of the {len(frames)} photos it lists can be read (first: {first})")
     root = _common_root(list(photos.values()))
     views, notes = _views(file, data, frames, photos, root)
     report: dict[str, Any] = {
@@ -60,7 +63,7 @@ def read_transforms(file: Path, workdir: Path, seed: int, progress: Progress) ->
     if len(points):
         report["points_from"] = str(data["ply_file_path"])
     else:
-        points, colors, facts = triangulated_cloud(views, root, workdir, seed, progress)
+        points, colors, facts = triangulated_cloud(views, workdir, seed, progress)
         notes += facts.pop("warnings")
         report.update(facts)
     report["points"] = len(points)
@@ -83,7 +86,7 @@ def _views(
     for index, photo in photos.items():
         frame = frames[index]
         lens, note = fit_lens(_lens(file, {**data, **frame}, photo), photo, file)
-        name = photo.relative_to(root).as_posix()
+        name = safe_name(_absolute(photo).relative_to(root).as_posix(), file)
         if name in views:
             notes.add(f"{name} is listed more than once; the first pose is used")
             continue
@@ -104,14 +107,18 @@ def _load(file: Path) -> dict[str, Any]:
     return data
 
 
-def _photos(file: Path, frames: list[dict[str, Any]]) -> tuple[dict[int, Path], list[dict[str, str]]]:
+def _photos(file: Path, frames: list[dict[str, Any]], strict: bool) -> tuple[dict[int, Path], list[dict[str, str]]]:
     photos, missing = {}, []
     for index, frame in enumerate(frames):
         photo = _find(file.parent, str(frame["file_path"]))
         if photo is None:
             missing.append({"name": str(frame["file_path"]), "why": "listed, but the photo is missing"})
-        else:
+        elif (damage := photo_damage(photo)) is None:
             photos[index] = photo
+        elif strict:
+            raise damage
+        else:
+            missing.append({"name": str(frame["file_path"]), "why": str(damage)})
     return photos, missing
 
 
@@ -131,7 +138,12 @@ def _is_file(path: Path) -> bool:
 
 
 def _common_root(photos: list[Path]) -> Path:
-    return Path(os.path.commonpath([str(photo.parent) for photo in photos]))
+    return Path(os.path.commonpath([_absolute(photo).parent for photo in photos]))
+
+
+def _absolute(path: Path) -> Path:
+    """The path without ".." and without following links, so that a view's name cannot leave its folder."""
+    return Path(os.path.abspath(path))  # noqa: PTH100
 
 
 def _pose(file: Path, frame: dict[str, Any]) -> np.ndarray:

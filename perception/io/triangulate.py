@@ -27,14 +27,14 @@ def view_lens(view: View) -> Lens:
 
 
 def triangulated_cloud(
-    views: list[View], root: Path, workdir: Path, seed: int, progress: Progress
+    views: list[View], workdir: Path, seed: int, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """points [P, 3] float64 in the world of the views, colors [P, 3] uint8, facts for the report.
 
     Under MIN_POINTS points, random ones in the views' frusta take their place, and a warning says so.
     """
     started = time.perf_counter()
-    store = build_features(root, [v.photo for v in views], [view_lens(v) for v in views], workdir, seed, progress)
+    store = build_features([v.photo for v in views], [view_lens(v) for v in views], workdir, seed, progress)
     featured = time.perf_counter()
     points, colors, error = _triangulate(views, store, seed)
     facts: dict[str, Any] = {

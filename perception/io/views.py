@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from perception.errors import InputError
 from perception.geometry import nearest_rotation
 from perception.io.lens import is_pinhole, pinhole_from_lens, rescale_lens
-from perception.io.photos import check_photo, photo_size
+from perception.io.photos import photo_size, reduced_size, stored_size
 from perception.types import Lens, View
 
 FARTHEST = 1e12
@@ -40,20 +39,17 @@ def rigid_pose(matrix: np.ndarray, what: str) -> np.ndarray:
 
 
 def fit_lens(lens: Lens, photo: Path, source: Path) -> tuple[Lens, str | None]:
-    """The lens at the photo's true size, and a note when it had to be scaled; other aspects are an InputError."""
-    check_photo(photo)
-    size = photo_size(photo)
-    if size == (lens.width, lens.height) or _stored_size(photo) == (lens.width, lens.height):
+    """The lens at the photo's true size, and a note when it had to be scaled; other aspects are an InputError.
+
+    A photo so large that it is read at 1/2, 1/4 or 1/8 has the lens of its whole size scaled likewise.
+    """
+    size, whole = photo_size(photo), (lens.width, lens.height)
+    if whole in (size, stored_size(photo)) and max(whole) <= max(size):
         return lens, None
-    if size[0] * lens.height == size[1] * lens.width:
+    if size[0] * lens.height == size[1] * lens.width or size in (reduced_size(*whole, k) for k in (2, 4, 8)):
         note = f"{photo.name}: photo {size[0]}×{size[1]}, camera {lens.width}×{lens.height}: intrinsics scaled"
         return rescale_lens(lens, *size), note
     raise InputError(
         f"{source}: {photo.name} is {size[0]}×{size[1]} but its camera says {lens.width}×{lens.height}; "
         "give the camera of these photos or the photos of this camera"
     )
-
-
-def _stored_size(photo: Path) -> tuple[int, int]:
-    with Image.open(photo) as image:
-        return image.size

@@ -231,7 +231,7 @@ def _without_photos() -> None:
     """Points that a file lacks are found in its photos, which is no reading: random ones take their place here."""
     from perception.io import colmap, transforms, triangulate
 
-    def random(views: list[Any], root: Path, work: Path, seed: int, progress: Any) -> tuple[Any, Any, dict[str, Any]]:
+    def random(views: list[Any], work: Path, seed: int, progress: Any) -> tuple[Any, Any, dict[str, Any]]:
         return (*triangulate.random_cloud(views, seed), {"warnings": []})
 
     colmap.triangulated_cloud = transforms.triangulated_cloud = random  # type: ignore[assignment]
@@ -439,7 +439,8 @@ def _label_png() -> Target:
 def _photo() -> Target:
     from PIL import Image
 
-    from perception.io.photos import check_photo, photo_size, read_photo
+    from perception.io import photos
+    from perception.io.photos import photo_damage, photo_size, read_photo
 
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -462,8 +463,10 @@ def _photo() -> Target:
 
     def read(folder: Path, name: str) -> None:
         file = folder / name
-        with patch.object(Image, "MAX_IMAGE_PIXELS", _LARGEST):
-            check_photo(file)
+        with patch.object(photos, "MOST_DECODED", _LARGEST):
+            damage = photo_damage(file)
+            if damage is not None:
+                raise damage
             width, height = photo_size(file)
             photo = read_photo(file)
         assert photo.dtype == np.uint8 and photo.shape == (height, width, 3)

@@ -1,0 +1,84 @@
+"""A video as input: its sharp, well-spaced frames, written as photos."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.atomic import atomic_directory
+from perception.io.frame_choice import Chooser
+from perception.io.photo_folder import FRAMES_RECORD
+
+MOST_FRAMES = 200
+LOOKS_PER_SECOND = 15.0
+"""Frames a second among which the sharpest are chosen; at 30 a second neighbours hardly differ."""
+JPEG_QUALITY = 95
+
+
+def video_frames(video: Path, folder: Path, progress: Callable[[str, float], None]) -> dict[str, object]:
+    """Writes the chosen frames of `video` to the new `folder` as JPEG, upright, named by frame number.
+
+    Frames are chosen as `perception frames` does, at most MOST_FRAMES. Rotation told by the file is applied. A folder
+    that holds the frames of this very file is used again. Returns its record: video, bytes, mtime_ns, frames, chosen.
+    InputError for what is no video and for a folder that holds something else.
+    """
+    stat = video.stat()
+    record: dict[str, object] = {"video": video.name, "bytes": stat.st_size, "mtime_ns": stat.st_mtime_ns}
+    if folder.exists():
+        known = _known(folder)
+        if {key: known.get(key) for key in record} == record:
+            return known
+        raise InputError(f"{folder}: exists already, and holds no frames of {video}; remove or rename it")
+    chooser, numbers = Chooser(), []
+    for number, share, frame in _frames(video, None):
+        chooser.show(frame)
+        numbers.append(number)
+        progress("choosing frames", share)
+    chosen = [numbers[index] for index in chooser.chosen(MOST_FRAMES)]
+    if not chosen:
+        raise InputError(f"{video}: not a readable video; expected .mp4, .mov or another that OpenCV's FFmpeg decodes")
+    record |= {"frames": numbers[-1] + 1, "chosen": len(chosen)}
+    with atomic_directory(folder) as aside:
+        for number, share, frame in _frames(video, set(chosen)):
+            cv2.imwrite(str(aside / f"{number:06d}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+            progress("writing frames", share)
+        (aside / FRAMES_RECORD).write_text(json.dumps(record), encoding="utf-8")
+    return record
+
+
+def _known(folder: Path) -> dict[str, object]:
+    try:
+        record = json.loads((folder / FRAMES_RECORD).read_text(encoding="utf-8"))
+        return record if isinstance(record, dict) else {}
+    except (OSError, ValueError):
+        return {}
+
+
+def _frames(video: Path, wanted: set[int] | None) -> Iterator[tuple[int, float, np.ndarray]]:
+    """(number, share of the video, BGR [h, w, 3] uint8) of the `wanted` frames; None: LOOKS_PER_SECOND of all."""
+    capture = cv2.VideoCapture(str(video))
+    try:
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+        rate, total = capture.get(cv2.CAP_PROP_FPS), max(1.0, capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        step = max(1, round(rate / LOOKS_PER_SECOND)) if np.isfinite(rate) else 1
+        number = 0
+        while capture.grab():
+            if number in wanted if wanted is not None else number % step == 0:
+                good, frame = capture.retrieve()
+                if good:
+                    yield number, min(1.0, (number + 1) / total), frame
+            number += 1
+    finally:
+        capture.release()
+
+
+def frame_size(video: Path) -> tuple[int, int]:
+    """(width, height) of the video's frames, upright. InputError where there are none."""
+    for _, _, frame in _frames(video, {0}):
+        return frame.shape[1], frame.shape[0]
+    raise InputError(f"{video}: not a readable video; expected .mp4, .mov or another that OpenCV's FFmpeg decodes")
