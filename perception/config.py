@@ -44,6 +44,7 @@ class PhotoConfig(Settings):
     )
     held_out: str | None = Field(None, description="text file of the photos kept for scoring instead, a name a line")
     camera: str | None = Field(None, description="ROS camera_info YAML: the intrinsics of all photos, kept fixed")
+    strict: bool = Field(False, description="refuse a damaged photo instead of leaving it out")
 
 
 class TrainConfig(Settings):

@@ -18,7 +18,7 @@ def register(commands: Any) -> None:
 
 
 def _add_map(commands: Any) -> None:
-    p = command(commands, "map", _map, "build a map from photos, a COLMAP workspace or a transforms.json")
+    p = command(commands, "map", _map, "build a map from photos, a video, a COLMAP workspace or a transforms.json")
     p.formatter_class, p.late_epilog = argparse.RawDescriptionHelpFormatter, _settings
     p.add_argument("input", type=Path, metavar="INPUT")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="MAP")
@@ -27,6 +27,9 @@ def _add_map(commands: Any) -> None:
     p.add_argument("--preset", default="default", help="fast, default or quality")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
     p.add_argument("--camera", type=Path, metavar="FILE.yaml", help="fixed intrinsics, ROS camera_info")
+    p.add_argument(
+        "--strict", action="store_const", const=True, help="refuse damaged photos instead of leaving them out"
+    )
     p.add_argument("--max-side", metavar="PX", help="long side in pixels at which the map is trained")
     p.add_argument("--budget", metavar="N", help="most Gaussians the map may have")
     p.add_argument("--iterations", metavar="N")
@@ -49,6 +52,7 @@ def _settings() -> str:
 _SHORTCUTS = {
     "masks": "masks",
     "camera": "photos.camera",
+    "strict": "photos.strict",
     "max_side": "photos.max_side",
     "budget": "train.budget",
     "iterations": "train.iterations",

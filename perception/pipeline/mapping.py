@@ -16,7 +16,7 @@ from perception.errors import InputError
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
 from perception.instances.survival import carried_text, carry_labels
-from perception.io.inputs import load_scene
+from perception.io.inputs import EXPECTED, load_scene
 from perception.io.map_lock import writing
 from perception.io.photos import load_photo
 from perception.io.recentre import recentred
@@ -57,7 +57,7 @@ def build_map(
     labels_from: Path | None = None,
     on_note: Callable[[Trainer], None] | None = None,
 ) -> GaussianMap:
-    """Builds a map from photos, a COLMAP workspace or a transforms.json, and writes it to `output`.
+    """Builds a map from photos, a video, a COLMAP workspace or a transforms.json, and writes it to `output`.
 
     Raises InputError for bad input. What was done is kept in `work_folder(output)` until the map is written; with
     `resume` a run goes on from there. Names given to the instances of the map `labels_from` are carried over to those
@@ -101,7 +101,7 @@ def _build(
     started = time.monotonic()
 
     with stages("poses"):
-        scene = _scene(source, work, config, progress)
+        scene = _scene(source, output, work, config, progress)
     _tell_scene(scene, progress)
     training, held_out = split_views(scene.views, config.photos.holdout, config.photos.held_out)
 
@@ -160,7 +160,7 @@ def _build(
 
 def _prepare(source: Path, output: Path, resume: bool) -> Path:
     if not source.exists():
-        raise InputError(f"{source}: does not exist; give a folder of photos, a COLMAP workspace or a transforms.json")
+        raise InputError(f"{source}: does not exist; give {EXPECTED}")
     if output.exists():
         raise InputError(f"{output}: exists already; choose another -o or remove it first")
     work = work_folder(output)
@@ -186,13 +186,14 @@ def _finished(source: Path, output: Path, config: MapConfig) -> bool:
     return output.exists() and read_info(output).get("fingerprint") == fingerprint(source, config)
 
 
-def _scene(source: Path, work: Path, config: MapConfig, progress: Progress) -> Scene:
+def _scene(source: Path, output: Path, work: Path, config: MapConfig, progress: Progress) -> Scene:
     scene = load_saved_scene(work / "scene")
     if scene is None:
         camera = Path(config.photos.camera) if config.photos.camera else None
         scene = load_scene(
-            source, work / "sfm", camera_file=camera, progress=_stage(progress, "poses"), seed=config.seed
-        )
+            source, work / "sfm", camera_file=camera, progress=_stage(progress, "poses"), seed=config.seed,
+            strict=config.photos.strict, frames=output.with_suffix(".frames"),
+        )  # fmt: skip
         scene = recentred(scene)
         save_scene(work / "scene", scene)
     return scene
@@ -380,6 +381,8 @@ def _tell_scene(scene: Scene, progress: Progress) -> None:
     progress.log(f"{len(scene.views)} posed photos, {len(scene.points)} points")
     if "origin" in report:
         progress.log(f"far from the origin: the map's own lies at {report['origin']}; exports are in the input's frame")
+    for note in report.get("notes", []):
+        progress.log(note)
     for entry in report.get("left_out", []):
         progress.log(f"left out: {entry['name']} ({entry['why']})")
     for warning in report.get("warnings", []):

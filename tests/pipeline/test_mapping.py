@@ -245,7 +245,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     if change == "missing":
         source = tmp_path / "nowhere"
     code = main(
-        ["map", str(source), "-o", str(out), "--masks", f"labels:{scene / 'labels'}", *[f"--set={s}" for s in SETTINGS]]
+        ["map", str(source), "-o", str(out), "--strict", "--masks", f"labels:{scene / 'labels'}"]
+        + [f"--set={s}" for s in SETTINGS]
     )
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
     assert code == 2 and len(lines) == 1 and told in lines[0]
