@@ -32,7 +32,6 @@ LAYERS = [
         "pipeline",
         "viewer",
         "bench",
-        "launch",
     },
     {"cli"},
 ]

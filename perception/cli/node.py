@@ -1,9 +1,8 @@
-"""`perception node` and `perception launch`."""
+"""`perception node`."""
 
 from __future__ import annotations
 
 import argparse
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,6 @@ from perception.cli.parser import command
 
 def register(commands: Any) -> None:
     """Adds this module's subcommands."""
-    _add_node(commands)
-    _add_launch(commands)
-
-
-def _add_node(commands: Any) -> None:
     p = command(commands, "node", _node, "serve a map on DDS or ROS 2: prompts in; points, boxes and markers out")
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("--transport", help="dds, rclpy or auto: rclpy where ROS 2 is, else dds")
@@ -41,24 +35,3 @@ def _node(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     with stop_on_signals() as stop:
         figures = serve_node(args.map, config, stop, Progress().log)
     return figures, f"{figures['answered']} questions answered"
-
-
-def _add_launch(commands: Any) -> None:
-    p = command(commands, "launch", _launch, "start mapper, node and viewer as a YAML file says, and keep them running")
-    p.add_argument("file", type=Path, metavar="FILE.yaml")
-    p.add_argument("--only", default="", metavar="PARTS", help="comma-separated: mapper, node, viewer")
-    p.add_argument("--check", action="store_true", help="check the file and print the commands, start nothing")
-
-
-def _launch(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.launch.plan import read_plan
-    from perception.launch.run import run_plan
-    from perception.node.run import stop_on_signals
-    from perception.progress import Progress
-
-    jobs = read_plan(args.file, [name.strip() for name in args.only.split(",") if name.strip()])
-    if args.check:
-        return {"jobs": [job.to_json() for job in jobs]}, "\n".join(shlex.join(job.command) for job in jobs)
-    with stop_on_signals() as stop:
-        ended = run_plan(jobs, stop, Progress().log)
-    return {"ended": ended}, ""

@@ -1,1 +1,0 @@
-"""Mapper, node and viewer from one YAML file: `plan` reads and checks it, `run` starts the processes and watches."""
