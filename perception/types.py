@@ -29,6 +29,7 @@ class View:
     name: file name of the photo relative to its folder, unique in the scene ("a/0001.jpg").
     photo: where the photo lies. lens: None when the photo is already a pinhole image of size width × height.
     K: [3, 3] float64, pixels. camera_from_world: [4, 4] float64, OpenCV axes (x right, y down, z forward).
+    held_out: whether a finished map was not trained on this view, but scored on it.
     """
 
     name: str
@@ -38,6 +39,7 @@ class View:
     height: int
     camera_from_world: np.ndarray
     lens: Lens | None = None
+    held_out: bool = False
 
 
 @dataclass

@@ -15,12 +15,12 @@ import numpy as np
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory, atomic_file
-from perception.io.store import GaussianMap, read_map
+from perception.io.store import Map, read_map
 from perception.pipeline.mapping import build_map
 from perception.pipeline.record import versions
 from perception.pipeline.rendering import as_gaussians, map_views
 from perception.progress import Progress
-from perception.query import LoadedMap
+from perception.query import QueryMap
 from perception.types import View
 
 Masks = Mapping[tuple[str, str], np.ndarray]
@@ -38,7 +38,7 @@ class Workplace:
     config: Callable[..., MapConfig]
     progress: Progress
 
-    def map(self, scene: str, source: Path, held_out: list[str] | None = None) -> GaussianMap:
+    def map(self, scene: str, source: Path, held_out: list[str] | None = None) -> Map:
         """The scene's map: read where it lies in `maps`, else built (an interrupted run goes on).
 
         held_out: photo names kept out of training. They are not known to a map that was brought along.
@@ -162,7 +162,7 @@ def _map_facts(path: Path) -> dict[str, Any] | None:
 class InstanceViews:
     """A map's instances as masks in its own views."""
 
-    def __init__(self, gmap: GaussianMap) -> None:
+    def __init__(self, gmap: Map) -> None:
         self.gmap = gmap
         self.gaussians = as_gaussians(gmap)
         self.views = {view.name: view for view in map_views(gmap, held_out=False)}
@@ -215,12 +215,12 @@ class InstanceViews:
         return out.colors[0, ..., 0].numpy()
 
 
-def by_words(gmap: GaussianMap, prompt: str, rule: str) -> list[int]:
+def by_words(gmap: Map, prompt: str, rule: str) -> list[int]:
     """Ids of the instances that a prompt selects, by the map's own words, whether or not it says "present".
 
     rule: "top-1", or "relative": all whose score, less the least, reaches .85 of the best's.
     """
-    hits = LoadedMap(gmap).query(prompt, top_k=max(len(gmap.instances), 1), min_score=0.0)
+    hits = QueryMap.of(gmap).query(prompt, top_k=max(len(gmap.instances), 1), min_score=0.0)
     if not hits:
         return []
     if rule == "top-1":

@@ -21,7 +21,7 @@ from perception.bench.prompts import ABSENT, HOUSEHOLD, accuracy, chance, singul
 from perception.errors import InputError
 from perception.language.description import InstanceDescription, from_arrays
 from perception.language.ranking import Ranker
-from perception.query import LoadedMap, load_map
+from perception.query import QueryMap, load_map
 
 MANY = 200
 
@@ -50,9 +50,9 @@ def measure(map_path: Path, scene: Path) -> dict[str, Any]:
     if not opened.instances:
         raise InputError(f"{map_path}: holds no instances; map again with masks")
     owners = true_objects(opened, scene)
-    descriptions, _ = from_arrays(opened.gmap.language)
+    descriptions, _ = from_arrays(opened.language)
     report: dict[str, Any] = {"map": str(map_path), "scene": scene.name, "instances": len(opened.instances)}
-    report |= {"encoder": str(opened.gmap.language["encoder"]), "prompts": len(queries), "unseen_prompts": unseen}
+    report |= {"encoder": str(opened.language["encoder"]), "prompts": len(queries), "unseen_prompts": unseen}
     report |= _figures(opened.ranker, descriptions, owners, queries, read_words(scene))
     report |= {"load_ms": round(loaded * 1e3, 1), "cold_ms": round(cold * 1e3, 1)}
     report |= latency(opened.ranker, [text for text, _ in queries], "warm")
@@ -76,7 +76,7 @@ def read_words(scene: Path) -> set[str]:
     return {singular(word) for text in texts for word in re.findall(r"[a-z]+", text.lower())}
 
 
-def true_objects(opened: LoadedMap, scene: Path) -> list[int]:
+def true_objects(opened: QueryMap, scene: Path) -> list[int]:
     """The true id under most exported points of each instance, −1 where none lies."""
     from perception.export.transfer import check_overlap, export_labels
     from perception.io.cloud import read_cloud
@@ -84,9 +84,9 @@ def true_objects(opened: LoadedMap, scene: Path) -> list[int]:
     cloud = read_cloud(scene / "gt_points.ply")
     if "instance_id" not in cloud.labels:
         raise InputError(f"{scene / 'gt_points.ply'}: expected a property instance_id, found none")
-    if check_overlap(opened.gmap.means, cloud.points) < 0.5:
+    if check_overlap(opened.means, cloud.points) < 0.5:
         raise InputError(f"{opened.path}: most of {scene.name}'s points lie outside it; map the scene with its poses")
-    labels = export_labels(opened.gmap.means, opened.gmap.instance_ids, opened.gmap.opacities, cloud)
+    labels = export_labels(opened.means, opened.instance_ids, opened.opacities, cloud)
     truth = cloud.labels["instance_id"]
     owners = []
     for entry in opened.instances:

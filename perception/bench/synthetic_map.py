@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from perception.boxes import oriented_box
-from perception.io.store import GaussianMap, write_map
+from perception.io.store import Map, write_map
 from perception.language.base import Encoder
 from perception.language.description import InstanceDescription, to_arrays
 
@@ -48,7 +48,7 @@ def write_synthetic_map(
     means = means.astype(np.float32)
     ids = np.where(owner < 0, -1, owner + first_id).astype(np.int32)
     quats = rng.normal(size=(gaussians, 4)).astype(np.float32)
-    gmap = GaussianMap(
+    gmap = Map(
         means=means,
         quats=quats / np.linalg.norm(quats, axis=1, keepdims=True),
         log_scales=rng.normal(-4, 0.3, (gaussians, 3)).astype(np.float32),
@@ -59,7 +59,6 @@ def write_synthetic_map(
         membership=np.ones(gaussians, np.float32),
         instances=[_entry(means[owner == k], k + first_id) for k in range(len(names))],
         info=_info(encoder_spec, seed),
-        cameras={"names": np.array([], np.str_)},
         language={} if encoder is None else _language(names, encoder),
     )
     write_map(path, gmap)
@@ -101,6 +100,5 @@ def _info(spec: str, seed: int) -> dict[str, Any]:
         "source": "synthetic",
         "seed": seed,
         "config": {"language": {"encoder": spec}, "photos": {"max_side": 800}},
-        "views": [],
         "quality": {},
     }

@@ -40,6 +40,6 @@ def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     else:
         answers = [(text, opened.query(text, args.top, args.min_score)) for text in args.text]
     if args.points:
-        write_hits(args.points, opened.gmap, [hit for _, hits in answers for hit in hits])
+        write_hits(args.points, opened, [hit for _, hits in answers for hit in hits])
     results = [{"text": text, "present": bool(hits), "hits": [h.to_json() for h in hits]} for text, hits in answers]
     return {"results": results, "frame": opened.frame, "metric": opened.metric}, query_text(answers, opened.metric)

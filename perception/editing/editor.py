@@ -21,8 +21,9 @@ from perception.boxes import oriented_box
 from perception.config import InstanceConfig
 from perception.editing.changes import NEIGHBORS, described, instances_named, isolated, joined, nearest_filled
 from perception.errors import InputError
+from perception.io.map import GAUSSIANS, Map
 from perception.io.map_lock import writing
-from perception.io.store import GaussianMap, map_signature, read_info, read_map, write_map
+from perception.io.store import map_signature, read_info, read_map, write_map
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
 
 UNDO_DEPTH = 100
@@ -133,15 +134,10 @@ class Editor:
         raise InputError(f"instance {instance}: not in {self.path}; expected one of its {len(self.instances)} ids")
 
     @_step
-    def current(self) -> GaussianMap:
+    def current(self) -> Map:
         """The map as edited, deleted Gaussians left out."""
         now, kept = self._now, self._now.kept
-        count = len(self.original)
-        arrays: dict[str, Any] = {
-            field.name: value[kept]
-            for field in dataclasses.fields(GaussianMap)
-            if isinstance(value := getattr(self.original, field.name), np.ndarray) and len(value) == count
-        }
+        arrays: dict[str, Any] = {name: getattr(self.original, name)[kept] for name in GAUSSIANS}
         arrays["instance_ids"] = now.ids[kept]
         arrays["membership"] = np.where(now.ids[kept] >= 0, self.original.membership[kept], 0).astype(np.float32)
         language = to_arrays(now.descriptions, self._encoder) if self._encoder else {}

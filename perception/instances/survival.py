@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from perception.geometry import align_similarity, camera_centres
-from perception.io.store import GaussianMap
+from perception.io.store import Map
 
 SHARE = 0.5  # of the points of either must lie nearest to the other: then each has at most one partner
 REACH = 0.1  # of an instance's size: nearest neighbours farther away belong to no common surface
@@ -25,7 +25,7 @@ class Carried:
     aligned: bool = False
 
 
-def carry_labels(old: GaussianMap, new: GaussianMap) -> Carried:
+def carry_labels(old: Map, new: Map) -> Carried:
     """Names of `old`'s instances for those of `new` that fill the same place (more than half, both ways)."""
     named = {entry["id"]: str(entry["label"]) for entry in old.instances if entry.get("label")}
     moved, aligned = _into_frame_of(new, old)
@@ -80,18 +80,17 @@ def _sample(points: np.ndarray) -> np.ndarray:
     return points[::step].astype(np.float64)
 
 
-def _into_frame_of(new: GaussianMap, old: GaussianMap) -> tuple[np.ndarray, bool]:
+def _into_frame_of(new: Map, old: Map) -> tuple[np.ndarray, bool]:
     """`old`'s means in `new`'s frame: structure from motion chooses a frame anew, common photos tie the two together.
 
     Without three common photos, or when their paths differ, the frames are taken to be the same.
     """
-    names = [str(n) for n in new.cameras.get("names", [])]
-    place = {str(n): k for k, n in enumerate(old.cameras.get("names", []))}
-    common = [(k, place[name]) for k, name in enumerate(names) if name in place]
+    place = {view.name: k for k, view in enumerate(old.views)}
+    common = [(k, place[view.name]) for k, view in enumerate(new.views) if view.name in place]
     if len(common) < 3:
         return old.means, False
     rows = np.array(common)
-    there, here = (camera_centres(m.cameras["camera_from_world"])[c] for m, c in ((new, rows[:, 0]), (old, rows[:, 1])))
+    there, here = (camera_centres(m.poses)[c] for m, c in ((new, rows[:, 0]), (old, rows[:, 1])))
     if np.linalg.matrix_rank(here - here.mean(axis=0), tol=1e-3 * max(float(np.ptp(here)), 1e-12)) < 2:
         return old.means, False  # cameras on a line tie no rotation about it
     scale, rotation, shift = align_similarity(there, here)

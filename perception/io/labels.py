@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from perception.errors import InputError
-from perception.io.map_files import MapFiles
+from perception.io.map import Map
 from perception.io.store import set_labels
 
 LONGEST = 200  # characters of a label
@@ -13,7 +13,7 @@ LONGEST = 200  # characters of a label
 
 def given_names(path: Path) -> dict[int, str]:
     """The names given so far, by instance id; raises InputError when `path` is no map."""
-    return {entry["id"]: entry["label"] for entry in MapFiles(path).instances if entry.get("label")}
+    return {entry["id"]: entry["label"] for entry in Map.open(path).instances if entry.get("label")}
 
 
 def give_names(path: Path, names: dict[int, str | None]) -> dict[int, str | None]:

@@ -1,4 +1,4 @@
-"""A map directory opened without reading it: facts now, arrays mapped into memory, the rest when it is asked for."""
+"""The files of a map folder, opened without reading them: facts now, arrays mapped, the rest when it is asked for."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import json
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,12 @@ from perception.io.atomic import recover
 from perception.io.checksums import EDITABLE, FACTS, check_file, check_sizes
 from perception.io.documents import brief
 from perception.io.instance_index import InstanceIndex, build_index
+from perception.io.map_views import check_names, views_of_facts
 from perception.io.ply import map_ply
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+READABLE = (1, 2)
+"""Version 1 kept the views twice, in map.json and as arrays in cameras.npz; 2 keeps them in map.json."""
 _ARRAYS = {"features": 2, "instance_ids": 1, "membership": 1}
 ARCHIVES = ("cameras", "language", "index", "parts")
 _TRIES = 5
@@ -29,17 +33,18 @@ Signature = tuple[tuple[int, int, int], ...]
 
 
 class MapFiles:
-    """What lies in a map directory, consistent even if another map takes its place right now or later.
+    """What lies in a map folder, consistent even if another map takes its place right now or later.
 
-    info: map.json. instances: the list of instances.json. Files are opened (mapped) here and stay open, so a map that
-    is replaced or deleted can still be read through this object. Arrays that answers need are read into memory;
-    Gaussians and features are mapped, so whoever truncates those files in place (no writer of ours does) ends readers.
+    Files are opened (mapped) here and stay open, so a map that is replaced or deleted can still be read through this
+    object. Gaussians and features stay mapped, so whoever truncates those files in place (no writer of ours does) ends
+    readers. facts: map.json. info: the same without the views. instances: the list of instances.json. map_id: changes
+    with every byte of the two.
     """
 
     def __init__(self, path: Path):
         self.path = Path(path)
         self._lock = threading.Lock()
-        self._made: dict[str, Any] = {}
+        self._checked = False
         _put_back(self.path)
         for left in reversed(range(_TRIES)):
             self._identity = _folder_identity(self.path)
@@ -54,10 +59,12 @@ class MapFiles:
         raise InputError(f"{self.path}: was replaced again and again while it was opened; try again")
 
     def _open(self) -> None:
-        self.info, facts = _read_facts(self.path)
-        check_sizes(self.path, self.info)
+        facts, raw_facts = _read_facts(self.path)
+        check_sizes(self.path, facts)
+        self.facts = facts
+        self.info = {key: value for key, value in facts.items() if key != "views"}
         self.instances, raw = _read_instances(self.path / EDITABLE)
-        self.map_id = hashlib.sha256(facts + b"\0" + raw).hexdigest()[:12]
+        self.map_id = hashlib.sha256(raw_facts + b"\0" + raw).hexdigest()[:12]
         try:
             self._rows = map_ply(self.path / "gaussians.ply", "vertex")
             self._arrays = {name: self._map_array(name, sides) for name, sides in _ARRAYS.items()}
@@ -86,75 +93,79 @@ class MapFiles:
             raise InputError(f"{file}: holds {array.dtype} of shape {list(array.shape)}; the map is damaged")
         return array
 
-    @property
-    def means(self) -> np.ndarray:
-        """[N, 3] float32, copied out of gaussians.ply."""
-        return np.stack([self._rows[axis] for axis in "xyz"], axis=1).astype(np.float32, copy=False)
+    def read(self, name: str) -> Any:
+        """The field `name` of a `Map`, in memory. What is read whole is compared with its checksum first.
 
-    @property
-    def instance_ids(self) -> np.ndarray:
-        """[N] int32, mapped, −1 = none."""
-        return self._arrays["instance_ids"]
+        Arrays are copies, float32 or int32 and writable. InputError naming the file when it is damaged.
+        """
+        if name in ("info", "instances"):
+            return getattr(self, name)
+        if name == "views":
+            return views_of_facts(self.facts, self.path / FACTS, self._unpack("cameras"))
+        if name == "index":
+            return self._index()
+        if name in ("language", "parts"):
+            return self._unpack(name)
+        self._check_contents()
+        if name in _ARRAYS:
+            return np.array(self._arrays[name])
+        try:
+            return _OF_PLY[name](self._rows)
+        except (KeyError, ValueError) as error:
+            file = self.path / "gaussians.ply"
+            raise InputError(f"{file}: is no 3DGS cloud ({error}); the map is damaged, build it again") from error
 
-    @property
-    def cameras(self) -> dict[str, np.ndarray]:
-        """The views' arrays; {} in a map without."""
-        return self._once("cameras", lambda: self._unpack("cameras"))
+    def _check_contents(self) -> None:
+        """Compares the SHA-256 of every file with the one recorded, once; InputError names the first that differs.
 
-    @property
-    def language(self) -> dict[str, np.ndarray]:
-        """What the encoder knows of each instance; {} in a map without."""
-        return self._once("language", lambda: self._unpack("language"))
+        Nothing is compared once another map has taken the folder's place.
+        """
+        with self._lock:
+            if self._checked or _folder_identity(self.path) != self._identity:
+                return
+            for name in self.info.get("files", {}):
+                if name != EDITABLE:
+                    check_file(self.path, self.info, name)
+            self._checked = True
 
-    @property
-    def parts(self) -> dict[str, np.ndarray]:
-        """Which part of its instance each Gaussian is (see io.store); {} in a map without parts."""
-        return self._once("parts", lambda: self._unpack("parts"))
-
-    def instance_index(self) -> InstanceIndex:
+    def _index(self) -> InstanceIndex:
         """The points of each instance; made from the Gaussians for maps that were written before it was stored."""
-        return self._once("index", self._make_index)
-
-    @property
-    def rows(self) -> np.ndarray:
-        """gaussians.ply as a structured array [N], mapped."""
-        return self._rows
-
-    @property
-    def arrays(self) -> dict[str, np.ndarray]:
-        """features [N, D] float32, instance_ids [N] int32, membership [N] float32, mapped."""
-        return self._arrays
-
-    def check_contents(self) -> None:
-        """Compares the SHA-256 of every file read whole with the one recorded; InputError names the first that
-        differs. Nothing is compared once another map has taken the directory's place."""
-        if _folder_identity(self.path) != self._identity:
-            return
-        for name in self.info.get("files", {}):
-            if name != EDITABLE:
-                check_file(self.path, self.info, name)
-
-    def _make_index(self) -> InstanceIndex:
-        arrays = self._unpack("index")
+        arrays, ids = self._unpack("index"), self._arrays["instance_ids"]
         if not arrays:
-            return build_index(self.means, self.instance_ids)
+            return build_index(_OF_PLY["means"](self._rows), ids)
         index = instance_index.from_arrays(arrays, f"{self.path / 'index.npz'}")
-        if len(index.points) != np.count_nonzero(np.asarray(self.instance_ids) >= 0):
+        if len(index.points) != np.count_nonzero(np.asarray(ids) >= 0):
             raise InputError(f"{self.path / 'index.npz'}: does not fit instance_ids.npy; the map is damaged")
         return index
-
-    def _once(self, name: str, make: Any) -> Any:
-        with self._lock:
-            if name in self._made:
-                return self._made[name]
-        made = make()
-        with self._lock:
-            return self._made.setdefault(name, made)
 
     def _unpack(self, name: str) -> dict[str, np.ndarray]:
         """The arrays of an .npz; its CRC-32s tell damage."""
         raw, file = self._archives[name], self.path / f"{name}.npz"
         return {} if raw is None else read_npz(raw, file, "the map is damaged, build it again")
+
+
+def _columns(names: list[str]) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda rows: np.stack([rows[name] for name in names], axis=1).astype(np.float32)
+
+
+def _harmonics(rows: np.ndarray) -> np.ndarray:
+    """[N, K, 3] from f_dc_* and f_rest_*, which are channel-major (all R, then G, then B)."""
+    constant = _columns([f"f_dc_{i}" for i in range(3)])(rows)[:, None, :]
+    width = sum(name.startswith("f_rest_") for name in rows.dtype.names or ())
+    if width == 0:
+        return constant
+    rest = _columns([f"f_rest_{i}" for i in range(width)])(rows).reshape(len(constant), 3, width // 3)
+    return np.ascontiguousarray(np.concatenate([constant, rest.transpose(0, 2, 1)], axis=1))
+
+
+_OF_PLY: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "means": _columns(["x", "y", "z"]),
+    "quats": _columns([f"rot_{i}" for i in range(4)]),
+    "log_scales": _columns([f"scale_{i}" for i in range(3)]),
+    "opacity_logits": lambda rows: np.ascontiguousarray(rows["opacity"], np.float32),
+    "sh": _harmonics,
+}
+"""Fields of a map that gaussians.ply holds, from its rows."""
 
 
 def read_info(path: Path) -> dict[str, Any]:
@@ -198,15 +209,17 @@ def _read_facts(path: Path) -> tuple[dict[str, Any], bytes]:
         version = info["format_version"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{file}: cannot be read as a map's facts ({error})") from error
-    if isinstance(version, int) and not isinstance(version, bool) and version != FORMAT_VERSION:
+    if isinstance(version, bool) or not isinstance(version, int):
+        raise InputError(f"{file}: format_version is {version!r}, expected {FORMAT_VERSION}; the map is damaged")
+    if version not in READABLE:
         advice = (
             f"it was made by an older perception; build the map again from {info.get('source', 'its photos')}"
             if version < FORMAT_VERSION
             else "it was made by a newer perception; update this one"
         )
-        raise InputError(f"{file}: format_version is {version}, this program reads {FORMAT_VERSION}: {advice}")
-    if version != FORMAT_VERSION or isinstance(version, bool):
-        raise InputError(f"{file}: format_version is {version!r}, expected {FORMAT_VERSION}; the map is damaged")
+        known = " and ".join(map(str, READABLE))
+        raise InputError(f"{file}: format_version is {version}, this program reads {known}: {advice}")
+    check_names(info, file)
     return info, raw
 
 

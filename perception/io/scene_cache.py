@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from perception.errors import InputError
 from perception.io.arrays import DAMAGE
 from perception.io.atomic import atomic_directory
-from perception.types import Lens, Scene, View
+from perception.io.map_views import view_from_json, view_json
+from perception.types import Scene, View
 
 
 def save_scene(folder: Path, scene: Scene) -> None:
@@ -31,35 +31,7 @@ def load_saved_scene(folder: Path) -> Scene | None:
         facts = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
         with np.load(folder / "points.npz") as arrays:
             points, colors = arrays["points"], arrays["colors"]
-        views = [view_from_json(entry) for entry in facts["views"]]
+        views: list[View] = [view_from_json(entry) for entry in facts["views"]]
         return Scene(views, points, colors, facts["metric"], facts["frame"], facts["report"])
     except DAMAGE as error:
         raise InputError(f"{folder}: the kept poses are damaged; delete {folder.parent} to start over") from error
-
-
-def view_json(view: View) -> dict[str, Any]:
-    """A view as JSON."""
-    lens = view.lens
-    return {
-        "name": view.name,
-        "photo": str(view.photo),
-        "K": view.K.tolist(),
-        "width": view.width,
-        "height": view.height,
-        "camera_from_world": view.camera_from_world.tolist(),
-        "lens": None if lens is None else [lens.model, list(lens.params), lens.width, lens.height],
-    }
-
-
-def view_from_json(entry: dict[str, Any]) -> View:
-    """The inverse of `view_json`."""
-    lens = entry["lens"]
-    return View(
-        entry["name"],
-        Path(entry["photo"]),
-        np.array(entry["K"]),
-        entry["width"],
-        entry["height"],
-        np.array(entry["camera_from_world"]),
-        None if lens is None else Lens(lens[0], tuple(lens[1]), lens[2], lens[3]),
-    )

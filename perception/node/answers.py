@@ -9,7 +9,7 @@ import numpy as np
 
 from perception.colors import rgb8_from_sh
 from perception.io.ros_messages import Stamp, box_markers, detection, header, packed_rgb, point_cloud2
-from perception.query import Hit, LoadedMap, Reply
+from perception.query import Hit, QueryMap, Reply
 
 _STRING, _DOUBLE_ARRAY = 4, 8  # rcl_interfaces/ParameterType
 _OK, _WARN, _ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
@@ -71,15 +71,14 @@ def points_value(reply: Reply) -> dict[str, Any]:
     return {"type": _DOUBLE_ARRAY, "double_array_value": rows.reshape(-1)}
 
 
-def map_cloud(opened: LoadedMap, most: int, stamp: Stamp) -> dict[str, Any]:
+def map_cloud(gmap: QueryMap, most: int, stamp: Stamp) -> dict[str, Any]:
     """PointCloud2 of the whole map, at most `most` points evenly thinned: x y z, rgb, instance_id (−1 = none)."""
-    gmap = opened.gmap
     rows = slice(None, None, max(1, -(-len(gmap) // most)))
     colors = rgb8_from_sh(gmap.sh[rows, 0])
     columns = {axis: np.asarray(gmap.means[rows, i], np.float32) for i, axis in enumerate("xyz")}
     columns["rgb"] = packed_rgb(colors)
     columns["instance_id"] = np.asarray(gmap.instance_ids[rows], np.int32)
-    return point_cloud2(columns, opened.frame, stamp)
+    return point_cloud2(columns, gmap.frame, stamp)
 
 
 def diagnostics(name: str, facts: Mapping[str, Any], warnings: Sequence[str], stamp: Stamp) -> dict[str, Any]:

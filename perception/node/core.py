@@ -18,7 +18,7 @@ from perception.errors import InputError
 from perception.node import answers, channels
 from perception.node.config import NodeConfig
 from perception.node.questions import Question, error_json, identity_of, read_questions
-from perception.query import EngineBusy, EngineClosed, LoadedMap, QueryEngine, Reply
+from perception.query import EngineBusy, EngineClosed, QueryEngine, QueryMap, Reply
 
 Message = dict[str, Any]
 _MOST_NAMES = 32
@@ -107,7 +107,7 @@ class Core:
 
         future.add_done_callback(finish)
 
-    def _value(self, gmap: LoadedMap, name: str) -> Message:
+    def _value(self, gmap: QueryMap, name: str) -> Message:
         try:
             questions = read_questions(name)
             if len(questions) != 1:
@@ -146,7 +146,7 @@ class Core:
         told = answers.diagnostics(self._config.namespace, facts, self._transport.warnings(), self._stamps.next())
         self._transport.publish(channels.HEALTH, told)
 
-    def _send_map(self, gmap: LoadedMap) -> None:
+    def _send_map(self, gmap: QueryMap) -> None:
         if not self._config.map_points:
             return
         with self._sending_map:
@@ -154,7 +154,7 @@ class Core:
                 cloud = answers.map_cloud(gmap, self._config.map_points, self._stamps.next())
                 self._transport.publish(channels.MAP_CLOUD, cloud)
 
-    def _submit(self, work: Callable[[LoadedMap], None]) -> None:
+    def _submit(self, work: Callable[[QueryMap], None]) -> None:
         """Work on the map by the engine's threads; when they are all taken and the queue is full, here and now."""
         try:
             self._engine.run(work)

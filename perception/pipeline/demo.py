@@ -15,11 +15,11 @@ from perception.errors import InputError
 from perception.evaluate.instances import evaluate
 from perception.export import export_labels, write_export
 from perception.geometry import align_similarity, camera_centres
-from perception.io.store import GaussianMap, read_map
+from perception.io.store import Map
 from perception.pipeline.mapping import build_map
 from perception.pipeline.reporting import map_picture, write_map_report
 from perception.progress import Progress
-from perception.query import LoadedMap
+from perception.query import QueryMap, load_map
 from perception.types import PointCloud
 
 SETTINGS = ["train.iterations=2000", "train.budget=40000"]
@@ -39,8 +39,7 @@ def run_demo(output: Path, progress: Progress | None = None) -> tuple[dict[str, 
 
     config: MapConfig = load_config(None, SETTINGS)
     build_map(photos, map_path, config, progress=progress)
-    gmap = read_map(map_path)
-    opened = LoadedMap(gmap, map_path)
+    gmap = load_map(map_path)
 
     cloud, scale = truth_in_map_frame(truth, gmap)
     labels = export_labels(gmap.means, gmap.instance_ids, gmap.opacities, cloud)
@@ -48,11 +47,11 @@ def run_demo(output: Path, progress: Progress | None = None) -> tuple[dict[str, 
     scored = evaluate(
         labels, {entry["id"]: entry["score"] for entry in gmap.instances}, truth.instance_ids.astype(np.int64)
     )
-    queries = [_ask(opened, text, ids, truth, labels) for text, ids in truth.queries]
+    queries = [_ask(gmap, text, ids, truth, labels) for text, ids in truth.queries]
     facts = {
         "map": str(map_path),
         "seconds": {"photos": round(made, 1), "total": round(time.monotonic() - started, 1)},
-        "registered": len(gmap.cameras["names"]),
+        "registered": len(gmap.views),
         "photos": len(truth.names),
         "gaussians": len(gmap),
         "instances": len(gmap.instances),
@@ -63,32 +62,31 @@ def run_demo(output: Path, progress: Progress | None = None) -> tuple[dict[str, 
         "units_per_metre": scale,
         "peak_memory_mib": gmap.info["peak_memory_mib"],
     }
-    facts["report"] = str(write_map_report(opened, output / "report.html", [query["text"] for query in queries]))
+    facts["report"] = str(write_map_report(gmap, output / "report.html", [query["text"] for query in queries]))
     from PIL import Image
 
-    Image.fromarray(map_picture(opened, truth.queries[0][0])).save(output / "demo.jpg", quality=88)
+    Image.fromarray(map_picture(gmap, truth.queries[0][0])).save(output / "demo.jpg", quality=88)
     (output / "demo.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     return facts, demo_text(facts)
 
 
-def truth_in_map_frame(truth: DemoTruth, gmap: GaussianMap) -> tuple[PointCloud, float]:
+def truth_in_map_frame(truth: DemoTruth, gmap: Map) -> tuple[PointCloud, float]:
     """The truth's surface points moved into the map's frame by aligning the cameras, and map units per metre.
 
     SfM fixes neither scale nor frame; the cameras' centres, known on both sides, do.
     """
     by_name = dict(zip(truth.names, truth.cameras, strict=True))
-    names = [str(name) for name in gmap.cameras["names"]]
-    mapped = camera_centres(gmap.cameras["camera_from_world"])
-    true = np.stack([by_name[name].center for name in names])
+    mapped = camera_centres(gmap.poses)
+    true = np.stack([by_name[view.name].center for view in gmap.views])
     scale, rotation, shift = align_similarity(mapped, true)
     points = scale * truth.points.astype(np.float64) @ rotation.T + shift
     normals = (truth.normals.astype(np.float64) @ rotation.T).astype(np.float32)
     return PointCloud(points.astype(np.float32), truth.colors, normals), float(scale)
 
 
-def _ask(opened: LoadedMap, text: str, ids: list[int], truth: DemoTruth, labels: np.ndarray) -> dict[str, Any]:
+def _ask(gmap: QueryMap, text: str, ids: list[int], truth: DemoTruth, labels: np.ndarray) -> dict[str, Any]:
     """A prompt, its answer, and whether the answer is right: the true object under most of the first hit's points."""
-    hits = opened.query(text, top_k=1)
+    hits = gmap.query(text, top_k=1)
     found = None
     if hits:
         under = truth.instance_ids[labels == hits[0].instance_id]

@@ -15,8 +15,7 @@ from perception.export.formats import sidecar_of, write_boxes, write_export, wri
 from perception.export.transfer import ExportOptions, check_overlap, export_labels, resolved
 from perception.io.cloud import read_cloud
 from perception.io.recentre import map_origin
-from perception.io.scene_cache import view_from_json
-from perception.io.store import GaussianMap, read_map
+from perception.io.store import Map, read_map
 from perception.types import PointCloud
 
 SUFFIXES = (".ply", ".pcd", ".npz", ".mcap")
@@ -79,14 +78,14 @@ def export_map(
     return result, _table(result)
 
 
-def surface_points(gmap: GaussianMap, means: np.ndarray | None = None) -> PointCloud:
+def surface_points(gmap: Map, means: np.ndarray | None = None) -> PointCloud:
     """The means of opaque Gaussians with their colours; `means` [N, 3] instead of the map's own."""
     rows = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY)
     return PointCloud((gmap.means if means is None else means)[rows], rgb8_from_sh(gmap.sh[rows, 0]))
 
 
 def _write(
-    output: Path, gmap: GaussianMap, cloud: PointCloud, labels: np.ndarray, origin: np.ndarray, outputs: Outputs
+    output: Path, gmap: Map, cloud: PointCloud, labels: np.ndarray, origin: np.ndarray, outputs: Outputs
 ) -> dict[str, Any]:
     """Writes everything, the output last: where it lies, all lies. Returns the sidecar."""
     instances, frame = {entry["id"]: entry for entry in gmap.instances}, str(gmap.info.get("frame", "map"))
@@ -102,7 +101,7 @@ def _write(
     from perception.export.mcap import write_recording
 
     local = replace(cloud, points=cloud.points - origin) if origin.any() else cloud
-    write_recording(output, local, labels, gmap.instances, [view_from_json(v) for v in gmap.info["views"]], frame)
+    write_recording(output, local, labels, gmap.instances, gmap.located_views(), frame)
     return sidecar_of(labels, instances)
 
 

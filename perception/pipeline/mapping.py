@@ -18,10 +18,11 @@ from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
 from perception.instances.survival import carried_text, carry_labels
 from perception.io.inputs import EXPECTED, load_scene
 from perception.io.map_lock import writing
+from perception.io.map_views import stored_view
 from perception.io.photos import load_photo
 from perception.io.recentre import recentred
-from perception.io.scene_cache import load_saved_scene, save_scene, view_json
-from perception.io.store import GaussianMap, read_info, read_map, write_map
+from perception.io.scene_cache import load_saved_scene, save_scene
+from perception.io.store import Map, read_info, read_map, write_map
 from perception.masks import MaskSource, make_source
 from perception.masks.source import GeometryMaskSource
 from perception.masks.store import compute_masks
@@ -56,7 +57,7 @@ def build_map(
     progress: Progress | None = None,
     labels_from: Path | None = None,
     on_note: Callable[[Trainer], None] | None = None,
-) -> GaussianMap:
+) -> Map:
     """Builds a map from photos, a video, a COLMAP workspace or a transforms.json, and writes it to `output`.
 
     Raises InputError for bad input. What was done is kept in `work_folder(output)` until the map is written; with
@@ -94,9 +95,9 @@ def _build(
     work: Path,
     config: MapConfig,
     progress: Progress,
-    labelled: GaussianMap | None,
+    labelled: Map | None,
     on_note: Callable[[Trainer], None] | None,
-) -> GaussianMap:
+) -> Map:
     stages = Stages()
     started = time.monotonic()
 
@@ -142,11 +143,10 @@ def _build(
         "training": vars(trainer.record),
         "instances": found.report,
         "quality": quality,
-        "views": [view_json(view) for view in scene.views],
         "seconds": {**stages.seconds, "total": round(time.monotonic() - started, 2)},
         "peak_memory_mib": peak_memory_mib(),
     }
-    gmap = _assemble(gaussians, found, scene, held_out, record)
+    gmap = _assemble(gaussians, found, scene, held_out, record, output)
     if labelled is not None:
         _carry_labels(labelled, gmap, progress)
     write_map(output, gmap)
@@ -328,32 +328,24 @@ def score_views(gaussians: Gaussians, views: list[TrainingView]) -> dict[str, An
 
 
 def _assemble(
-    gaussians: Gaussians, found: Any, scene: Scene, held_out: list[View], record: dict[str, Any]
-) -> GaussianMap:
+    gaussians: Gaussians, found: Any, scene: Scene, held_out: list[View], record: dict[str, Any], output: Path
+) -> Map:
     held = {view.name for view in held_out}
-    cameras = {
-        "names": np.array([view.name for view in scene.views]),
-        "photos": np.array([str(view.photo) for view in scene.views]),
-        "K": np.stack([view.K for view in scene.views]),
-        "sizes": np.array([[view.width, view.height] for view in scene.views]),
-        "camera_from_world": np.stack([view.camera_from_world for view in scene.views]),
-        "held_out": np.array([view.name in held for view in scene.views]),
-    }
     arrays = {name: tensor.detach().numpy() for name, tensor in vars(gaussians).items()}
     arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)
-    return GaussianMap(
+    return Map(
         **arrays,
         instance_ids=found.ids,
         membership=found.membership,
         instances=found.instances,
         info=record,
-        cameras=cameras,
+        views=[stored_view(view, output, view.name in held) for view in scene.views],
         language=found.language,
         parts=found.parts,
     )
 
 
-def _carry_labels(old: GaussianMap, gmap: GaussianMap, progress: Progress) -> None:
+def _carry_labels(old: Map, gmap: Map, progress: Progress) -> None:
     carried = carry_labels(old, gmap)
     for entry in gmap.instances:
         entry["label"] = carried.labels.get(entry["id"], entry["label"])
@@ -389,7 +381,7 @@ def _tell_scene(scene: Scene, progress: Progress) -> None:
         progress.log(f"warning: {warning}")
 
 
-def _tell_result(gmap: GaussianMap, output: Path, progress: Progress) -> None:
+def _tell_result(gmap: Map, output: Path, progress: Progress) -> None:
     info = gmap.info
     quality = info["quality"]
     scored = f", held-out PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.3f}" if "psnr" in quality else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -16,7 +17,7 @@ from perception.gaussians.train import depth_image
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.recentre import map_origin, moved
 from perception.io.safe_names import safe_name
-from perception.io.store import GaussianMap, read_map
+from perception.io.store import Map, read_map
 from perception.types import OrientedBox, View
 
 KINDS = ("rgb", "depth", "instances", "features", "boxes")
@@ -50,29 +51,16 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     return facts, f"{output}: {len(views)} views of {', '.join(what)}"
 
 
-def as_gaussians(gmap: GaussianMap) -> Gaussians:
+def as_gaussians(gmap: Map) -> Gaussians:
     """A map's Gaussians as tensors."""
     names = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
     return Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(getattr(gmap, name))) for name in names})
 
 
-def map_views(gmap: GaussianMap, held_out: bool = True) -> list[View]:
-    """The views a map was made from: the held-out ones, or all when none were (or `held_out` is False)."""
-    cameras = gmap.cameras
-    rows = np.flatnonzero(cameras["held_out"]) if held_out else np.arange(len(cameras["names"]))
-    if len(rows) == 0:
-        rows = np.arange(len(cameras["names"]))
-    return [
-        View(
-            str(cameras["names"][i]),
-            Path(str(cameras["photos"][i])),
-            cameras["K"][i],
-            int(cameras["sizes"][i][0]),
-            int(cameras["sizes"][i][1]),
-            cameras["camera_from_world"][i],
-        )
-        for i in rows
-    ]
+def map_views(gmap: Map, held_out: bool = True) -> list[View]:
+    """The undistorted views of a map: the held-out ones, or all when none were (or `held_out` is False)."""
+    chosen = [view for view in gmap.views if view.held_out or not held_out] or gmap.views
+    return [replace(view, lens=None) for view in chosen]
 
 
 def _cameras(path: Path) -> list[View]:
@@ -96,7 +84,7 @@ def _cameras(path: Path) -> list[View]:
     return views
 
 
-def _through_lens(kind: str, gaussians: Gaussians, gmap: GaussianMap, view: View) -> np.ndarray:
+def _through_lens(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarray:
     """The picture as the view's own lens takes it: a wider pinhole picture, warped."""
     if view.lens is None:
         return _picture(kind, gaussians, gmap, view)
@@ -120,7 +108,7 @@ def _through_lens(kind: str, gaussians: Gaussians, gmap: GaussianMap, view: View
 
 
 @torch.no_grad()
-def _picture(kind: str, gaussians: Gaussians, gmap: GaussianMap, view: View) -> np.ndarray:
+def _picture(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarray:
     pose = torch.from_numpy(view.camera_from_world.astype(np.float32))
     K = torch.from_numpy(view.K.astype(np.float32))
     if kind == "instances":
@@ -150,7 +138,7 @@ def _picture(kind: str, gaussians: Gaussians, gmap: GaussianMap, view: View) -> 
     raise ValueError(f"unknown kind of picture: {kind}")
 
 
-def _boxed(image: np.ndarray, depth: np.ndarray, gmap: GaussianMap, view: View) -> np.ndarray:
+def _boxed(image: np.ndarray, depth: np.ndarray, gmap: Map, view: View) -> np.ndarray:
     from perception.pictures import draw_boxes
 
     boxes = {entry["id"]: OrientedBox.from_json(entry["obb"]) for entry in gmap.instances}

@@ -16,13 +16,12 @@ from perception.gaussians.render import render
 from perception.gaussians.train import TrainingView, render_view
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.photos import load_photo, scaled_K
-from perception.io.scene_cache import view_from_json
-from perception.io.store import GaussianMap
+from perception.io.store import Map
 from perception.pictures import features_to_rgb, montage, outline, overlay
 from perception.pipeline.rendering import as_gaussians
 from perception.pipeline.top_view import instances_top_view
 from perception.pipeline.view_coverage import weak_coverage
-from perception.query import LoadedMap
+from perception.query import QueryMap
 from perception.report import InstanceRow, QueryRow, ReportData, ViewRow, write_report
 from perception.types import View
 
@@ -31,23 +30,22 @@ SHOWN = ("worst", "middle", "best")
 
 
 def write_map_report(
-    opened: LoadedMap, path: Path, queries: list[str], expected: dict[str, list[int]] | None = None
+    opened: QueryMap, path: Path, queries: list[str], expected: dict[str, list[int]] | None = None
 ) -> Path:
     """The one-page report of a map, with the answers to `queries`; photos that are gone are left out."""
-    gmap, gaussians = opened.gmap, as_gaussians(opened.gmap)
-    info = gmap.info
+    gaussians, info = as_gaussians(opened), opened.info
     curve = info["training"]["curve"]
-    album = _Album(gmap, gaussians)
+    album = _Album(opened, gaussians)
     data = ReportData(
         title=(opened.path or path).stem,
         subtitle=f"from {info['source']}",
-        figures=_figures(gmap),
+        figures=_figures(opened),
         seconds={name: value for name, value in info["seconds"].items() if name != "total"},
         psnr_curve=[(entry["iteration"], entry["psnr"]) for entry in curve],
         ssim_curve=[(entry["iteration"], entry["ssim"]) for entry in curve if "ssim" in entry],
         gaussians_curve=[(entry["iteration"], entry["gaussians"]) for entry in curve],
-        views=_view_rows(gmap, album),
-        overview=_overview(gmap, album),
+        views=_view_rows(opened, album),
+        overview=_overview(opened, album),
         instances=[_instance_row(opened, i, album, names) for i, names in enumerate(_names(opened))],
         metric=opened.metric,
         queries=[_query_row(opened, text, album, (expected or {}).get(text)) for text in queries],
@@ -103,9 +101,9 @@ def _left_out(scene: dict[str, Any], most: int = 12) -> list[str]:
 class _Album:
     """Photos, renders and silhouettes of the map's views, made when first asked for."""
 
-    def __init__(self, gmap: GaussianMap, gaussians: Gaussians):
+    def __init__(self, gmap: Map, gaussians: Gaussians):
         self.gmap, self.gaussians = gmap, gaussians
-        self.views = {view.name: view for view in saved_views(gmap)}
+        self.views = {view.name: view for view in gmap.views}
         self.max_side = int(gmap.info["config"]["photos"]["max_side"])
         self._photos: dict[str, np.ndarray | None] = {}
         self._ids: dict[str, np.ndarray] = {}
@@ -114,7 +112,7 @@ class _Album:
         """[h, w, 3] uint8 at training size; None when it can no longer be read."""
         if name not in self._photos:
             try:
-                self._photos[name] = load_photo(self.views[name], self.max_side)
+                self._photos[name] = load_photo(self.gmap.with_photo(self.views[name]), self.max_side)
             except InputError:
                 self._photos[name] = None
         return self._photos[name]
@@ -140,9 +138,9 @@ class _Album:
         return self._ids[name]
 
 
-def map_picture(opened: LoadedMap, text: str) -> np.ndarray:
+def map_picture(opened: QueryMap, text: str) -> np.ndarray:
     """Four pictures in a row from the photo that answers `text` best: photo, render, instances, answer."""
-    album = _Album(opened.gmap, as_gaussians(opened.gmap))
+    album = _Album(opened, as_gaussians(opened))
     hits = opened.query(text, top_k=1)
     names = list(album.views)
     name = hits[0].views[0] if hits and hits[0].views else names[len(names) // 2]
@@ -155,12 +153,7 @@ def map_picture(opened: LoadedMap, text: str) -> np.ndarray:
     return montage([photo, album.render(name, photo), overlay(photo, ids), answer], 4, titles)
 
 
-def saved_views(gmap: GaussianMap) -> list[View]:
-    """The views a map was made from, with their lenses, as the map records them."""
-    return [view_from_json(entry) for entry in gmap.info["views"]]
-
-
-def _figures(gmap: GaussianMap) -> dict[str, str]:
+def _figures(gmap: Map) -> dict[str, str]:
     info = gmap.info
     figures = {"Gaussians": f"{len(gmap):,}", "Instances": str(len(gmap.instances))}
     if "psnr" in info["quality"]:
@@ -173,7 +166,7 @@ def _figures(gmap: GaussianMap) -> dict[str, str]:
     return figures
 
 
-def _view_rows(gmap: GaussianMap, album: _Album) -> list[ViewRow]:
+def _view_rows(gmap: Map, album: _Album) -> list[ViewRow]:
     scored = gmap.info["quality"].get("views", {})
     shown: dict[str, str] = {}
     by_psnr = sorted(scored, key=lambda name: float(scored[name]["psnr"]))
@@ -188,7 +181,7 @@ def _view_rows(gmap: GaussianMap, album: _Album) -> list[ViewRow]:
     return rows
 
 
-def _overview(gmap: GaussianMap, album: _Album) -> dict[str, np.ndarray]:
+def _overview(gmap: Map, album: _Album) -> dict[str, np.ndarray]:
     """Instances and features over a photo in the middle of the walk."""
     names = list(album.views)
     name = names[len(names) // 2]
@@ -211,7 +204,7 @@ def feature_picture(album: _Album, name: str, photo: np.ndarray) -> np.ndarray:
     return features_to_rgb(out.features[0].numpy())
 
 
-def _best_crop(opened: LoadedMap, index: int, album: _Album, whole: bool) -> np.ndarray | None:
+def _best_crop(opened: QueryMap, index: int, album: _Album, whole: bool) -> np.ndarray | None:
     """The instance in the photo that shows it best: outlined in the whole photo, or cut out with a margin."""
     hit = opened.hit(index)
     if not hit.views:
@@ -231,12 +224,12 @@ def _best_crop(opened: LoadedMap, index: int, album: _Album, whole: bool) -> np.
     return picture[top : rows[-1] + margin, left : columns[-1] + margin]
 
 
-def _names(opened: LoadedMap) -> list[list[str]]:
+def _names(opened: QueryMap) -> list[list[str]]:
     """Likeliest names of the instances; none for a map without language."""
-    return opened.likely_names() if opened.gmap.language else [[] for _ in opened.instances]
+    return opened.likely_names() if opened.language else [[] for _ in opened.instances]
 
 
-def write_sheet(opened: LoadedMap, path: Path) -> None:
+def write_sheet(opened: QueryMap, path: Path) -> None:
     """The contact sheet as a picture file, by suffix."""
     from PIL import Image
 
@@ -248,13 +241,13 @@ def write_sheet(opened: LoadedMap, path: Path) -> None:
         Image.fromarray(contact_sheet(opened)).save(file, "PNG" if path.suffix.lower() == ".png" else "JPEG")
 
 
-def contact_sheet(opened: LoadedMap, columns: int = 6, side: int = 240) -> np.ndarray:
+def contact_sheet(opened: QueryMap, columns: int = 6, side: int = 240) -> np.ndarray:
     """Every instance's best crop with its id and label or likeliest names, [H, W, 3] uint8; unseen ones left out."""
     import cv2
 
     from perception.instances.crops import letterbox
 
-    album = _Album(opened.gmap, as_gaussians(opened.gmap))
+    album = _Album(opened, as_gaussians(opened))
     pictures, titles = [], []
     for i, names in enumerate(_names(opened)):
         crop = _best_crop(opened, i, album, whole=False)
@@ -268,7 +261,7 @@ def contact_sheet(opened: LoadedMap, columns: int = 6, side: int = 240) -> np.nd
     return montage(pictures, columns, titles)
 
 
-def _instance_row(opened: LoadedMap, index: int, album: _Album, names: list[str]) -> InstanceRow:
+def _instance_row(opened: QueryMap, index: int, album: _Album, names: list[str]) -> InstanceRow:
     entry = opened.instances[index]
     return InstanceRow(
         entry["id"],
@@ -281,7 +274,7 @@ def _instance_row(opened: LoadedMap, index: int, album: _Album, names: list[str]
     )
 
 
-def _query_row(opened: LoadedMap, text: str, album: _Album, expected: list[int] | None) -> QueryRow:
+def _query_row(opened: QueryMap, text: str, album: _Album, expected: list[int] | None) -> QueryRow:
     hits = opened.query(text)
     index = next((i for i, entry in enumerate(opened.instances) if hits and entry["id"] == hits[0].instance_id), None)
     picture = None if index is None else _best_crop(opened, index, album, whole=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from perception.config import MapConfig
 from perception.errors import InputError
-from perception.io.store import REPORT, GaussianMap
+from perception.io.store import REPORT, Map
 from perception.pipeline.mapping import build_map
 from perception.pipeline.reporting import write_map_report
 from perception.progress import Progress
@@ -21,7 +21,7 @@ def run_map(
     resume: bool = False,
     progress: Progress | None = None,
     labels_from: Path | None = None,
-) -> GaussianMap:
+) -> Map:
     """`build_map`, then `report.html` inside the map."""
     progress = progress or Progress(quiet=True)
     gmap = build_map(source, output, config, resume=resume, progress=progress, labels_from=labels_from)

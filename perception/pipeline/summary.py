@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from perception.io.store import GaussianMap
+from perception.io.store import Map
 from perception.query import Hit
 
 
@@ -114,7 +114,7 @@ def query_text(answers: list[tuple[str, list[Hit]]], metric: bool) -> str:
     return "\n".join(lines)
 
 
-def write_hits(path: Path, gmap: GaussianMap, hits: list[Hit]) -> None:
+def write_hits(path: Path, gmap: Map, hits: list[Hit]) -> None:
     """The hits' points as one cloud with `instance_id` and the map's colours."""
     from perception.colors import rgb8_from_sh
     from perception.io.cloud import write_cloud

@@ -9,7 +9,7 @@ import torch
 from perception.colors import instance_palette
 from perception.gaussians.rasterize import rasterize
 from perception.geometry import camera_centres
-from perception.io.store import GaussianMap
+from perception.io.store import Map
 
 SOLID = 0.3
 """Opacity from which a Gaussian is drawn."""
@@ -19,12 +19,12 @@ INK = (70, 70, 70)
 
 
 @torch.no_grad()
-def instances_top_view(gmap: GaussianMap, side: int = 480) -> np.ndarray:
+def instances_top_view(gmap: Map, side: int = 480) -> np.ndarray:
     """[side, side, 3] uint8: the instances in their colours, cameras as dots, a scale bar.
 
     "Down" is the mean of the cameras' downward axes. What lies above every camera, as ceilings do, is left out.
     """
-    poses = gmap.cameras["camera_from_world"].astype(np.float64)
+    poses = gmap.poses
     axes = _axes(poses)
     turned = gmap.means @ axes.T
     eyes = camera_centres(poses) @ axes.T

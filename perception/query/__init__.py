@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from perception.query.engine import AnswerTimeout, EngineBusy, EngineClosed, QueryEngine
     from perception.query.frames import Frame
     from perception.query.hit import Description, Hit, Neighbor
-    from perception.query.opened import LoadedMap, load_map
     from perception.query.parts import PartsMap
+    from perception.query.query_map import QueryMap, load_map
     from perception.query.regions import Prism, Region, axis_box
     from perception.query.requests import Reply, Request
     from perception.query.where import Where
@@ -25,17 +25,17 @@ _HOMES = {
     "EngineClosed": "engine",
     "Frame": "frames",
     "Hit": "hit",
-    "LoadedMap": "opened",
     "Neighbor": "hit",
     "PartsMap": "parts",
     "Prism": "regions",
     "QueryEngine": "engine",
+    "QueryMap": "query_map",
     "Region": "regions",
     "Reply": "requests",
     "Request": "requests",
     "Where": "where",
     "axis_box": "regions",
-    "load_map": "opened",
+    "load_map": "query_map",
 }
 __all__ = [
     "AnswerTimeout",
@@ -44,11 +44,11 @@ __all__ = [
     "EngineClosed",
     "Frame",
     "Hit",
-    "LoadedMap",
     "Neighbor",
     "PartsMap",
     "Prism",
     "QueryEngine",
+    "QueryMap",
     "Region",
     "Reply",
     "Request",

@@ -5,30 +5,29 @@ from __future__ import annotations
 import numpy as np
 
 from perception.errors import InputError
-from perception.query.opened import LoadedMap
+from perception.query.query_map import QueryMap
 
 MARGIN = 0.15
 """Share of the box's longer side that is left around it."""
 
 
-def best_crop(gmap: LoadedMap, instance_id: int, side: int = 320) -> np.ndarray | None:
+def best_crop(gmap: QueryMap, instance_id: int, side: int = 320) -> np.ndarray | None:
     """The instance in its best photo, [h, w, 3] uint8 RGB, longer side at most `side` pixels.
 
     None when no photo shows it, or the photo has moved or cannot be read any more. InputError for an unknown id.
     """
     from perception.io.photos import load_photo
-    from perception.io.scene_cache import view_from_json
 
     position = gmap.position(instance_id)
     box = gmap.best_view(position)
     if box is None:
         return None
     name, (x0, y0, x1, y1) = box
-    entry = next((entry for entry in gmap.info.get("views", []) if entry["name"] == name), None)
-    if entry is None:
+    view = next((view for view in gmap.views if view.name == name), None)
+    if view is None:
         return None
     try:
-        photo = load_photo(view_from_json(entry), int(gmap.info["config"]["photos"]["max_side"]))
+        photo = load_photo(gmap.with_photo(view), int(gmap.info["config"]["photos"]["max_side"]))
     except (InputError, OSError, KeyError):
         return None
     margin = 2 + round(MARGIN * max(x1 - x0, y1 - y0))

@@ -19,8 +19,8 @@ from perception.errors import InputError
 from perception.io.store import map_signature
 from perception.language.base import Encoder
 from perception.language.encoders import make_encoder
-from perception.query.line import Figures, Job, Line
-from perception.query.opened import LoadedMap, load_map
+from perception.query.query_map import QueryMap, load_map
+from perception.query.request_queue import Counters, Job, RequestQueue
 from perception.query.requests import Reply, Request
 
 T = TypeVar("T")
@@ -67,10 +67,10 @@ class QueryEngine:
         self._encoders = _Shared(encoders or make_encoder)
         self._signature = map_signature(self.path)
         self._map = self._open()
-        self._figures = Figures()
-        self._line = Line(queue_size, self._drop)
+        self._counters = Counters()
+        self._queue = RequestQueue(queue_size, self._drop)
         self._reloading = threading.Lock()
-        self._listeners: list[Callable[[LoadedMap], None]] = []
+        self._listeners: list[Callable[[QueryMap], None]] = []
         self._problem: str | None = None
         self._closed = threading.Event()
         self._threads = [threading.Thread(target=self._work, name=f"query-{n}", daemon=True) for n in range(workers)]
@@ -82,7 +82,7 @@ class QueryEngine:
     # ------------------------------------------------------------------ asking
 
     @property
-    def current(self) -> LoadedMap:
+    def current(self) -> QueryMap:
         """The map that answers now. Keep the reference for as long as one answer needs one map."""
         return self._map
 
@@ -95,24 +95,24 @@ class QueryEngine:
         asked = time.monotonic()
         item = Request(request) if isinstance(request, str) else request
 
-        def work(gmap: LoadedMap) -> Reply:
+        def work(gmap: QueryMap) -> Reply:
             hits = gmap.query(item.text, item.top_k, item.min_score, where=item.where, frame=item.frame)
             frame = item.frame.name if item.frame else gmap.frame
             return Reply(item, tuple(hits), gmap.map_id, frame, gmap.metric, time.monotonic() - asked)
 
         return self.run(work, timeout)
 
-    def run(self, work: Callable[[LoadedMap], T], timeout: float | None = None) -> Future[T]:
+    def run(self, work: Callable[[QueryMap], T], timeout: float | None = None) -> Future[T]:
         """Queues any question to the map: `work` is called with it by a worker. EngineBusy when the queue is full."""
         if self._closed.is_set():
             raise EngineClosed(f"{self.path}: the engine has been closed")
         now = time.monotonic()
         job = Job(work, Future(), now, now + (self.timeout if timeout is None else timeout))
-        if not self._line.join(job):
+        if not self._queue.put(job):
             if self._closed.is_set():
                 raise EngineClosed(f"{self.path}: the engine has been closed")
-            self._figures.count("refused")
-            raise EngineBusy(f"{self._line.most} questions are waiting already; ask again later")
+            self._counters.count("refused")
+            raise EngineBusy(f"{self._queue.most} questions are waiting already; ask again later")
         return job.future
 
     def wait(self, future: Future[T], timeout: float | None = None) -> T:
@@ -124,7 +124,7 @@ class QueryEngine:
             if isinstance(error, AnswerTimeout):
                 raise
             future.cancel()  # drops it if it has not begun
-            self._figures.count("timed_out")
+            self._counters.count("timed_out")
             raise AnswerTimeout(f"no answer within {seconds:g} s") from None
 
     async def awaited(self, future: Future[T], timeout: float | None = None) -> T:
@@ -135,7 +135,7 @@ class QueryEngine:
         except (TimeoutError, asyncio.TimeoutError) as error:
             if isinstance(error, AnswerTimeout):
                 raise
-            self._figures.count("timed_out")
+            self._counters.count("timed_out")
             raise AnswerTimeout(f"no answer within {seconds:g} s") from None
 
     # --------------------------------------------------------------- reloading
@@ -156,18 +156,18 @@ class QueryEngine:
                 raise
             self._signature, self._problem, old = signature, None, self._map
             self._map = fresh
-            self._figures.count("reloads")
+            self._counters.count("reloads")
             if fresh.map_id == old.map_id:
                 return False
             for listener in list(self._listeners):
                 listener(fresh)
             return True
 
-    def on_reload(self, listener: Callable[[LoadedMap], None]) -> None:
+    def on_reload(self, listener: Callable[[QueryMap], None]) -> None:
         """Calls `listener(new map)` after each swap, from the thread that reloaded; it must not raise."""
         self._listeners.append(listener)
 
-    def _open(self) -> LoadedMap:
+    def _open(self) -> QueryMap:
         gmap = load_map(self.path, encoders=self._encoders)
         gmap.warm()
         return gmap
@@ -208,9 +208,9 @@ class QueryEngine:
             "metric": gmap.metric,
             "instances": len(gmap.instances),
             "gaussians": int(gmap.info.get("num_gaussians", 0)),
-            "waiting": len(self._line),
-            "queue_size": self._line.most,
-            **self._figures.to_json(),
+            "waiting": len(self._queue),
+            "queue_size": self._queue.most,
+            **self._counters.to_json(),
         }
 
     def close(self) -> None:
@@ -218,7 +218,7 @@ class QueryEngine:
         if self._closed.is_set():
             return
         self._closed.set()
-        for job in self._line.close():
+        for job in self._queue.close():
             if job.future.set_running_or_notify_cancel():
                 job.future.set_exception(EngineClosed(f"{self.path}: the engine has been closed"))
         for thread in self._threads:
@@ -234,7 +234,7 @@ class QueryEngine:
     # ----------------------------------------------------------------- workers
 
     def _work(self) -> None:
-        while (job := self._line.next()) is not None:
+        while (job := self._queue.get()) is not None:
             if time.monotonic() > job.deadline:
                 self._drop(job)
             elif job.future.set_running_or_notify_cancel():
@@ -243,20 +243,20 @@ class QueryEngine:
     def _drop(self, job: Job) -> None:
         """Tells who asked that the time is over; nothing when they have gone already."""
         if job.future.set_running_or_notify_cancel():
-            self._figures.count("timed_out")
+            self._counters.count("timed_out")
             job.future.set_exception(AnswerTimeout("the question waited too long and was dropped"))
 
     def _answer(self, job: Job) -> None:
         try:
             result = job.work(self._map)
         except InputError as error:
-            self._figures.count("bad_input")
+            self._counters.count("bad_input")
             job.future.set_exception(error)
         except Exception as error:  # a defect in one answer must not end the worker
-            self._figures.count("failed")
+            self._counters.count("failed")
             job.future.set_exception(error)
         else:
-            self._figures.answered(time.monotonic() - job.asked)
+            self._counters.answered(time.monotonic() - job.asked)
             job.future.set_result(result)
 
 

@@ -7,7 +7,7 @@ import re
 
 from perception.errors import InputError
 from perception.query.hit import Hit
-from perception.query.opened import LoadedMap
+from perception.query.query_map import QueryMap
 
 _OF = re.compile(r"^(?:the\s+)?(?P<part>.+?)\s+of\s+(?:the\s+|a\s+|an\s+)?(?P<whole>.+)$", re.IGNORECASE)
 _WHOLES = 3
@@ -17,19 +17,17 @@ _WHOLES = 3
 class PartsMap:
     """The parts of a map's instances (see io.store), asked like instances. Made from an opened map, lazily cheap."""
 
-    def __init__(self, opened: LoadedMap):
+    def __init__(self, opened: QueryMap):
         self.opened = opened
-        gmap = opened.gmap
-        entries = [part for entry in gmap.instances for part in entry.get("parts", [])]
+        entries = [part for entry in opened.instances for part in entry.get("parts", [])]
         self.entries = sorted(entries, key=lambda part: int(part["id"]))
-        self._asked: LoadedMap | None = None
-        if self.entries and "ids" in gmap.parts:
+        self._asked: QueryMap | None = None
+        if self.entries and "ids" in opened.parts:
             prefix = "language_"
-            language = {name[len(prefix) :]: a for name, a in gmap.parts.items() if name.startswith(prefix)}
-            held = dataclasses.replace(
-                gmap, instances=self.entries, instance_ids=gmap.parts["ids"], language=language, parts={}
+            language = {name[len(prefix) :]: a for name, a in opened.parts.items() if name.startswith(prefix)}
+            self._asked = QueryMap.of(
+                opened, instances=self.entries, instance_ids=opened.parts["ids"], language=language, parts={}
             )
-            self._asked = LoadedMap(held, opened.path)
 
     def of(self, instance: int) -> list[Hit]:
         """The parts of instance id `instance`, largest first, scored by the mapper's confidence."""
@@ -44,7 +42,7 @@ class PartsMap:
 
         "X of the Y" looks for X among the parts of what answers Y, and says what fits best there: that Y is present
         is the evidence. Any other text is judged against all parts as a prompt is against instances; empty when not
-        present. Raises InputError as LoadedMap.query does.
+        present. Raises InputError as QueryMap.query does.
         """
         if not text.strip():
             raise InputError('query: the text is empty; ask for a part, such as "handle of the mug"')

@@ -19,7 +19,7 @@ from perception.query.bodies import AtBody, FindBody, NearestBody, QueryBody
 from perception.query.crops import best_crop
 from perception.query.engine import QueryEngine
 from perception.query.frames import Frame
-from perception.query.opened import LoadedMap, UnknownInstance
+from perception.query.query_map import QueryMap, UnknownInstance
 from perception.serve import answers
 from perception.serve.errors import HANDLERS, OtherMap
 from perception.serve.guard import Guard
@@ -84,7 +84,7 @@ class _Routes:
         """The instances that answer each text, ranked."""
         questions = body.requests()
 
-        def work(gmap: LoadedMap) -> dict[str, Any]:
+        def work(gmap: QueryMap) -> dict[str, Any]:
             results = []
             for q in questions:
                 hits = gmap.query(q.text, q.top_k, q.min_score, where=q.where, frame=q.frame)
@@ -109,7 +109,7 @@ class _Routes:
         """The instance that a point lies on."""
         frame = body.asked_frame()
 
-        def work(gmap: LoadedMap) -> list[Any]:
+        def work(gmap: QueryMap) -> list[Any]:
             hit = gmap.instance_at(np.array(body.point), max_distance=body.max_distance, frame=frame)
             return [] if hit is None else [hit]
 
@@ -146,23 +146,23 @@ class _Routes:
 
     # ------------------------------------------------------------------ shared
 
-    async def _answer(self, wanted: str | None, work: Callable[[LoadedMap], T]) -> T:
+    async def _answer(self, wanted: str | None, work: Callable[[QueryMap], T]) -> T:
         """`work` done by the engine, on the map `wanted` if the client named one."""
 
-        def checked(gmap: LoadedMap) -> T:
+        def checked(gmap: QueryMap) -> T:
             if wanted is not None and wanted != gmap.map_id:
                 raise OtherMap(f"the map is now {gmap.map_id}, not {wanted[:40]}; ask again")
             return work(gmap)
 
         return await self.engine.awaited(self.engine.run(checked))
 
-    async def _hits(self, wanted: str | None, work: Callable[[LoadedMap], list[Any]], frame: Frame | None) -> Response:
-        def answer(gmap: LoadedMap) -> dict[str, Any]:
+    async def _hits(self, wanted: str | None, work: Callable[[QueryMap], list[Any]], frame: Frame | None) -> Response:
+        def answer(gmap: QueryMap) -> dict[str, Any]:
             return {"hits": [hit.to_json() for hit in work(gmap)], **_source(gmap, frame)}
 
         return JSONResponse(await self._answer(wanted, answer))
 
-    def _jpeg(self, gmap: LoadedMap, number: int, side: int) -> bytes | None:
+    def _jpeg(self, gmap: QueryMap, number: int, side: int) -> bytes | None:
         key = (gmap.map_id, number, side)
         with self._lock:
             if key in self._crops:
@@ -175,7 +175,7 @@ class _Routes:
         return data
 
 
-def _source(gmap: LoadedMap, frame: Frame | None) -> dict[str, Any]:
+def _source(gmap: QueryMap, frame: Frame | None) -> dict[str, Any]:
     return {"frame": frame.name if frame else gmap.frame, "metric": gmap.metric, "map_id": gmap.map_id}
 
 

@@ -14,7 +14,7 @@ from starlette.exceptions import HTTPException
 from perception.errors import InputError
 from perception.query.bodies import problem_line
 from perception.query.engine import AnswerTimeout, EngineBusy, EngineClosed
-from perception.query.opened import UnknownInstance
+from perception.query.query_map import UnknownInstance
 
 _log = logging.getLogger("perception.serve")
 

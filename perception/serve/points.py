@@ -7,13 +7,13 @@ import io
 import numpy as np
 
 from perception.io.ply import ply_bytes
-from perception.query.opened import LoadedMap
+from perception.query.query_map import QueryMap
 
 FORMATS = {"npz": "application/x-npz", "ply": "application/octet-stream"}
 """Name → media type."""
 
 
-def encode(gmap: LoadedMap, instance_id: int, kind: str) -> bytes:
+def encode(gmap: QueryMap, instance_id: int, kind: str) -> bytes:
     """The instance's points in the map's frame, in map order.
 
     npz: points [P, 3] float32, centroid [3], covariance [3, 3], obb_center, obb_rotation, obb_extent, instance_id,

@@ -76,7 +76,7 @@ class Viewer:
         gmap = self.session.editor.original
         low, high = np.percentile(gmap.means, [5, 95], axis=0) if len(gmap) else (np.zeros(3), np.ones(3))
         self.scale = 10 / max(float(np.linalg.norm(high - low)), 1e-9)
-        poses = gmap.cameras.get("camera_from_world", np.zeros((0, 4, 4)))
+        poses = gmap.poses
         if len(poses) == 0:
             return
         self.server.scene.set_up_direction(tuple(-poses[:, 1, :3].mean(axis=0)))
@@ -174,7 +174,7 @@ class Viewer:
         spread = float(np.ptp(np.array(centres), axis=0).max()) if centres else 1.0
         for view, centre in zip(self.session.views.values(), centres, strict=True):
             try:
-                image = load_photo(view, FRUSTUM_PHOTO)
+                image = load_photo(self.session.editor.original.with_photo(view), FRUSTUM_PHOTO)
             except InputError:  # the photo has moved: the frustum is drawn without it
                 image = None
             wxyz = Rotation.from_matrix(view.camera_from_world[:3, :3].T).as_quat()[[3, 0, 1, 2]]

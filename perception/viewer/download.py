@@ -9,11 +9,11 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.ply import write_ply
-from perception.io.store import GaussianMap
+from perception.io.store import Map
 from perception.viewer.paint import base_colors
 
 
-def selection_ply(gmap: GaussianMap, chosen: list[int]) -> bytes:
+def selection_ply(gmap: Map, chosen: list[int]) -> bytes:
     """A binary PLY of the chosen instances' Gaussian means: x y z, red green blue, instance_id."""
     if not chosen:
         raise InputError("nothing is selected; click a thing first")

@@ -8,20 +8,20 @@ import cv2
 import numpy as np
 
 from perception.colors import instance_palette, rgb8_from_sh
-from perception.io.store import GaussianMap
+from perception.io.store import Map
 from perception.pictures import features_to_rgb
 
 MODES = ("photo", "instances", "parts", "features", "confidence", "depth")
 HIGHLIGHT = np.array([255, 214, 10], np.uint8)
 
 
-def base_colors(gmap: GaussianMap) -> np.ndarray:
+def base_colors(gmap: Map) -> np.ndarray:
     """[N, 3] uint8: each Gaussian's colour seen from anywhere (its constant harmonic)."""
     return rgb8_from_sh(gmap.sh[:, 0])
 
 
 def paint(
-    gmap: GaussianMap, ids: np.ndarray, mode: str, scores: Mapping[int, float], from_above: np.ndarray | None = None
+    gmap: Map, ids: np.ndarray, mode: str, scores: Mapping[int, float], from_above: np.ndarray | None = None
 ) -> np.ndarray:
     """[N, 3] uint8 colours in a mode of MODES.
 

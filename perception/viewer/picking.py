@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.io.store import GaussianMap
+from perception.io.store import Map
 
 PIXEL = 0.0015
 """Radians that a click covers: about a pixel of a laptop's window. Thinner Gaussians count as that wide."""
@@ -35,9 +35,7 @@ def responses(
     return t, np.where(t > 0, strength, 0)
 
 
-def pick(
-    gmap: GaussianMap, ids: np.ndarray, shown: np.ndarray, origin: np.ndarray, direction: np.ndarray
-) -> int | None:
+def pick(gmap: Map, ids: np.ndarray, shown: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> int | None:
     """The instance id that a ray (origin [3], direction [3], map frame) shows, None when it meets none.
 
     Alpha compositing along the ray, front to back: the instance with the largest summed weight. shown [N] bool:
@@ -68,7 +66,7 @@ def pick(
     return int(totals.argmax())
 
 
-def covariances(gmap: GaussianMap) -> np.ndarray:
+def covariances(gmap: Map) -> np.ndarray:
     """[N, 3, 3] float32 second moments R S Sᵀ Rᵀ."""
     norms = np.linalg.norm(gmap.quats, axis=1, keepdims=True)
     quats = np.where(norms > 0, gmap.quats / np.where(norms > 0, norms, 1), np.array([1, 0, 0, 0], np.float32))

@@ -11,8 +11,7 @@ import numpy as np
 from perception.editing import Editor
 from perception.errors import InputError
 from perception.io.photos import load_photo
-from perception.io.scene_cache import view_from_json
-from perception.query import Hit, LoadedMap, PartsMap
+from perception.query import Hit, PartsMap, QueryMap
 from perception.types import View
 from perception.viewer.paint import highlight, paint
 from perception.viewer.picking import pick
@@ -32,19 +31,18 @@ class Session:
         self.question = ""
         self.hits: list[Hit] = []
         self._lock = threading.RLock()
-        self._opened: tuple[int, LoadedMap] | None = None
+        self._opened: tuple[int, QueryMap] | None = None
         self._edits = 0
         self.views = self._views()
 
     def _views(self) -> dict[str, View]:
-        views = [view_from_json(entry) for entry in self.editor.original.info.get("views", [])]
-        return {view.name: view for view in views}
+        return {view.name: view for view in self.editor.original.views}
 
     # ------------------------------------------------------------------ asking
 
-    def _loaded(self) -> LoadedMap:
+    def _loaded(self) -> QueryMap:
         if self._opened is None or self._opened[0] != self._edits:
-            self._opened = (self._edits, LoadedMap(self.editor.current(), self.editor.path))
+            self._opened = (self._edits, QueryMap.of(self.editor.current()))
         return self._opened[1]
 
     def ask(self, text: str, top_k: int = 5, parts: bool = False) -> list[Hit]:
@@ -145,7 +143,7 @@ class Session:
 
     def crop(self, instance: int) -> np.ndarray | None:
         """The best photo of an instance, cut out with a margin; None when no photo shows it or it is gone."""
-        gmap = self._loaded().gmap
+        gmap = self._loaded()
         place = next(i for i, entry in enumerate(gmap.instances) if entry["id"] == instance)
         if not gmap.language or gmap.language["view_counts"][place] == 0:
             return None
@@ -154,7 +152,7 @@ class Session:
         if view is None:
             return None
         try:
-            photo = load_photo(view, int(gmap.info["config"]["photos"]["max_side"]))
+            photo = load_photo(gmap.with_photo(view), int(gmap.info["config"]["photos"]["max_side"]))
         except InputError:  # photos may have moved since the map was made; the map itself is whole
             return None
         return _cut(photo, gmap.language["view_boxes"][row])

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from perception.io.store import GaussianMap
+from perception.io.store import Map
 from perception.viewer.picking import covariances
 
 FIRST = 25_000
@@ -17,7 +17,7 @@ FIRST = 25_000
 class Splats:
     """Sends each browser its own copy, since each has its own camera and comes and goes by itself."""
 
-    def __init__(self, gmap: GaussianMap, scale: float):
+    def __init__(self, gmap: Map, scale: float):
         self.centers = (gmap.means * np.float32(scale)).astype(np.float32)
         self.covariances = covariances(gmap) * np.float32(scale**2)
         self.first = most_visible(gmap, FIRST)
@@ -47,7 +47,7 @@ class Splats:
             self._handles.pop(client.client_id, None)
 
 
-def most_visible(gmap: GaussianMap, count: int) -> np.ndarray:
+def most_visible(gmap: Map, count: int) -> np.ndarray:
     """Rows of the `count` Gaussians that cover most (opacity times the area of the widest section), ascending."""
     if len(gmap) <= count:
         return np.arange(len(gmap))

@@ -312,4 +312,4 @@ def test_a_bag_of_the_fox_becomes_a_scene_for_the_mapper(tmp_path: Path) -> None
 
     quick = ["train.iterations=40", "train.budget=3000", "photos.max_side=120", "language.encoder=none"]
     gmap = build_map(tmp_path / "out", tmp_path / "fox.gsmap", load_config(None, quick))
-    assert len(gmap.cameras["names"]) == facts["chosen"] and gmap.info["quality"]["psnr"] > 12
+    assert len(gmap.views) == facts["chosen"] and gmap.info["quality"]["psnr"] > 12

@@ -17,6 +17,7 @@ from perception.cli import main
 from perception.demo import load_truth
 from perception.errors import InputError
 from perception.io.cloud import write_cloud
+from perception.io.store import read_info
 from perception.types import PointCloud
 
 QUICK = [
@@ -107,8 +108,8 @@ def ovs_run(downloads: Path, small_scene: Path, truth, tmp_path_factory: pytest.
 def test_lerf_ovs_from_download_to_table(ovs_run: Path, downloads: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = json.loads((ovs_run / "lerf_ovs.json").read_text())
     assert first["failed"] == {} and first["maps"]["table"]["quality"]["psnr"] > 10
-    held = np.load(ovs_run / "maps" / "table.gsmap" / "cameras.npz")
-    assert sorted(held["names"][held["held_out"]]) == TESTS
+    views = read_info(ovs_run / "maps" / "table.gsmap")["views"]
+    assert sorted(view["name"] for view in views if view["held_out"]) == TESTS
     # A second run renders nothing anew: it scores the predictions as they lie there.
     for picture in (ovs_run / "predictions").rglob("*.png"):
         cv2.imwrite(str(picture), np.zeros((96, 128), np.uint8))

@@ -16,7 +16,7 @@ from support.query_maps import NAMES, encoders, write_map_of
 
 
 def test_the_bench_finds_every_answer_right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("words", "engine"):
+    for module in ("text_ranking", "engine"):
         monkeypatch.setattr(f"perception.query.{module}.make_encoder", encoders)
     path = write_map_of(tmp_path / "a.gsmap", gaussians=600)
     facts, answers = warm(path, NAMES, 30)

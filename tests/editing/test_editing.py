@@ -9,7 +9,7 @@ import pytest
 
 from perception.editing import Editor, isolated
 from perception.errors import InputError
-from perception.io.store import GaussianMap, read_map, write_map
+from perception.io.store import Map, read_map, write_map
 from perception.language.colors import PALETTE
 from perception.language.description import InstanceDescription, to_arrays
 
@@ -39,7 +39,7 @@ def path(tmp_path: Path) -> Path:
         | {"obb": {"center": [0, 0, 0], "rotation": np.eye(3).tolist(), "extent": [1, 1, 1]}}
         for i in range(3)
     ]
-    gmap = GaussianMap(
+    gmap = Map(
         means.astype(np.float32),
         np.tile(np.float32([1, 0, 0, 0]), (201, 1)),
         np.full((201, 3), np.log(0.05), np.float32),
@@ -50,7 +50,7 @@ def path(tmp_path: Path) -> Path:
         np.where(ids >= 0, 0.9, 0).astype(np.float32),
         entries,
         {"frame": "map"},
-        {},
+        [],
         arrays,
     )
     out = tmp_path / "m.gsmap"
@@ -256,7 +256,7 @@ def test_parts_are_asked_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     parts = PartsMap(opened)
     assert [(hit.instance_id, len(hit.points), hit.parent) for hit in parts.of(0)] == [(4, 30, 0), (3, 25, 0)]
     assert parts.of(1) == []
-    np.testing.assert_array_equal(parts.of(0)[1].points, opened.gmap.means[:25])
+    np.testing.assert_array_equal(parts.of(0)[1].points, opened.means[:25])
 
     class Ranked:
         """Part number 1 fits "handle" best."""

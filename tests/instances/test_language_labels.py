@@ -13,12 +13,13 @@ from perception.errors import InputError
 from perception.geometry import look_at
 from perception.instances.survival import carry_labels, match_instances
 from perception.io.labels import give_names
-from perception.io.store import GaussianMap, read_map, write_map
+from perception.io.store import Map, read_map, write_map
+from support.views_at import views_at
 
 PLACES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1.2, 1, 0.2]])
 
 
-def a_map(places: np.ndarray, seed: int, names: list[str | None] | None = None) -> GaussianMap:
+def a_map(places: np.ndarray, seed: int, names: list[str | None] | None = None) -> Map:
     """Blobs of 300 Gaussians, ten centimetres wide, one an instance, with six cameras above."""
     rng = np.random.default_rng(seed)
     count = 300 * len(places)
@@ -27,7 +28,7 @@ def a_map(places: np.ndarray, seed: int, names: list[str | None] | None = None) 
     labels = names or [None] * len(places)
     eyes = [np.array([3 * np.cos(a), 3 * np.sin(a), 2 + 0.1 * a]) for a in range(6)]
     poses = np.stack([look_at(eye, np.zeros(3), np.array([0, 0, 1.0])) for eye in eyes])
-    return GaussianMap(
+    return Map(
         means.astype(np.float32), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, 3)), np.zeros(count),
         np.zeros((count, 1, 3)), np.zeros((count, 2)), ids.astype(np.int32), np.ones(count),
         [
@@ -35,7 +36,7 @@ def a_map(places: np.ndarray, seed: int, names: list[str | None] | None = None) 
              "obb": {"center": places[i].tolist(), "rotation": np.eye(3).tolist(), "extent": [0.2, 0.2, 0.2]}}
             for i, name in enumerate(labels)
         ], {},
-        {"names": np.array([f"{k}.jpg" for k in range(6)]), "camera_from_world": poses},
+        views_at(poses),
     )  # fmt: skip
 
 
@@ -100,14 +101,14 @@ def test_another_frame_is_tied_by_common_photos() -> None:
     old, new = a_map(PLACES, 0, ["cup", None, None, None]), a_map(PLACES, 1)
     rotation = look_at(np.zeros(3), np.array([1.0, 2, 3]), np.array([0, 0, 1.0]))[:3, :3]
     new.means = (2.5 * new.means @ rotation.T + [4, 5, 6]).astype(np.float32)
-    poses = new.cameras["camera_from_world"].copy()
+    poses = new.poses
     centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     poses[:, :3, :3] = poses[:, :3, :3] @ rotation.T
     poses[:, :3, 3] = -np.einsum("nij,nj->ni", poses[:, :3, :3], 2.5 * centres @ rotation.T + [4, 5, 6])
-    new.cameras = {"names": new.cameras["names"], "camera_from_world": poses}
+    new.views = views_at(poses)
     carried = carry_labels(old, new)
     assert carried.labels == {0: "cup"} and carried.aligned
-    new.cameras["names"] = np.array([f"other{k}.jpg" for k in range(6)])
+    new.views = views_at(poses, [f"other{k}.jpg" for k in range(6)])
     assert carry_labels(old, new).dropped == [(0, "cup")]
 
 

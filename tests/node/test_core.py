@@ -160,7 +160,7 @@ def test_thinned_cloud_of_the_map(tmp_path: Path) -> None:
         with heard.news:
             assert heard.news.wait_for(lambda: bool(heard.messages), 20)
         topic, cloud = heard.messages[0]
-        means = engine.current.gmap.means[::4]
+        means = engine.current.means[::4]
     assert topic is channels.MAP_CLOUD and cloud["width"] == 25
     rows = np.frombuffer(cloud["data"].tobytes(), [("xyz", "<f4", 3), ("rgb", "<u4"), ("id", "<i4")])
     np.testing.assert_array_equal(rows["xyz"], means)

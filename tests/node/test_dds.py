@@ -215,7 +215,7 @@ def test_late_comers_get_the_cloud_of_the_map(asker: NodeClient, map_path: Path)
     seat = Participant(DOMAIN, "localhost")
     reader = seat.reader("rt/steady/map/points", channels.MAP_CLOUD.kind, latched=True)
     rows = cloud_rows(take_until(reader, channels.MAP_CLOUD.kind, lambda m: True))
-    gmap = load_map(map_path, encoders=encoders).gmap
+    gmap = load_map(map_path, encoders=encoders)
     np.testing.assert_array_equal(np.stack([rows[axis] for axis in "xyz"], axis=1), gmap.means)
     np.testing.assert_array_equal(rows["instance_id"], gmap.instance_ids)
     seat.close()

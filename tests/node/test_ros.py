@@ -83,7 +83,7 @@ def test_both_nodes_give_the_same_answer_point_for_point(asked: tuple[Path, dict
 
 def test_latched_cloud_and_health_reach_rclpy(asked: tuple[Path, dict[str, dict[str, Any]]]) -> None:
     path, heard = asked
-    gmap = load_map(path, encoders=encoders).gmap
+    gmap = load_map(path, encoders=encoders)
     for transport in heard:
         np.testing.assert_array_equal(heard[transport]["map"], gmap.means)
         assert str(heard[transport]["health"]) == "serving"

@@ -22,8 +22,7 @@ from perception.errors import InputError  # noqa: E402
 from perception.export import ExportOptions  # noqa: E402
 from perception.geometry import look_at  # noqa: E402
 from perception.io.cloud import read_cloud, write_cloud  # noqa: E402
-from perception.io.scene_cache import view_json  # noqa: E402
-from perception.io.store import GaussianMap, write_map  # noqa: E402
+from perception.io.store import Map, write_map  # noqa: E402
 from perception.pipeline.exporting import Outputs, export_map  # noqa: E402
 from perception.types import PointCloud, View  # noqa: E402
 
@@ -50,8 +49,7 @@ def path(tmp_path: Path) -> Path:
         if i < 2:  # the last photo is gone
             cv2.imwrite(str(photo), np.full((480, 1280 // 2, 3), 40 * (i + 1), np.uint8))
         views.append(View(photo.name, photo, K, 640, 480, pose))
-    gmap.info["views"] = [view_json(view) for view in views]
-    gmap.cameras = {"camera_from_world": np.array(poses)}
+    gmap.views = views
     gmap.instances[2]["label"] = "blue ball"
     write_map(tmp_path / "m.gsmap", gmap)
     return tmp_path / "m.gsmap"
@@ -77,7 +75,7 @@ def test_every_message_decodes_and_lies_over_the_photos(path: Path, tmp_path: Pa
     assert schemas == DRAWN
     assert {topic: len(told) for topic, told in found.items()} == dict(zip(DRAWN, (1, 1, 1, 1, 3, 2, 2), strict=True))
 
-    gmap: GaussianMap = small_map()
+    gmap: Map = small_map()
     points = found["/map/points"][0]
     solid = gmap.opacities >= 0.5
     rows = np.frombuffer(points.data, [("p", "<f4", 3), ("rgb", "<u4")])

@@ -21,17 +21,14 @@ OUTSIDE = ["../outside", "a/../../outside", "..\\outside"]
 
 def received_map(folder: Path, name: str) -> Path:
     """A map whose one stored view is called `name`."""
+    path = folder / "m.gsmap"
     gmap = small_map(60)
-    gmap.cameras = {
-        "names": np.array([name]),
-        "photos": np.array(["gone.jpg"]),
-        "K": np.array([[[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]]),
-        "sizes": np.array([[32, 24]]),
-        "camera_from_world": np.eye(4)[None],
-        "held_out": np.array([True]),
-    }
-    write_map(folder / "m.gsmap", gmap)
-    return folder / "m.gsmap"
+    K = np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]])
+    gmap.views = [View("good.jpg", Path("gone.jpg"), K, 32, 24, np.eye(4))]
+    write_map(path, gmap)
+    text = (path / "map.json").read_text()
+    (path / "map.json").write_text(text.replace('"name": "good.jpg"', f'"name": {json.dumps(name)}'))
+    return path
 
 
 def camera_file(folder: Path, names: list[str]) -> Path:
@@ -48,7 +45,7 @@ def files(folder: Path) -> set[str]:
 @pytest.mark.parametrize("name", [*OUTSIDE, "/tmp/outside", ""])
 def test_a_view_name_of_a_received_map_never_leaves_the_output_folder(name: str, tmp_path: Path) -> None:
     path = received_map(tmp_path, name)
-    with pytest.raises(InputError, match=r"m\.gsmap: the photo name"):
+    with pytest.raises(InputError, match=r"map\.json: the photo name"):
         render_map(path, tmp_path / "a" / "b", None, ["rgb"])
     assert files(tmp_path) == set()
 

@@ -15,7 +15,7 @@ import pytest
 
 from perception.errors import InputError
 from perception.io.store import set_labels
-from perception.query import AnswerTimeout, EngineBusy, EngineClosed, LoadedMap, QueryEngine, Request, Where, load_map
+from perception.query import AnswerTimeout, EngineBusy, EngineClosed, QueryEngine, QueryMap, Request, Where, load_map
 from support.query_maps import NAMES, HashEncoder, encoders, write_map_of
 
 
@@ -32,7 +32,7 @@ def held(engine: QueryEngine) -> threading.Event:
     """Keeps one worker busy until the event is set; returns once it has begun."""
     begun, end = threading.Event(), threading.Event()
 
-    def work(gmap: LoadedMap) -> None:
+    def work(gmap: QueryMap) -> None:
         begun.set()
         end.wait(30)
 
@@ -237,12 +237,12 @@ def test_one_loaded_map_serves_many_threads_from_the_first_moment(path: Path) ->
         gmap = load_map(path, encoders)
         gate = threading.Barrier(8)
 
-        def ask(number: int, gmap: LoadedMap = gmap, gate: threading.Barrier = gate) -> list[int]:
+        def ask(number: int, gmap: QueryMap = gmap, gate: threading.Barrier = gate) -> list[int]:
             gate.wait()
             name = NAMES[number % len(NAMES)]
             hit = gmap.query(name, where=Where(near=[0, 0, 0]))[0]
             at = gmap.instance_at(hit.centroid)
-            assert at is not None and len(gmap.gmap) == 900
+            assert at is not None and len(gmap) == 900
             return [hit.instance_id, at.instance_id, gmap.describe(hit.instance_id).hit.instance_id]
 
         with ThreadPoolExecutor(8) as pool:
@@ -262,7 +262,7 @@ def test_memory_of_answers_is_let_go(path: Path) -> None:
     with engine_of(path) as engine:
         for number in range(400):
             engine.ask(Request(f"thing {number}", min_score=0.0))
-        assert len(engine.current._words._ranked) <= 256
+        assert len(engine.current._ranking._ranked) <= 256
         assert np.array_equal(engine.ask("mug").hits[0].points, engine.current.get(0).points)
 
 

@@ -39,7 +39,7 @@ def world(kitchen: Path) -> Iterator[dict[str, Any]]:
     """The names after all Python snippets have run, a server at the port they speak of."""
     before = read_map(kitchen)
     patch = pytest.MonkeyPatch()
-    for module in ("words", "engine"):
+    for module in ("text_ranking", "engine"):
         patch.setattr(f"perception.query.{module}.make_encoder", encoders)
     patch.chdir(kitchen.parent)
     names: dict[str, Any] = {"before": before}

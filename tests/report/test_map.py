@@ -10,9 +10,10 @@ import pytest
 
 from perception.colors import instance_palette
 from perception.config import load_config
-from perception.io.store import GaussianMap
+from perception.io.store import Map
 from perception.pipeline.reporting import _left_out, rerun_command
 from perception.pipeline.top_view import instances_top_view
+from support.views_at import views_at
 
 
 @pytest.mark.parametrize(
@@ -47,7 +48,7 @@ def test_photos_that_are_not_in_the_map_are_named_by_reason() -> None:
     assert _left_out({}) == []
 
 
-def plan(ceiling: bool) -> GaussianMap:
+def plan(ceiling: bool) -> Map:
     """Balls on the ground (z up), id 0 at x = 0 and 1 at x = 4, perhaps a ceiling; a camera at z = 2 looks along y."""
     rng = np.random.default_rng(0)
     count = 400
@@ -59,7 +60,7 @@ def plan(ceiling: bool) -> GaussianMap:
     pose = np.eye(4)
     pose[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # right = x, down = -z, forward = y
     pose[:3, 3] = -pose[:3, :3] @ [2, -1, 2]
-    return GaussianMap(
+    return Map(
         means.astype(np.float32),
         np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
         np.full((n, 3), np.log(0.1), np.float32),
@@ -70,7 +71,7 @@ def plan(ceiling: bool) -> GaussianMap:
         np.ones(n, np.float32),
         [],
         {"metric": True},
-        {"camera_from_world": pose[None]},
+        views_at([pose]),
     )
 
 

@@ -27,7 +27,7 @@ from perception.errors import InputError
 from perception.io.cloud import read_cloud
 from perception.io.store import read_map
 from perception.listening import is_local, read_token
-from perception.query import LoadedMap, QueryEngine
+from perception.query import QueryEngine, QueryMap
 from perception.serve.app import build_app
 from perception.serve.guard import Guard
 from perception.serve.settings import ServeSettings
@@ -137,12 +137,11 @@ def test_the_best_photo_is_cut_around_its_box(tmp_path: Path) -> None:
     photo[40:60, 100:130] = (255, 0, 0)
     cv2.imwrite(str(tmp_path / "p.png"), photo[..., ::-1])
     gmap = read_map(path)
-    from perception.io.scene_cache import view_json
     from perception.io.store import write_map
     from perception.types import View
 
     view = View("00000.jpg", tmp_path / "p.png", np.eye(3), 160, 100, np.eye(4))
-    gmap.info["views"] = [view_json(view)]
+    gmap.views = [view]
     gmap.language["view_boxes"] = np.array([[100, 40, 130, 60]], np.int32)
     write_map(path, gmap)
     with QueryEngine(path, watch=None, encoders=encoders) as engine:
@@ -338,7 +337,7 @@ def test_a_full_queue_and_a_slow_answer_are_told(path: Path) -> None:
         client = client_of(engine)
         begun, end = threading.Event(), threading.Event()
 
-        def work(gmap: LoadedMap) -> None:
+        def work(gmap: QueryMap) -> None:
             begun.set()
             end.wait(30)
 
@@ -358,10 +357,10 @@ def test_a_full_queue_and_a_slow_answer_are_told(path: Path) -> None:
 def test_a_defect_is_logged_and_not_shown(
     engine: QueryEngine, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def broken(self: LoadedMap, *_: Any, **__: Any) -> None:
+    def broken(self: QueryMap, *_: Any, **__: Any) -> None:
         raise ZeroDivisionError("secret detail")
 
-    monkeypatch.setattr(LoadedMap, "find", broken)
+    monkeypatch.setattr(QueryMap, "find", broken)
     answer = client_of(engine).get("/instances")
     refused(answer, 500, "log")
     assert "secret" not in answer.text and "secret detail" in caplog.text

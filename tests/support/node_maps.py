@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.boxes import oriented_box
-from perception.io.store import GaussianMap, write_map
+from perception.io.store import Map, write_map
 from perception.language.description import InstanceDescription, to_arrays
 
 DIM = 16
@@ -66,7 +66,7 @@ def write_small_map(path: Path, labels: Sequence[str], points: int = 50, seed: i
     ]
     write_map(
         path,
-        GaussianMap(
+        Map(
             means=means,
             quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
             log_scales=np.full((count, 3), -4, np.float32),

@@ -6,10 +6,11 @@ import socket
 
 import numpy as np
 
-from perception.io.store import GaussianMap
+from perception.io.store import Map
+from support.views_at import views_at
 
 
-def small_map(count: int = 600, seed: int = 0) -> GaussianMap:
+def small_map(count: int = 600, seed: int = 0) -> Map:
     """Three balls of colour in front of a wall that is no instance; a camera at the origin looks along z."""
     rng = np.random.default_rng(seed)
     ids = rng.integers(-1, 3, count).astype(np.int32)
@@ -24,7 +25,7 @@ def small_map(count: int = 600, seed: int = 0) -> GaussianMap:
         | {"obb": {"center": centres[i].tolist(), "rotation": np.eye(3).tolist(), "extent": [1, 1, 1]}}
         for i in range(3)
     ]
-    return GaussianMap(
+    return Map(
         (centres[ids] + rng.normal(size=(count, 3)) * spread).astype(np.float32),
         (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
         rng.uniform(np.log(0.05), np.log(0.15), (count, 3)).astype(np.float32),
@@ -34,8 +35,8 @@ def small_map(count: int = 600, seed: int = 0) -> GaussianMap:
         ids,
         np.where(ids >= 0, 1, 0).astype(np.float32),
         entries,
-        {"frame": "map", "metric": True, "views": [], "config": {"language": {"encoder": "auto"}}},
-        {"camera_from_world": pose},
+        {"frame": "map", "metric": True, "config": {"language": {"encoder": "auto"}}},
+        views_at(pose),
     )
 
 

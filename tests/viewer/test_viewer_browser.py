@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from perception.io.map_lock import writing
-from perception.io.store import GaussianMap, read_map, set_labels, write_map
+from perception.io.store import Map, read_map, set_labels, write_map
 from perception.language.description import InstanceDescription, to_arrays
 from support.viewer_maps import free_port, small_map
 
@@ -29,7 +29,7 @@ FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-
 class Asked:
     """Stands for the language model: "pear" is instance 1, nothing else is present."""
 
-    def __init__(self, opened: GaussianMap, path: Path):
+    def __init__(self, opened: Map, path: Path):
         self.gmap = opened
 
     def query(self, text: str, top_k: int) -> list[Any]:
@@ -66,7 +66,7 @@ def path(tmp_path: Path) -> Path:
 def viewer(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     from perception.viewer import session, start_viewer
 
-    monkeypatch.setattr(session, "LoadedMap", Asked)
+    monkeypatch.setattr(session, "QueryMap", Asked)
     running = start_viewer(path, port=free_port())
     yield running
     running.stop()
@@ -236,14 +236,14 @@ def test_parts_are_shown_found_and_split_along(path: Path, browser: Any, monkeyp
 
     class AskedParts:
         def __init__(self, opened: Any):
-            self.gmap = opened.gmap
+            self.gmap = opened
 
         def query(self, text: str, top_k: int) -> list[Hit]:
             points = self.gmap.means[self.gmap.parts["ids"] == 10]
             box = OrientedBox(points.mean(0), np.eye(3), np.ones(3))
             return [Hit(10, 0.8, points, points.mean(0), box, parent=1)]
 
-    monkeypatch.setattr(session, "LoadedMap", Asked)
+    monkeypatch.setattr(session, "QueryMap", Asked)
     monkeypatch.setattr(session, "PartsMap", AskedParts)
     viewer = start_viewer(path, port=free_port())
     try:

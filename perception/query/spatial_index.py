@@ -1,4 +1,4 @@
-"""Distances and shares over the points of instances: exact, with boxes to spare most of the work."""
+"""Exact distances to instances' points, and shares of them inside regions; bounding boxes rule most instances out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z i
 _NEIGHBORS = 8
 
 
-class Space:
+class SpatialIndex:
     """The points of all instances; bounds [K, 2, 3] are their lowest and highest corners, in the order of ids."""
 
     def __init__(self, index: InstanceIndex) -> None:

@@ -1,25 +1,22 @@
-"""A map opened for questions: `perception.load_map`."""
+"""A map that answers questions: `perception.load_map`."""
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.instance_index import InstanceIndex
-from perception.io.map_files import MapFiles
-from perception.io.store import GaussianMap, gaussian_map
+from perception.io.map import Map
 from perception.query.frames import Frame, move_points
 from perception.query.hit import Description, Hit, Neighbor
 from perception.query.requests import Request
-from perception.query.space import Space
+from perception.query.spatial_index import SpatialIndex
+from perception.query.text_ranking import Encoders, TextRanking
 from perception.query.where import Where, place, tidy
-from perception.query.words import Encoders, Words
 from perception.types import OrientedBox
 
 if TYPE_CHECKING:
@@ -33,74 +30,32 @@ class UnknownInstance(InputError):
     """The map has no instance with this id."""
 
 
-class LoadedMap:
-    """A map opened for questions, by any number of threads at once.
+class QueryMap(Map):
+    """A `Map` that answers questions, from any number of threads at once.
 
-    What only some questions need waits for them: Gaussians for `gmap`, embeddings and encoder for the first prompt.
-    The directory may be replaced meanwhile: this object goes on answering from the map it opened.
+    What only some questions need is read for the first of them: embeddings and encoder for the first prompt. The folder
+    may be replaced meanwhile: this object goes on answering from the map it opened.
 
     Every method that takes `frame` speaks that frame: points, poses, boxes and lengths given to it are in that frame,
     and so is all it returns. Without, everything is in the map's own frame (`frame`), in metres when `metric`.
     """
 
-    def __init__(self, held: GaussianMap | MapFiles, path: Path | None = None, encoders: Encoders | None = None):
-        self._held, self.path = held, path
-        self._words = Words(held, path, encoders, lambda: self._index)
-        self._lock = threading.RLock()
-        self._covariances: dict[int, np.ndarray] = {}
-        self._made_gmap: GaussianMap | None = None
-        self._made_space: Space | None = None
-
-    # ------------------------------------------------------------------- facts
-
-    @property
-    def frame(self) -> str:
-        """The name of the map's frame."""
-        return str(self.info.get("frame", "map"))
-
-    @property
-    def metric(self) -> bool:
-        """Whether the unit of length is known to be the metre."""
-        return bool(self.info.get("metric", False))
-
-    @property
-    def info(self) -> dict[str, Any]:
-        """map.json."""
-        return self._held.info
-
-    @property
-    def instances(self) -> list[dict[str, Any]]:
-        """The list of instances.json."""
-        return self._held.instances
-
-    @property
-    def map_id(self) -> str:
-        """Short name of this very map with these very labels; another one has another."""
-        return self._held.map_id if isinstance(self._held, MapFiles) else "unsaved"
-
-    @property
-    def gmap(self) -> GaussianMap:
-        """All arrays in memory, read at first use."""
-        if isinstance(self._held, GaussianMap):
-            return self._held
-        with self._lock:
-            if self._made_gmap is None:
-                self._made_gmap = gaussian_map(self._held)
-            return self._made_gmap
+    encoders: Encoders | None = None
+    """Makes an encoder from its name in the map's config; perception.language.make_encoder when None."""
 
     @property
     def problem(self) -> str | None:
         """Why prompts cannot be answered (no embeddings, no encoder), one line; None when they can."""
-        return self._words.problem
+        return self._ranking.problem
 
     @property
     def ranker(self) -> Ranker:
-        """What ranks the instances for a prompt; InputError when the map has no words."""
-        return self._words.ranker
+        """What ranks the instances for a prompt; InputError when the map has no embeddings or encoder."""
+        return self._ranking.ranker
 
     def warm(self) -> None:
         """Does now what the first questions would wait for."""
-        _ = self._space
+        _ = self._spatial
         if self.problem is None and self.instances:
             _ = self.ranker.shapes
             self.query("thing")
@@ -125,7 +80,7 @@ class LoadedMap:
         Request(text, top_k, min_score)
         if not self.instances:
             return []
-        answer = self._words.rank(text, min_score)
+        answer = self._ranking.rank(text, min_score)
         if where is None:
             if not answer.present:
                 return []
@@ -157,21 +112,21 @@ class LoadedMap:
         wanted = (where or Where()).in_map(frame)
         point = place(near) if frame is None else move_points(frame.to_map, place(near))
         ids = {self._id(n): n for n in self._fulfilling(wanted)}
-        found = self._space.nearest(point, top_k, ids)
+        found = self._spatial.nearest(point, top_k, ids)
         return [self._in(frame, self._measured(ids[i], Where(near=point))) for _, i in found]
 
     def instance_at(
         self, point: np.ndarray, *, max_distance: float | None = None, frame: Frame | None = None
     ) -> Hit | None:
         """The instance that `point` [3] lies on: the one with the nearest point, if that is at most `max_distance`
-        away; when None, no farther than the spacing of the instance's points there (see `Space.reaches`)."""
+        away; when None, no farther than the spacing of the instance's points there (see `SpatialIndex.reaches`)."""
         hits = self.nearest(place(point), 1, frame=frame)
         if not hits or hits[0].distance is None:
             return None
         if max_distance is not None:
             return hits[0] if hits[0].distance <= max_distance else None
         spot = place(point) if frame is None else move_points(frame.to_map, place(point))
-        return hits[0] if self._space.reaches(hits[0].instance_id, spot) else None
+        return hits[0] if self._spatial.reaches(hits[0].instance_id, spot) else None
 
     def get(self, instance_id: int, *, frame: Frame | None = None) -> Hit:
         """The instance with this id; InputError when there is none."""
@@ -182,7 +137,7 @@ class LoadedMap:
         position = self.position(instance_id)
         hit = self._in(frame, self.hit(position))
         scale = 1.0 if frame is None else float(np.cbrt(np.linalg.det(frame.from_map[:3, :3])))
-        beside = self._space.neighbors(instance_id, _NEIGHBORS)
+        beside = self._spatial.neighbors(instance_id, _NEIGHBORS)
         labels = {entry["id"]: entry.get("label") for entry in self.instances}
         bounds = np.array([hit.points.min(axis=0), hit.points.max(axis=0)] if len(hit.points) else np.full((2, 3), 0.0))
         return Description(
@@ -203,7 +158,7 @@ class LoadedMap:
         """The instance at place `position` of instances.json; score: its own confidence when None."""
         entry = self.instances[position]
         box = entry["obb"]
-        points = self._index.of(entry["id"])
+        points = self.index.of(entry["id"])
         return Hit(
             int(entry["id"]),
             float(entry["score"]) if score is None else score,
@@ -230,7 +185,7 @@ class LoadedMap:
         if not names:
             return None
         start = int(self._view_stops[position]) - len(names)
-        x0, y0, x1, y1 = (int(value) for value in self._held.language["view_boxes"][start])
+        x0, y0, x1, y1 = (int(value) for value in self.language["view_boxes"][start])
         return names[0], (x0, y0, x1, y1)
 
     # --------------------------------------------------------------- internals
@@ -260,16 +215,16 @@ class LoadedMap:
             return False
         if where.max_size is not None and longest > where.max_size:
             return False
-        if where.region is not None and self._space.share_inside(entry["id"], where.region) < where.share:
+        if where.region is not None and self._spatial.share_inside(entry["id"], where.region) < where.share:
             return False
-        return where.within is None or self._space.distance(entry["id"], np.asarray(where.near)) <= where.within
+        return where.within is None or self._spatial.distance(entry["id"], np.asarray(where.near)) <= where.within
 
     def _measured(self, position: int, where: Where, score: float | None = None) -> Hit:
         """A hit that says its distance where `where` names a place."""
         hit = self.hit(position, score)
         if where.near is None:
             return hit
-        return replace(hit, distance=self._space.distance(hit.instance_id, np.asarray(where.near)))
+        return replace(hit, distance=self._spatial.distance(hit.instance_id, np.asarray(where.near)))
 
     def _in(self, frame: Frame | None, hit: Hit) -> Hit:
         return hit if frame is None else hit.transformed(frame.from_map, frame.name)
@@ -282,7 +237,7 @@ class LoadedMap:
         return {int(entry["id"]): n for n, entry in enumerate(self.instances)}
 
     def _views(self, position: int) -> tuple[str, ...]:
-        language = self._held.language
+        language = self.language
         if not language:
             return ()
         stop = int(self._view_stops[position])
@@ -291,12 +246,12 @@ class LoadedMap:
 
     @cached_property
     def _view_stops(self) -> np.ndarray:
-        return np.cumsum(self._held.language["view_counts"])
+        return np.cumsum(self.language["view_counts"])
 
     def _covariance(self, position: int) -> np.ndarray:
         """[3, 3] of the instance's points, computed once."""
         if position not in self._covariances:
-            points = self._index.of(self._id(position)).astype(np.float64)
+            points = self.index.of(self._id(position)).astype(np.float64)
             centred = points - points.mean(axis=0) if len(points) else points
             covariance = centred.T @ centred / max(len(points), 1)
             covariance.setflags(write=False)
@@ -305,7 +260,7 @@ class LoadedMap:
 
     def _colors(self, position: int) -> tuple[tuple[str, float], ...]:
         """Names of the instance's colours and their shares, from 5 % up, largest first."""
-        palettes = self._held.language.get("palettes")
+        palettes = self.language.get("palettes")
         if palettes is None:
             return ()
         from perception.language.colors import COLOR_NAMES, color_share
@@ -313,23 +268,25 @@ class LoadedMap:
         shares = [(name, float(color_share(palettes[position : position + 1], name)[0])) for name in COLOR_NAMES]
         return tuple(sorted((entry for entry in shares if entry[1] >= _LEAST_COLOR), key=lambda entry: -entry[1]))
 
-    @property
-    def _index(self) -> InstanceIndex:
-        return self._space.index
+    @cached_property
+    def _covariances(self) -> dict[int, np.ndarray]:
+        return {}
 
-    @property
-    def _space(self) -> Space:
-        with self._lock:
-            if self._made_space is None:
-                self._made_space = Space(self._held.instance_index())
-            return self._made_space
+    @cached_property
+    def _ranking(self) -> TextRanking:
+        return TextRanking(self, self.encoders)
+
+    @cached_property
+    def _spatial(self) -> SpatialIndex:
+        return SpatialIndex(self.index)
 
 
-def load_map(path: str | Path, encoders: Encoders | None = None) -> LoadedMap:
+def load_map(path: str | Path, encoders: Encoders | None = None) -> QueryMap:
     """Opens a map directory, a million Gaussians in well under a second.
 
     encoders: makes an encoder from its name in the map's config; perception.language.encoders.make_encoder when None.
     Raises InputError when `path` is no map, damaged, or of another format version.
     """
-    path = Path(path)
-    return LoadedMap(MapFiles(path), path, encoders)
+    gmap = QueryMap.open(Path(path))
+    gmap.encoders = encoders
+    return gmap

@@ -1,4 +1,4 @@
-"""The words of a map: its embeddings and their encoder, loaded at the first prompt, and rankings kept for the next."""
+"""Ranks the instances of a map for prompts; embeddings and encoder are loaded at the first prompt."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.instance_index import InstanceIndex
-from perception.io.map_files import MapFiles
-from perception.io.store import GaussianMap
+from perception.io.map import Map
 from perception.language.base import Encoder
 from perception.language.encoders import make_encoder
 
@@ -27,18 +24,11 @@ REMEMBERED = 256
 """Prompts whose ranking is kept: planners ask the same thing again and again."""
 
 
-class Words:
-    """Ranks the instances of an opened map for prompts; thread-safe."""
+class TextRanking:
+    """Ranks the instances of `gmap` for prompts; thread-safe. `encoders` makes an encoder from its name."""
 
-    def __init__(
-        self,
-        held: GaussianMap | MapFiles,
-        path: Path | None,
-        encoders: Encoders | None,
-        index: Callable[[], InstanceIndex],
-    ) -> None:
-        """index: gives the points of the instances when a prompt first names a shape."""
-        self._held, self._path, self._index = held, path, index
+    def __init__(self, gmap: Map, encoders: Encoders | None) -> None:
+        self._gmap = gmap
         self._encoders = encoders or make_encoder
         self._lock = threading.RLock()
         self._made: Ranker | InputError | None = None
@@ -86,26 +76,26 @@ class Words:
         from perception.language.description import check_encoder, from_arrays
         from perception.language.ranking import Ranker
 
-        if not self._held.language:
+        if not self._gmap.language:
             raise InputError(
-                f"{self._path}: holds no language embeddings; map again with an encoder (language.encoder=…)"
+                f"{self._gmap.path}: holds no language embeddings; map again with an encoder (language.encoder=…)"
             )
-        descriptions, identity = from_arrays(self._held.language)
-        spec = self._held.info.get("config", {}).get("language", {}).get("encoder", "auto")
+        descriptions, identity = from_arrays(self._gmap.language)
+        spec = self._gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
         encoder = self._encoders("conse" if spec == "auto" else spec)
         if encoder is None:
-            raise InputError(f"{self._path}: was mapped without an encoder; map again with language.encoder=conse")
+            raise InputError(f"{self._gmap.path}: was mapped without an encoder; map again with language.encoder=conse")
         check_encoder(identity, encoder.identity)
-        labels = [entry.get("label") for entry in self._held.instances]
+        labels = [entry.get("label") for entry in self._gmap.instances]
         return Ranker(descriptions, encoder, labels, self._shapes)
 
     def _shapes(self) -> np.ndarray:
         from perception.instances.shapes import shape_scores
 
-        index = self._index()
+        index = self._gmap.index
         owners = np.repeat(index.ids, np.diff(index.starts))
-        poses = self._held.cameras.get("camera_from_world", np.zeros((0, 4, 4)))
-        return shape_scores(index.points, owners, [entry["id"] for entry in self._held.instances], poses)
+        poses = self._gmap.poses
+        return shape_scores(index.points, owners, [entry["id"] for entry in self._gmap.instances], poses)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What stands behind the engine: the line of waiting questions, and the figures of what became of them."""
+"""The engine's bounded request queue, and its counters."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from perception.query.opened import LoadedMap
+    from perception.query.query_map import QueryMap
 
 _REMEMBERED = 1000
-"""Latencies kept for the health figures."""
+"""Latencies kept for `health`."""
 
 
 @dataclass(eq=False)
 class Job:
     """A question, who waits for its answer, and since and until when (monotonic seconds)."""
 
-    work: Callable[[LoadedMap], Any]
+    work: Callable[[QueryMap], Any]
     future: Future[Any]
     asked: float
     deadline: float
 
 
-class Line:
-    """Jobs waiting their turn, at most `most`; those nobody waits for any more make room for others."""
+class RequestQueue:
+    """At most `most` waiting jobs, first in, first out. When it is full, cancelled and expired jobs make room: `drop`
+    is called with each of them."""
 
     def __init__(self, most: int, drop: Callable[[Job], None]) -> None:
         self.most, self._drop = most, drop
@@ -41,8 +42,8 @@ class Line:
     def __len__(self) -> int:
         return len(self._jobs)
 
-    def join(self, job: Job) -> bool:
-        """False when the line is full or closed."""
+    def put(self, job: Job) -> bool:
+        """Appends a job; False when the queue is full or closed."""
         late: list[Job] = []
         with self._changed:
             if len(self._jobs) >= self.most:
@@ -57,15 +58,15 @@ class Line:
             self._drop(waiting)
         return taken
 
-    def next(self) -> Job | None:
-        """The job that waited longest, None once the line is closed; blocks."""
+    def get(self) -> Job | None:
+        """The job that waited longest; blocks until there is one. None once the queue is closed."""
         with self._changed:
             while self._open and not self._jobs:
                 self._changed.wait()
             return self._jobs.popleft() if self._open else None
 
     def close(self) -> list[Job]:
-        """Ends the line; returns those that still waited."""
+        """Closes the queue; returns the jobs that were still waiting."""
         with self._changed:
             self._open = False
             self._changed.notify_all()
@@ -73,8 +74,8 @@ class Line:
         return left
 
 
-class Figures:
-    """Totals and recent latencies."""
+class Counters:
+    """How many requests ended in which way since the start, and the latencies of the last answers."""
 
     _NAMES = ("answered", "bad_input", "failed", "refused", "timed_out", "reloads")
 

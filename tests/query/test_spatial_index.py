@@ -11,8 +11,8 @@ import perception
 from perception.bench.synthetic_map import SIGMA, grid
 from perception.errors import InputError
 from perception.geometry import rotation_from_quaternion
-from perception.io.store import GaussianMap, read_map, set_labels
-from perception.query import Frame, LoadedMap, Prism, Where, axis_box, load_map
+from perception.io.store import Map, read_map, set_labels
+from perception.query import Frame, Prism, QueryMap, Where, axis_box, load_map
 from perception.types import OrientedBox
 from support.query_maps import NAMES, encoders, write_map_of
 
@@ -25,16 +25,16 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def gmap(path: Path) -> LoadedMap:
+def gmap(path: Path) -> QueryMap:
     return load_map(path, encoders)
 
 
 @pytest.fixture(scope="module")
-def arrays(path: Path) -> GaussianMap:
+def arrays(path: Path) -> Map:
     return read_map(path)
 
 
-def members(arrays: GaussianMap, number: int) -> np.ndarray:
+def members(arrays: Map, number: int) -> np.ndarray:
     return arrays.means[arrays.instance_ids == number].astype(np.float64)
 
 
@@ -45,7 +45,7 @@ def similarity(rng: np.random.Generator, scale: float) -> np.ndarray:
     return matrix
 
 
-def test_hits_are_the_gaussians_of_their_instance(gmap: LoadedMap, arrays: GaussianMap) -> None:
+def test_hits_are_the_gaussians_of_their_instance(gmap: QueryMap, arrays: Map) -> None:
     hits = gmap.find()
     assert [hit.instance_id for hit in hits] == list(range(3, 12))
     for hit in hits:
@@ -60,7 +60,7 @@ def test_hits_are_the_gaussians_of_their_instance(gmap: LoadedMap, arrays: Gauss
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_nearest_agrees_with_brute_force(gmap: LoadedMap, arrays: GaussianMap, seed: int) -> None:
+def test_nearest_agrees_with_brute_force(gmap: QueryMap, arrays: Map, seed: int) -> None:
     point = np.random.default_rng(seed).uniform(-2, 5, 3)
     brute = sorted((np.linalg.norm(members(arrays, k) - point, axis=1).min(), k) for k in range(3, 12))
     hits = gmap.nearest(point, 4)
@@ -72,14 +72,14 @@ def test_nearest_agrees_with_brute_force(gmap: LoadedMap, arrays: GaussianMap, s
     assert len(gmap.nearest(point, 100)) == 9
 
 
-def test_nearest_on_ties_and_inside_points(gmap: LoadedMap, arrays: GaussianMap) -> None:
+def test_nearest_on_ties_and_inside_points(gmap: QueryMap, arrays: Map) -> None:
     for k in (3, 7, 11):
         (hit,) = gmap.nearest(members(arrays, k)[5])
         assert (hit.instance_id, hit.distance) == (k, 0.0)
 
 
 @pytest.mark.parametrize("share", [0.01, 0.5, 1.0])
-def test_in_box_counts_points(gmap: LoadedMap, arrays: GaussianMap, share: float) -> None:
+def test_in_box_counts_points(gmap: QueryMap, arrays: Map, share: float) -> None:
     rng = np.random.default_rng(int(100 * share))
     for _ in range(12):
         box = OrientedBox(rng.uniform(0, 2, 3), rotation_from_quaternion(rng.normal(size=4)), rng.uniform(0.1, 3, 3))
@@ -96,7 +96,7 @@ def test_in_box_counts_points(gmap: LoadedMap, arrays: GaussianMap, share: float
     assert gmap.in_box(axis_box([5, 5, 5], [6, 6, 6]), share=0.01) == []
 
 
-def test_a_concave_polygon_holds_what_lies_over_it(gmap: LoadedMap) -> None:
+def test_a_concave_polygon_holds_what_lies_over_it(gmap: QueryMap) -> None:
     """An L over the cells (0, 0), (1, 0), (2, 0), (0, 1), (0, 2) of the 3 × 3 grid."""
     corners = np.array([[-0.5, -0.5], [2.5, -0.5], [2.5, 0.5], [0.5, 0.5], [0.5, 2.5], [-0.5, 2.5]])
     for polygon in (corners, corners[::-1]):
@@ -107,7 +107,7 @@ def test_a_concave_polygon_holds_what_lies_over_it(gmap: LoadedMap) -> None:
     assert [hit.instance_id for hit in half] == [3, 4, 5, 6, 9]
 
 
-def test_instance_at_follows_the_points_spacing(gmap: LoadedMap, arrays: GaussianMap) -> None:
+def test_instance_at_follows_the_points_spacing(gmap: QueryMap, arrays: Map) -> None:
     for k, center in zip(range(3, 12), grid(9), strict=True):
         hit = gmap.instance_at(center)
         assert hit is not None and hit.instance_id == k
@@ -120,7 +120,7 @@ def test_instance_at_follows_the_points_spacing(gmap: LoadedMap, arrays: Gaussia
     assert gmap.instance_at([0, 0, 100.0]) is None
 
 
-def test_filters_of_size_label_and_distance(gmap: LoadedMap, arrays: GaussianMap) -> None:
+def test_filters_of_size_label_and_distance(gmap: QueryMap, arrays: Map) -> None:
     longest = {k: max(gmap.get(k).obb.extent) for k in range(3, 12)}
     bound = float(np.median(list(longest.values())))
     big = [k for k, value in longest.items() if value >= bound]
@@ -139,7 +139,7 @@ def test_filters_of_size_label_and_distance(gmap: LoadedMap, arrays: GaussianMap
             assert hit.distance is not None and hit.distance <= within
 
 
-def test_a_prompt_with_a_filter_looks_only_where_it_may(gmap: LoadedMap) -> None:
+def test_a_prompt_with_a_filter_looks_only_where_it_may(gmap: QueryMap) -> None:
     around = Where(region=axis_box(grid(9)[2] - 0.5, grid(9)[2] + 0.5))
     assert [hit.instance_id for hit in gmap.query("laptop", where=around)] == [5]
     assert gmap.query("mug", where=around) == []  # the mug is elsewhere, and nothing here is like it
@@ -151,9 +151,7 @@ def test_a_prompt_with_a_filter_looks_only_where_it_may(gmap: LoadedMap) -> None
 
 
 @pytest.mark.parametrize("scale", [1.0, 2.5])
-def test_everything_in_another_frame_is_the_same_thing_moved(
-    gmap: LoadedMap, arrays: GaussianMap, scale: float
-) -> None:
+def test_everything_in_another_frame_is_the_same_thing_moved(gmap: QueryMap, arrays: Map, scale: float) -> None:
     rng = np.random.default_rng(3)
     base_from_map = similarity(rng, scale)
     base = Frame("base", base_from_map)
@@ -187,7 +185,7 @@ def test_everything_in_another_frame_is_the_same_thing_moved(
     assert len(gmap.find(size, frame=base)) == 5
 
 
-def test_there_and_back_is_where_we_were(gmap: LoadedMap) -> None:
+def test_there_and_back_is_where_we_were(gmap: QueryMap) -> None:
     a_from_b = similarity(np.random.default_rng(5), 0.3)
     hit = gmap.get(5)
     back = hit.transformed(a_from_b, "a").transformed(np.linalg.inv(a_from_b), "map")
@@ -195,7 +193,7 @@ def test_there_and_back_is_where_we_were(gmap: LoadedMap) -> None:
     assert np.allclose(back.covariance, hit.covariance) and np.allclose(back.obb.rotation, hit.obb.rotation)
 
 
-def test_a_description_names_neighbours_by_their_gap(gmap: LoadedMap, arrays: GaussianMap) -> None:
+def test_a_description_names_neighbours_by_their_gap(gmap: QueryMap, arrays: Map) -> None:
     told = gmap.describe(7).to_json()
     gaps = {}
     for k in range(3, 12):
@@ -242,7 +240,7 @@ def test_a_description_names_neighbours_by_their_gap(gmap: LoadedMap, arrays: Ga
         lambda g: g.get(3, frame=Frame("a", np.zeros((4, 4)))),
     ],
 )
-def test_bad_questions_are_told_in_one_line(gmap: LoadedMap, ask) -> None:
+def test_bad_questions_are_told_in_one_line(gmap: QueryMap, ask) -> None:
     with pytest.raises(InputError) as error:
         ask(gmap)
     assert "\n" not in str(error.value) and len(str(error.value)) < 300
@@ -262,11 +260,11 @@ def test_a_map_without_instances_answers_nothing(tmp_path: Path) -> None:
     gmap = read_map(write_map_of(tmp_path / "a.gsmap", gaussians=50))
     gmap.instances, gmap.language = [], {}
     gmap.instance_ids[:] = -1
-    empty = LoadedMap(gmap)
+    empty = QueryMap.of(gmap)
     assert empty.query("mug") == [] and empty.nearest([0, 0, 0]) == [] and empty.instance_at([0, 0, 0]) is None
     assert empty.find() == []
 
 
-def test_balls_are_as_the_generator_says(arrays: GaussianMap) -> None:
+def test_balls_are_as_the_generator_says(arrays: Map) -> None:
     for k, center in zip(range(3, 12), grid(9), strict=True):
         assert np.abs(members(arrays, k) - center).max() <= 3 * SIGMA + 1e-6

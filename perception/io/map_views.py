@@ -1,0 +1,158 @@
+"""The views of a map as map.json records them: one JSON object a view, and where its photo is found again.
+
+name, K, width, height, camera_from_world, lens, held_out: as in `types.View`. photo: absolute path of the photo.
+photo_beside: its path relative to the map's folder. photo_bytes: its size; a file of another size under the same name
+is not the photo. The last two may be null; format version 1 has none of the last three.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.safe_names import safe_name
+from perception.types import Lens, View
+
+
+@dataclass(frozen=True)
+class StoredView(View):
+    """A view with what a map records of its photo; the fields are explained at the top of this file."""
+
+    photo_beside: str | None = None
+    photo_bytes: int | None = None
+
+
+def stored_view(view: View, folder: Path, held_out: bool = False) -> StoredView:
+    """`view` as the map at `folder` records it: its photo absolute, relative and with its size (None when gone)."""
+    photo = Path(os.path.abspath(view.photo))  # noqa: PTH100  (links are kept: they are how the user names his photos)
+    try:
+        size = photo.stat().st_size if photo.is_file() else None
+    except OSError:
+        size = None
+    K, pose = np.asarray(view.K, np.float64), np.asarray(view.camera_from_world, np.float64)
+    beside = _relative(photo, folder)
+    return StoredView(view.name, photo, K, view.width, view.height, pose, view.lens, held_out, beside, size)
+
+
+def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
+    """The record of a map read at `before` for a map at `after`: the relative path follows."""
+    if view.photo_beside is None or absolute(before) == absolute(after):
+        return view
+    from dataclasses import replace
+
+    return replace(view, photo_beside=_relative(absolute(before / view.photo_beside), after))
+
+
+def locate_photo(view: View, folder: Path | None) -> Path:
+    """Where the photo of `view` lies: beside the map, else where it lay when the map was made.
+
+    folder: the map's, None when it is not on disk. InputError when no file is there, or only one of another size.
+    """
+    places = [Path(view.photo)]
+    size = None
+    if isinstance(view, StoredView):
+        size = view.photo_bytes
+        if folder is not None and view.photo_beside is not None:
+            places.insert(0, absolute(folder / view.photo_beside))
+    other = None
+    for place in places:
+        try:
+            found = place.stat().st_size if place.is_file() else None
+        except OSError:
+            found = None
+        if found is not None and size in (None, found):
+            return place
+        other = other or (found is not None and f"{place}: has {found} bytes, the photo of the map had {size}") or None
+    raise InputError(f"{other or f'{places[0]}: the photo is missing'}; tell where the photos are: perception relink")
+
+
+def absolute(path: Path) -> Path:
+    """`path` absolute and without "..", symbolic links kept."""
+    return Path(os.path.abspath(path))  # noqa: PTH100
+
+
+def _relative(photo: Path, folder: Path) -> str | None:
+    try:
+        return Path(os.path.relpath(photo, absolute(folder))).as_posix()
+    except ValueError:  # another drive
+        return None
+
+
+# ------------------------------------------------------------------------ JSON
+
+
+def view_json(view: View) -> dict[str, Any]:
+    """A view as JSON; what a map records besides is there when `view` has it."""
+    lens = view.lens
+    entry = {
+        "name": view.name,
+        "photo": str(absolute(view.photo)),
+        "K": np.asarray(view.K).tolist(),
+        "width": view.width,
+        "height": view.height,
+        "camera_from_world": np.asarray(view.camera_from_world).tolist(),
+        "lens": None if lens is None else [lens.model, list(lens.params), lens.width, lens.height],
+    }
+    if isinstance(view, StoredView):
+        entry |= {name: getattr(view, name) for name in ("held_out", "photo_beside", "photo_bytes")}
+    return entry
+
+
+def view_from_json(entry: dict[str, Any]) -> StoredView:
+    """The inverse of `view_json`. ValueError, TypeError or KeyError for an entry that is none."""
+    lens, beside, size = entry.get("lens"), entry.get("photo_beside"), entry.get("photo_bytes")
+    K, pose = (np.array(entry[name], np.float64) for name in ("K", "camera_from_world"))
+    if K.shape != (3, 3) or pose.shape != (4, 4) or not (np.isfinite(K).all() and np.isfinite(pose).all()):
+        raise ValueError(f"{entry['name']}: K or camera_from_world is no finite matrix")
+    return StoredView(
+        str(entry["name"]),
+        Path(entry["photo"]),
+        K,
+        int(entry["width"]),
+        int(entry["height"]),
+        pose,
+        None if lens is None else Lens(str(lens[0]), tuple(map(float, lens[1])), int(lens[2]), int(lens[3])),
+        bool(entry.get("held_out", False)),
+        None if beside is None else str(beside),
+        None if size is None else int(size),
+    )
+
+
+def views_of_facts(info: dict[str, Any], file: Path, cameras: dict[str, np.ndarray]) -> list[StoredView]:
+    """The views that map.json records, `info` being its content and `file` its name for messages.
+
+    cameras: the arrays of cameras.npz, where format version 1 keeps which views were held out, and all of the views in
+    the oldest maps. InputError when the record makes no sense.
+    """
+    try:
+        entries = info.get("views") or _entries_of_arrays(cameras)
+        held = {
+            str(name) for name, out in zip(cameras.get("names", ()), cameras.get("held_out", ()), strict=False) if out
+        }
+        return [view_from_json({"held_out": entry["name"] in held, **entry}) for entry in entries]
+    except (ValueError, TypeError, KeyError, IndexError, OverflowError, AttributeError) as error:
+        raise InputError(f"{file}: its views cannot be understood ({error}); the map is damaged") from error
+
+
+def check_names(info: dict[str, Any], file: Path) -> None:
+    """InputError for a recorded name that would leave the folder it is joined to (see `safe_name`)."""
+    views = info.get("views", [])
+    for entry in views if isinstance(views, list) else []:
+        safe_name(entry.get("name") if isinstance(entry, dict) else entry, file)
+
+
+def _entries_of_arrays(cameras: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    fields = ("names", "photos", "K", "sizes", "camera_from_world")
+    if not all(name in cameras for name in fields):
+        return []
+    entries = []
+    for name, photo, K, (width, height), pose in zip(*(cameras[field] for field in fields), strict=True):
+        safe_name(str(name), "cameras.npz")
+        entry = {"name": str(name), "photo": str(photo), "K": K, "width": width, "height": height}
+        entries.append({**entry, "camera_from_world": pose})
+    return entries
