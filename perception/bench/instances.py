@@ -28,7 +28,7 @@ def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
     truth = cloud.labels["instance_id"]
     about = json.loads((scene / "scene.json").read_text(encoding="utf-8"))["instances"]
     stuff = np.isin(truth, [entry["id"] for entry in about if entry["is_stuff"]])
-    labels = export_labels(gmap.means, gmap.instance_ids, gmap.opacities, cloud)
+    labels = export_labels(gmap.means, gmap.instance_ids, cloud)
     confidence = {entry["id"]: float(entry["score"]) for entry in gmap.instances}
     rows = {}
     for name, ignore in (("all", None), ("things", stuff), ("stuff", ~stuff)):

@@ -86,7 +86,7 @@ def true_objects(opened: QueryMap, scene: Path) -> list[int]:
         raise InputError(f"{scene / 'gt_points.ply'}: expected a property instance_id, found none")
     if check_overlap(opened.means, cloud.points) < 0.5:
         raise InputError(f"{opened.path}: most of {scene.name}'s points lie outside it; map the scene with its poses")
-    labels = export_labels(opened.means, opened.instance_ids, opened.opacities, cloud)
+    labels = export_labels(opened.means, opened.instance_ids, cloud)
     truth = cloud.labels["instance_id"]
     owners = []
     for entry in opened.instances:

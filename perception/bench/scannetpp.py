@@ -136,9 +136,7 @@ def predict_scene(
         link(scene / "dslr" / part, source / called)
     gmap = place.map(name, source, [] if train_on_test else _test_photos(scene))
     mesh = read_cloud(scene / "scans" / f"{MESH}.ply")
-    labels = export_labels(
-        gmap.means, gmap.instance_ids, gmap.opacities, mesh, options, quats=gmap.quats, scales=gmap.scales
-    )
+    labels = export_labels(gmap.means, gmap.instance_ids, mesh, options)
     write_scannet(target, name, labels, {entry["id"]: entry for entry in gmap.instances})
 
 

@@ -196,7 +196,7 @@ def _instance_scores(scene: SweepScene, gaussians: Any, found: Any, held: Sequen
     if not file.is_file() or found.report.get("count", 0) == 0:
         return {}
     cloud = read_cloud(file)
-    labels = export_labels(gaussians.means.numpy(), found.ids, gaussians.opacities.numpy(), cloud)
+    labels = export_labels(gaussians.means.numpy(), found.ids, cloud)
     confidence = {entry["id"]: entry["score"] for entry in found.instances}
     result = evaluate(labels, confidence, cloud.labels["instance_id"])
     figures = {key: result[key] for key in ("ap", "ap50", "ap25")}

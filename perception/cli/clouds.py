@@ -28,16 +28,12 @@ def _add_export(commands: Any) -> None:
         help=".ply, .pcd or .npz; .mcap (Foxglove, RViz): with boxes, cameras and photos",
     )
     p.add_argument("--smooth", action=argparse.BooleanOptionalAction, default=True)
-    p.add_argument("--rule", choices=("nearest", "densest"), default="nearest", help="nearest mean is the paper's")
     p.add_argument(
         "--max-distance",
         type=_length,
         metavar="D",
         help="points farther than D from any Gaussian stay -1 (auto: by the map's own spacing)",
     )
-    p.add_argument("--fill", action=argparse.BooleanOptionalAction, default=True, help="noise Gaussians do not vote")
-    p.add_argument("--graph", choices=("auto", "mesh", "knn", "radius"), default="auto", help="what smoothing runs on")
-    p.add_argument("--color-weight", type=float, metavar="W", help="weight of an edge's RGB distance when smoothing")
     p.add_argument("--segments", type=Path, metavar="X.segs.json", help="ScanNet segments instead of our own")
     p.add_argument("--color", choices=("original", "instance"), default="original")
     p.add_argument("--split", type=Path, metavar="DIR", help="one cloud an instance")
@@ -51,17 +47,9 @@ def _length(text: str) -> float | str:
 
 def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.export import ExportOptions
-    from perception.export.smooth import SmoothOptions
     from perception.pipeline.exporting import Outputs, export_map
 
-    options = ExportOptions(
-        rule=args.rule,
-        drop_noise=args.fill,
-        max_distance=args.max_distance,
-        smooth=args.smooth,
-        smoothing=SmoothOptions(graph=args.graph, color_weight=args.color_weight),
-        segments=args.segments,
-    )
+    options = ExportOptions(max_distance=args.max_distance, smooth=args.smooth, segments=args.segments)
     outputs = Outputs(args.color, args.split, args.boxes, args.scannet)
     return export_map(args.map, args.output, args.points, options, outputs)
 

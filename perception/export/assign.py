@@ -13,11 +13,10 @@ CHUNK = 1 << 20  # points at a time: 24 MiB of working memory
 def nearest_gaussian(
     points: np.ndarray, means: np.ndarray, *, chunk: int = CHUNK, max_distance: float | None = None
 ) -> np.ndarray:
-    """Index [P] int64 of the nearest of means [N, 3] for each of points [P, 3] (OpenSplat3D, point cloud
-    transfer).
+    """Index [P] int64 of the nearest of means [N, 3] for each of points [P, 3].
 
-    −1 for points that are not finite or farther than max_distance from every mean. Equal distances go to the
-    smaller index. Means that are not finite take no part.
+    −1 for points that are not finite or farther than max_distance from every mean. Equal distances go to the smaller
+    index. Means that are not finite take no part.
     """
     points = _checked(points, "points")
     means = _checked(means, "means")

@@ -20,32 +20,19 @@ def mesh_edges(faces: np.ndarray, num_points: int) -> np.ndarray:
     return np.ascontiguousarray(edges[edges[:, 0] != edges[:, 1]], dtype=np.int32)
 
 
-def knn_edges(points: np.ndarray, k: int = 8) -> np.ndarray:
-    """Edges [E, 2] int32, each once with a < b: each finite point and its k nearest neighbours."""
-    return list_edges(neighbor_lists(points, k + 1))
+def neighbor_lists(points: np.ndarray, k: int) -> np.ndarray:
+    """The k nearest points [P, k] int32 of each point, itself among them, nearest first; −1 where there are fewer.
 
-
-def radius_edges(points: np.ndarray, radius: float, max_neighbors: int = 32) -> np.ndarray:
-    """Edges [E, 2] int32 between points within `radius`, at most the `max_neighbors` nearest of each."""
-    if not radius > 0:
-        raise InputError(f"radius is {radius}; expected a positive length")
-    return list_edges(neighbor_lists(points, max_neighbors + 1, radius))
-
-
-def neighbor_lists(points: np.ndarray, k: int, max_distance: float = np.inf) -> np.ndarray:
-    """The k nearest points [P, k] int32 of each point, itself among them, nearest first; −1 where there are
-    fewer.
-
-    A point that is not finite has no neighbours and is none.
+    A point that is not finite has no neighbours and is nobody's neighbour.
     """
     finite = np.flatnonzero(np.isfinite(points).all(axis=1)).astype(np.int32)
     if len(finite) == 0:
         return np.full((len(points), 1), -1, np.int32)
     k = min(k, len(finite), 1024)
     if len(finite) == len(points):
-        return Neighbors(points).query(points, k, max_distance)[0]
+        return Neighbors(points).query(points, k)[0]
     inside = points[finite]
-    found = Neighbors(inside).query(inside, k, max_distance)[0]
+    found = Neighbors(inside).query(inside, k)[0]
     lists = np.full((len(points), k), -1, np.int32)
     lists[finite] = np.where(found >= 0, finite[found], -1)
     return lists
@@ -55,17 +42,6 @@ def list_edges(lists: np.ndarray) -> np.ndarray:
     """Edges [E, 2] int32, each once with a < b, of neighbour lists [P, k]."""
     edges = np.empty((lists.size, 2), np.int32)
     return edges[: _core.undirected(np.ascontiguousarray(lists), edges)]
-
-
-def spacing(points: np.ndarray, sample: int = 20000) -> float:
-    """Median distance from a point to its nearest other point, over an even sample of the finite points."""
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) < 2:
-        return 0.0
-    chosen = points[:: max(len(points) // sample, 1)]
-    distances = Neighbors(points).query(chosen, 2)[1][:, 1]
-    positive = distances[distances > 0]
-    return float(np.median(positive)) if len(positive) else 0.0
 
 
 def mesh_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -80,19 +56,11 @@ def mesh_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return _unit(total)
 
 
-def estimate_normals(points: np.ndarray, k: int = 12) -> np.ndarray:
-    """Normals [P, 3] float32 of a bare cloud: least variance direction of the k nearest points, itself
-    included.
-
-    The sign is arbitrary: weights of such normals must not tell the two directions apart. Zero where the
-    neighbours span no plane.
-    """
-    return list_normals(points, neighbor_lists(points, k))
-
-
 def list_normals(points: np.ndarray, lists: np.ndarray) -> np.ndarray:
-    """Normals [P, 3] float32 of the planes through the neighbour lists [P, k] of points [P, 3]; zero where
-    none is.
+    """Normals [P, 3] float32 of the planes through the neighbour lists [P, k] of points [P, 3].
+
+    The normal is the direction of least variance of a point and its neighbours, of arbitrary sign: weights must not
+    tell the two directions apart. Zero where the neighbours span no plane.
     """
     normals = np.empty((len(points), 3), np.float32)
     first = np.flatnonzero(np.isfinite(points).all(axis=1))[:1]

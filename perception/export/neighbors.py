@@ -1,6 +1,4 @@
-"""Nearest neighbours in 3D on the compiled k-d tree: exact in float32 about a common centre, any machine, any
-order.
-"""
+"""Nearest neighbours in 3D on the compiled k-d tree: exact in float32 about a common centre."""
 
 from __future__ import annotations
 

@@ -1,81 +1,52 @@
-"""Instances of a Gaussian map onto the points of a cloud: assignment, then the superpoint vote."""
+"""Instances of a Gaussian map onto the points of a cloud: the nearest Gaussian's, then the superpoint vote."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from perception.errors import InputError
 from perception.export.assign import auto_distance, nearest_gaussian
-from perception.export.likelihood import densest_instance
-from perception.export.smooth import SmoothOptions, read_segments, segment_cloud, vote
+from perception.export.smooth import read_segments, segment_cloud, vote
 from perception.types import PointCloud
 
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """rule: "nearest" mean (the paper), or "densest" instance, which asks for the Gaussians' shapes.
+    """How labels are transferred; the defaults are the paper's.
 
-    drop_noise: Gaussians without an instance take no part, so every point gets a label (the paper's
-    released code).
-
-    max_distance: in map units; None = no limit, as in the paper; "auto" = measured from the map's own spacing
-    (`auto_distance`). smooth: superpoint vote, on or off.
-    segments: a ScanNet *.segs.json used instead of an own segmentation.
+    drop_noise: Gaussians without an instance take no part, so every point gets a label (the paper's released code).
+    max_distance: in map units; None = no limit; "auto" = measured from the map's own spacing (`auto_distance`).
+    smooth: superpoint vote, on or off. segments: a ScanNet *.segs.json used instead of an own segmentation.
     """
 
-    rule: str = "nearest"
     drop_noise: bool = True
     max_distance: float | str | None = None
     smooth: bool = True
-    smoothing: SmoothOptions = field(default_factory=SmoothOptions)
     segments: Path | None = None
 
 
-@dataclass(frozen=True)
-class _Gaussians:
-    means: np.ndarray
-    ids: np.ndarray
-    opacities: np.ndarray | None
-    quats: np.ndarray | None
-    scales: np.ndarray | None
-
-    def rows(self, used: np.ndarray) -> _Gaussians:
-        parts = (self.means, self.ids, self.opacities, self.quats, self.scales)
-        return _Gaussians(*(None if part is None else part[used] for part in parts))  # type: ignore[arg-type]
-
-
 def export_labels(
-    means: np.ndarray,
-    instance_ids: np.ndarray,
-    opacities: np.ndarray | None,
-    cloud: PointCloud,
-    options: ExportOptions | None = None,
-    *,
-    quats: np.ndarray | None = None,
-    scales: np.ndarray | None = None,
+    means: np.ndarray, instance_ids: np.ndarray, cloud: PointCloud, options: ExportOptions | None = None
 ) -> np.ndarray:
-    """Instance of each point [P] int32, −1 = none.
+    """Instance of each point [P] int32, −1 = none: that of the nearest mean (OpenSplat3D, point cloud transfer).
 
-    means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise). The rule "densest" also asks for
-    opacities [N] in (0, 1), quats [N, 4] wxyz and scales [N, 3] > 0.
+    means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise).
     """
-    used = np.isfinite(means).all(axis=1)
     options = resolved(options or ExportOptions(), means, instance_ids)
-    if options.drop_noise:
-        used &= instance_ids >= 0
-    gaussians = _Gaussians(means, instance_ids, opacities, quats, scales).rows(used)
-    labels = _assigned(gaussians, cloud.points, options)
+    limit = options.max_distance
+    assert not isinstance(limit, str)  # resolved
+    used = np.isfinite(means).all(axis=1) & ((instance_ids >= 0) | (not options.drop_noise))
+    nearest = nearest_gaussian(cloud.points, means[used], max_distance=limit)
+    labels = np.append(instance_ids[used], -1).astype(np.int32)[nearest]
     if not options.smooth or not (labels >= 0).any():
         return labels
-    if options.segments is not None:
-        segments = read_segments(options.segments, len(labels))
-    else:
-        segments = segment_cloud(cloud, options.smoothing)
+    given = options.segments
+    segments = segment_cloud(cloud) if given is None else read_segments(given, len(labels))
     smoothed = vote(labels, segments)
-    if options.max_distance is not None:
+    if limit is not None:
         smoothed[labels < 0] = -1  # a vote does not reach where the map has nothing
     return np.where(np.isfinite(cloud.points).all(axis=1), smoothed, -1).astype(np.int32)
 
@@ -89,19 +60,6 @@ def resolved(options: ExportOptions, means: np.ndarray, instance_ids: np.ndarray
         raise InputError(f"max_distance is {limit}; expected a length that is not negative, or auto")
     used = means[instance_ids >= 0] if options.drop_noise else means
     return replace(options, max_distance=auto_distance(used))
-
-
-def _assigned(g: _Gaussians, points: np.ndarray, options: ExportOptions) -> np.ndarray:
-    limit = options.max_distance
-    assert not isinstance(limit, str)  # resolved
-    if options.rule == "nearest":
-        owner = nearest_gaussian(points, g.means, max_distance=limit)
-        return np.append(g.ids, -1).astype(np.int32)[owner]
-    if options.rule != "densest":
-        raise InputError(f"assignment rule '{options.rule}' is unknown; expected nearest or densest")
-    if g.opacities is None or g.quats is None or g.scales is None:
-        raise InputError("assignment rule 'densest' needs the Gaussians' rotations, scales and opacities")
-    return densest_instance(points, g.means, g.quats, g.scales, g.opacities, g.ids, max_distance=limit)
 
 
 def check_overlap(means: np.ndarray, points: np.ndarray) -> float:

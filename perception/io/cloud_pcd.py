@@ -1,5 +1,7 @@
-"""PCD, the Point Cloud Library's format (version 0.7): ASCII, binary and binary_compressed (LZF) in, binary
-out.
+"""PCD, the Point Cloud Library's format (version 0.7): ASCII, binary and binary_compressed (LZF) in, binary out.
+
+Our own reader, because pypcd4 1.5 reads a file that is cut short at the end of a row as a smaller cloud, allocates what
+a damaged header asks for, and needs a compiled LZF beside it.
 """
 
 from __future__ import annotations

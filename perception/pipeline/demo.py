@@ -42,7 +42,7 @@ def run_demo(output: Path, progress: Progress | None = None) -> tuple[dict[str, 
     gmap = load_map(map_path)
 
     cloud, scale = truth_in_map_frame(truth, gmap)
-    labels = export_labels(gmap.means, gmap.instance_ids, gmap.opacities, cloud)
+    labels = export_labels(gmap.means, gmap.instance_ids, cloud)
     write_export(output / "instances.ply", cloud, labels, {entry["id"]: entry for entry in gmap.instances})
     scored = evaluate(
         labels, {entry["id"]: entry["score"] for entry in gmap.instances}, truth.instance_ids.astype(np.int64)

@@ -59,9 +59,7 @@ def export_map(
     else:
         cloud, options = read_cloud(points), resolved(options, means, gmap.instance_ids)
     inside = check_overlap(means, cloud.points)
-    labels = export_labels(
-        means, gmap.instance_ids, gmap.opacities, cloud, options, quats=gmap.quats, scales=gmap.scales
-    )
+    labels = export_labels(means, gmap.instance_ids, cloud, options)
     if outputs.color == "instance":
         cloud = replace(cloud, colors=instance_palette(labels))
     sidecar = _write(output, gmap, cloud, labels, origin, outputs)
@@ -70,7 +68,6 @@ def export_map(
         "labelled": int((labels >= 0).sum()),
         "inside_map": inside,
         "seconds": time.perf_counter() - began,
-        "rule": options.rule,
         "max_distance": options.max_distance,
         "smoothed": options.smooth,
         **sidecar,

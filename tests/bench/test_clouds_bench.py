@@ -28,13 +28,13 @@ def test_points_beyond_the_map_stay_unlabelled_under_auto() -> None:
     grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), axis=-1).reshape(-1, 3)
     ids = (grid[:, 0] > 3).astype(np.int32)
     points = np.array([[0, 0, 0], [7, 7, 7], [3.5, 3.5, 3.5], [7, 7, 8.9], [7, 7, 9.2], [-40, 0, 0]], np.float32)
-    labels = export_labels(grid, ids, None, PointCloud(points), ExportOptions(max_distance="auto", smooth=False))
+    labels = export_labels(grid, ids, PointCloud(points), ExportOptions(max_distance="auto", smooth=False))
     assert labels.tolist()[:2] == [0, 1] and labels[3] == 1 and labels.tolist()[4:] == [-1, -1]
-    unlimited = export_labels(grid, ids, None, PointCloud(points), ExportOptions(smooth=False))
+    unlimited = export_labels(grid, ids, PointCloud(points), ExportOptions(smooth=False))
     assert (unlimited >= 0).all()  # off by default, as in the paper
     for bad in ("far", -1.0):
         with pytest.raises(InputError, match="max_distance"):
-            export_labels(grid, ids, None, PointCloud(points), ExportOptions(max_distance=bad))
+            export_labels(grid, ids, PointCloud(points), ExportOptions(max_distance=bad))
 
 
 def test_all_trees_give_the_same_neighbours_and_segments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,6 @@ import pytest
 from perception.boxes import instance_boxes, oriented_box
 from perception.errors import InputError
 from perception.export.formats import write_boxes, write_export, write_scannet, write_split
-from perception.export.smooth import SmoothOptions
 from perception.export.transfer import ExportOptions, check_overlap, export_labels
 from perception.io.cloud import read_cloud, write_cloud
 from perception.types import PointCloud
@@ -30,58 +29,13 @@ def test_export_takes_the_nearest_gaussian_and_drops_noise():
     ids = (means[:, 0] * 4).astype(np.int32) - 1
     distance = np.linalg.norm(cloud.points[:, None] - means[None], axis=2)
     plain = ExportOptions(smooth=False, drop_noise=False)
-    np.testing.assert_array_equal(export_labels(means, ids, None, cloud, plain), ids[distance.argmin(axis=1)])
+    np.testing.assert_array_equal(export_labels(means, ids, cloud, plain), ids[distance.argmin(axis=1)])
     kept = np.where(ids >= 0, distance, np.inf)
-    dropped = export_labels(means, ids, None, cloud, ExportOptions(smooth=False))
+    dropped = export_labels(means, ids, cloud, ExportOptions(smooth=False))
     np.testing.assert_array_equal(dropped, ids[kept.argmin(axis=1)])
-    limited = export_labels(means, ids, None, cloud, ExportOptions(smooth=False, max_distance=0.05))
+    limited = export_labels(means, ids, cloud, ExportOptions(smooth=False, max_distance=0.05))
     np.testing.assert_array_equal(limited, np.where(kept.min(axis=1) <= 0.05, dropped, -1))
-    assert (export_labels(means, np.full(900, -1, np.int32), None, cloud) == -1).all()
-
-
-def test_densest_instance_sums_densities_of_the_candidates():
-    from scipy.spatial.transform import Rotation
-
-    rng = np.random.default_rng(3)
-    cloud, _ = scene(500)
-    means, quats = rng.random((300, 3)), rng.normal(size=(300, 4))
-    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    scales, opacities = rng.uniform(0.01, 0.2, (300, 3)), rng.random(300)
-    ids = rng.integers(0, 6, 300).astype(np.int32)
-    options = ExportOptions(rule="densest", smooth=False)
-    got = export_labels(means, ids, opacities, cloud, options, quats=quats, scales=scales)
-    # float64, one point at a time, with the definition's own inverse
-    apart = np.linalg.norm(means[:, None] - means[None], axis=2)
-    np.fill_diagonal(apart, np.inf)
-    widen = np.median(apart.min(axis=1)) / 2
-    rotation = Rotation.from_quat(np.roll(quats, -1, axis=1)).as_matrix()
-    inverse = np.linalg.inv([r @ np.diag(s**2 + widen**2) @ r.T for r, s in zip(rotation, scales, strict=True)])
-    for point, label in zip(cloud.points, got, strict=True):
-        near = np.argsort(np.linalg.norm(means - point, axis=1))[:16]
-        total = np.zeros(6)
-        for i in near:
-            d = point - means[i]
-            total[ids[i]] += opacities[i] * np.exp(-0.5 * d @ inverse[i] @ d)
-        best = np.sort(total)[-2:]
-        assert label == total.argmax() or best[0] > best[1] * (1 - 1e-4)
-    with pytest.raises(InputError, match="rotations, scales"):
-        export_labels(means, ids, None, cloud, options)
-    with pytest.raises(InputError, match="nearest or densest"):
-        export_labels(means, ids, None, cloud, ExportOptions(rule="best"))
-
-
-def test_a_wall_of_large_gaussians_keeps_its_surface_under_the_densest_rule():
-    grid = np.stack(np.meshgrid(np.linspace(0, 1, 60), np.linspace(0, 1, 60)), axis=-1).reshape(-1, 2)
-    wall = PointCloud(np.concatenate([grid, np.zeros((3600, 1))], axis=1))
-    # One wide flat Gaussian is the wall; a small thing floats 10 cm before it.
-    means = np.array([[0.1, 0.5, 0], *([[0.8, 0.5 + 0.01 * i, 0.1] for i in range(5)])])
-    scales = np.array([[0.5, 0.5, 0.005], *[[0.01, 0.01, 0.01]] * 5])
-    quats, opacities = np.tile([1.0, 0, 0, 0], (6, 1)), np.full(6, 0.9)
-    ids = np.array([0, 1, 1, 1, 1, 1], np.int32)
-    plain = ExportOptions(smooth=False)
-    assert (export_labels(means, ids, None, wall, plain) == 1).mean() > 0.4
-    densest = ExportOptions(rule="densest", smooth=False)
-    assert (export_labels(means, ids, opacities, wall, densest, quats=quats, scales=scales) == 0).all()
+    assert (export_labels(means, np.full(900, -1, np.int32), cloud) == -1).all()
 
 
 def test_smoothing_repairs_wrong_gaussians_and_nan_points_get_nothing():
@@ -95,7 +49,7 @@ def test_smoothing_repairs_wrong_gaussians_and_nan_points_get_nothing():
     points[17] = np.nan
     cloud = PointCloud(points, normals=normals)
     means = np.nan_to_num(points, nan=5.0)
-    labels = export_labels(means, ids, None, cloud, ExportOptions(smoothing=SmoothOptions(color_weight=0)))
+    labels = export_labels(means, ids, cloud)
     assert labels[17] == -1
     right = np.delete(labels == side, 17)
     assert right.mean() > 0.99
@@ -135,14 +89,12 @@ def test_a_cloud_in_another_frame_is_told_with_its_distance():
         check_overlap(cloud.points, np.full((3, 3), np.nan))
 
 
-@pytest.mark.parametrize("graph", ["knn", "radius"])
-def test_one_point_and_duplicated_points_are_exported(graph):
+def test_one_point_and_duplicated_points_are_exported():
     means, ids = np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([3, 8], np.int32)
-    options = ExportOptions(smoothing=SmoothOptions(graph=graph))
-    assert export_labels(means, ids, None, PointCloud(np.array([[0.9, 0, 0]])), options).tolist() == [8]
+    assert export_labels(means, ids, PointCloud(np.array([[0.9, 0, 0]]))).tolist() == [8]
     twins = PointCloud(np.tile([[0.1, 0, 0]], (50, 1)))
-    assert export_labels(means, ids, None, twins, options).tolist() == [3] * 50
-    assert export_labels(means[:0], ids[:0], None, twins, options).tolist() == [-1] * 50
+    assert export_labels(means, ids, twins).tolist() == [3] * 50
+    assert export_labels(means[:0], ids[:0], twins).tolist() == [-1] * 50
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3, 1.2])

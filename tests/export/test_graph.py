@@ -10,16 +10,16 @@ import pytest
 from perception.errors import InputError
 from perception.export.assign import nearest_gaussian
 from perception.export.graph import (
-    estimate_normals,
-    knn_edges,
+    list_edges,
+    list_normals,
     mesh_edges,
     mesh_normals,
-    radius_edges,
+    neighbor_lists,
     scannet_weights,
     step_weights,
 )
 from perception.export.neighbors import Neighbors
-from perception.export.smooth import SmoothOptions, felzenszwalb, read_segments, segment_cloud, vote
+from perception.export.smooth import felzenszwalb, read_segments, segment_cloud, vote
 from perception.types import PointCloud
 
 CLOUDS = {
@@ -161,6 +161,10 @@ def test_weights_are_scannets():
     np.testing.assert_allclose(scannet_weights(points, normals, edges, oriented=False), [0.2, 0.2, 0.2], rtol=1e-6)
 
 
+def estimate_normals(points):
+    return list_normals(points, neighbor_lists(points, 12))
+
+
 def test_estimated_normals_of_a_sphere_point_outwards_or_inwards():
     rng = np.random.default_rng(0)
     sphere = rng.normal(size=(6000, 3))
@@ -174,7 +178,7 @@ def test_estimated_normals_of_a_sphere_point_outwards_or_inwards():
     assert (estimate_normals(np.zeros((30, 3))) == 0).all()
 
 
-def test_knn_and_radius_edges_equal_brute_force():
+def test_edges_to_the_nearest_neighbours_equal_brute_force():
     rng = np.random.default_rng(4)
     points = rng.random((250, 3))
     points[7] = np.nan
@@ -183,20 +187,18 @@ def test_knn_and_radius_edges_equal_brute_force():
     np.fill_diagonal(distance, np.inf)
     near = np.argsort(distance, axis=1)[:, :5]
     want = {(min(a, b), max(a, b)) for a in range(250) for b in near[a].tolist() if np.isfinite(distance[a, b])}
-    got = [tuple(e) for e in knn_edges(points, 5).tolist()]
+    got = [tuple(e) for e in list_edges(neighbor_lists(points, 6)).tolist()]
     assert len(got) == len(set(got)) and set(got) == want
-    pairs = {(a, b) for a, b in np.argwhere(distance <= 0.12).tolist() if a < b}
-    assert {tuple(e) for e in radius_edges(points, 0.12, 200).tolist()} == pairs
 
 
-@pytest.mark.parametrize("graph", ["mesh", "knn", "radius"])
+@pytest.mark.parametrize("graph", ["mesh", "knn"])
 def test_floor_and_wall_are_two_segments(graph):
     points, faces = box_mesh()
     normals = mesh_normals(points, faces)
     cloud = PointCloud(points, normals=normals, faces=faces if graph == "mesh" else None)
-    segments = segment_cloud(cloud, SmoothOptions(graph=graph))
+    segments = segment_cloud(cloud)
     assert segments.tolist() == [0] * (len(points) // 2) + [1] * (len(points) // 2)
-    bare = segment_cloud(PointCloud(points), SmoothOptions())
+    bare = segment_cloud(PointCloud(points))
     assert len(np.unique(bare[: len(points) // 2])) < 6
 
 
@@ -206,7 +208,7 @@ def test_colour_keeps_a_poster_from_its_wall():
     poster = (np.abs(points[:, :2] - 0.5) < 0.2).all(axis=1)
     colors = np.where(poster[:, None], [200, 30, 30], [220, 220, 210]).astype(np.uint8)
     normals = np.tile(np.float32([0, 0, 1]), (4000, 1))
-    assert segment_cloud(PointCloud(points, colors, normals), SmoothOptions(color_weight=0)).max() == 0
+    assert segment_cloud(PointCloud(points, colors, normals), color_weight=0).max() == 0
     segments = segment_cloud(PointCloud(points, colors, normals))
     assert segments.max() == 1
     own = np.bincount(segments[poster]).argmax()
@@ -265,7 +267,3 @@ def test_degenerate_meshes_and_clouds_do_not_break_smoothing():
     assert segment_cloud(PointCloud(points, faces=faces)).shape == (5,)
     for cloud in (points[:1], np.zeros((40, 3)), np.full((3, 3), np.nan)):
         assert segment_cloud(PointCloud(cloud)).shape == (len(cloud),)
-    with pytest.raises(InputError, match="no faces"):
-        segment_cloud(PointCloud(points), SmoothOptions(graph="mesh"))
-    with pytest.raises(InputError, match="auto, mesh, knn or radius"):
-        segment_cloud(PointCloud(points), SmoothOptions(graph="delaunay"))

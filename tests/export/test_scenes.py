@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from perception.evaluate.instances import evaluate
-from perception.export.smooth import SmoothOptions, segment_cloud, vote
+from perception.export.smooth import segment_cloud, vote
 from perception.export.transfer import ExportOptions, export_labels
 from perception.io.cloud import read_cloud
 from perception.types import PointCloud
@@ -38,8 +38,8 @@ def noisy_map(cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
 def test_smoothing_raises_the_figure_of_noisy_labels(cloud):
     means, ids = noisy_map(cloud)
     truth = cloud.labels["instance_id"]
-    raw = evaluate(export_labels(means, ids, None, cloud, ExportOptions(smooth=False)), None, truth)
-    smooth = evaluate(export_labels(means, ids, None, cloud), None, truth)
+    raw = evaluate(export_labels(means, ids, cloud, ExportOptions(smooth=False)), None, truth)
+    smooth = evaluate(export_labels(means, ids, cloud), None, truth)
     assert raw["ap"] < 0.6 and smooth["ap"] > 0.97 and smooth["ap50"] == 1.0
 
 
@@ -50,9 +50,7 @@ def test_smoothing_leaves_true_labels_nearly_whole(cloud):
     assert evaluate(smoothed, None, truth)["ap"] > 0.99
 
 
-def test_smoothing_works_without_normals_and_on_a_radius_graph(cloud):
+def test_smoothing_works_without_normals(cloud):
     truth = cloud.labels["instance_id"]
     bare = PointCloud(cloud.points, cloud.colors)
     assert evaluate(vote(truth, segment_cloud(bare)), None, truth)["ap"] > 0.95
-    radius = segment_cloud(bare, SmoothOptions(graph="radius"))
-    assert evaluate(vote(truth, radius), None, truth)["ap"] > 0.95
