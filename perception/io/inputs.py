@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 from perception.errors import InputError
@@ -62,6 +63,48 @@ def load_scene(
         raise InputError(f"{source}: expected {EXPECTED}")
     scene.report["seconds"]["total"] = time.perf_counter() - started
     return scene
+
+
+@dataclass(frozen=True)
+class PhotoSizes:
+    """(width, height) of every photo of an input; posed: it brings cameras; what: their number in words."""
+
+    sizes: list[tuple[int, int]]
+    posed: bool
+    what: str
+
+
+def photo_sizes(source: Path) -> PhotoSizes:
+    """The sizes of the photos of `source` from their headers; those that cannot be read are not counted.
+
+    A video counts as the most frames that are taken of it. No photos for what is no input.
+    """
+    from perception.io.colmap import is_workspace
+    from perception.io.photo_folder import VIDEO_SUFFIXES, list_photos
+    from perception.io.transforms import listed_photos
+    from perception.io.video import MOST_FRAMES, frame_size
+
+    file = source / "transforms.json" if source.is_dir() else source
+    if file.suffix.lower() in VIDEO_SUFFIXES:
+        return PhotoSizes([frame_size(source)] * MOST_FRAMES, False, f"at most {MOST_FRAMES} frames")
+    workspace = source.is_dir() and is_workspace(source)
+    if workspace:
+        photos = list_photos(source / "images")
+    elif file.is_file():
+        photos = listed_photos(file)
+    else:
+        photos = list_photos(source)
+    sizes = [size for size in map(_size, photos) if size is not None]
+    return PhotoSizes(sizes, workspace or file.is_file(), f"{len(sizes)} photos")
+
+
+def _size(photo: Path) -> tuple[int, int] | None:
+    from perception.io.photos import photo_size
+
+    try:
+        return photo_size(photo)
+    except InputError:
+        return None
 
 
 def _scene_of_video(

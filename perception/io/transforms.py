@@ -78,6 +78,12 @@ def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:
     ]
 
 
+def listed_photos(file: Path) -> list[Path]:
+    """The photos that a transforms.json lists and that exist, in file order."""
+    found = (_find(file.parent, str(frame["file_path"])) for frame in _load(file)["frames"])
+    return [photo for photo in found if photo is not None]
+
+
 def _views(
     file: Path, data: dict[str, Any], frames: list[dict[str, Any]], photos: dict[int, Path], root: Path
 ) -> tuple[list[View], list[str]]:

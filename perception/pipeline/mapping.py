@@ -27,6 +27,7 @@ from perception.masks import MaskSource, make_source
 from perception.masks.source import GeometryMaskSource
 from perception.masks.store import compute_masks
 from perception.pipeline.checkpoint import fingerprint, load_checkpoint, save_checkpoint
+from perception.pipeline.estimate import tell_estimate
 from perception.pipeline.instances import find_instances
 from perception.pipeline.photos import load_all, split_views, with_labels
 from perception.pipeline.record import Stages, peak_memory_mib, versions
@@ -189,13 +190,13 @@ def _finished(source: Path, output: Path, config: MapConfig) -> bool:
 def _scene(source: Path, output: Path, work: Path, config: MapConfig, progress: Progress) -> Scene:
     scene = load_saved_scene(work / "scene")
     if scene is None:
+        tell_estimate(source, config, progress.log)
         camera = Path(config.photos.camera) if config.photos.camera else None
         scene = load_scene(
             source, work / "sfm", camera_file=camera, progress=_stage(progress, "poses"), seed=config.seed,
             strict=config.photos.strict, frames=output.with_suffix(".frames"),
         )  # fmt: skip
-        scene = recentred(scene)
-        save_scene(work / "scene", scene)
+        save_scene(work / "scene", scene := recentred(scene))
     return scene
 
 
