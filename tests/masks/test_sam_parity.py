@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("onnx")
 torch = pytest.importorskip("torch")
 
-from perception.masks.sam import AutomaticMasks, SamSettings, paint  # noqa: E402
+from perception.masks.sam import SamSettings, automatic_masks, paint  # noqa: E402
 from perception.masks.sam_models import open_sam  # noqa: E402
 from support.sam_exports import export, imported  # noqa: E402
 
@@ -98,8 +98,6 @@ CASES = [
     ({}, (96, 128), 7),
     ({}, (131, 87), 7),
     ({"stability": 0.8, "pred_iou": 0.5}, (96, 128), 6),
-    ({"crop_layers": 1, "crop_points_downscale": 2, "stability": 0.8, "pred_iou": 0.5}, (150, 200), 6),
-    ({"min_area": 60, "stability": 0.8, "pred_iou": 0.5}, (96, 128), 7),
 ]
 
 
@@ -112,27 +110,25 @@ def test_same_masks_in_the_same_order(segment_anything, sam, exported, changes, 
         points_per_side=side,
         pred_iou_thresh=settings.pred_iou,
         stability_score_thresh=settings.stability,
-        crop_n_layers=settings.crop_layers,
-        crop_n_points_downscale_factor=settings.crop_points_downscale,
-        min_mask_region_area=settings.min_area,
     ).generate(image)
-    ours = AutomaticMasks(open_sam(str(exported)), settings)(image)
+    ours = automatic_masks(open_sam(str(exported)), image, settings)
     print(f"{len(theirs)} masks")
     assert len(ours) == len(theirs) >= 5
-    for row, record in enumerate(theirs):
-        mask, expected = ours.packed[row].unpack(), record["segmentation"]
+    for found, record in zip(ours, theirs, strict=True):
+        mask, expected = found.pixels(), record["segmentation"]
         assert (mask & expected).sum() >= 0.995 * (mask | expected).sum()
-        assert ours.pred_iou[row] == pytest.approx(record["predicted_iou"], abs=1e-4)
-        assert ours.stability[row] == pytest.approx(record["stability_score"], abs=5e-3)
-        np.testing.assert_allclose(ours.points[row], record["point_coords"][0], atol=1e-9)
+        assert found.pred_iou == pytest.approx(record["predicted_iou"], abs=1e-4)
+        assert found.stability == pytest.approx(record["stability_score"], abs=5e-3)
+        np.testing.assert_allclose(found.point, record["point_coords"][0], atol=1e-9)
 
 
 def test_label_image_gives_every_pixel_to_the_best_mask(exported):
     image = photo(96, 128, seed=10)
-    masks = AutomaticMasks(open_sam(str(exported)), SamSettings(points_per_side=10, stability=0.8, pred_iou=0.5))(image)
+    settings = SamSettings(points_per_side=10, stability=0.8, pred_iou=0.5)
+    masks = automatic_masks(open_sam(str(exported)), image, settings)
     labels = paint(masks, image.shape[:2])
-    stack = np.stack([mask.unpack() for mask in masks.packed])
-    scores = np.where(stack, (masks.pred_iou * masks.stability)[:, None, None], -np.inf)
+    stack = np.stack([mask.pixels() for mask in masks])
+    of_mask = np.array([mask.pred_iou * mask.stability for mask in masks])
+    scores = np.where(stack, of_mask[:, None, None], -np.inf)
     winners = np.where(stack.any(axis=0), scores.max(axis=0), 0.0)
-    order = np.sort(masks.pred_iou * masks.stability)
-    np.testing.assert_allclose(np.concatenate([[0.0], order])[labels], winners)
+    np.testing.assert_allclose(np.concatenate([[0.0], np.sort(of_mask)])[labels], winners)
