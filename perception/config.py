@@ -138,7 +138,7 @@ def load_config(file: Path | None = None, pairs: list[str] | None = None, preset
         raise InputError(f"--preset: found '{preset}', expected one of: {', '.join(PRESETS)}")
     given = {key: (value, "--preset") for key, value in PRESETS[preset].items()}
     if file is not None:
-        given |= {key: (value, str(file)) for key, value in flat(_read_toml(file))}
+        given |= {key: (value, str(file)) for key, value in flat(read_toml(file))}
     given |= {key: (text, "--set") for key, text in read_pairs(pairs or []).items()}
     return settings_from(MapConfig, given)
 
@@ -243,7 +243,8 @@ def flat(table: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield name, value
 
 
-def _read_toml(file: Path) -> dict[str, Any]:
+def read_toml(file: Path) -> dict[str, Any]:
+    """The tables of a TOML file; InputError where it cannot be read or is not valid."""
     try:
         import tomllib
     except ModuleNotFoundError:  # Python 3.10

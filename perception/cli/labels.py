@@ -24,7 +24,7 @@ def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if sum((args.text is not None, args.clear, args.old is not None)) > 1:
         raise InputError("label: give a NAME, --clear or --from, only one of them")
     if args.old is not None:
-        return _carry(args)
+        return _transfer(args)
     if args.id is not None:
         return _set(args)
     if args.clear:
@@ -45,14 +45,14 @@ def _set(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     return {"id": args.id, "label": label}, said
 
 
-def _carry(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.instances.survival import carried_text, carry_labels
+def _transfer(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.instances.label_transfer import transfer_labels, transfer_text
     from perception.io.labels import give_names
     from perception.io.store import read_map
 
     if args.id is not None:
         raise InputError("label: --from carries all names over and takes no ID")
-    carried = carry_labels(read_map(args.old), read_map(args.map))
-    if carried.labels:
-        give_names(args.map, dict(carried.labels))
-    return {"labels": carried.labels, "dropped": [name for _, name in carried.dropped]}, carried_text(carried)
+    transfer = transfer_labels(read_map(args.old), read_map(args.map))
+    if transfer.labels:
+        give_names(args.map, dict(transfer.labels))
+    return {"labels": transfer.labels, "dropped": [name for _, name in transfer.dropped]}, transfer_text(transfer)

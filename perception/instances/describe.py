@@ -1,4 +1,7 @@
-"""Describe instances photo by photo: an encoder sees their crops, a palette keeps their colours."""
+"""Descriptions of instances, photo by photo: embeddings of their crops (§3.2.2, eq. 11) and a palette of their colours.
+
+l_i = (1 / KL) Σ_k Σ_l l_ikl    over the L crops of the K best views, each of unit length; then scaled to length 1
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from perception.instances.crops import Background, crop_levels, mask_box
+from perception.instances.crops import crop_levels, mask_box
 from perception.language.base import Encoder, unit_rows
 from perception.language.colors import palette
 from perception.language.description import InstanceDescription, unseen
@@ -22,15 +25,12 @@ def describe_instances(
     load: Load,
     view_names: Sequence[str],
     levels: int = 3,
-    expansion: float = 0.3,
-    background: Background = "plain",
     progress: Callable[[int, int], Any] | None = None,
 ) -> list[InstanceDescription]:
     """Descriptions of the I instances whose views `choices` lists (see `crops.choose_views`).
 
-    load(view) → photo [H, W, 3] uint8 and instance image [H, W] int32 (silhouettes with occlusion; value =
-    position in `choices`, −1 = none). Each needed photo is loaded once and dropped, so memory does not grow
-    with their number. progress(done, all) is told after every photo.
+    load(view) → photo [H, W, 3] uint8 and instance image [H, W] int32 (silhouettes with occlusion; value = position in
+    `choices`, −1 = none). One photo at a time is in memory. progress(done, all) is called after every photo.
     """
     wanted: dict[int, list[tuple[int, int]]] = {}
     for instance, views in enumerate(choices):
@@ -40,7 +40,7 @@ def describe_instances(
     for done, view in enumerate(sorted(wanted)):
         photo, ids = load(view)
         shown = [(i, rank, ids == i) for i, rank in wanted[view]]
-        crops = [crop_levels(photo, mask, levels, expansion, background) for _, _, mask in shown]
+        crops = [crop_levels(photo, mask, levels) for _, _, mask in shown]
         flat = [crop for group in crops for crop in group]
         embedded = encoder.encode_images(flat) if flat else np.zeros((0, encoder.dim), np.float32)
         start = 0
@@ -71,9 +71,7 @@ def _summary(found: dict[int, Any], dim: int) -> InstanceDescription:
 
 
 def _color_sample(photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Up to COLOR_SAMPLES pixels [P, 3] of the mask less its rim, whose colours bleed; the whole mask if too
-    thin.
-    """
+    """Up to COLOR_SAMPLES pixels [P, 3] of the mask without its rim, where colours mix; of a thin mask, all of it."""
     import cv2
 
     inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)

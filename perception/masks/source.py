@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from perception.config import read_toml
 from perception.errors import InputError
 from perception.io.model_store import default_model
 from perception.types import View
@@ -64,7 +65,7 @@ def make_source(spec: str) -> MaskSource:
 
         return BuiltinSegmentation()
     if kind == "labels" and argument:
-        from perception.masks.labels import LabelFolder
+        from perception.masks.label_folder import LabelFolder
 
         return LabelFolder(Path(argument))
     if kind == "sam" and argument:
@@ -83,18 +84,7 @@ def configured_sam() -> str | None:
     file = home / "perception" / "config.toml"
     if not file.is_file():
         return default_model("sam")
-    value = _read_toml(file).get("masks", {}).get("sam")
+    value = read_toml(file).get("masks", {}).get("sam")
     if value is not None and not isinstance(value, str):
         raise InputError(f"{file}: masks.sam is {value!r}, expected the path of a SAM model as text")
     return value or default_model("sam")
-
-
-def _read_toml(file: Path) -> dict[str, Any]:
-    try:
-        import tomllib as toml
-    except ModuleNotFoundError:  # Python 3.10
-        import tomli as toml  # type: ignore[no-redef]
-    try:
-        return toml.loads(file.read_text(encoding="utf-8"))
-    except (toml.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not valid TOML ({error})") from error

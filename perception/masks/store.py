@@ -18,7 +18,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.safe_names import safe_name
-from perception.masks.labels import read_labels, read_png_header
+from perception.masks.label_folder import read_labels, read_png_header
 from perception.masks.source import GeometryMaskSource, MaskSource
 from perception.types import View
 

@@ -15,7 +15,7 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
-from perception.instances.survival import carried_text, carry_labels
+from perception.instances.label_transfer import transfer_labels, transfer_text
 from perception.io.inputs import EXPECTED, load_scene
 from perception.io.map_lock import writing
 from perception.io.map_views import stored_view
@@ -149,7 +149,7 @@ def _build(
     }
     gmap = _assemble(gaussians, found, scene, held_out, record, output)
     if labelled is not None:
-        _carry_labels(labelled, gmap, progress)
+        _transfer_labels(labelled, gmap, progress)
     write_map(output, gmap)
     shutil.rmtree(work, ignore_errors=True)
     _tell_result(gmap, output, progress)
@@ -346,12 +346,12 @@ def _assemble(
     )
 
 
-def _carry_labels(old: Map, gmap: Map, progress: Progress) -> None:
-    carried = carry_labels(old, gmap)
+def _transfer_labels(old: Map, gmap: Map, progress: Progress) -> None:
+    transfer = transfer_labels(old, gmap)
     for entry in gmap.instances:
-        entry["label"] = carried.labels.get(entry["id"], entry["label"])
-    gmap.info["labels"] = {"carried": len(carried.labels), "dropped": [name for _, name in carried.dropped]}
-    progress.log(carried_text(carried))
+        entry["label"] = transfer.labels.get(entry["id"], entry["label"])
+    gmap.info["labels"] = {"carried": len(transfer.labels), "dropped": [name for _, name in transfer.dropped]}
+    progress.log(transfer_text(transfer))
 
 
 # ----------------------------------------------------------------------- words

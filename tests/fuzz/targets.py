@@ -406,7 +406,7 @@ def repaired_png(data: bytes) -> bytes:
 def _label_png() -> Target:
     from PIL import Image
 
-    from perception.masks.labels import LabelFolder
+    from perception.masks.label_folder import LabelFolder
     from perception.masks.store import load_labels, stored_key
     from perception.types import View
 

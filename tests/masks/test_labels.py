@@ -63,6 +63,26 @@ def test_palette_indices_are_the_labels(tmp_path):
     np.testing.assert_array_equal(source.label_image(view("a.jpg"), photo(view("a.jpg"))), indices)
 
 
+@pytest.mark.parametrize("name", ["../secret.jpg", "/etc/secret.jpg", "a/../../secret.jpg"])
+def test_label_images_are_read_and_written_below_their_folder_only(tmp_path, name):
+    """The names come from a COLMAP model or a map of somebody else."""
+    inside = tmp_path / "labels"
+    inside.mkdir()
+    for file in (tmp_path / "secret.png", inside / "secret.png"):
+        cv2.imwrite(str(file), np.ones((HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(InputError, match="photo name"):
+        make_source(f"labels:{inside}").check([view(name)])
+    with pytest.raises(InputError, match="photo name"):
+        compute_masks([view(name)], Counting(), photo, inside)
+    assert sorted(p.name for p in tmp_path.rglob("*.png")) == ["secret.png", "secret.png"]
+
+
+def test_a_folder_without_label_images_is_refused_when_the_source_is_made(tmp_path):
+    (tmp_path / "notes.txt").write_text("no labels yet")
+    with pytest.raises(InputError, match="holds no PNG"):
+        make_source(f"labels:{tmp_path}")
+
+
 def test_missing_label_image_names_the_photo(folder):
     with pytest.raises(InputError, match=r"c\.jpg without a label image"):
         make_source(f"labels:{folder}").check([view("a.jpg"), view("c.jpg")])

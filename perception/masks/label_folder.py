@@ -11,6 +11,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.documents import brief
+from perception.io.safe_names import safe_name
 from perception.types import View
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -27,6 +28,8 @@ class LabelFolder:
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():
             raise InputError(f"labels:{folder}: no such folder; expected one PNG per photo in it")
+        if not _pngs(folder):
+            raise InputError(f"labels:{folder}: holds no PNG; expected a label image for each photo")
         self.name = "labels"
         self.folder = folder
         self.identity = f"labels {_fingerprint(folder)}"
@@ -65,7 +68,7 @@ class LabelFolder:
         return warp_labels(view, read_labels(file), width, height)
 
     def _find(self, view: View, views: list[View]) -> Path | None:
-        stem = PurePosixPath(view.name).with_suffix(".png")
+        stem = PurePosixPath(safe_name(view.name, f"labels:{self.folder}")).with_suffix(".png")
         if (self.folder / stem).is_file():
             return self.folder / stem
         flat = self.folder / stem.name

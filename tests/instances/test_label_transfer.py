@@ -11,7 +11,7 @@ import pytest
 from perception.cli import main
 from perception.errors import InputError
 from perception.geometry import look_at
-from perception.instances.survival import carry_labels, match_instances
+from perception.instances.label_transfer import match_instances, transfer_labels
 from perception.io.labels import give_names
 from perception.io.store import Map, read_map, write_map
 from support.views_at import views_at
@@ -91,8 +91,8 @@ def test_no_map_is_told(tmp_path: Path) -> None:
 def test_names_follow_the_place_not_the_id(tmp_path: Path) -> None:
     write_map(tmp_path / "old.gsmap", a_map(PLACES, 0, ["cup", None, "lamp", "box"]))
     write_map(tmp_path / "new.gsmap", a_map(PLACES[[2, 1, 0]], 1))  # other ids, other samples, one thing is gone
-    carried = carry_labels(read_map(tmp_path / "old.gsmap"), read_map(tmp_path / "new.gsmap"))
-    assert carried.labels == {2: "cup", 0: "lamp"} and carried.dropped == [(3, "box")] and carried.aligned
+    transfer = transfer_labels(read_map(tmp_path / "old.gsmap"), read_map(tmp_path / "new.gsmap"))
+    assert transfer.labels == {2: "cup", 0: "lamp"} and transfer.dropped == [(3, "box")] and transfer.aligned
     assert main(["label", str(tmp_path / "new.gsmap"), "--from", str(tmp_path / "old.gsmap")]) == 0
     assert labels_of(tmp_path / "new.gsmap") == ["lamp", None, "cup"]
 
@@ -106,10 +106,10 @@ def test_another_frame_is_tied_by_common_photos() -> None:
     poses[:, :3, :3] = poses[:, :3, :3] @ rotation.T
     poses[:, :3, 3] = -np.einsum("nij,nj->ni", poses[:, :3, :3], 2.5 * centres @ rotation.T + [4, 5, 6])
     new.views = views_at(poses)
-    carried = carry_labels(old, new)
-    assert carried.labels == {0: "cup"} and carried.aligned
+    transfer = transfer_labels(old, new)
+    assert transfer.labels == {0: "cup"} and transfer.aligned
     new.views = views_at(poses, [f"other{k}.jpg" for k in range(6)])
-    assert carry_labels(old, new).dropped == [(0, "cup")]
+    assert transfer_labels(old, new).dropped == [(0, "cup")]
 
 
 def test_merged_split_and_moved_instances_have_no_partner() -> None:

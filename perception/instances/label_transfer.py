@@ -1,4 +1,4 @@
-"""Which instances of an old map live on in a new one, so that the names given to them can be carried over."""
+"""Labels of an old map transferred to the instances of a new one that fill the same place."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ import numpy as np
 from perception.geometry import align_similarity, camera_centres
 from perception.io.store import Map
 
-SHARE = 0.5  # of the points of either must lie nearest to the other: then each has at most one partner
+SHARE = 0.5  # of the points of either that must lie nearest to the other: so each has at most one partner
 REACH = 0.1  # of an instance's size: nearest neighbours farther away belong to no common surface
-ALIGNED = 0.02  # of the cameras' spread: larger residuals mean that the two maps know other camera paths
-SAMPLES = 2000  # points of an instance that vote
+ALIGNED = 0.02  # of the cameras' spread: larger residuals mean that the camera paths of the two maps differ
+SAMPLES = 2000  # points of an instance that are looked at
 
 
 @dataclass
-class Carried:
-    """labels: new id -> name. dropped: (old id, name) of instances that live on nowhere. aligned: whether the frames
-    were brought together by common cameras (else they were taken to be the same)."""
+class LabelTransfer:
+    """labels: new id -> name. dropped: (old id, name) of instances without a partner. aligned: whether the frames were
+    aligned by common cameras (else they are taken to be the same)."""
 
     labels: dict[int, str] = field(default_factory=dict)
     dropped: list[tuple[int, str]] = field(default_factory=list)
     aligned: bool = False
 
 
-def carry_labels(old: Map, new: Map) -> Carried:
+def transfer_labels(old: Map, new: Map) -> LabelTransfer:
     """Names of `old`'s instances for those of `new` that fill the same place (more than half, both ways)."""
     named = {entry["id"]: str(entry["label"]) for entry in old.instances if entry.get("label")}
-    moved, aligned = _into_frame_of(new, old)
+    moved, aligned = _in_frame_of(new, old)
     partners = match_instances(moved, old.instance_ids, new.means, new.instance_ids, list(named))
-    carried = Carried(aligned=aligned)
+    transfer = LabelTransfer(aligned=aligned)
     for i, name in named.items():
         if i in partners:
-            carried.labels[partners[i]] = name
+            transfer.labels[partners[i]] = name
         else:
-            carried.dropped.append((i, name))
-    return carried
+            transfer.dropped.append((i, name))
+    return transfer
 
 
 def match_instances(
@@ -80,8 +80,8 @@ def _sample(points: np.ndarray) -> np.ndarray:
     return points[::step].astype(np.float64)
 
 
-def _into_frame_of(new: Map, old: Map) -> tuple[np.ndarray, bool]:
-    """`old`'s means in `new`'s frame: structure from motion chooses a frame anew, common photos tie the two together.
+def _in_frame_of(new: Map, old: Map) -> tuple[np.ndarray, bool]:
+    """`old`'s means [N, 3] in `new`'s frame, by a similarity (Umeyama 1991) that aligns the cameras of common photos.
 
     Without three common photos, or when their paths differ, the frames are taken to be the same.
     """
@@ -92,7 +92,7 @@ def _into_frame_of(new: Map, old: Map) -> tuple[np.ndarray, bool]:
     rows = np.array(common)
     there, here = (camera_centres(m.poses)[c] for m, c in ((new, rows[:, 0]), (old, rows[:, 1])))
     if np.linalg.matrix_rank(here - here.mean(axis=0), tol=1e-3 * max(float(np.ptp(here)), 1e-12)) < 2:
-        return old.means, False  # cameras on a line tie no rotation about it
+        return old.means, False  # cameras on a line leave the rotation about it open
     scale, rotation, shift = align_similarity(there, here)
     residual = np.linalg.norm(scale * here @ rotation.T + shift - there, axis=1)
     if np.median(residual) > ALIGNED * float(np.linalg.norm(np.ptp(there, axis=0))):
@@ -100,8 +100,8 @@ def _into_frame_of(new: Map, old: Map) -> tuple[np.ndarray, bool]:
     return (scale * old.means.astype(np.float64) @ rotation.T + shift).astype(np.float32), True
 
 
-def carried_text(carried: Carried) -> str:
-    """What became of the old names, a line each."""
-    lines = [f"instance {i} is called “{name}”" for i, name in carried.labels.items()]
-    lines += [f"warning: “{name}” (old instance {i}) lives on nowhere; dropped" for i, name in carried.dropped]
+def transfer_text(transfer: LabelTransfer) -> str:
+    """What became of the old labels, a line each."""
+    lines = [f"instance {i} is called “{name}”" for i, name in transfer.labels.items()]
+    lines += [f"warning: “{name}” (old instance {i}) has no partner; dropped" for i, name in transfer.dropped]
     return "\n".join(lines) or "the old map has no names"

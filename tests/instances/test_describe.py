@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from perception.errors import InputError
 from perception.instances.crops import (
     FILL,
     choose_views,
@@ -16,7 +15,6 @@ from perception.instances.crops import (
     expand_box,
     letterbox,
     mask_box,
-    soften_background,
     view_scores,
 )
 from perception.instances.describe import describe_instances
@@ -46,26 +44,6 @@ def test_best_views_first_ties_by_order_and_zeros_never() -> None:
     first, second = choose_views(scores, 3)
     assert first.tolist() == [1, 3, 0]
     assert second.tolist() == []
-    with pytest.raises(InputError, match=r"expected a \[instances, views\] array"):
-        choose_views(np.zeros(3))
-
-
-def test_diversity_picks_the_greedy_optimum() -> None:
-    rng = np.random.default_rng(0)
-    scores = rng.uniform(0.1, 1.0, (1, 8))
-    directions = rng.normal(size=(1, 8, 3))
-    directions /= np.linalg.norm(directions, axis=2, keepdims=True)
-    picked = choose_views(scores, 3, directions, diversity=0.8)[0].tolist()
-    done: list[int] = []
-    for _ in range(3):  # brute force over all views, straight from the docstring's formula
-
-        def gain(v: int) -> float:
-            near = max([0.0, *(float(directions[0, v] @ directions[0, u]) for u in done)])
-            return float(scores[0, v]) * (1 - 0.8 * near)
-
-        done.append(max((v for v in range(8) if v not in done), key=gain))
-    assert picked == done
-    assert choose_views(scores, 3, directions, diversity=0.0)[0].tolist() == np.argsort(-scores[0])[:3].tolist()
 
 
 def test_boxes_by_hand() -> None:
@@ -94,22 +72,10 @@ def test_levels_grow_by_the_expansion() -> None:
     photo = np.random.default_rng(2).integers(0, 255, (100, 100, 3), dtype=np.uint8)
     mask = np.zeros((100, 100), bool)
     mask[40:60, 45:55] = True
-    crops = crop_levels(photo, mask, levels=3, expansion=0.3)
+    crops = crop_levels(photo, mask, levels=3)
     assert [len(c) for c in crops] == [20, 32, 44]
     assert np.array_equal(crops[1][:, 8:24], photo[34:66, 42:58])
     assert crop_levels(photo, np.zeros((100, 100), bool)) == []
-
-
-@pytest.mark.parametrize("background", ["dim", "blur", "fill"])
-def test_softening_leaves_the_inside_and_changes_the_outside(background: str) -> None:
-    photo = np.random.default_rng(3).integers(0, 255, (64, 64, 3), dtype=np.uint8)
-    mask = np.zeros((64, 64), bool)
-    mask[20:44, 20:44] = True
-    soft = soften_background(photo, mask, background)  # type: ignore[arg-type]
-    assert np.array_equal(soft[26:38, 26:38], photo[26:38, 26:38])
-    assert soft[:12].std() < photo[:12].std()
-    with pytest.raises(InputError, match="expected plain, dim, blur or fill"):
-        soften_background(photo, mask, "swirl")  # type: ignore[arg-type]
 
 
 def test_description_is_the_mean_over_crops_whatever_the_order_of_photos() -> None:
@@ -129,7 +95,7 @@ def test_description_is_the_mean_over_crops_whatever_the_order_of_photos() -> No
     found = describe_instances(MeanColor(), choices, load, names, progress=lambda a, b: told.append((a, b)))
     assert loaded == [0, 2, 3]
     assert told == [(1, 3), (2, 3), (3, 3)]
-    rows = [MeanColor().encode_images(crop_levels(photos[v], ids[v] == 0, 3, 0.3)).astype(np.float64) for v in (2, 0)]
+    rows = [MeanColor().encode_images(crop_levels(photos[v], ids[v] == 0, 3)).astype(np.float64) for v in (2, 0)]
     mean = np.mean(list(itertools.chain(*rows)), axis=0)
     assert np.allclose(found[0].embedding, mean / np.linalg.norm(mean), atol=1e-6)
     assert found[0].views == ["2.jpg", "0.jpg"] and found[0].boxes == [(8, 5, 30, 20)] * 2
