@@ -1,4 +1,9 @@
-"""All or nothing: what is written appears under its name complete, or not at all."""
+"""Files and folders that appear under their name complete, or not at all.
+
+A writer fills a temporary sibling `.NAME.new-PID-RANDOM`, on which it holds a lock, and renames it. Only writers remove
+what writers left behind, and only what nobody holds a lock on: a process number says nothing about a process in another
+container or on another host. Where there are no locks, leftovers stay.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +12,14 @@ import ctypes
 import errno
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 from uuid import uuid4
 
 from perception.errors import InputError
+from perception.io.file_locks import lock, names
 
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # Linux' fcntl.h and fs.h
@@ -29,9 +35,10 @@ def atomic_file(path: Path) -> Iterator[Path]:
     path = Path(path)
     temporary = _sibling(path, "new")
     try:
-        with _disk_errors(path):
+        with contextlib.ExitStack() as held, _disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             recover(path)
+            held.enter_context(_locked(temporary, lambda: temporary.touch(exist_ok=False)))
             yield temporary
             _sync(temporary)
             temporary.replace(path)
@@ -64,16 +71,16 @@ def atomic_directory(path: Path) -> Iterator[Path]:
 
     On Linux the two folders are exchanged in one step, so there is no instant without a `path`. Where the system
     cannot, the old folder is moved aside first: between the two renames (microseconds) `path` does not exist, and a
-    process killed right there leaves the old folder beside it for the next `atomic_directory(path)` or
-    `recover(path)` to put back. It is never half of one.
+    process killed right there leaves the old folder beside it: `standing(path)` for readers, and the next
+    `atomic_directory(path)` or `recover(path)` puts it back. It is never half of one.
     """
     path = Path(path)
     temporary, old = _sibling(path, "new"), _sibling(path, "old")
     try:
-        with _disk_errors(path):
+        with contextlib.ExitStack() as held, _disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             recover(path)
-            temporary.mkdir()
+            held.enter_context(_locked(temporary, temporary.mkdir))
             with _told_of(path, temporary):
                 yield temporary
             for file in temporary.rglob("*"):
@@ -85,29 +92,57 @@ def atomic_directory(path: Path) -> Iterator[Path]:
 
 
 def recover(path: Path) -> None:
-    """Put `path` back when a writer died between its two renames, and delete leftovers of writers that are gone."""
+    """For writers: puts `path` back when a writer died between its two renames, and deletes leftovers nobody holds."""
     path = Path(path)
-    for kind, writer, item in _leftovers(path):
-        if _alive(writer):
-            continue
-        if kind == "old" and not path.exists():
-            item.rename(path)
-        elif item.is_dir():
-            shutil.rmtree(item, ignore_errors=True)
-        else:
-            item.unlink(missing_ok=True)
+    for kind, item in _leftovers(path):
+        with contextlib.suppress(OSError):
+            descriptor = os.open(item, os.O_RDONLY)
+            try:
+                if not lock(descriptor) or not names(item, descriptor):
+                    continue
+                if kind == "old" and not path.exists():
+                    item.rename(path)
+                elif item.is_dir():
+                    shutil.rmtree(item, ignore_errors=True)
+                else:
+                    item.unlink(missing_ok=True)
+            finally:
+                os.close(descriptor)
 
 
-def _leftovers(path: Path) -> list[tuple[str, int, Path]]:
-    """(new or old, process that wrote it, where) of all temporary siblings of `path`, oldest first."""
+def standing(path: Path) -> Path:
+    """For readers: `path`, or the folder that lay there when a writer stands or died between its two renames."""
+    if path.exists():
+        return path
+    return next((item for kind, item in reversed(_leftovers(path)) if kind == "old"), path)
+
+
+@contextlib.contextmanager
+def _locked(path: Path, make: Callable[[], None]) -> Iterator[None]:
+    """Makes a temporary file or folder and holds a lock on it, where there are locks."""
+    while True:
+        make()
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            with contextlib.suppress(OSError):
+                lock(descriptor)
+            if names(path, descriptor):
+                yield
+                return
+        finally:  # else another writer took it for a leftover between our two calls: once more
+            os.close(descriptor)
+
+
+def _leftovers(path: Path) -> list[tuple[str, Path]]:
+    """(new or old, where) of all temporary siblings of `path`, oldest first."""
     found = []
-    with contextlib.suppress(FileNotFoundError), os.scandir(path.parent) as entries:
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(path.parent) as entries:
         for entry in entries:
-            kind, writer = _parse(entry.name, path) if entry.name.startswith(f".{path.name}.") else (None, 0)
+            kind = _kind(entry.name, path)
             if kind is not None:
                 with contextlib.suppress(FileNotFoundError):  # a living writer has just renamed it
-                    found.append((entry.stat(follow_symlinks=False).st_mtime_ns, kind, writer, Path(entry.path)))
-    return [(kind, writer, item) for _, kind, writer, item in sorted(found)]
+                    found.append((entry.stat(follow_symlinks=False).st_mtime_ns, kind, Path(entry.path)))
+    return [(kind, item) for _, kind, item in sorted(found)]
 
 
 def _swap(new: Path, path: Path, old: Path) -> None:
@@ -116,12 +151,13 @@ def _swap(new: Path, path: Path, old: Path) -> None:
     elif _exchange(new, path):
         old = new  # where the old folder lies now
     else:
-        path.rename(old)
-        try:
-            new.rename(path)
-        except OSError:
-            old.rename(path)
-            raise
+        with _locked(path, lambda: None):  # between the renames too: nobody is to put the old folder back
+            path.rename(old)
+            try:
+                new.rename(path)
+            except OSError:
+                old.rename(path)
+                raise
     _sync(path.parent)  # before the old folder goes: a power cut must not leave neither
     shutil.rmtree(old, ignore_errors=True)
 
@@ -142,21 +178,11 @@ def _sibling(path: Path, kind: str) -> Path:
     return path.with_name(f".{path.name}.{kind}-{os.getpid()}-{uuid4().hex[:8]}")
 
 
-def _parse(name: str, path: Path) -> tuple[str | None, int]:
-    parts = name[len(path.name) + 2 :].split("-")
-    if len(parts) == 3 and parts[0] in ("new", "old") and parts[1].isdigit():
-        return parts[0], int(parts[1])
-    return None, 0
-
-
-def _alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
+def _kind(name: str, path: Path) -> str | None:
+    """Whether a file name is one that `_sibling` makes for `path`: "new", "old" or None."""
+    start = f".{path.name}."
+    parts = name[len(start) :].split("-") if name.startswith(start) else []
+    return parts[0] if len(parts) == 3 and parts[0] in ("new", "old") and parts[1].isdigit() else None
 
 
 def _sync(path: Path) -> None:

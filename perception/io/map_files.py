@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import threading
@@ -15,7 +14,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.io import instance_index
 from perception.io.arrays import DAMAGE, map_npy, read_npz
-from perception.io.atomic import recover
+from perception.io.atomic import standing
 from perception.io.checksums import EDITABLE, FACTS, check_file, check_sizes
 from perception.io.documents import brief
 from perception.io.instance_index import InstanceIndex, build_index
@@ -42,11 +41,10 @@ class MapFiles:
     """
 
     def __init__(self, path: Path):
-        self.path = Path(path)
         self._lock = threading.Lock()
         self._checked = False
-        _put_back(self.path)
         for left in reversed(range(_TRIES)):
+            self.path = standing(Path(path))
             self._identity = _folder_identity(self.path)
             try:
                 self._open()
@@ -170,25 +168,17 @@ _OF_PLY: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 def read_info(path: Path) -> dict[str, Any]:
     """map.json alone; raises InputError when `path` is no map or of a version this program does not read."""
-    _put_back(Path(path))
-    return _read_facts(Path(path))[0]
+    return _read_facts(standing(Path(path)))[0]
 
 
 def map_signature(path: Path) -> Signature:
     """Changes whenever another map or other labels lie at `path`: who, when and how big. InputError when none does."""
+    folder = standing(path)
     try:
-        stats = [file.stat() for file in (path, path / FACTS, path / EDITABLE)]
+        stats = [file.stat() for file in (folder, folder / FACTS, folder / EDITABLE)]
     except OSError as error:
         raise InputError(f"{path}: the map is gone ({error.strerror}); build it again or put it back") from error
     return tuple((stat.st_ino, stat.st_mtime_ns if n else 0, stat.st_size if n else 0) for n, stat in enumerate(stats))
-
-
-def _put_back(path: Path) -> None:
-    """Where two folders cannot be exchanged in one step, a writer killed between its two renames leaves the old map
-    aside; it is put back under its name."""
-    if not path.exists():
-        with contextlib.suppress(OSError):
-            recover(path)
 
 
 def _folder_identity(path: Path) -> tuple[int, int]:

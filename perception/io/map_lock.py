@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import threading
 from collections.abc import Iterator
@@ -12,11 +11,7 @@ from pathlib import Path
 
 from perception.errors import InputError
 from perception.io.atomic import recover
-
-try:
-    import fcntl
-except ImportError:  # Windows: no advisory locks of this kind; renames still keep readers safe
-    fcntl = None  # type: ignore[assignment]
+from perception.io.file_locks import SUPPORTED, lock, names
 
 _held: dict[Path, tuple[int, int]] = {}
 """Locks of this process: resolved path → (thread, depth)."""
@@ -59,14 +54,19 @@ def lock_file(path: Path) -> Path:
 
 
 def _take(path: Path) -> int | None:
-    if fcntl is None:
+    if not SUPPORTED:  # renames still keep readers safe
         return None
     file = lock_file(path)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         while True:
             descriptor = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
-            if _lock(descriptor, path) and _same(descriptor, file):
+            if not lock(descriptor):
+                holder = os.pread(descriptor, 32, 0).decode("ascii", "replace").strip()
+                os.close(descriptor)
+                who = f"process {holder}" if holder.isdigit() else "another process"
+                raise InputError(f"{path}: {who} is writing this map; wait for it to finish, or write to another place")
+            if names(file, descriptor):
                 break
             os.close(descriptor)  # its last holder removed the file between our open and our lock: once more
         with contextlib.suppress(OSError):  # on a full disk the lock holds too, it only does not say whose it is
@@ -79,34 +79,9 @@ def _take(path: Path) -> int | None:
         ) from error
 
 
-def _lock(descriptor: int, path: Path) -> bool:
-    """Locks an open file, or InputError naming who holds it."""
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        holder = os.pread(descriptor, 32, 0).decode("ascii", "replace").strip()
-        os.close(descriptor)
-        if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
-            raise
-        who = f"process {holder}" if holder.isdigit() else "another process"
-        raise InputError(
-            f"{path}: {who} is writing this map; wait for it to finish, or write to another place"
-        ) from None
-    return True
-
-
 def _drop(path: Path, descriptor: int | None) -> None:
     if descriptor is None:
         return
     with contextlib.suppress(OSError):
         lock_file(path).unlink()  # while we hold it: no one else can have locked this very file
     os.close(descriptor)
-
-
-def _same(descriptor: int, file: Path) -> bool:
-    """Whether `file` still names what we opened."""
-    try:
-        there, here = file.stat(), os.fstat(descriptor)
-    except FileNotFoundError:
-        return False
-    return (there.st_dev, there.st_ino) == (here.st_dev, here.st_ino)
