@@ -62,9 +62,3 @@ def align_similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, n
     rotation = u @ np.diag(sign) @ vt
     scale = float((singular * sign).sum() / ((b - mean_b) ** 2).sum(1).mean())
     return scale, rotation, mean_a - scale * rotation @ mean_b
-
-
-def rotation_angle(rotation: np.ndarray) -> np.ndarray:
-    """Angle in degrees of rotations [..., 3, 3]."""
-    cosine = (np.trace(rotation, axis1=-2, axis2=-1) - 1.0) / 2.0
-    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))

@@ -19,31 +19,12 @@ def colorize_instances(ids: np.ndarray) -> np.ndarray:
     return instance_palette(present)[inverse.reshape(ids.shape)]
 
 
-def colorize_depth(depth: np.ndarray, near: float | None = None, far: float | None = None) -> np.ndarray:
-    """Depth [H, W] -> picture, near bright, far dark, evenly in 1 / depth; 0 and non-finite depths are black.
-
-    near, far: the range shown; by default the 2nd and 98th percentile of what is there.
-    """
-    valid = np.isfinite(depth) & (depth > 0)
-    if not valid.any():
-        return np.zeros((*depth.shape, 3), np.uint8)
-    lowest, highest = np.percentile(depth[valid], [2, 98])
-    near, far = (lowest if near is None else near), (highest if far is None else far)
-    inverse = 1 / np.where(valid, depth, 1)
-    span = max(1 / near - 1 / far, 1e-12)
-    level = np.clip((inverse - 1 / far) / span, 0, 1)
-    picture = _colormap(level, cv2.COLORMAP_TURBO)
-    picture[~valid] = 0
-    return picture
-
-
 def _colormap(level: np.ndarray, name: int) -> np.ndarray:
     return cv2.applyColorMap(np.round(255 * level).astype(np.uint8), name)[..., ::-1].copy()
 
 
 def error_map(a: np.ndarray, b: np.ndarray, full: float = 0.25) -> np.ndarray:
-    """Where two pictures (uint8, or float in [0, 1]) differ: black = equal, bright = `full` or more (of
-    1)."""
+    """Where two pictures (uint8, or float in [0, 1]) differ: black = equal, bright = `full` or more (of 1)."""
     if a.shape != b.shape:
         raise ValueError(f"error_map: pictures of shapes {a.shape} and {b.shape}; they must agree")
     difference = np.abs(_unit(a) - _unit(b)).mean(-1)
@@ -55,8 +36,7 @@ def _unit(picture: np.ndarray) -> np.ndarray:
 
 
 def overlay(photo: np.ndarray, ids: np.ndarray, alpha: float = 0.55) -> np.ndarray:
-    """Instance colours laid over a photo with a thin border between instances; -1 leaves the photo as it
-    is."""
+    """Instance colours laid over a photo with a thin border between instances; -1 leaves the photo as it is."""
     tinted = (1 - alpha) * photo + alpha * colorize_instances(ids)
     out = np.where((ids >= 0)[..., None], tinted, photo)
     out[_borders(ids)] = 255
@@ -131,11 +111,9 @@ def _draw_edge(
 
 
 def features_to_rgb(features: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
-    """Features [..., D] -> colours [..., 3] uint8: their first three principal components, stretched to 1-99
-    %.
+    """Features [..., D] -> colours [..., 3] uint8: their first three principal components, stretched to 1-99 %.
 
-    mask [...]: which entries decide the axes and the stretch (default all); the sign of an axis is made
-    definite.
+    mask [...]: which entries decide the axes and the stretch (default all); the sign of an axis is made definite.
     """
     flat = features.reshape(-1, features.shape[-1]).astype(np.float64)
     basis = flat if mask is None or not mask.any() else flat[mask.ravel()]

@@ -66,14 +66,6 @@ def test_error_map_is_dark_where_equal_and_bright_where_not() -> None:
         pictures.error_map(a, b[:4])
 
 
-def test_depth_is_black_where_missing_and_monotone() -> None:
-    depth = np.array([[0.0, np.inf, np.nan, 1.0, 2.0, 4.0]])
-    picture = pictures.colorize_depth(depth, near=1, far=4).astype(int)
-    assert not picture[0, :3].any()
-    assert picture[0, 3, 0] > picture[0, 5, 0]  # near is red in turbo, far dark blue
-    assert not pictures.colorize_depth(np.zeros((2, 3))).any()
-
-
 def test_features_to_rgb_ignores_rotation_up_to_axis_signs() -> None:
     rng = np.random.default_rng(0)
     features = rng.standard_normal((40, 30, 8)) * np.array([9, 5, 3, 1, 1, 1, 0.5, 0.1])

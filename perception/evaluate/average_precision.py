@@ -1,9 +1,8 @@
 """Instance average precision as ScanNet defines it, on contingency tables pooled over scenes.
 
-Rules (ScanNet benchmark, 3D semantic instance evaluation): strict IoU > threshold; the truth is walked in
-order, and predictions in input order; the first match uses a prediction up, later ones are false positives at
-the lower score; an unmatched prediction is a false positive unless its share of void and too-small truth
-exceeds the threshold.
+Rules (ScanNet benchmark, 3D semantic instance evaluation): strict IoU > threshold; the truth is walked in order, and
+predictions in input order; the first match uses a prediction up, later ones are false positives at the lower score; an
+unmatched prediction is a false positive unless its share of void and too-small truth exceeds the threshold.
 """
 
 from __future__ import annotations
@@ -74,9 +73,7 @@ def _unmatched(
     min_region: int,
     result: Matches,
 ) -> None:
-    """Predictions that meet no truth of their class, not even a small one, are false positives unless
-    ignored.
-    """
+    """Predictions that meet no truth of their class, not even a small one, are false positives unless ignored."""
     small = truths[scene.gt_sizes[truths] < min_region]
     for p in preds[~hit[np.ix_(preds, truths)].any(axis=1)].tolist():
         ignored = scene.pred_void[p] + scene.intersections[p, small].sum()

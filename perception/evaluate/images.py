@@ -71,9 +71,7 @@ def pictures(folder: str | Path) -> dict[str, Path]:
 
 
 def evaluate_images(prediction_dir: str | Path, truth_dir: str | Path) -> dict[str, Any]:
-    """PSNR and SSIM of each true picture and their means; pictures are paired by stem, a missing one scores
-    0.
-    """
+    """PSNR and SSIM of each true picture and their means; pictures are paired by stem, a missing one scores 0."""
     predictions, truths = pictures(prediction_dir), pictures(truth_dir)
     if not truths:
         raise InputError(f"{truth_dir}: holds no pictures")

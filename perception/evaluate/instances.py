@@ -79,12 +79,10 @@ def evaluate(
     ignore: np.ndarray | None = None,
     **changes: Any,
 ) -> dict[str, Any]:
-    """AP of a labelling against the truth, both [N] int over the same points; negative prediction = no
-    instance.
+    """AP of a labelling against the truth, both [N] int over the same points; negative prediction = no instance.
 
-    pred_scores: confidence by id (None: all 1). *_semantics [N] int are needed for by_class and
-    valid_classes; a prediction's class is the most frequent semantic id of its points. ignore [N] bool.
-    changes: switches of Protocol.
+    pred_scores: confidence by id (None: all 1). *_semantics [N] int are needed for by_class and valid_classes; a
+    prediction's class is the most frequent semantic id of its points. ignore [N] bool. changes: switches of Protocol.
     """
     rules = get_protocol(protocol, **changes)
     pred_ids, gt_ids = np.asarray(pred_ids), np.asarray(gt_ids)
@@ -105,24 +103,6 @@ def evaluate(
     return evaluate_overlaps([overlap_of_ids(pred_ids, scores, truth, classes)], rules)
 
 
-def evaluate_masks(
-    masks: Sequence[np.ndarray],
-    scores: Sequence[float],
-    gt_ids: np.ndarray,
-    protocol: str | Protocol = "scannet",
-    *,
-    classes: Sequence[int] | None = None,
-    gt_semantics: np.ndarray | None = None,
-    ignore: np.ndarray | None = None,
-    **changes: Any,
-) -> dict[str, Any]:
-    """AP of masks (each bool [N]; they may overlap) against the truth ids [N]; the masks' order is the input
-    order.
-    """
-    rules = get_protocol(protocol, **changes)
-    return evaluate_overlaps([mask_overlap(rules, masks, scores, gt_ids, classes, gt_semantics, ignore)], rules)
-
-
 def mask_overlap(
     rules: Protocol,
     masks: Sequence[np.ndarray],
@@ -132,7 +112,10 @@ def mask_overlap(
     gt_semantics: np.ndarray | None,
     ignore: np.ndarray | None,
 ) -> Overlap:
-    """Overlap of one scene's masks (each bool [N]) with its truth under a protocol; see evaluate_masks."""
+    """Overlap of one scene's masks (each bool [N]; they may overlap) with its truth ids [N] under a protocol.
+
+    The masks' order is the input order.
+    """
     for i, mask in enumerate(masks):
         if len(mask) != len(gt_ids):
             raise InputError(f"prediction mask {i} has {len(mask)} points, truth has {len(gt_ids)}; they must agree")
@@ -171,9 +154,7 @@ def _truth(
 
 
 def evaluate_overlaps(scenes: Sequence[Overlap], rules: Protocol) -> dict[str, Any]:
-    """AP over scenes pooled as the benchmarks pool them. NaN (no truth of a class) becomes null in the
-    result.
-    """
+    """AP over scenes pooled as the benchmarks pool them. NaN (no truth of a class) becomes null in the result."""
     thresholds = [*rules.thresholds, *rules.extra_thresholds]
     labels = sorted({int(c) for scene in scenes for c in scene.gt_classes})
     table = np.full((len(labels), len(thresholds)), np.nan)

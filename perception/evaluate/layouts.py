@@ -1,9 +1,8 @@
 """Dataset directories of the field, as downloaded, and the runners that judge predictions against them.
 
 LERF-mask (Gaussian Grouping): <scene>/test_mask/<view>/<prompt>.png|jpg; predictions alike. LERF-OVS:
-label/<scene>/frame_*.json with polygons. ScanNet and ScanNet++: <scene>.txt with truth ids (1000 · class +
-instance, one a vertex), predictions as submission files <scene>.txt that name masks, or <scene>.json with
-run-length masks.
+label/<scene>/frame_*.json with polygons. ScanNet and ScanNet++: <scene>.txt with truth ids (1000 · class + instance,
+one a vertex), predictions as submission files <scene>.txt that name masks, or <scene>.json with run-length masks.
 """
 
 from __future__ import annotations
@@ -35,9 +34,7 @@ def read_mask_folder(folder: str | Path) -> dict[tuple[str, str], np.ndarray]:
 
 
 def read_lerf_polygons(folder: str | Path) -> dict[tuple[str, str], np.ndarray]:
-    """{(view, category): mask [H, W] bool} of LERF-OVS label files frame_*.json; polygons of a category are
-    united.
-    """
+    """{(view, category): mask [H, W] bool} of LERF-OVS label files frame_*.json; polygons of a category are united."""
     masks: dict[tuple[str, str], np.ndarray] = {}
     files = sorted(Path(folder).glob("*.json"))
     if not files:
@@ -60,8 +57,7 @@ def run_lerf_mask(
 ) -> tuple[dict[str, Any], str]:
     """LERF-mask over the scenes of a dataset folder (or one scene): (result, table).
 
-    dataset: <scene>/test_mask/<view>/<prompt>.*; prediction: <scene>/<view>/<prompt>.*, or with test_mask
-    between.
+    dataset: <scene>/test_mask/<view>/<prompt>.*; prediction: <scene>/<view>/<prompt>.*, or with test_mask between.
     """
     scenes = {
         name: evaluate_lerf_mask(
@@ -75,8 +71,7 @@ def run_lerf_mask(
 def run_lerf_ovs(prediction: str | Path, dataset: str | Path, **switches: Any) -> tuple[dict[str, Any], str]:
     """LERF-OVS 3D selection over the scenes of a dataset folder: (result, table).
 
-    dataset: label/<scene>/frame_*.json; prediction: <scene>/<view>/<prompt>.*, silhouettes as pictures (255 =
-    1).
+    dataset: label/<scene>/frame_*.json; prediction: <scene>/<view>/<prompt>.*, silhouettes as pictures (255 = 1).
     """
     root = Path(dataset) / "label" if (Path(dataset) / "label").is_dir() else Path(dataset)
     folders = {p.name: p for p in sorted(root.iterdir()) if p.is_dir()} if root.is_dir() else {}
@@ -129,9 +124,8 @@ def run_scannet(
 ) -> tuple[dict[str, Any], str]:
     """Instance AP over all scenes of a ScanNet or ScanNet++ layout: (result, table).
 
-    truth: <scene>.txt, one id a vertex (1000 · class + instance, 0 = void); prediction: <scene>.txt naming
-    masks, or <scene>.json with run-length masks. A scene without a prediction has none and is counted with
-    its misses.
+    truth: <scene>.txt, one id a vertex (1000 · class + instance, 0 = void); prediction: <scene>.txt naming masks, or
+    <scene>.json with run-length masks. A scene without a prediction has none and is counted with its misses.
     """
     from perception.evaluate.labelled_clouds import instances_table
 

@@ -20,8 +20,7 @@ def mask_iou(prediction: np.ndarray, truth: np.ndarray) -> float:
 
 
 def mask_boundary(mask: np.ndarray, dilation_ratio: float = 0.02) -> np.ndarray:
-    """The mask's pixels within round(ratio · image diagonal) (at least 1) of its border or the picture's
-    edge.
+    """The mask's pixels within round(ratio · image diagonal) (at least 1) of its border or the picture's edge.
 
     Boundary IoU (Cheng et al. 2021): 3x3 erosions with zeros beyond the picture.
     """
@@ -39,8 +38,7 @@ def boundary_iou(prediction: np.ndarray, truth: np.ndarray, dilation_ratio: floa
 
 
 def evaluate_lerf_mask(predictions: Masks, truths: Masks, *, missing: str = "zero", **switches: Any) -> dict[str, Any]:
-    """LERF-mask (Gaussian Grouping): mIoU and mean boundary IoU, mean per prompt over views, then over
-    prompts.
+    """LERF-mask (Gaussian Grouping): mIoU and mean boundary IoU, mean per prompt over views, then over prompts.
 
     truths: {(view, prompt): 8-bit mask, object > 128}; predictions alike, or bool, resized to the truth by
     nearest neighbour. missing: "zero" scores an absent prediction 0; "skip" leaves it out, as the original
@@ -86,8 +84,7 @@ def evaluate_lerf_mask(predictions: Masks, truths: Masks, *, missing: str = "zer
 
 
 def evaluate_lerf_ovs(predictions: Masks, truths: Masks, **switches: Any) -> dict[str, Any]:
-    """LERF-OVS in 3D (OpenGaussian) of one scene: flat mean of IoU over (view, object), and mAcc@.25
-    (strict).
+    """LERF-OVS in 3D (OpenGaussian) of one scene: flat mean of IoU over (view, object), and mAcc@.25 (strict).
 
     truths: {(view, prompt): 8-bit mask, object > 10}; predictions: silhouettes in [0, 1] of the selected
     Gaussians (object > .7), or bool. An absent prediction scores 0. switches (selection rule, occlusion,

@@ -16,9 +16,8 @@ OBJECT = 1  # the one class of class-agnostic evaluation
 class Overlap:
     """Sizes and intersections in points; P predictions in input order, G true instances in ascending id.
 
-    pred_ids, pred_classes, pred_sizes, pred_void [P] int64; pred_scores [P] float64; gt_ids, gt_classes,
-    gt_sizes [G] int64; intersections [P, G] int64. pred_void counts a prediction's points that the truth
-    leaves void.
+    pred_ids, pred_classes, pred_sizes, pred_void [P] int64; pred_scores [P] float64; gt_ids, gt_classes, gt_sizes [G]
+    int64; intersections [P, G] int64. pred_void counts a prediction's points that the truth leaves void.
     """
 
     pred_ids: np.ndarray
@@ -56,11 +55,9 @@ def read_truth(
     valid_classes: Sequence[int] | None = None,
     by_class: bool = False,
 ) -> Truth:
-    """Compact the truth ids [N] int. Void: negative ids, `void_ids`, and points of a class outside
-    `valid_classes`.
+    """Compact the truth ids [N] int. Void: negative ids, `void_ids`, and points of a class outside `valid_classes`.
 
-    With `by_class` an instance's class is its points' semantic id (the most frequent one); else all are
-    OBJECT.
+    With `by_class` an instance's class is its points' semantic id (the most frequent one); else all are OBJECT.
     """
     index, ids = compact(gt_ids, void_ids)
     semantics = None if gt_semantics is None else np.asarray(gt_semantics, np.int64)
@@ -80,9 +77,7 @@ def read_truth(
 
 
 def compact(ids: np.ndarray, void_ids: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
-    """(index [N] int64 into the ascending ids that occur, those ids); −1 where the id is negative or in
-    `void_ids`.
-    """
+    """(index [N] int64 into the ascending ids that occur, those ids); −1 where the id is negative or in `void_ids`."""
     ids = np.asarray(ids)
     if ids.ndim != 1 or ids.dtype.kind not in "iu":
         raise InputError(f"instance ids must be whole numbers [N]; found {ids.dtype} {list(ids.shape)}")
@@ -101,9 +96,7 @@ def compact(ids: np.ndarray, void_ids: Sequence[int] = ()) -> tuple[np.ndarray, 
 
 
 def mode_by_group(group: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """The most frequent value of each group 0..count−1 [count]; ties go to the smallest value; group −1 is
-    left out.
-    """
+    """The most frequent value of each group 0..count−1 [count]; ties go to the smallest value; group −1 is left out."""
     inside = group >= 0
     distinct, index = np.unique(values[inside], return_inverse=True)
     if len(distinct) == 0:
@@ -139,9 +132,7 @@ def overlap_of_ids(
 def overlap_of_masks(
     masks: Sequence[np.ndarray], scores: Sequence[float], truth: Truth, classes: Sequence[int] | None = None
 ) -> Overlap:
-    """Overlap of P masks, each bool [N] or an array of point indices; masks may overlap each other, order is
-    kept.
-    """
+    """Overlap of P masks, each bool [N] or an array of point indices; masks may overlap each other, order is kept."""
     if len(scores) != len(masks) or (classes is not None and len(classes) != len(masks)):
         raise InputError(
             f"prediction: {len(masks)} masks, {len(scores)} scores; one score (and class) per mask is needed"

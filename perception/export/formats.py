@@ -115,8 +115,7 @@ def write_scannet(
     instances: Instances,
     classes: Mapping[int, int] | None = None,
 ) -> Path:
-    """ScanNet's 3D instance submission: <scene>.txt with "predicted_masks/<scene>_<nnn>.txt <class>
-    <confidence>" rows.
+    """ScanNet's 3D instance submission: <scene>.txt with "predicted_masks/<scene>_<nnn>.txt <class> <confidence>" rows.
 
     Each mask file has one 0 or 1 for each vertex. classes: class by instance id; None writes 1 for all. Best
     score first.

@@ -1,6 +1,4 @@
-"""Point clouds and meshes from and to files, the format told by the file's extension. Order and count are
-kept.
-"""
+"""Point clouds and meshes from and to files, the format told by the file's extension. Order and count are kept."""
 
 from __future__ import annotations
 
@@ -51,9 +49,7 @@ def read_cloud(path: str | Path) -> PointCloud:
 
 
 def write_cloud(path: str | Path, cloud: PointCloud) -> None:
-    """Write .ply (binary), .pcd (binary), .npz or .xyz: points, and colours, normals, faces and labels the
-    format has.
-    """
+    """Write .ply (binary), .pcd (binary), .npz or .xyz: points and what the format has of the rest."""
     path = Path(path)
     writer = _WRITERS.get(path.suffix.lower())
     if writer is None:
@@ -62,9 +58,7 @@ def write_cloud(path: str | Path, cloud: PointCloud) -> None:
 
 
 def to_int32(values: np.ndarray, where: str) -> np.ndarray:
-    """Label column as int32; values that do not fit (or are no whole numbers) are an InputError naming
-    `where`.
-    """
+    """Label column as int32; values that do not fit (or are no whole numbers) are an InputError naming `where`."""
     if values.dtype == np.int32:
         return values
     limits = np.iinfo(np.int32)
@@ -108,9 +102,7 @@ def _read_ply_cloud(path: Path) -> PointCloud:
 
 
 def to_uint8(colors: np.ndarray) -> np.ndarray:
-    """Colours [P, 3] as uint8: floats in [0, 1] are scaled by 255, 16-bit values by 1/257, bytes are taken as
-    they are.
-    """
+    """Colours [P, 3] as uint8: floats in [0, 1] are scaled by 255, 16-bit values by 1/257, bytes are kept."""
     if colors.dtype == np.uint8:
         return colors
     if colors.dtype.kind == "f":

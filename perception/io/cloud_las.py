@@ -11,9 +11,7 @@ from perception.types import PointCloud
 
 
 def read_las(path: Path) -> PointCloud:
-    """points [P, 3] float64 (scale and offset applied); 16-bit colours become 8-bit; `classification` is a
-    label.
-    """
+    """points [P, 3] float64 (scale and offset applied); 16-bit colours become 8-bit; `classification` is a label."""
     try:
         import laspy
     except ImportError as error:

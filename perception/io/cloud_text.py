@@ -12,8 +12,7 @@ from perception.types import PointCloud
 
 
 def read_xyz(path: Path) -> PointCloud:
-    """Rows of x y z, then optionally r g b (all whole numbers in 0..255) and/or a normal; separators: blank ,
-    ;
+    """Rows of x y z, then optionally r g b (all whole numbers in 0..255) and/or a normal; separators: blank , ;
 
     Lines starting with # or // and a leading count line (.pts) are skipped. points [P, 3] float64.
     """
@@ -82,8 +81,7 @@ def write_xyz(path: Path, cloud: PointCloud) -> None:
 
 
 def read_obj(path: Path) -> PointCloud:
-    """Vertices (with r g b after x y z where given) and faces of an OBJ file; texture and normal indices are
-    ignored.
+    """Vertices (with r g b after x y z where given) and faces of an OBJ file; texture and normal indices are ignored.
 
     points [P, 3] float64. Faces are split into fans; negative indices count back from the last vertex read.
     """

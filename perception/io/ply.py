@@ -1,7 +1,6 @@
 """The PLY container: elements of named properties, ASCII and both byte orders, fixed or ragged lists.
 
-Format: Greg Turk's "The PLY Polygon File Format" (1994). Binary tables are mapped straight onto structured
-arrays.
+Format: Greg Turk's "The PLY Polygon File Format" (1994). Binary tables are mapped straight onto structured arrays.
 """
 
 from __future__ import annotations
@@ -93,23 +92,20 @@ def map_ply(path: str | Path, element: str) -> np.ndarray:
         return np.memmap(file, dtype, "r", start, (tables[0].rows,))
 
 
-def write_ply(path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]], *, ascii: bool = False) -> None:
+def write_ply(path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]]) -> None:
     """Write elements of scalar properties [rows] and list properties [rows, k], in the order given.
 
-    Binary little endian unless `ascii`. The file appears complete or not at all.
+    Binary little endian. The file appears complete or not at all.
     """
     with replacing(path) as file:
-        file.write(_header(elements, ascii).encode("ascii"))
+        file.write(_header(elements))
         for properties in elements.values():
-            if ascii:
-                _write_ascii(file, properties)
-            else:
-                _packed(properties).tofile(file)
+            _packed(properties).tofile(file)
 
 
 def ply_bytes(elements: Mapping[str, Mapping[str, np.ndarray]]) -> bytes:
     """What `write_ply` would write, binary, for those who send it elsewhere."""
-    return _header(elements, False).encode("ascii") + b"".join(_packed(p).tobytes() for p in elements.values())
+    return _header(elements) + b"".join(_packed(p).tobytes() for p in elements.values())
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_Table]]:
@@ -270,14 +266,14 @@ def _kind(values: np.ndarray) -> str:
     return kind
 
 
-def _header(elements: Mapping[str, Mapping[str, np.ndarray]], ascii: bool) -> str:
-    lines = ["ply", f"format {'ascii' if ascii else 'binary_little_endian'} 1.0"]
+def _header(elements: Mapping[str, Mapping[str, np.ndarray]]) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0"]
     for name, properties in elements.items():
         lines.append(f"element {name} {len(next(iter(properties.values())))}")
         for key, values in properties.items():
             prefix = "list uchar " if values.ndim == 2 else ""
             lines.append(f"property {prefix}{_NAMES[_kind(values)]} {key}")
-    return "\n".join([*lines, "end_header", ""])
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
 def _packed(properties: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -293,12 +289,3 @@ def _packed(properties: Mapping[str, np.ndarray]) -> np.ndarray:
         if values.ndim == 2:
             rows[f"{key}\0count"] = values.shape[1]
     return rows
-
-
-def _write_ascii(file: BinaryIO, properties: Mapping[str, np.ndarray]) -> None:
-    for i in range(len(next(iter(properties.values())))):
-        words = []
-        for values in properties.values():
-            row = values[i]
-            words += [str(len(row)), *map(str, row)] if values.ndim == 2 else [str(row)]
-        file.write((" ".join(words) + "\n").encode("ascii"))

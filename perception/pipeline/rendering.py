@@ -26,12 +26,11 @@ KINDS = ("rgb", "depth", "instances", "features", "boxes")
 def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[str]) -> tuple[dict[str, Any], str]:
     """Writes one picture per camera and kind: `NAME.png` for a single kind, `KIND/NAME.png` for several.
 
-    rgb: 8-bit PNG. depth: 16-bit PNG, thousandths of the map's unit along the optical axis, 0 = nothing.
-    instances: 16-bit PNG of id + 1, 0 = none. features: 8-bit PNG of the three main components. boxes: rgb with the
-    instances' oriented boxes, hidden edges thin.
-    cameras: a transforms.json in the coordinates of the map's input; None takes the map's held-out views (all views if
-    none were held out). A camera with lens distortion is rendered as that lens sees, so that the picture lies over the
-    photo it was given for.
+    rgb: 8-bit PNG. depth: 16-bit PNG, thousandths of the map's unit along the optical axis, 0 = nothing. instances:
+    16-bit PNG of id + 1, 0 = none. features: 8-bit PNG of the three main components. boxes: rgb with the instances'
+    oriented boxes, hidden edges thin. cameras: a transforms.json in the coordinates of the map's input; None takes the
+    map's held-out views (all views if none were held out). A camera with lens distortion is rendered as that lens sees,
+    so that the picture lies over the photo it was given for.
     """
     for kind in what:
         if kind not in KINDS:

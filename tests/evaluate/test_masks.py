@@ -10,7 +10,6 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 from perception.errors import InputError
-from perception.evaluate.instances import evaluate_masks
 from perception.evaluate.layouts import run_lerf_mask, run_lerf_ovs, run_scannet
 from perception.evaluate.masks import (
     boundary_iou,
@@ -20,6 +19,7 @@ from perception.evaluate.masks import (
     mask_iou,
 )
 from perception.export.formats import write_scannet
+from support.ap import evaluate_masks
 
 
 def blob(seed, shape=(60, 90)):

@@ -90,8 +90,11 @@ def test_ascii_ply_equals_binary(tmp_path):
     rng = np.random.default_rng(0)
     vertex = {a: rng.normal(size=30) for a in "xyz"} | {"id": rng.integers(-9, 9, 30).astype(np.int32)}
     elements = {"vertex": vertex, "face": {"vertex_index": rng.integers(0, 30, (8, 3)).astype(np.int32)}}
-    write_ply(tmp_path / "a.ply", elements, ascii=True)
     write_ply(tmp_path / "b.ply", elements)
+    header = (tmp_path / "b.ply").read_bytes().split(b"end_header\n")[0].replace(b"binary_little_endian", b"ascii")
+    rows = [" ".join(map(repr, row)) for row in zip(*(column.tolist() for column in vertex.values()), strict=True)]
+    rows += [f"3 {a} {b} {c}" for a, b, c in elements["face"]["vertex_index"].tolist()]
+    (tmp_path / "a.ply").write_bytes(header + b"end_header\n" + "\n".join(rows).encode() + b"\n")
     a, b = read_cloud(tmp_path / "a.ply"), read_cloud(tmp_path / "b.ply")
     np.testing.assert_array_equal(a.points, b.points)
     np.testing.assert_array_equal(a.faces, b.faces)

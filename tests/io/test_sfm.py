@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
-from perception.geometry import align_similarity, inverse_se3, look_at, rotation_angle
+from perception.geometry import align_similarity, inverse_se3, look_at
 from perception.io import features, sfm_checks
 from perception.io.inputs import load_scene
 from perception.io.lens import load_pycolmap
@@ -72,7 +73,9 @@ def errors(scene, truth):
     centers = scale * found[:, :3, 3] @ rotation.T + shift
     spread = np.linalg.norm(right[:, :3, 3] - right[:, :3, 3].mean(0), axis=1).mean()
     turned = np.swapaxes(right[:, :3, :3], 1, 2) @ rotation @ found[:, :3, :3]
-    return np.linalg.norm(right[:, :3, 3] - centers, axis=1).max() / spread, rotation_angle(turned).max()
+    return np.linalg.norm(right[:, :3, 3] - centers, axis=1).max() / spread, np.degrees(
+        Rotation.from_matrix(turned).magnitude()
+    ).max()
 
 
 def test_poses_are_the_true_ones(corner, run):
