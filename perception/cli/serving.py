@@ -17,6 +17,14 @@ def register(commands: Any) -> None:
     p.add_argument("--host", default="127.0.0.1", help="other than this machine only with a token")
     p.add_argument("--port", type=int, default=8765, help="0: any free one")
     p.add_argument("--token-file", type=Path, metavar="FILE", help="clients send its content as a bearer token")
+    p.add_argument(
+        "--photos",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="show photos from this folder too, not only from the map's own; repeatable",
+    )
     p.add_argument("--timeout", type=float, default=10.0, metavar="S", help="seconds an answer may take")
     p.add_argument("--workers", type=int, default=2, metavar="N", help="questions answered at once")
     p.add_argument("--queue", type=int, default=64, metavar="N", help="questions that may wait; more are refused")
@@ -37,6 +45,7 @@ def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         queue_size=args.queue,
         rate=args.rate,
         watch=args.watch,
+        photos=tuple(args.photos),
     )
     from perception.serve.run import serve
 

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 
 from perception.errors import InputError
-from perception.query.query_map import QueryMap
+from perception.query.query_map import QueryMap, UnknownInstance
 
 MARGIN = 0.15
 """Share of the box's longer side that is left around it."""
 
 
-def best_crop(gmap: QueryMap, instance_id: int, side: int = 320) -> np.ndarray | None:
+def best_crop(
+    gmap: QueryMap, instance_id: int, side: int = 320, folders: Sequence[Path] | None = None
+) -> np.ndarray | None:
     """The instance in its best photo, [h, w, 3] uint8 RGB, longer side at most `side` pixels.
 
     None when no photo shows it, or the photo has moved or cannot be read any more. InputError for an unknown id.
+    folders: where photos may be read, None = anywhere. The map says where its photos lie, and a map from somebody else
+    may say anything: UnknownInstance for a photo elsewhere, symbolic links followed.
     """
     from perception.io.photos import load_photo
 
@@ -27,13 +35,30 @@ def best_crop(gmap: QueryMap, instance_id: int, side: int = 320) -> np.ndarray |
     if view is None:
         return None
     try:
-        photo = load_photo(gmap.with_photo(view), int(gmap.info["config"]["photos"]["max_side"]))
-    except (InputError, OSError, KeyError):
+        view = gmap.with_photo(view)
+        if folders is not None:
+            view = replace(view, photo=_within(view.photo, folders, instance_id))
+        photo = load_photo(view, int(gmap.info["config"]["photos"]["max_side"]))
+    except UnknownInstance:
+        raise
+    except (InputError, OSError, ValueError, KeyError):
         return None
     margin = 2 + round(MARGIN * max(x1 - x0, y1 - y0))
     top, left = max(0, y0 - margin), max(0, x0 - margin)
     cut = photo[top : y1 + margin, left : x1 + margin]
     return _shrunk(cut, side) if cut.size else None
+
+
+def _within(photo: Path, folders: Sequence[Path], instance_id: int) -> Path:
+    """`photo` without symbolic links; UnknownInstance unless it is a file below one of the folders."""
+    try:
+        real = photo.resolve()
+        known = any(real.is_relative_to(folder.resolve()) for folder in folders) and real.is_file()
+    except (OSError, ValueError, RuntimeError):  # no path at all, or links in a circle
+        known = False
+    if not known:
+        raise UnknownInstance(f"instance {instance_id}: its photo is not in the map's folder nor in --photos DIR")
+    return real
 
 
 def _shrunk(picture: np.ndarray, side: int) -> np.ndarray:

@@ -72,6 +72,7 @@ class QueryEngine:
         self._reloading = threading.Lock()
         self._listeners: list[Callable[[QueryMap], None]] = []
         self._problem: str | None = None
+        self._busy_since: dict[int, float] = {}
         self._closed = threading.Event()
         self._threads = [threading.Thread(target=self._work, name=f"query-{n}", daemon=True) for n in range(workers)]
         if watch is not None:
@@ -195,13 +196,14 @@ class QueryEngine:
     # ------------------------------------------------------------------ health
 
     def health(self) -> dict[str, Any]:
-        """status: ok, degraded (the map on disk is gone or unreadable; the one in memory answers) or closed; the map's
-        identity and counts, the queue, totals since the start, and latency of the last thousand answers in ms."""
+        """status: ok, closed or degraded, and the problem then: the map on disk is gone or unreadable and the one in
+        memory answers, prompts cannot be answered, or answers are overdue; the map's identity and counts, the queue,
+        totals since the start, and latency of the last thousand answers in ms."""
         gmap = self._map
-        status = "closed" if self._closed.is_set() else "degraded" if self._problem or gmap.problem else "ok"
+        problem = self._problem or gmap.problem or self._overdue()
         return {
-            "status": status,
-            "problem": self._problem or gmap.problem,
+            "status": "closed" if self._closed.is_set() else "degraded" if problem else "ok",
+            "problem": problem,
             "map": str(self.path),
             "map_id": gmap.map_id,
             "frame": gmap.frame,
@@ -212,6 +214,11 @@ class QueryEngine:
             "queue_size": self._queue.most,
             **self._counters.to_json(),
         }
+
+    def _overdue(self) -> str | None:
+        now = time.monotonic()
+        late = sum(now - since > self.timeout for since in list(self._busy_since.values()))
+        return f"{late} answers take longer than {self.timeout:g} s" if late else None
 
     def close(self) -> None:
         """Answers what runs, refuses what waits, and ends the threads."""
@@ -238,7 +245,10 @@ class QueryEngine:
             if time.monotonic() > job.deadline:
                 self._drop(job)
             elif job.future.set_running_or_notify_cancel():
+                own = threading.get_ident()
+                self._busy_since[own] = time.monotonic()
                 self._answer(job)
+                del self._busy_since[own]
 
     def _drop(self, job: Job) -> None:
         """Tells who asked that the time is over; nothing when they have gone already."""

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import threading
-from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal, TypeVar
@@ -21,6 +18,7 @@ from perception.query.engine import QueryEngine
 from perception.query.frames import Frame
 from perception.query.query_map import QueryMap, UnknownInstance
 from perception.serve import answers
+from perception.serve.crops import Crops
 from perception.serve.errors import HANDLERS, OtherMap
 from perception.serve.guard import Guard
 from perception.serve.points import FORMATS, encode
@@ -33,7 +31,6 @@ _ABOUT = (
     "Text prompts and places in, 3D instances of a map out. Lengths are in the unit of the map's frame, metres when "
     "`metric`. With `frame`, everything in a request and its answer is in that frame."
 )
-_MAX_CROPS = 256
 _PAGE = {"/": "html", "/page.js": "javascript", "/page.css": "css"}
 """The page for people: path → kind of text."""
 
@@ -52,7 +49,7 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
     app.add_middleware(Guard, settings=settings)
     for path, kind in _PAGE.items():
         app.add_api_route(path, _static(path[1:] or "page.html", f"text/{kind}"), include_in_schema=False)
-    routes = _Routes(engine)
+    routes = _Routes(engine, settings)
     app.get("/health", response_model=answers.Health)(routes.health)
     app.post("/query", response_model=answers.Results)(routes.query)
     app.post("/find", response_model=answers.Hits)(routes.find)
@@ -69,14 +66,16 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
 class _Routes:
     """One method a route. Each answer is made by one map, named in `map_id` or in the header X-Map-Id."""
 
-    def __init__(self, engine: QueryEngine) -> None:
+    def __init__(self, engine: QueryEngine, settings: ServeSettings) -> None:
         self.engine = engine
-        self._crops: OrderedDict[tuple[str, int, int], bytes | None] = OrderedDict()
-        self._lock = threading.Lock()
+        self._folders = (engine.path, *settings.photos)
+        self._crops = Crops(engine.timeout)
 
     async def health(self, request: Request) -> Response:
         """How the server is; without the token its status only."""
         health = self.engine.health()
+        if hung := self._crops.hung():
+            health |= {"status": "degraded", "problem": f"{hung} photos cannot be read: their disk does not answer"}
         shown = health if request.state.trusted else {"status": health["status"]}
         return JSONResponse(shown, 200 if health["status"] != "closed" else 503)
 
@@ -134,10 +133,13 @@ class _Routes:
         self, number: Id, map_id: MapId = None, side: Annotated[int, Query(ge=16, le=1024)] = 256
     ) -> Response:
         """The photo that shows the instance best, cut out, longer side at most `side` pixels."""
-        made_by, data = await self._answer(map_id, lambda gmap: (gmap.map_id, self._jpeg(gmap, number, side)))
+        gmap = self.engine.current
+        _check_map(gmap, map_id)
+        future = self._crops.jpeg((gmap.map_id, number, side), lambda: best_crop(gmap, number, side, self._folders))
+        data = await self.engine.awaited(future)
         if data is None:
             raise UnknownInstance(f"instance {number}: no photo of it can be read")
-        return Response(data, media_type="image/jpeg", headers={"X-Map-Id": made_by})
+        return Response(data, media_type="image/jpeg", headers={"X-Map-Id": gmap.map_id})
 
     async def reload(self) -> Response:
         """Takes over the map that lies on disk now."""
@@ -150,8 +152,7 @@ class _Routes:
         """`work` done by the engine, on the map `wanted` if the client named one."""
 
         def checked(gmap: QueryMap) -> T:
-            if wanted is not None and wanted != gmap.map_id:
-                raise OtherMap(f"the map is now {gmap.map_id}, not {wanted[:40]}; ask again")
+            _check_map(gmap, wanted)
             return work(gmap)
 
         return await self.engine.awaited(self.engine.run(checked))
@@ -162,31 +163,14 @@ class _Routes:
 
         return JSONResponse(await self._answer(wanted, answer))
 
-    def _jpeg(self, gmap: QueryMap, number: int, side: int) -> bytes | None:
-        key = (gmap.map_id, number, side)
-        with self._lock:
-            if key in self._crops:
-                return self._crops[key]
-        data = _encode_jpeg(best_crop(gmap, number, side))
-        with self._lock:
-            self._crops[key] = data
-            if len(self._crops) > _MAX_CROPS:
-                self._crops.popitem(last=False)
-        return data
+
+def _check_map(gmap: QueryMap, wanted: str | None) -> None:
+    if wanted is not None and wanted != gmap.map_id:
+        raise OtherMap(f"the map is now {gmap.map_id}, not {wanted[:40]}; ask again")
 
 
 def _source(gmap: QueryMap, frame: Frame | None) -> dict[str, Any]:
     return {"frame": frame.name if frame else gmap.frame, "metric": gmap.metric, "map_id": gmap.map_id}
-
-
-def _encode_jpeg(picture: Any) -> bytes | None:
-    if picture is None:
-        return None
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, "JPEG", quality=85)
-    return buffer.getvalue()
 
 
 def _binary(*kinds: str) -> dict[int | str, dict[str, Any]]:

@@ -13,7 +13,8 @@ from perception.listening import listen, url_host
 from perception.query.engine import QueryEngine
 from perception.serve.settings import ServeSettings
 
-_MOST_CONNECTIONS = 256
+_TOTAL_TIMEOUT = 300.0
+"""Seconds from a request's header to the end of its answer: 100 MB of points at 3 Mbit/s."""
 
 
 def serve(
@@ -33,6 +34,7 @@ def serve(
     import uvicorn
 
     from perception.serve.app import build_app
+    from perception.serve.connections import MAX_CONNECTIONS, Connections
 
     with (
         listen(settings.host, settings.port) as sock,
@@ -48,12 +50,15 @@ def serve(
         (say or _say)(f"serving {path} at http://{url_host(settings.host)}:{sock.getsockname()[1]} (Ctrl-C stops)")
         if (trouble := engine.current.problem) is not None:
             (say or _say)(f"warning: prompts cannot be answered: {trouble}")
+        connections = Connections(settings.timeout, _TOTAL_TIMEOUT)
         config = uvicorn.Config(
-            build_app(engine, settings),
+            connections.watched(build_app(engine, settings)),
+            http=connections.protocol_class(),
+            proxy_headers=False,  # they name the client that the rate is counted for, and anybody can write them
             log_level="warning",
             lifespan="off",
             server_header=False,
-            limit_concurrency=_MOST_CONNECTIONS,
+            limit_concurrency=MAX_CONNECTIONS,
             timeout_graceful_shutdown=max(1, round(settings.timeout)),
         )
         uvicorn.Server(config).run(sockets=[sock])

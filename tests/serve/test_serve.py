@@ -145,7 +145,7 @@ def test_the_best_photo_is_cut_around_its_box(tmp_path: Path) -> None:
     gmap.language["view_boxes"] = np.array([[100, 40, 130, 60]], np.int32)
     write_map(path, gmap)
     with QueryEngine(path, watch=None, encoders=encoders) as engine:
-        client = client_of(engine)
+        client = client_of(engine, photos=(tmp_path,))
         answer = client.get("/instances/0/crop.jpg?side=64")
         picture = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
         height, width = picture.shape[:2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import signal
@@ -105,6 +106,38 @@ def test_what_is_no_http_does_not_end_the_server(tmp_path: Path) -> None:
             assert b"root:" not in answer and b"Traceback" not in answer
         assert process.poll() is None
         assert ask(port, "mug")["results"][0]["hits"][0]["instance_id"] == 0
+
+
+@pytest.mark.slow
+def test_half_sent_headers_hold_up_nobody(tmp_path: Path) -> None:
+    """300 connections that never finish their header; the server must answer others, and close these in the end."""
+    path = write_map_of(tmp_path / "a.gsmap", gaussians=300)
+    with served(path) as (_, port):
+        held = [socket.create_connection(("127.0.0.1", port), timeout=60) for _ in range(300)]
+        try:
+            for raw in held:
+                with contextlib.suppress(OSError):  # closed by the server already
+                    raw.sendall(b"GET /health HTTP/1.1\r\nHost: local")
+            for _ in range(20):
+                assert ask(port, "mug")["results"][0]["hits"][0]["instance_id"] == 0
+            for raw in held:
+                with contextlib.suppress(ConnectionResetError):
+                    assert raw.recv(1) == b""
+        finally:
+            for raw in held:
+                raw.close()
+
+
+@pytest.mark.slow
+def test_a_header_after_an_answer_has_a_time_too(tmp_path: Path) -> None:
+    path = write_map_of(tmp_path / "a.gsmap", gaussians=300)
+    with served(path) as (_, port), socket.create_connection(("127.0.0.1", port), timeout=60) as raw:
+        raw.sendall(b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert b" 200 OK" in raw.recv(65536)
+        raw.sendall(b"GET /health HTTP/1.1\r\nHost: local")
+        with contextlib.suppress(ConnectionResetError):
+            while raw.recv(65536):
+                pass
 
 
 def test_a_port_in_use_is_told_before_the_map_is_opened(tmp_path: Path) -> None:
