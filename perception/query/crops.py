@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.map_views import locate_photo
 from perception.query.query_map import QueryMap, UnknownInstance
 
 MARGIN = 0.15
@@ -49,11 +51,26 @@ def best_crop(
     return _shrunk(cut, side) if cut.size else None
 
 
+def folders_needed(gmap: QueryMap, folders: Sequence[Path]) -> list[Path]:
+    """The folders that hold photos of the map and are neither among `folders` nor below one, sorted."""
+    needed = set()
+    for view in gmap.views:
+        with suppress(OSError, ValueError, RuntimeError):
+            photo = locate_photo(view, gmap.path).resolve()
+            if not _is_below(photo, folders):
+                needed.add(photo.parent)
+    return sorted(needed)
+
+
+def _is_below(real: Path, folders: Sequence[Path]) -> bool:
+    return any(real.is_relative_to(folder.resolve()) for folder in folders)
+
+
 def _within(photo: Path, folders: Sequence[Path], instance_id: int) -> Path:
     """`photo` without symbolic links; UnknownInstance unless it is a file below one of the folders."""
     try:
         real = photo.resolve()
-        known = any(real.is_relative_to(folder.resolve()) for folder in folders) and real.is_file()
+        known = _is_below(real, folders) and real.is_file()
     except (OSError, ValueError, RuntimeError):  # no path at all, or links in a circle
         known = False
     if not known:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 from perception.errors import missing_extra
 from perception.language.base import Encoder
 from perception.listening import listen, url_host
+from perception.query.crops import folders_needed
 from perception.query.engine import QueryEngine
 from perception.serve.settings import ServeSettings
 
@@ -50,6 +52,10 @@ def serve(
         (say or _say)(f"serving {path} at http://{url_host(settings.host)}:{sock.getsockname()[1]} (Ctrl-C stops)")
         if (trouble := engine.current.problem) is not None:
             (say or _say)(f"warning: prompts cannot be answered: {trouble}")
+        for folder in folders_needed(engine.current, (path, *settings.photos))[:3]:
+            (say or _say)(
+                f"note: photos in {folder} are not shown; --photos {shlex.quote(str(folder))} would show them"
+            )
         connections = Connections(settings.timeout, _TOTAL_TIMEOUT)
         config = uvicorn.Config(
             connections.watched(build_app(engine, settings)),

@@ -18,8 +18,10 @@ from PIL import Image
 from starlette.testclient import TestClient
 
 from perception.cli import main
+from perception.io.map_views import StoredView
 from perception.io.store import read_map, write_map
 from perception.query import QueryEngine
+from perception.query.crops import folders_needed
 from perception.query.engine import EngineBusy
 from perception.serve import app as app_module
 from perception.serve import crops
@@ -27,17 +29,15 @@ from perception.serve.app import build_app
 from perception.serve.settings import ServeSettings
 
 
-def write_photo_map(path: Path, photo: str) -> Path:
-    """A map of one instance that says its photo is the file `photo`."""
-    from perception.io.scene_cache import view_json
-    from perception.types import View
-
+def write_photo_map(path: Path, photo: str, beside: str | None = None) -> Path:
+    """A map of one instance that says its photo is the file `photo`, or `beside` relative to the map."""
     write_map_of(path, ["square"], gaussians=50)
     gmap = read_map(path)
-    entry = view_json(View("00000.jpg", Path("p.png"), np.eye(3), 160, 100, np.eye(4)))
-    gmap.info["views"] = [{**entry, "photo": photo}]
+    gmap.views = [StoredView("00000.jpg", Path(photo), np.eye(3), 160, 100, np.eye(4), photo_beside=beside)]
     gmap.language["view_boxes"] = np.array([[100, 40, 130, 60]], np.int32)
     write_map(path, gmap)
+    stored = read_map(path).views[0]
+    assert isinstance(stored, StoredView) and stored.photo_beside == beside
     return path
 
 
@@ -64,6 +64,15 @@ def test_a_received_map_cannot_have_a_private_file_served(tmp_path: Path) -> Non
     assert asked(path, picture(tmp_path / "photos/other.png").parent) == 404
     assert asked(path, private.parent) == 200
     assert asked(path, tmp_path) == 200
+    assert asked(write_photo_map(tmp_path / "b.gsmap", "gone.png", "../private/secret.png")) == 404
+
+
+def test_the_folders_that_would_be_needed_are_told(tmp_path: Path) -> None:
+    private = picture(tmp_path / "private/secret.png")
+    path = write_photo_map(tmp_path / "a.gsmap", str(private))
+    with QueryEngine(path, watch=None, encoders=encoders) as engine:
+        assert folders_needed(engine.current, (path,)) == [private.parent]
+        assert folders_needed(engine.current, (path, tmp_path)) == []
 
 
 def test_photos_below_the_map_are_served_and_links_out_of_it_are_not(tmp_path: Path) -> None:
