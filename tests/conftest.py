@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -23,19 +24,11 @@ def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     The label images carry other ids in every photo, as a segmenter's would. truth/ holds the truth.
     """
-    import cv2
-    import numpy as np
-
     from perception.demo import make_photos
 
     root = tmp_path_factory.mktemp("small")
-    truth = make_photos(root / "images", views=12, width=128, height=96, light_samples=2)
-    (root / "labels").mkdir()
-    rng = np.random.default_rng(0)
-    for name in truth.names:
-        ids = truth.labels(name)
-        shuffle = np.concatenate([[0], 1 + rng.permutation(int(ids.max()))]).astype(np.uint16)
-        cv2.imwrite(str(root / "labels" / f"{Path(name).stem}.png"), shuffle[ids])
+    make_photos(root / "images", views=12, width=128, height=96, light_samples=2)
+    shutil.copytree(root / "truth" / "labels", root / "labels")
     cameras = json.loads((root / "truth" / "transforms.json").read_text())
     for frame in cameras["frames"]:
         frame["file_path"] = f"images/{Path(frame['file_path']).name}"

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from perception.cli.parser import command
+from perception.errors import InputError
 
 
 def register(commands: Any) -> None:
@@ -129,11 +130,18 @@ def _report(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 def _add_demo(commands: Any) -> None:
     p = command(commands, "demo", _demo, "photos -> SfM -> map -> export -> text query, on a scene it makes itself")
     p.add_argument("-o", "--output", type=Path, default=Path("perception-demo"), metavar="DIR")
+    p.add_argument("--scene", choices=("tabletop", "room"), default="tabletop", help="what is made (default: tabletop)")
+    p.add_argument("--seed", type=int, default=0, metavar="N", help="another N makes another scene (default: 0)")
+    p.add_argument("--photos-only", type=Path, metavar="DIR", help="write photos, masks and truth to DIR; no map")
 
 
 def _demo(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.pipeline.demo import run_demo
+    from perception.pipeline.demo import run_demo, write_scene
     from perception.progress import Progress
 
+    if args.seed < 0:
+        raise InputError(f"--seed: found {args.seed}, expected 0 or more")
+    if args.photos_only is not None:
+        return write_scene(args.photos_only, args.scene, args.seed)
     with Progress() as progress:
-        return run_demo(args.output, progress)
+        return run_demo(args.output, progress, args.scene, args.seed)

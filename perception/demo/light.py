@@ -1,31 +1,49 @@
-"""Light baked once into small maps: a soft window lamp with shadows, a sky dimmed by what stands around.
+"""Light baked once into small maps: round lamps with soft shadows, and light from all around.
 
-The scene is matte and still, so the light that leaves a surface point is the same in every photo: it is
-computed
-per map texel (rendering equation, one diffuse bounce off the object a sky ray meets) and kept.
+The scene is matte and still, so the light that leaves a surface point is the same in every photo: it is computed per
+map texel (rendering equation, one diffuse bounce off the body that an ambient ray meets) and kept.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
-from perception.demo.shapes import Shape, to_local, to_world
+from perception.demo.cameras import Camera
+from perception.demo.shapes import Box, Shape, placed, spin, to_local, to_world
 
-LAMP_CENTER = np.array([-1.0, -0.9, 1.75])
-LAMP_RADIUS = 0.34
-LAMP_COLOR = np.array([1.0, 0.93, 0.82]) * 6.4  # irradiance at one metre
-SKY_COLOR = np.array([0.36, 0.41, 0.48])
-SKY_REACH = 0.8  # metres beyond which an object no longer dims the sky
+WORKERS = min(os.cpu_count() or 1, 8)  # a photo being cast holds about 150 MB
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A round lamp at `center` [3] that faces the origin; radius in metres, color [3]: irradiance at one metre."""
+
+    center: np.ndarray
+    radius: float
+    color: np.ndarray
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Lamps, and light `ambient` [3] from all around, dimmed by bodies nearer than `reach` metres. The first lamp makes
+    the highlights."""
+
+    lamps: list[Lamp]
+    ambient: np.ndarray
+    reach: float = 0.8
 
 
 @dataclass
 class Part:
     """One surface with its paint (sRGB [h, w, 3] float32) and, once lit, the uint8 picture a camera sees.
 
-    gloss: strength of the highlight. light_texels: resolution of the baked light, rows and columns.
+    gloss: strength of the highlight. light_texels: rows and columns of the baked light. casts: throws shadows.
     """
 
     shape: Shape
@@ -38,19 +56,39 @@ class Part:
 
 @dataclass
 class Body:
-    """A thing in the scene: its instance id, its name and the surfaces it is made of."""
+    """An instance of the scene: its name, further prompts that name it, and the surfaces it is made of."""
 
-    id: int
     name: str
     prompts: list[str]
     parts: list[Part]
     is_stuff: bool = False
+    kind: str = ""
+
+    @property
+    def category(self) -> str:
+        """`kind`, or the last word of the name."""
+        return self.kind or self.name.split()[-1]
+
+    def placed(self, turn: float, shift: np.ndarray, scale: float = 1.0) -> Body:
+        """The body scaled about the origin, turned by `turn` degrees about z and moved by `shift` [3]."""
+        rotation = spin(turn)
+        parts = [replace(part, shape=placed(part.shape, rotation, shift, scale)) for part in self.parts]
+        return replace(self, parts=parts)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Lit bodies (their ids are 1 + their places), cameras(views, width, height), and the demo's prompts."""
+
+    bodies: list[Body]
+    lighting: Lighting
+    cameras: Callable[[int, int, int], list[Camera]]
+    asked: list[str]
 
 
 @dataclass(frozen=True)
 class Caster:
-    """What a shadow ray needs of a body: its shapes, a ball around them, the colour it lends to its
-    neighbours."""
+    """What a shadow ray needs of a body: its shapes, a ball around them, the colour it lends to its neighbours."""
 
     shapes: list[Shape]
     center: np.ndarray
@@ -59,7 +97,7 @@ class Caster:
 
 
 def casters(bodies: list[Body]) -> list[Caster]:
-    """The bodies that stand in the light, ready for `first_hits`."""
+    """The bodies that throw shadows, ready for `first_hits`."""
     found = []
     for body in bodies:
         shapes = [part.shape for part in body.parts if part.casts]
@@ -100,8 +138,7 @@ def _linear(srgb: np.ndarray) -> np.ndarray:
 
 
 def first_hits(around: list[Caster], origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance [N] to the first caster along each unit ray (inf = none) and its index in the list (-1 =
-    none)."""
+    """Distance [N] to the first caster along each unit ray (inf = none) and its index in the list (-1 = none)."""
     origins, rays = origins.astype(np.float32), rays.astype(np.float32)
     distance = np.full(len(origins), np.inf, np.float32)
     index = np.full(len(origins), -1, np.int32)
@@ -121,7 +158,20 @@ def first_hits(around: list[Caster], origins: np.ndarray, rays: np.ndarray) -> t
     return distance, index
 
 
-def bake(around: list[Caster], part: Part, rng: np.random.Generator, samples: int = 20) -> None:
+def bake_all(bodies: list[Body], lighting: Lighting, rng: np.random.Generator, samples: int) -> None:
+    """Lights every part of every body. samples: rays per texel to each lamp and to all around."""
+    parts = [part for body in bodies for part in body.parts]
+    seeds = rng.integers(0, 2**31, len(parts))
+    around = casters(bodies)
+
+    def one(k: int) -> None:
+        bake(around, parts[k], lighting, np.random.default_rng(seeds[k]), samples)
+
+    with ThreadPoolExecutor(WORKERS) as pool:  # numpy lets go of the interpreter lock in its loops
+        list(pool.map(one, range(len(parts))))
+
+
+def bake(around: list[Caster], part: Part, lighting: Lighting, rng: np.random.Generator, samples: int = 20) -> None:
     """Fills `part.lit` with paint × light, as the 8-bit sRGB picture a camera would record."""
     rows, columns = part.light_texels
     v, u = np.mgrid[0:rows, 0:columns]
@@ -129,30 +179,60 @@ def bake(around: list[Caster], part: Part, rng: np.random.Generator, samples: in
     points, normals = part.shape.point_normal(u, v)
     points, normals = to_world(part.shape, points), normals @ part.shape.rotation.T
     start = points + 1e-3 * normals
-    light = _lamp(around, start, normals, rng, samples) + _sky(around, start, normals, rng, samples)
-    light = light.reshape(rows, columns, 3).astype(np.float32)
+    light = np.zeros((len(start), 3))
+    for lamp in lighting.lamps:
+        light += _from_lamp(_between(around, start, lamp), start, normals, lamp, rng, samples)
+    light += _from_around(_within(around, start, lighting.reach), start, normals, lighting, rng, samples)
+    grid = light.reshape(rows, columns, 3).astype(np.float32)
+    faces = 6 if isinstance(part.shape, Box) else 1  # light of one face does not run over into the next
+    strips = zip(np.split(part.paint, faces), np.split(grid, faces), strict=True)
+    part.lit = np.concatenate([_recorded(paint, strip) for paint, strip in strips])
+
+
+def _recorded(paint: np.ndarray, light: np.ndarray) -> np.ndarray:
+    columns = light.shape[1]
     wide = np.concatenate([light[:, -4:], light, light[:, :4]], 1)  # the chart of a round thing closes on itself
     wide = cv2.GaussianBlur(wide if wide.shape[1] > 12 else light, (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
     light = wide[:, 4:-4] if wide.shape[1] > columns else wide
-    height, width = part.paint.shape[:2]
+    height, width = paint.shape[:2]
     light = cv2.resize(light, (width, height), interpolation=cv2.INTER_LINEAR)
-    part.lit = _RECORD[(_linear(part.paint) * light * _STEPS).astype(np.int32).clip(0, len(_RECORD) - 1)]
+    return _RECORD[(_linear(paint) * light * _STEPS).astype(np.int32).clip(0, len(_RECORD) - 1)]
 
 
-def _lamp(
-    around: list[Caster], start: np.ndarray, normals: np.ndarray, rng: np.random.Generator, samples: int
+def _within(around: list[Caster], start: np.ndarray, reach: float) -> list[Caster]:
+    """The casters that a ray no longer than `reach` from some start can meet."""
+    center = (start.min(0) + start.max(0)) / 2
+    radius = np.linalg.norm(start - center, axis=1).max() + reach
+    return [caster for caster in around if np.linalg.norm(caster.center - center) < radius + caster.radius]
+
+
+def _between(around: list[Caster], start: np.ndarray, lamp: Lamp) -> list[Caster]:
+    """The casters that a ray from some start to the lamp can meet."""
+    center = (start.min(0) + start.max(0)) / 2
+    radius = np.linalg.norm(start - center, axis=1).max() + lamp.radius
+    axis = lamp.center - center
+    kept = []
+    for caster in around:
+        share = np.clip((caster.center - center) @ axis / (axis @ axis), 0, 1)
+        if np.linalg.norm(center + share * axis - caster.center) < radius + caster.radius:
+            kept.append(caster)
+    return kept
+
+
+def _from_lamp(
+    around: list[Caster], start: np.ndarray, normals: np.ndarray, lamp: Lamp, rng: np.random.Generator, samples: int
 ) -> np.ndarray:
-    """Light [N, 3] of the round lamp: mean over its disc of visibility × cosine / distance²."""
+    """Light [N, 3] of a lamp: mean over its disc of visibility × cosine / distance²."""
     total = np.zeros(len(start))
     shift = rng.random((len(start), 2))
-    down = -LAMP_CENTER / np.linalg.norm(LAMP_CENTER)
+    down = -lamp.center / np.linalg.norm(lamp.center)
     side = np.cross(down, [0, 0, 1.0])
     side /= np.linalg.norm(side)
     up = np.cross(side, down)
     for k in range(samples):
         a, b = _sequence(k, shift)
-        r, angle = LAMP_RADIUS * np.sqrt(a), 2 * np.pi * b
-        target = LAMP_CENTER + (r * np.cos(angle))[:, None] * side + (r * np.sin(angle))[:, None] * up
+        r, angle = lamp.radius * np.sqrt(a), 2 * np.pi * b
+        target = lamp.center + (r * np.cos(angle))[:, None] * side + (r * np.sin(angle))[:, None] * up
         ray = target - start
         length = np.linalg.norm(ray, axis=1)
         ray = ray / length[:, None]
@@ -160,14 +240,18 @@ def _lamp(
         facing = np.flatnonzero(cosine > 0)
         blocked = first_hits(around, start[facing], ray[facing])[0] < length[facing]
         total[facing] += np.where(blocked, 0, cosine[facing] / length[facing] ** 2)
-    return total[:, None] / samples * LAMP_COLOR
+    return total[:, None] / samples * lamp.color
 
 
-def _sky(
-    around: list[Caster], start: np.ndarray, normals: np.ndarray, rng: np.random.Generator, samples: int
+def _from_around(
+    around: list[Caster],
+    start: np.ndarray,
+    normals: np.ndarray,
+    lighting: Lighting,
+    rng: np.random.Generator,
+    samples: int,
 ) -> np.ndarray:
-    """Light [N, 3] from all around: cosine-spread rays; one that meets a body brings a little of its
-    colour."""
+    """Ambient light [N, 3] by cosine-spread rays; one that meets a body brings a little of its colour."""
     tints = np.array([caster.tint for caster in around] + [np.zeros(3)])
     helper = np.where(np.abs(normals[:, :1]) > 0.7, [[0.0, 1, 0]], [[1.0, 0, 0]])
     side = np.cross(helper, normals)
@@ -181,9 +265,9 @@ def _sky(
         ray = (r * np.cos(angle))[:, None] * side + (r * np.sin(angle))[:, None] * up
         ray += np.sqrt(1 - a)[:, None] * normals
         distance, index = first_hits(around, start, ray.astype(np.float32))
-        shade = np.clip(1 - distance / SKY_REACH, 0, 1)[:, None]
+        shade = np.clip(1 - distance / lighting.reach, 0, 1)[:, None]
         height = 0.72 + 0.28 * ray[:, 2:]
-        total += height * SKY_COLOR * (1 - shade) + shade * 0.55 * tints[index]
+        total += height * lighting.ambient * (1 - shade) + shade * 0.55 * tints[index]
     return total / samples
 
 

@@ -7,45 +7,27 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from perception.demo.light import LAMP_CENTER, Body, Part, corners
+from perception.demo.cameras import Camera
+from perception.demo.light import Body, Lamp, Part, corners
 from perception.demo.shapes import to_local, to_world
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A pinhole camera: K [3, 3] pixels (centres at +0.5), camera_from_world [4, 4] (x right, y down, z
-    forward)."""
-
-    K: np.ndarray
-    camera_from_world: np.ndarray
-    width: int
-    height: int
-
-    @property
-    def center(self) -> np.ndarray:
-        rotation = self.camera_from_world[:3, :3]
-        return -rotation.T @ self.camera_from_world[:3, 3]
-
-    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """World points [N, 3] -> pixels [N, 2], depth [N] along the optical axis."""
-        local = points @ self.camera_from_world[:3, :3].T + self.camera_from_world[:3, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return (local @ self.K.T)[:, :2] / local[:, 2:], local[:, 2]
 
 
 @dataclass
 class Picture:
-    """rgb [H, W, 3] uint8; ids [H, W] uint16, 0 = nothing; depth [H, W] float32 along the optical axis, inf
-    = nothing."""
+    """rgb [H, W, 3] uint8; ids, parts [H, W] uint16: which body (from 1) and which of its parts (from 0) is seen, ids 0
+    = nothing; depth [H, W] float32 metres along the optical axis, inf = nothing."""
 
     rgb: np.ndarray
     ids: np.ndarray
+    parts: np.ndarray
     depth: np.ndarray
 
 
-def cast(bodies: list[Body], camera: Camera, samples: int = 2) -> Picture:
-    """A noise-free picture with samples × samples rays a pixel; ids and depth at the finer grid are
-    reduced."""
+def cast(bodies: list[Body], lamp: Lamp, camera: Camera, samples: int = 2) -> Picture:
+    """A noise-free picture with samples × samples rays a pixel; ids, parts and depth at the finer grid are reduced.
+
+    lamp: the one that makes highlights.
+    """
     height, width = camera.height * samples, camera.width * samples
     rotation = camera.camera_from_world[:3, :3]
     x = ((np.arange(width) + 0.5) / samples - camera.K[0, 2]) / camera.K[0, 0]
@@ -53,22 +35,28 @@ def cast(bodies: list[Body], camera: Camera, samples: int = 2) -> Picture:
     grid = np.stack([*np.meshgrid(x, y), np.ones((height, width))], -1)
     rays = (grid @ rotation).astype(np.float32)  # unit depth along the optical axis: t is the z-depth
     depth = np.full((height, width), np.inf, np.float32)
-    ids = np.zeros((height, width), np.uint16)
+    seen = np.zeros((height, width), np.uint16)
     color = np.full((height, width, 3), 40, np.uint8)
-    for body in bodies:
-        for part in body.parts:
+    owners, places = [0], [0]  # of each part: number of its body, and its place there
+    for number, body in enumerate(bodies, start=1):
+        for place, part in enumerate(body.parts):
+            owners.append(number)
+            places.append(place)
             window = _window(part, camera, samples)
             if window is not None:
-                _paint(part, body.id, camera.center, rays[window], depth[window], ids[window], color[window])
+                painter = _Painter(part, camera.center, lamp)
+                painter.paint(len(owners) - 1, rays[window], depth[window], seen[window], color[window])
     rgb = cv2.resize(color, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    id_blocks, depth_blocks = _blocks(ids, samples), _blocks(depth, samples)
+    part_blocks, depth_blocks = _blocks(seen, samples), _blocks(depth, samples)
+    id_blocks = np.array(owners, np.uint16)[part_blocks]
     # The second smallest of four ids is the majority wherever three agree; most blocks hold one id only.
-    middle, mean = id_blocks[:, :, 0].copy(), depth_blocks.mean(-1)
+    middle, mean, parts = id_blocks[:, :, 0].copy(), depth_blocks.mean(-1), part_blocks[:, :, 0].copy()
     mixed = (id_blocks != middle[..., None]).any(-1)
     middle[mixed] = np.sort(id_blocks[mixed], -1)[:, (samples * samples - 1) // 2]
     same = id_blocks[mixed] == middle[mixed][:, None]
     mean[mixed] = np.where(same, depth_blocks[mixed], 0).sum(-1) / same.sum(-1)
-    return Picture(rgb, middle, mean.astype(np.float32))
+    parts[mixed] = np.take_along_axis(part_blocks[mixed], same.argmax(-1)[:, None], -1)[:, 0]
+    return Picture(rgb, middle, np.array(places, np.uint16)[parts], mean.astype(np.float32))
 
 
 def _blocks(image: np.ndarray, samples: int) -> np.ndarray:
@@ -78,67 +66,61 @@ def _blocks(image: np.ndarray, samples: int) -> np.ndarray:
 
 
 def _window(part: Part, camera: Camera, samples: int) -> tuple[slice, slice] | None:
-    """The part of the fine grid where the part can be seen, from its projected bounds; None = out of
-    sight."""
-    pixels, z = camera.project(to_world(part.shape, corners(part.shape)))
+    """The part of the fine grid where the part can be seen, from its projected bounds; None = out of sight."""
+    world = to_world(part.shape, corners(part.shape))
+    pixels, z = camera.project(world)
     if (z <= 0.02).all():
         return None
-    if (z <= 0.02).any():  # reaches behind the camera: projected bounds mean nothing
-        return slice(None), slice(None)
-    low, high = (
-        np.floor(pixels.min(0) * samples).astype(int) - 1,
-        np.ceil(pixels.max(0) * samples).astype(int) + 1,
-    )
+    if (z <= 0.02).any():  # reaches behind the camera: projected bounds mean nothing, the sides of the view do
+        local = world @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+        across = local[:, :2] * [camera.K[0, 0], camera.K[1, 1]] + local[:, 2:] * camera.K[:2, 2]
+        beyond = local[:, 2:] * [camera.width, camera.height]
+        hidden = (across < 0).all(0).any() or (across > beyond).all(0).any()
+        return None if hidden else (slice(None), slice(None))
+    low, high = np.floor(pixels.min(0) * samples).astype(int) - 1, np.ceil(pixels.max(0) * samples).astype(int) + 1
     low, high = np.maximum(low, 0), np.minimum(high, np.array([camera.width, camera.height]) * samples)
     return (slice(low[1], high[1]), slice(low[0], high[0])) if (high > low).all() else None
 
 
-# type: ignore[no-untyped-def]
-def _paint(
-    part: Part,
-    id: int,
-    eye: np.ndarray,
-    rays: np.ndarray,
-    depth: np.ndarray,
-    ids: np.ndarray,
-    color: np.ndarray,
-) -> None:
-    """Casts the rays [h, w, 3] of a window at one part and writes where it is nearest (depth, ids, color in
-    place)."""
-    shape = part.shape
-    origin = to_local(shape, eye[None])[0].astype(np.float32)
-    local = rays @ shape.rotation.astype(np.float32)
-    t, u, v = shape.hit(np.broadcast_to(origin, local.shape), local)
-    rows, columns = np.nonzero(t < depth)
-    if not len(rows):
-        return
-    t, u, v = (array[rows, columns] for array in (t, u, v))
-    height, width = part.lit.shape[:2]
-    map_x = (u * width - 0.5).astype(np.float32)
-    map_y = np.clip(v * height - 0.5, 0, height - 1).astype(np.float32)
-    sampled = _sample(part.lit, map_x, map_y)
-    if part.gloss:
-        sampled = _add_highlight(part, sampled, u, v, eye)
-    depth[rows, columns] = t
-    ids[rows, columns] = id
-    color[rows, columns] = sampled
+@dataclass(frozen=True)
+class _Painter:
+    """Casts rays from `eye` at one part."""
+
+    part: Part
+    eye: np.ndarray
+    lamp: Lamp
+
+    def paint(self, number: int, rays: np.ndarray, depth: np.ndarray, seen: np.ndarray, color: np.ndarray) -> None:
+        """Writes where the part is nearest along the rays [h, w, 3] of a window: depth, `number`, color, in place."""
+        shape, lit = self.part.shape, self.part.lit
+        origin = to_local(shape, self.eye[None])[0].astype(np.float32)
+        local = rays @ shape.rotation.astype(np.float32)
+        t, u, v = shape.hit(np.broadcast_to(origin, local.shape), local)
+        rows, columns = np.nonzero(t < depth)
+        if not len(rows):
+            return
+        t, u, v = (array[rows, columns] for array in (t, u, v))
+        height, width = lit.shape[:2]
+        map_y = np.clip(v * height - 0.5, 0, height - 1).astype(np.float32)
+        sampled = _sample(lit, (u * width - 0.5).astype(np.float32), map_y)
+        depth[rows, columns] = t
+        seen[rows, columns] = number
+        color[rows, columns] = self._with_highlight(sampled, u, v) if self.part.gloss else sampled
+
+    def _with_highlight(self, sampled: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Blinn-Phong highlight of the lamp, [N, 3] uint8."""
+        points, normals = self.part.shape.point_normal(u, v)
+        points, normals = to_world(self.part.shape, points), normals @ self.part.shape.rotation.T
+        to_lamp, to_eye = self.lamp.center - points, self.eye - points
+        half = to_lamp / np.linalg.norm(to_lamp, axis=1, keepdims=True)
+        half += to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True)
+        half /= np.linalg.norm(half, axis=1, keepdims=True)
+        shine = self.part.gloss * np.maximum(np.einsum("nk,nk->n", half, normals), 0) ** 60
+        return np.clip(sampled + 110 * shine[:, None], 0, 255).astype(np.uint8)
 
 
 def _sample(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Bilinear lookup at [N] positions. OpenCV remaps at most 32767 rows, so the list is folded into a
-    square."""
+    """Bilinear lookup at [N] positions. OpenCV remaps at most 32767 rows, so the list is folded into a square."""
     side = int(np.ceil(np.sqrt(len(x))))
     map_x, map_y = (np.pad(a, (0, side * side - len(a))).reshape(side, side) for a in (x, y))
     return cv2.remap(picture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).reshape(-1, 3)[: len(x)]
-
-
-def _add_highlight(part: Part, sampled: np.ndarray, u: np.ndarray, v: np.ndarray, eye: np.ndarray) -> np.ndarray:
-    """Blinn-Phong gleam of the lamp, only where the baked light says that the lamp is seen."""
-    points, normals = part.shape.point_normal(u, v)
-    points, normals = to_world(part.shape, points), normals @ part.shape.rotation.T
-    to_lamp, to_eye = LAMP_CENTER - points, eye - points
-    half = to_lamp / np.linalg.norm(to_lamp, axis=1, keepdims=True)
-    half += to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True)
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    gleam = part.gloss * np.maximum(np.einsum("nk,nk->n", half, normals), 0) ** 60
-    return np.clip(sampled + 110 * gleam[:, None], 0, 255).astype(np.uint8)

@@ -1,8 +1,8 @@
-"""`make_photos`: a folder of photos of the demo's tabletop, and the truth about them in a folder beside
-it."""
+"""`make_photos`: a folder of photos of a made scene, and the truth about them."""
 
 from __future__ import annotations
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -10,17 +10,19 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from perception.demo import tabletop
-from perception.demo.light import Body
-from perception.demo.orbit import FOCAL_35MM, orbit
-from perception.demo.render import Camera, Picture, cast
-from perception.demo.shapes import Ellipsoid, to_world
+from perception.demo import room, tabletop
+from perception.demo.cameras import Camera
+from perception.demo.light import WORKERS, Scene
+from perception.demo.render import Picture, cast
+from perception.demo.segmenter import erring_labels, perfect_labels
+from perception.demo.shapes import Box, Ellipsoid, Shape, to_world
 from perception.demo.truth import DemoTruth, Truth, load_truth
 from perception.errors import InputError
 
-__all__ = ["DemoTruth", "load_truth", "make_photos"]
+__all__ = ["SCENES", "DemoTruth", "load_truth", "make_photos"]
 
-POINTS = 60_000  # truth points before those that no two photos see are dropped
+SCENES = {"tabletop": tabletop, "room": room}
+LEAST_POINTS = 1200  # of an object, before those that no two photos see are dropped
 NOISE = 1.6  # sensor noise, deviation in 8-bit steps
 QUALITY = 92
 
@@ -28,100 +30,131 @@ QUALITY = 92
 def make_photos(
     folder: Path | str,
     *,
-    views: int = 40,
+    scene: str = "tabletop",
+    views: int | None = None,
     width: int = 640,
     height: int = 480,
     seed: int = 0,
     light_samples: int = 20,
+    truth_folder: Path | None = None,
 ) -> DemoTruth:
-    """Writes `views` JPEG photos (000.jpg ...) into `folder` and the truth into its sibling folder `truth`.
+    """Writes JPEG photos (000.jpg ...) of one of SCENES into `folder`, and the truth into `truth_folder` (default: the
+    folder `truth` beside it).
 
-    The truth: labels/*.png (16-bit instance ids, 0 = nothing), scene.json, transforms.json, gt_points.ply.
-    light_samples: rays per texel of the light maps; fewer are faster and noisier.
-    The same arguments give the same photos. Distances in metres, z up, the origin on the middle of the table
-    top.
+    The truth: transforms.json with exact poses; labels/*.png as a perfect segmenter gives them, labels_sam/*.png with a
+    segmenter's errors; masks_gt/*.png (16-bit instance ids, 0 = nothing), depth/*.png (16-bit millimetres along the
+    optical axis, 0 = nothing), scene.json (instances, prompts), gt_points.ply (instance_id, semantic_id).
+    light_samples: rays per texel of the light maps; fewer are faster and noisier. The same arguments give the same
+    photos. Metres, z up. Raises InputError for fewer than 3 views or views under 64 × 48.
     """
+    if scene not in SCENES:
+        raise InputError(f"demo photos: found scene '{scene}', expected one of: {', '.join(SCENES)}")
+    maker = SCENES[scene]
+    views = maker.VIEWS if views is None else views
     if views < 3 or width < 64 or height < 48:
         raise InputError(f"demo photos: {views} views of {width}x{height} asked; at least 3 views of 64x48 are needed")
     folder = Path(folder)
-    truth_folder = folder.parent / "truth"
-    folder.mkdir(parents=True, exist_ok=True)
-    (truth_folder / "labels").mkdir(parents=True, exist_ok=True)
-    bodies = tabletop.build(seed, light_samples)
-    cameras = orbit(views, width, height)
+    home = truth_folder or folder.parent / "truth"
+    for path in (folder, *(home / name for name in ("labels", "labels_sam", "masks_gt", "depth"))):
+        path.mkdir(parents=True, exist_ok=True)
+    made: Scene = maker.build(seed, light_samples)
+    cameras = made.cameras(views, width, height)
     names = [f"{i:03d}.jpg" for i in range(views)]
+    stuff = {number for number, body in enumerate(made.bodies, start=1) if body.is_stuff}
 
     def shoot(i: int) -> Picture:
-        picture = cast(bodies, cameras[i])
-        _write_photo(folder / names[i], picture.rgb, np.random.default_rng((seed, i)))
-        cv2.imwrite(str(truth_folder / "labels" / f"{i:03d}.png"), picture.ids)
+        picture = cast(made.bodies, made.lighting.lamps[0], cameras[i])
+        _write_photo(folder / names[i], picture.rgb, maker.FOCAL_35MM, np.random.default_rng((seed, i)))
+        rng = np.random.default_rng((seed, i, 1))
+        images = {
+            "masks_gt": picture.ids,
+            "depth": np.round(1000 * np.where(picture.depth < 65, picture.depth, 0)).astype(np.uint16),
+            "labels": perfect_labels(picture.ids, rng),
+            "labels_sam": erring_labels(picture.ids, picture.parts, stuff, rng),
+        }
+        for name, image in images.items():
+            cv2.imwrite(str(home / name / f"{i:03d}.png"), image)
         return picture
 
-    with ThreadPoolExecutor(tabletop.WORKERS) as pool:  # numpy and OpenCV let go of the interpreter lock in their loops
+    with ThreadPoolExecutor(WORKERS) as pool:  # numpy and OpenCV let go of the interpreter lock in their loops
         pictures = list(pool.map(shoot, range(views)))
-    points, normals, colors, ids = _surface(bodies, np.random.default_rng((seed, views)))
-    seen = _times_seen(points, normals, ids, cameras, pictures) >= 2
-    name_of = {body.name: body.id for body in bodies}
-    truth = DemoTruth(
-        [Truth(body.id, body.name, body.prompts, body.is_stuff) for body in bodies],
-        [(text, [name_of[name] for name in answers]) for text, answers in tabletop.QUERIES],
-        names,
-        cameras,
-        points[seen],
-        normals[seen],
-        colors[seen],
-        ids[seen],
-        truth_folder,
-    )
+    cloud = _surface(made, maker.POINTS, np.random.default_rng((seed, views)))
+    seen = _times_seen(cloud[0], cloud[1], cloud[3], cameras, pictures) >= 2
+    points, normals, colors, ids = (column[seen] for column in cloud)
+    instances = _instances(made, ids, pictures)
+    photos = Path(os.path.relpath(folder, home)).as_posix()
+    truth = DemoTruth(instances, made.asked, names, cameras, points, normals, colors, ids, home, photos)
     truth.save()
     return truth
 
 
-def _write_photo(path: Path, rgb: np.ndarray, rng: np.random.Generator) -> None:
+def _instances(made: Scene, ids: np.ndarray, pictures: list[Picture]) -> list[Truth]:
+    """One entry per body; categories are numbered in the order of their names."""
+    categories = sorted({body.category for body in made.bodies})
+    points = np.bincount(ids, minlength=len(made.bodies) + 1)
+    views = np.zeros(len(made.bodies) + 1, int)
+    for picture in pictures:
+        views[np.unique(picture.ids)] += 1
+    return [
+        Truth(
+            number,
+            body.name,
+            body.category,
+            1 + categories.index(body.category),
+            body.prompts,
+            body.is_stuff,
+            int(points[number]),
+            int(views[number]),
+        )
+        for number, body in enumerate(made.bodies, start=1)
+    ]
+
+
+def _write_photo(path: Path, rgb: np.ndarray, focal_35mm: int, rng: np.random.Generator) -> None:
     """Sensor noise, then a JPEG whose EXIF tells the focal length, as a phone's would."""
     noisy = rgb + NOISE * rng.standard_normal(rgb.shape, dtype=np.float32)
     image = Image.fromarray(np.round(np.clip(noisy, 0, 255)).astype(np.uint8))
     exif = Image.Exif()
-    exif.get_ifd(0x8769)[0xA405] = FOCAL_35MM  # FocalLengthIn35mmFilm
+    exif.get_ifd(0x8769)[0xA405] = focal_35mm  # FocalLengthIn35mmFilm
     image.save(path, quality=QUALITY, exif=exif)
 
 
-def _surface(bodies: list[Body], rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Points drawn on all surfaces, half of them by area, half in equal shares for the objects on the
-    table."""
-    charts = [(body, part) for body in bodies for part in body.parts]
-    area = np.array([np.prod(part.shape.size()) for _, part in charts])
-    small = np.array([0.0 if body.is_stuff else 1.0 for body, _ in charts])
+def _surface(made: Scene, total: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Points, normals, colours and ids on all surfaces: half by area, half on the objects alone, LEAST_POINTS each."""
+    charts = [(number, body, part) for number, body in enumerate(made.bodies, start=1) for part in body.parts]
+    owners = np.array([number for number, _, _ in charts])
+    area = np.array([np.prod(part.shape.size()) for _, _, part in charts])
+    small = np.array([0.0 if body.is_stuff else 1.0 for _, body, _ in charts])
     share = area / area.sum() + small * area / (small * area).sum()
-    counts = np.ceil(POINTS * share / share.sum()).astype(int)
+    wanted = total * share / share.sum()
+    wanted *= np.maximum(1, small * LEAST_POINTS / np.bincount(owners, wanted)[owners])
     columns: list[list[np.ndarray]] = [[], [], [], []]
-    for (body, part), count in zip(charts, counts, strict=True):
-        u, v = rng.random((2, count))
-        if isinstance(part.shape, Ellipsoid):
-            v = np.arccos(1 - 2 * v) / np.pi  # even over a ball
+    for (number, _, part), count in zip(charts, np.ceil(wanted).astype(int), strict=True):
+        u, v = _even(part.shape, *rng.random((2, count)))
         p, n = part.shape.point_normal(u, v)
         rows, across = part.lit.shape[:2]
         color = part.lit[np.minimum(v * rows, rows - 1).astype(int), np.minimum(u * across, across - 1).astype(int)]
-        for column, value in zip(
-            columns,
-            (to_world(part.shape, p), n @ part.shape.rotation.T, color, np.full(count, body.id)),
-            strict=True,
-        ):
+        values = (to_world(part.shape, p), n @ part.shape.rotation.T, color, np.full(count, number))
+        for column, value in zip(columns, values, strict=True):
             column.append(value)
     points, normals, colors, ids = (np.concatenate(column) for column in columns)
-    return (
-        points.astype(np.float32),
-        normals.astype(np.float32),
-        colors.astype(np.uint8),
-        ids.astype(np.int32),
-    )
+    return points.astype(np.float32), normals.astype(np.float32), colors.astype(np.uint8), ids.astype(np.int32)
+
+
+def _even(shape: Shape, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Chart coordinates even over the surface from even u, v in [0, 1]."""
+    if isinstance(shape, Ellipsoid):
+        return u, np.arccos(1 - 2 * v) / np.pi  # exact on a ball
+    if isinstance(shape, Box):
+        edges = np.concatenate([[0], np.cumsum(shape.face_sizes().prod(1))])
+        return u, np.interp(v, edges / edges[-1], np.arange(7) / 6)
+    return u, v
 
 
 def _times_seen(
     points: np.ndarray, normals: np.ndarray, ids: np.ndarray, cameras: list[Camera], pictures: list[Picture]
 ) -> np.ndarray:
-    """In how many photos each point is seen: inside the frame, facing the camera, its own body the
-    nearest."""
+    """In how many photos each point is seen: inside the frame, facing the camera, its own body the nearest."""
     seen = np.zeros(len(points), int)
     for camera, picture in zip(cameras, pictures, strict=True):
         pixels, depth = camera.project(points)

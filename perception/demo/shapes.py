@@ -1,4 +1,4 @@
-"""Primitives a ray can hit: flat sheets, ellipsoids, turned (lathe) surfaces and bent tubes.
+"""Primitives a ray can hit: flat sheets, boxes, ellipsoids, turned (lathe) surfaces and bent tubes.
 
 Every shape lives in its own frame, `world_from_local = (rotation, origin)`, and is charted by u, v in [0, 1]:
 `point_normal` gives the surface at (u, v), `hit` finds the first crossing of a ray and its (u, v). Metres.
@@ -7,8 +7,8 @@ Every shape lives in its own frame, `world_from_local = (rotation, origin)`, and
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -16,8 +16,9 @@ NEAR = 1e-4  # hits closer than this (metres along the ray) are the surface the 
 
 
 class Shape(Protocol):
-    """What the renderer and the light baker need of a surface."""
+    """What the renderer and the light baker need of a surface. LENGTHS: the fields that scale with the shape."""
 
+    LENGTHS: ClassVar[tuple[str, ...]]
     rotation: np.ndarray
     origin: np.ndarray
 
@@ -48,6 +49,12 @@ def to_world(shape: Shape, points: np.ndarray) -> np.ndarray:
     return points @ shape.rotation.T + shape.origin
 
 
+def placed(shape: Any, turn: np.ndarray, shift: np.ndarray, scale: float = 1.0) -> Any:
+    """The shape scaled about the origin, turned by the rotation `turn` [3, 3] and moved by `shift` [3]."""
+    lengths = {name: scale * np.asarray(getattr(shape, name)) for name in shape.LENGTHS}
+    return replace(shape, rotation=turn @ shape.rotation, origin=scale * turn @ shape.origin + shift, **lengths)
+
+
 def _identity() -> np.ndarray:
     return np.eye(3)
 
@@ -69,6 +76,7 @@ class Sheet:
     """A rectangle in the local xy plane, or an ellipse inscribed in it; the normal is +z. u along x, v along
     -y."""
 
+    LENGTHS: ClassVar[tuple[str, ...]] = ("width", "height")
     width: float
     height: float
     rotation: np.ndarray = field(default_factory=_identity)
@@ -98,10 +106,70 @@ class Sheet:
         return self.width, self.height
 
 
+_FACES = np.array([  # of a box: axis and sign of the normal, of u, and of v
+    (2, 1, 0, 1, 1, -1), (2, -1, 0, 1, 1, 1), (1, -1, 0, 1, 2, -1),
+    (0, 1, 1, 1, 2, -1), (1, 1, 0, -1, 2, -1), (0, -1, 1, -1, 2, -1),
+])  # fmt: skip
+_FACE_OF = np.array([[5, 3], [2, 4], [1, 0]])  # by axis and sign of the normal
+_RIM = 0.01  # share of a face's chart at its edges where the texture of the next face would bleed in
+
+
+@dataclass
+class Box:
+    """A cuboid of edge lengths `extent` [3] about its origin. v runs through six charts: +z, -z, -y, +x, +y, -x."""
+
+    LENGTHS: ClassVar[tuple[str, ...]] = ("extent",)
+    extent: np.ndarray
+    rotation: np.ndarray = field(default_factory=_identity)
+    origin: np.ndarray = field(default_factory=_zero)
+
+    def hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        half = (np.asarray(self.extent) / 2).astype(directions.dtype)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            one, other = (-half - origins) / directions, (half - origins) / directions
+        enter, leave = np.fmin(one, other).max(-1), np.fmax(one, other).min(-1)
+        t = np.where(enter > NEAR, enter, leave)
+        t = np.where((enter <= leave) & (t > NEAR), t, np.inf)
+        u, v = np.zeros_like(t), np.zeros_like(t)
+        found = np.isfinite(t)
+        share = ((np.broadcast_to(origins, directions.shape)[found] + t[found, None] * directions[found]) / half) / 2
+        axis = np.abs(share).argmax(-1)
+        rows = np.arange(len(share))
+        face = _FACE_OF[axis, (share[rows, axis] > 0).astype(int)]
+        _, _, along, along_sign, down, down_sign = _FACES[face].T
+        u[found] = share[rows, along] * along_sign + 0.5
+        v[found] = (face + _RIM + (1 - 2 * _RIM) * np.clip(share[rows, down] * down_sign + 0.5, 0, 1)) / 6
+        return t, u, v
+
+    def point_normal(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        face = np.minimum((6 * v).astype(int), 5)
+        down_share = np.clip((6 * v - face - _RIM) / (1 - 2 * _RIM), 0, 1)
+        axis, sign, along, along_sign, down, down_sign = _FACES[face].T
+        rows = np.arange(len(face))
+        points, normals = np.zeros((2, len(face), 3))
+        normals[rows, axis] = sign
+        points[rows, axis] = 0.5 * sign
+        points[rows, along] = (u - 0.5) * along_sign
+        points[rows, down] = (down_share - 0.5) * down_sign
+        return points * self.extent, normals
+
+    def bounds(self) -> np.ndarray:
+        return np.stack([-np.asarray(self.extent), np.asarray(self.extent)]) / 2
+
+    def face_sizes(self) -> np.ndarray:
+        """[6, 2] width and height of each face's chart."""
+        return np.asarray(self.extent)[_FACES[:, [2, 4]]]
+
+    def size(self) -> tuple[float, float]:
+        side = float(np.sqrt(self.face_sizes().prod(1).sum()))
+        return side, side
+
+
 @dataclass
 class Ellipsoid:
     """An ellipsoid with semi-axes `radii`; u is the longitude, v runs from the +z pole to the -z pole."""
 
+    LENGTHS: ClassVar[tuple[str, ...]] = ("radii",)
     radii: np.ndarray
     rotation: np.ndarray = field(default_factory=_identity)
     origin: np.ndarray = field(default_factory=_zero)
@@ -137,6 +205,7 @@ class Lathe:
     normals.
     """
 
+    LENGTHS: ClassVar[tuple[str, ...]] = ("profile",)
     profile: np.ndarray
     rotation: np.ndarray = field(default_factory=_identity)
     origin: np.ndarray = field(default_factory=_zero)
@@ -211,6 +280,7 @@ class Tube:
     ones.
     """
 
+    LENGTHS: ClassVar[tuple[str, ...]] = ("bend", "radii")
     bend: float
     start: float
     stop: float

@@ -205,3 +205,100 @@ def mosaic(rng: np.random.Generator, height: int, width: int, colors: list[str])
             corners = np.array([[x, y]]) + rng.uniform(-r, r, (3, 2))
             cv2.fillPoly(art, [corners.astype(np.int32)], color, cv2.LINE_AA)
     return np.clip(art * (1 + 0.02 * noise(rng, height, width, (60, 60), 3)[..., None]), 0, 1)
+
+
+def fur(rng: np.random.Generator, height: int, width: int, light: str, dark: str) -> np.ndarray:
+    """Short hair: fine noise over clouds."""
+    tone = (
+        0.4 + 0.2 * noise(rng, height, width, (height / 3, width / 3), 1) + 0.12 * noise(rng, height, width, (6, 9), 3)
+    )
+    return np.clip(blend(tone, rgb(light), rgb(dark)), 0, 1)
+
+
+def fabric(rng: np.random.Generator, height: int, width: int, color: str, dots: list[str] | None = None) -> np.ndarray:
+    """Woven cloth of one colour, slightly mottled; with `dots`, strewn with small figures of these colours."""
+    y, x = np.mgrid[:height, :width]
+    weave = 0.05 * (np.sin(1.9 * x) * np.sin(1.7 * y)) + 0.07 * noise(rng, height, width, (height / 6, width / 6), 2)
+    cloth = rgb(color) * (1 + weave + 0.045 * noise(rng, height, width, (5, 7), 5))[..., None]
+    if dots:
+        cloth = speckle(rng, cloth, height * width // 700, (3, 9), dots)
+    return np.clip(cloth, 0, 1).astype(np.float32)
+
+
+def plaster(rng: np.random.Generator, height: int, width: int, color: str) -> np.ndarray:
+    """A painted wall: patches, trowel marks, specks."""
+    patches = 0.05 * noise(rng, height, width, (7, 11), 6) + 0.02 * rng.standard_normal((height, width))
+    strokes = 0.03 * noise(rng, height, width, (height / 9, width / 70), 2)
+    wall = rgb(color) * (1 + patches + strokes)[..., None]
+    tones = [rgb_code(rgb(color) * f) for f in (0.80, 0.88, 1.08)]
+    return np.clip(speckle(rng, wall, height * width // 1500, (1, 4), tones), 0, 1).astype(np.float32)
+
+
+def rgb_code(color: np.ndarray) -> str:
+    """[3] in [0, 1] -> '#rrggbb'."""
+    return "#" + "".join(f"{round(255 * float(np.clip(c, 0, 1))):02x}" for c in color)
+
+
+def bricks(rng: np.random.Generator, height: int, width: int, color: str, course: int = 34) -> np.ndarray:
+    """A brick wall, every brick of its own tone; course: pixels a row."""
+    wall = np.ascontiguousarray(np.broadcast_to(rgb("#b9ada0"), (height, width, 3)), np.float32).copy()
+    length = int(2.9 * course)
+    for row, top in enumerate(range(0, height, course)):
+        for left in range(-length, width, length):
+            start = left + (row % 2) * length // 2
+            tone = rgb(color) * rng.uniform(0.72, 1.18) + rng.normal(0, 0.02, 3)
+            wall[top + 3 : top + course, max(start + 3, 0) : max(start + length, 0)] = tone
+    grain = 0.08 * noise(rng, height, width, (height / 5, width / 5), 3) + 0.05 * noise(rng, height, width, (6, 9), 3)
+    return np.clip(wall * (1 + grain)[..., None], 0, 1).astype(np.float32)
+
+
+def rug(rng: np.random.Generator, height: int, width: int, colors: list[str]) -> np.ndarray:
+    """A woven rug: a field of figures mirrored both ways, a medallion, borders, fringes at the short ends."""
+    half_h, half_w = (height + 1) // 2, (width + 1) // 2
+    field = np.ascontiguousarray(np.broadcast_to(rgb(colors[0]), (half_h, half_w, 3)), np.float32).copy()
+    for _ in range(120):
+        center = int(rng.integers(half_w)), int(rng.integers(half_h))
+        color, reach = rgb(colors[rng.integers(1, len(colors))]).tolist(), int(rng.integers(5, 18))
+        corners = cv2.boxPoints((center, (reach, reach * float(rng.uniform(0.4, 1.6))), float(rng.choice([0, 45]))))
+        cv2.fillPoly(field, [corners.astype(np.int32)], color, cv2.LINE_AA)
+    rug = np.concatenate([np.concatenate([field, field[:, ::-1]], 1), np.concatenate([field, field[:, ::-1]], 1)[::-1]])
+    rug = rug[:height, :width].copy()
+    for scale, color in ((0.55, colors[1]), (0.42, colors[2]), (0.25, colors[3 % len(colors)])):
+        w, h = scale * width / 2, scale * height / 2
+        diamond = np.array([[-w, 0], [0, -h], [w, 0], [0, h]]) + np.array([width, height]) / 2
+        cv2.polylines(rug, [diamond.astype(np.int32)], True, rgb(color).tolist(), 7, cv2.LINE_AA)
+    for inset, color in ((0, colors[1]), (10, colors[2]), (26, colors[1]), (34, colors[3 % len(colors)])):
+        cv2.rectangle(rug, (inset, inset), (width - 1 - inset, height - 1 - inset), rgb(color).tolist(), 7)
+    for x in range(18, width - 18, 22):
+        for y in (19, height - 20):
+            cv2.circle(rug, (x, y), 4, rgb(colors[3 % len(colors)]).tolist(), -1, cv2.LINE_AA)
+    wool = 0.07 * noise(rng, height, width, (height / 4, width / 4), 1) + 0.05 * noise(rng, height, width, (5, 8), 4)
+    return np.clip(rug * (1 + wool)[..., None], 0, 1).astype(np.float32)
+
+
+def spines(rng: np.random.Generator, height: int, width: int, pitch: float = 9.0) -> np.ndarray:
+    """A row of book spines of about `pitch` pixels each, with bands and marks, some books lower than the row."""
+    colors = ["#7a1f1f", "#1f3f7a", "#2d6b3f", "#c9a227", "#3a3a3f", "#e4ddca", "#7d4a8c", "#b5562b", "#4d8a94"]
+    row = np.zeros((height, width, 3), np.float32) + rgb("#1b1512")
+    left = 0
+    while left < width:
+        thick = max(4, int(rng.normal(pitch, 0.3 * pitch)))
+        color, top = rgb(colors[rng.integers(len(colors))]) * rng.uniform(0.8, 1.15), int(rng.uniform(0, 0.25) * height)
+        row[top:, left : left + thick - 1] = color
+        mark = rgb("#f2e2b0") if color.mean() < 0.5 else rgb("#2a2320")
+        for level in rng.uniform(0.1, 0.9, int(rng.integers(2, 5))):
+            y = top + int(level * (height - top))
+            row[y : y + max(2, height // 40), left + 1 : left + thick - 2] = mark
+        left += thick
+    return np.clip(row * (1 + 0.05 * noise(rng, height, width, (20, 40), 3))[..., None], 0, 1).astype(np.float32)
+
+
+def crop(rng: np.random.Generator, tile: np.ndarray, height: int, width: int) -> np.ndarray:
+    """[height, width] cut from a texture at random, its width along the longer side; repeated where it is too small."""
+    if height > width:
+        return np.ascontiguousarray(crop(rng, tile, width, height).transpose(1, 0, 2))
+    down, across = -(-height // tile.shape[0]), -(-width // tile.shape[1])
+    if down > 1 or across > 1:
+        tile = np.tile(np.concatenate([tile, tile[:, ::-1]], 1), (down, (across + 1) // 2, 1))
+    top, left = int(rng.integers(tile.shape[0] - height + 1)), int(rng.integers(tile.shape[1] - width + 1))
+    return tile[top : top + height, left : left + width]

@@ -1,7 +1,8 @@
-"""The objects on the table: everyday things of plain shapes. Metres; z up; the table top is z = 0."""
+"""Small everyday things of plain shapes. Metres; z up; they stand on z = 0."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from perception.demo import textures as tex
@@ -15,7 +16,7 @@ def _at(place: Place, height: float = 0.0) -> np.ndarray:
     return np.array([*place, height])
 
 
-def mug(rng: np.random.Generator, id: int, name: str, place: Place, turn: float, paint: np.ndarray) -> Body:
+def mug(rng: np.random.Generator, name: str, place: Place, turn: float, paint: np.ndarray) -> Body:
     """A mug of coffee: a turned cup with a thick rim and a bent handle that points to `turn` (degrees)."""
     profile = [
         (0.0, 0.0), (0.034, 0.0), (0.040, 0.005), (0.0425, 0.015), (0.0435, 0.092), (0.0425, 0.0965),
@@ -29,13 +30,11 @@ def mug(rng: np.random.Generator, id: int, name: str, place: Place, turn: float,
         np.stack([outward, up, np.cross(outward, up)], 1), _at(place, 0.05) + 0.0455 * outward,
     )  # fmt: skip
     grip = np.ascontiguousarray(paint[110:150, :60])
-    return Body(id, name, [name, "coffee mug"], [Part(cup, paint, 0.5, (40, 48)), Part(handle, grip, 0.5, (12, 32))])
+    return Body(name, ["mug", "coffee mug"], [Part(cup, paint, 0.5, (40, 48)), Part(handle, grip, 0.5, (12, 32))])
 
 
 def mug_paint(rng: np.random.Generator, color: str, ink: str, hearts: bool) -> np.ndarray:
     """Glaze with hearts or dots on the outer wall, a cream inside, coffee (the profile's last fifth)."""
-    import cv2
-
     height, width = 480, 560
     paint = tex.glaze(rng, height, width, color, [ink, "#1c1c1c"], 60)
     for i in range(3 if hearts else 14):
@@ -56,8 +55,10 @@ def mug_paint(rng: np.random.Generator, color: str, ink: str, hearts: bool) -> n
     return paint
 
 
-def vase(rng: np.random.Generator, id: int, name: str, place: Place) -> Body:
-    """A bellied vase with a narrow neck, white with painted blue bands, dots and leaves."""
+def vase(
+    rng: np.random.Generator, name: str, place: Place, inks: tuple[str, str, str] = ("#1f3f94", "#2f62b8", "#5b8ccf")
+) -> Body:
+    """A bellied vase with a narrow neck, white with painted bands, dots and leaves."""
     z = np.linspace(0, 1, 22)
     radius = 0.034 + 0.036 * np.exp(-(((z - 0.42) / 0.26) ** 2)) - 0.012 * np.exp(-(((z - 0.86) / 0.13) ** 2))
     radius[-3:] += [0.0015, 0.005, 0.009]
@@ -65,48 +66,47 @@ def vase(rng: np.random.Generator, id: int, name: str, place: Place) -> Body:
     inner = np.array([(radius[-1] - 0.004, 0.26), (radius[-4] - 0.005, 0.215), (0.05, 0.11), (0.0, 0.1)])
     height, width = 620, 800
     paint = tex.glaze(rng, height, width, "#ebe9e0", ["#c9ccd0", "#b9b3a2"], 260)
-    paint = _painted_bands(rng, paint)
+    paint = _painted_bands(rng, paint, inks)
     body = Lathe(np.concatenate([[(0.0, 0.0)], outer, inner]), spin(0), _at(place))
-    return Body(id, name, [name, "blue and white vase", "ceramic vase"], [Part(body, paint, 0.6, (64, 56))])
+    words = ["blue and white vase", "ceramic vase"] if name == "vase" else ["vase", "ceramic vase"]
+    return Body(name, words, [Part(body, paint, 0.6, (64, 56))])
 
 
-def _painted_bands(rng: np.random.Generator, paint: np.ndarray) -> np.ndarray:
-    import cv2
-
+def _painted_bands(rng: np.random.Generator, paint: np.ndarray, inks: tuple[str, str, str]) -> np.ndarray:
     height, width = paint.shape[:2]
-    blue = [tex.rgb("#1f3f94"), tex.rgb("#2f62b8"), tex.rgb("#5b8ccf")]
+    ink = [tex.rgb(color) for color in inks]
     for top, thick in ((0.11, 9), (0.135, 4), (0.47, 7), (0.50, 3), (0.61, 8)):
-        paint[int(top * height) : int(top * height) + thick] = blue[0]
+        paint[int(top * height) : int(top * height) + thick] = ink[0]
     for i in range(26):
         x, y = int((i + 0.5) * width / 26), int((0.30 + 0.055 * np.sin(i * 2 * np.pi / 6.5)) * height)
         for leaf in range(int(rng.integers(4, 7))):
             a = float(rng.uniform(0, 360))
             r = int(rng.integers(10, 22))
             tip = int(x + r * np.cos(np.radians(a))), int(y + r * np.sin(np.radians(a)))
-            cv2.ellipse(paint, tip, (r // 2 + 3, 4), a, 0, 360, blue[leaf % 3].tolist(), -1, cv2.LINE_AA)
+            cv2.ellipse(paint, tip, (r // 2 + 3, 4), a, 0, 360, ink[leaf % 3].tolist(), -1, cv2.LINE_AA)
         cv2.circle(paint, (x, y), 5, tex.rgb("#d8b13c").tolist(), -1, cv2.LINE_AA)
     for i in range(40):
-        color = blue[int(rng.integers(3))].tolist()
+        color = ink[int(rng.integers(3))].tolist()
         cv2.circle(paint, (int((i + 0.5) * width / 40), int(0.555 * height)), 5, color, -1, cv2.LINE_AA)
     return paint
 
 
-def ball(id: int, name: str, place: Place, radius: float, paint: np.ndarray, tilt: list[float]) -> Body:
+def ball(name: str, place: Place, radius: float, paint: np.ndarray, tilt: list[float]) -> Body:
     """A ball resting on the table, its pole along `tilt`."""
     rotation = rotation_from_axes([1, 0.3, 0.1], tilt)
     part = Part(Ellipsoid(np.full(3, radius), rotation, _at(place, radius)), paint, 0.18, (36, 64))
-    return Body(id, name, [name, "ball"], [part])
+    return Body(name, ["ball"], [part])
 
 
-def orange(rng: np.random.Generator, id: int, name: str, place: Place) -> Body:
-    """An orange, slightly flattened."""
+def fruit(rng: np.random.Generator, name: str, place: Place, light: str = "#f7921e", dark: str = "#dd6a07") -> Body:
+    """A round fruit, slightly flattened."""
     radii = np.array([0.040, 0.040, 0.037])
     shape = Ellipsoid(radii, rotation_from_axes([1, 0, 0.2], [0.25, -0.35, 1]), _at(place, 0.0375))
-    paint = tex.peel(rng, 280, 560, "#f7921e", "#dd6a07")
-    return Body(id, name, [name, "orange fruit"], [Part(shape, paint, 0.25, (32, 56))])
+    paint = tex.peel(rng, 280, 560, light, dark)
+    return Body(name, [f"{name} fruit", "fruit"], [Part(shape, paint, 0.25, (32, 56))])
 
 
-def banana(rng: np.random.Generator, id: int, name: str, place: Place, turn: float) -> Body:
+def banana(rng: np.random.Generator, name: str, place: Place, turn: float) -> Body:
     """A banana lying on its side: a tapering bent tube with a stem and brown tips."""
     radii = np.array([0.0045, 0.005, 0.0095, 0.0155, 0.0178, 0.0185, 0.0185, 0.0175, 0.0145, 0.008, 0.004])
     shape = Tube(0.115, np.radians(28), np.radians(137), radii, spin(turn), _at(place, 0.0186), steps=64)
@@ -120,7 +120,7 @@ def banana(rng: np.random.Generator, id: int, name: str, place: Place, turn: flo
     paint = tex.blend((0.10 - v) / 0.06, paint, tex.rgb("#8d8a3a"))
     paint = tex.blend((v - 0.955) / 0.02, paint, tex.rgb("#33240f"))
     paint = tex.blend((0.018 - v) / 0.01, paint, tex.rgb("#33240f"))
-    return Body(id, name, [name, "yellow banana"], [Part(shape, paint, 0.1, (48, 20))])
+    return Body(name, ["yellow banana", "fruit"], [Part(shape, paint, 0.1, (48, 20))])
 
 
 def box_parts(
@@ -142,27 +142,32 @@ def box_parts(
     return parts
 
 
-def book(rng: np.random.Generator, id: int, name: str, place: Place, turn: float) -> Body:
-    """A thick green hardback lying on the table, title up."""
+GREEN_BOOK = ["#0d4f4a", "#1c8a78", "#2a9a7d", "#166b5d", "#0f4c46", "#0a3330"]
+"""Sky, its lower edge, then the hills of a cover; the last colour is the binding's."""
+
+
+def book(
+    rng: np.random.Generator, name: str, place: Place, turn: float, colors: list[str] = GREEN_BOOK,
+    title: tuple[str, str, str] = ("FIELD GUIDE", "BIRDS", "OF THE NORTH"),
+) -> Body:  # fmt: skip
+    """A thick hardback lying flat, title up."""
     width, depth, thick = 0.150, 0.205, 0.036
-    cover = tex.landscape(
-        rng, 560, 410, ["#0d4f4a", "#1c8a78"], ["#2a9a7d", "#166b5d", "#0f4c46", "#0a3330"], "FIELD GUIDE"
-    )
-    cover = tex.draw_text(cover, "BIRDS", (205, 320), 88, "#fff3cf")
-    cover = tex.draw_text(cover, "OF THE NORTH", (205, 385), 34, "#f2d98a")
-    spine = tex.glaze(rng, 100, 560, "#0d4f4a", ["#1c8a78"], 200)
-    spine = tex.draw_text(spine, "BIRDS OF THE NORTH", (280, 50), 38, "#f2d98a")
+    cover = tex.landscape(rng, 560, 410, colors[:2], colors[2:], title[0])
+    cover = tex.draw_text(cover, title[1], (205, 320), 88, "#fff3cf")
+    cover = tex.draw_text(cover, title[2], (205, 385), 34, "#f2d98a")
+    spine = tex.glaze(rng, 100, 560, colors[0], [colors[1]], 200)
+    spine = tex.draw_text(spine, " ".join(title[1:]), (280, 50), 38, "#f2d98a")
     lines = tex.noise(rng, 100, 560, (50, 3), 2)
     pages = tex.blend(0.35 + 0.25 * lines, tex.rgb("#f1e8d2") * np.ones((100, 560, 3), np.float32), tex.rgb("#a8946a"))
     for edge in (slice(0, 8), slice(-8, None)):
-        pages[edge] = tex.rgb("#0a3330")
+        pages[edge] = tex.rgb(colors[-1])
     parts = box_parts(
         _at(place, thick / 2), (width, depth, thick), spin(turn), [cover, spine, pages, pages, pages, spine]
     )
-    return Body(id, name, [name, "green book", "hardback book"], parts)
+    return Body(name, ["green book", "hardback book"] if name == "book" else ["book", "hardback book"], parts)
 
 
-def cactus(rng: np.random.Generator, id: int, name: str, place: Place) -> Body:
+def cactus(rng: np.random.Generator, name: str, place: Place) -> Body:
     """A ribbed cactus with two arms in a terracotta pot."""
     profile = [
         (0.0, 0.0), (0.034, 0.0), (0.046, 0.062), (0.051, 0.063), (0.053, 0.085), (0.048, 0.086),
@@ -191,7 +196,7 @@ def cactus(rng: np.random.Generator, id: int, name: str, place: Place) -> Body:
         radii = np.array([0.009, 0.011, 0.0115, 0.0115, 0.011])
         bend = Tube(size, np.radians(-100), np.radians(20), radii, axes, origin)
         parts.append(Part(bend, _ribs(rng, 160, 160, 7), 0.0, (20, 24)))
-    return Body(id, name, [name, "potted cactus", "flowerpot"], parts)
+    return Body(name, ["potted cactus", "flowerpot"], parts)
 
 
 def _ribs(rng: np.random.Generator, height: int, width: int, count: int) -> np.ndarray:
@@ -207,10 +212,8 @@ def _ribs(rng: np.random.Generator, height: int, width: int, count: int) -> np.n
     return skin.astype(np.float32)
 
 
-def clock(rng: np.random.Generator, id: int, name: str, center: np.ndarray) -> Body:
+def clock(rng: np.random.Generator, name: str, center: np.ndarray) -> Body:
     """A wall clock that faces -y: a turned black case and a white dial at ten past ten."""
-    import cv2
-
     facing = rotation_from_axes([1, 0, 0], [0, -1, 0])
     case = Lathe(np.array([(0.132, 0.0), (0.135, 0.02), (0.128, 0.03), (0.120, 0.029), (0.117, 0.018)]), facing, center)
     dial = tex.glaze(rng, 480, 480, "#f3f1ea", ["#dedacd", "#c8c4b8"], 120)
@@ -229,9 +232,142 @@ def clock(rng: np.random.Generator, id: int, name: str, center: np.ndarray) -> B
     cv2.circle(dial, (240, 240), 14, tex.rgb("#b3271e").tolist(), -1, cv2.LINE_AA)
     face = Sheet(0.236, 0.236, facing, center + np.array([0, -0.019, 0]), elliptic=True)
     wood = tex.wood(rng, 120, 600, 1, "#4a2c1a", "#23130a")
-    return Body(
-        id,
-        name,
-        [name, "clock", "round clock"],
-        [Part(case, wood, 0.3, (12, 56)), Part(face, dial, 0.0, (24, 24))],
-    )
+    parts = [Part(case, wood, 0.3, (12, 56)), Part(face, dial, 0.0, (24, 24))]
+    return Body(name, ["clock", "round clock"], parts)
+
+
+def _binding(dark: str, light: str) -> list[str]:
+    """Colours of a cover as GREEN_BOOK has them, between two colours."""
+    shares = (0.0, 0.7, 1.0, 0.6, 0.3, -0.2)
+    return [tex.rgb_code(tex.rgb(dark) * (1 - share) + tex.rgb(light) * share) for share in shares]
+
+
+COLORS = {
+    "red": "#c3161c", "blue": "#1c4fb5", "green": "#2c7a3f", "yellow": "#e3b81d", "white": "#e9e6dc",
+    "black": "#26262a", "purple": "#6b3a8c", "pink": "#d97a9c",
+}  # fmt: skip
+FRUITS = {
+    "orange": ("#f7921e", "#dd6a07"),
+    "lemon": ("#f5dd3f", "#dcb71f"),
+    "lime": ("#8fc23c", "#5d8f24"),
+    "red apple": ("#c8202b", "#8e1320"),
+    "green apple": ("#a8c84a", "#7fa32e"),
+}
+BOOKS = {
+    "green book": (GREEN_BOOK, ("FIELD GUIDE", "BIRDS", "OF THE NORTH")),
+    "blue book": (_binding("#0e2a5c", "#3d76c9"), ("ATLAS", "OCEANS", "AND ISLANDS")),
+    "red book": (_binding("#6e1016", "#c9474a"), ("A NOVEL", "EMBERS", "OF AUTUMN")),
+    "yellow book": (_binding("#b07d10", "#f0cf55"), ("COOKING", "BREAD", "AND SALT")),
+}
+
+
+def colored_mug(rng: np.random.Generator, color: str) -> Body:
+    """A mug of one of COLORS, with hearts or dots."""
+    ink = "#1d2f66" if color in ("white", "yellow", "pink") else "#f6efe0"
+    paint = mug_paint(rng, COLORS[color], ink, hearts=bool(rng.integers(2)))
+    return mug(rng, f"{color} mug", (0, 0), 0, paint)
+
+
+def colored_fruit(rng: np.random.Generator, name: str) -> Body:
+    """One of FRUITS."""
+    return fruit(rng, name, (0, 0), *FRUITS[name])
+
+
+def named_book(rng: np.random.Generator, name: str) -> Body:
+    """One of BOOKS."""
+    return book(rng, name, (0, 0), 0, *BOOKS[name])
+
+
+def named_vase(rng: np.random.Generator) -> Body:
+    """A white vase painted in blue, red or green."""
+    inks = {
+        "blue": ("#1f3f94", "#2f62b8", "#5b8ccf"),
+        "red": ("#8e1d22", "#b8332f", "#cf6a5b"),
+        "green": ("#1f6b3a", "#2f9457", "#5bbf83"),
+    }
+    color = str(rng.choice(list(inks)))
+    return vase(rng, f"{color} vase", (0, 0), inks[color])
+
+
+def bowl(rng: np.random.Generator, name: str, color: str, filling: list[str] | None = None) -> Body:
+    """A turned bowl; filling: names of FRUITS that lie in it and belong to it."""
+    profile = [
+        (0.0, 0.0), (0.040, 0.0), (0.044, 0.006), (0.066, 0.030), (0.086, 0.062), (0.088, 0.066),
+        (0.085, 0.066), (0.062, 0.034), (0.040, 0.012), (0.0, 0.010),
+    ]  # fmt: skip
+    paint = tex.glaze(rng, 360, 640, color, ["#f4efe2", "#1c1c1c"], 260)
+    for row in (90, 104, 150):
+        paint[row : row + 6] = tex.rgb("#f4efe2") if color != COLORS["white"] else tex.rgb("#31549b")
+    parts = [Part(Lathe(np.array(profile)), paint, 0.5, (40, 48))]
+    for k, kind in enumerate(filling or []):
+        spot = (0.036 * np.cos(2.1 * k), 0.036 * np.sin(2.1 * k)) if k < 3 else (0.0, 0.0)
+        lift = np.array([0, 0, 0.020 if k < 3 else 0.072])
+        parts += colored_fruit(rng, kind).placed(40 * k, np.array([*spot, 0.0]) + lift, 0.85).parts
+    return Body(name, ["bowl", "fruit bowl"] if filling else ["bowl"], parts, kind="bowl")
+
+
+def plate(rng: np.random.Generator, name: str, color: str) -> Body:
+    """A flat plate with painted rings."""
+    profile = [(0.0, 0.0), (0.060, 0.0), (0.115, 0.014), (0.118, 0.017), (0.112, 0.017), (0.065, 0.006), (0.0, 0.006)]
+    paint = tex.glaze(rng, 360, 640, "#ece9df", ["#c9c4b4"], 120)
+    for row in (196, 214, 226):
+        paint[row : row + 7] = tex.rgb(color)
+    return Body(name, ["plate", "dinner plate"], [Part(Lathe(np.array(profile)), paint, 0.5, (32, 48))])
+
+
+def bottle(rng: np.random.Generator, name: str, color: str) -> Body:
+    """A bottle with a paper label and a cap."""
+    profile = [
+        (0.0, 0.0), (0.033, 0.0), (0.036, 0.004), (0.036, 0.150), (0.030, 0.178), (0.014, 0.205), (0.013, 0.240),
+        (0.015, 0.241), (0.015, 0.258), (0.0, 0.258),
+    ]  # fmt: skip
+    paint = tex.glaze(rng, 640, 480, color, ["#111111", "#ffffff"], 120)
+    label = tex.mosaic(rng, 140, 480, ["#d1495b", "#edae49", "#00798c", "#30638e"])
+    for x in (120, 360):
+        label = tex.draw_text(label, "CIDER", (x, 70), 54, "#22262b")
+    paint[190:330] = label[::-1]  # rows of a turned surface run upwards
+    paint[570:] = tex.rgb("#b08d2e")
+    return Body(name, ["bottle"], [Part(Lathe(np.array(profile)), paint, 0.7, (48, 36))])
+
+
+def tin(rng: np.random.Generator, name: str) -> Body:
+    """A food tin with a printed label."""
+    profile = [(0.0, 0.0), (0.037, 0.0), (0.037, 0.108), (0.035, 0.110), (0.034, 0.106), (0.0, 0.106)]
+    paint = tex.glaze(rng, 420, 560, "#b9bcc0", ["#8b8f94", "#e6e8ea"], 200)
+    label = tex.glaze(rng, 220, 560, "#c8302a", ["#e9c46a", "#7c1512"], 160)
+    for x in (90, 280, 470):
+        cv2.circle(label, (x, 80), 46, tex.rgb("#e8e3d2").tolist(), -1, cv2.LINE_AA)
+        cv2.circle(label, (x, 80), 34, tex.rgb("#d3271f").tolist(), -1, cv2.LINE_AA)
+        label = tex.draw_text(label, "TOMATO", (x, 170), 42, "#fff3cf")
+    paint[96:316] = label[::-1]  # rows of a turned surface run upwards
+    return Body(name, ["tin", "food tin", "can"], [Part(Lathe(np.array(profile)), paint, 0.4, (32, 40))])
+
+
+def carton(rng: np.random.Generator) -> Body:
+    """A food carton, printed on its four sides."""
+    color, name, word = [("#d9782d", "cereal box", "OATS"), ("#2d6fb0", "milk carton", "MILK")][int(rng.integers(2))]
+    width, depth, height = (0.125, 0.055, 0.19) if name == "cereal box" else (0.075, 0.075, 0.18)
+    top = tex.glaze(rng, 120, 200, color, ["#fff3cf"], 40)
+    sides = []
+    for across in (width, depth, width, depth):
+        side = tex.mosaic(rng, 560, int(3000 * across), [color, "#fff3cf", "#8f1d14", "#e9c46a"])
+        side = 0.45 * side + 0.55 * tex.rgb(color)
+        sides.append(tex.draw_text(side, word, (1500 * across, 170), int(900 * across), "#fff8e6"))
+    parts = box_parts(np.array([0, 0, height / 2]), (width, depth, height), np.eye(3), [top, top, *sides])
+    return Body(name, ["carton", "food box"], parts)
+
+
+def teddy(rng: np.random.Generator, name: str) -> Body:
+    """A sitting plush bear."""
+    fur = tex.fur(rng, 240, 480, "#b5814b", "#7c5228")
+    dark = tex.fur(rng, 80, 160, "#3a2716", "#20150b")
+    balls = [  # radii, centre, paint
+        ((0.050, 0.043, 0.058), (0, 0, 0.058), fur), ((0.041, 0.039, 0.038), (0, -0.006, 0.142), fur),
+        ((0.016, 0.010, 0.016), (-0.033, 0, 0.176), fur), ((0.016, 0.010, 0.016), (0.033, 0, 0.176), fur),
+        ((0.018, 0.018, 0.042), (-0.056, -0.012, 0.080), fur), ((0.018, 0.018, 0.042), (0.056, -0.012, 0.080), fur),
+        ((0.021, 0.044, 0.021), (-0.034, -0.052, 0.022), fur), ((0.021, 0.044, 0.021), (0.034, -0.052, 0.022), fur),
+        ((0.017, 0.014, 0.014), (0, -0.043, 0.134), fur), ((0.006, 0.005, 0.005), (0, -0.057, 0.139), dark),
+        ((0.005, 0.005, 0.005), (-0.015, -0.040, 0.154), dark), ((0.005, 0.005, 0.005), (0.015, -0.040, 0.154), dark),
+    ]  # fmt: skip
+    parts = [Part(Ellipsoid(np.array(r), spin(0), np.array(c, float)), paint, 0.0, (20, 28)) for r, c, paint in balls]
+    return Body(name, ["plush bear", "stuffed animal", "toy"], parts)

@@ -1,44 +1,49 @@
-"""What is true about the demo's photos: for scoring what the map found, never for making it."""
+"""What is true about a made scene: for scoring what a map of it holds, never for making the map."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from perception.demo.render import Camera
+from perception.demo.cameras import Camera
 from perception.errors import InputError
+from perception.io.cloud import read_cloud, write_cloud
+from perception.types import PointCloud
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes <-> the OpenGL axes of transforms.json
 
 
 @dataclass(frozen=True)
 class Truth:
-    """One instance as it is: id > 0, name, prompts that name it, whether it is background (table, wall,
-    floor...)."""
+    """One instance: id > 0, name, category and its id, prompts that name it, whether it is background (wall, floor...),
+    points of it in gt_points.ply, and photos that show it."""
 
     id: int
     name: str
+    category: str
+    semantic_id: int
     prompts: list[str]
     is_stuff: bool
+    gt_points: int
+    views_visible: int
 
 
 @dataclass
 class DemoTruth:
-    """Truth of a set of demo photos, metres, z up.
+    """Truth of a set of photos, metres, z up.
 
-    instances: by id. queries: (text, ids that answer it); no ids = not in the scene. names: photo file names.
-    cameras: one per photo. points [N, 3] float32, normals [N, 3] float32, colors [N, 3] uint8, instance_ids
-    [N] int32:
-    surface points seen in at least two photos. folder: where the label images lie.
+    instances: by id. asked: the prompts of `perception demo`. names: photo file names. cameras: one per photo.
+    points [N, 3] float32, normals [N, 3] float32, colors [N, 3] uint8, instance_ids [N] int32: surface points that at
+    least two photos see. folder: where the truth lies. photos: where the photos lie, relative to it.
     """
 
     instances: list[Truth]
-    queries: list[tuple[str, list[int]]]
+    asked: list[str]
     names: list[str]
     cameras: list[Camera]
     points: np.ndarray
@@ -46,15 +51,26 @@ class DemoTruth:
     colors: np.ndarray
     instance_ids: np.ndarray
     folder: Path
+    photos: str = "images"
 
     @property
     def things(self) -> list[Truth]:
         """The instances that are no background."""
         return [instance for instance in self.instances if not instance.is_stuff]
 
+    @property
+    def queries(self) -> list[tuple[str, list[int]]]:
+        """Every prompt with the ids of the visible instances that carry it."""
+        found: dict[str, list[int]] = {}
+        for instance in self.instances:
+            for text in dict.fromkeys([instance.name, instance.category, *instance.prompts]):
+                if instance.gt_points:
+                    found.setdefault(text, []).append(instance.id)
+        return sorted(found.items())
+
     def labels(self, name: str) -> np.ndarray:
         """Instance ids [H, W] uint16 of a photo, 0 = nothing; the same id in every photo."""
-        path = self.folder / "labels" / f"{Path(name).stem}.png"
+        path = self.folder / "masks_gt" / f"{Path(name).stem}.png"
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if image is None:
             raise InputError(f"{path}: no readable label image; make the demo's photos again")
@@ -62,15 +78,26 @@ class DemoTruth:
 
     def save(self) -> None:
         """Writes scene.json, transforms.json and gt_points.ply into the folder."""
+        stuff = {instance.id for instance in self.instances if instance.is_stuff}
+        queries = [{"text": text, "instance_ids": ids, "is_stuff": set(ids) <= stuff} for text, ids in self.queries]
         scene = {
             "units": "metres",
             "up": "+Z",
-            "instances": [vars(instance) for instance in self.instances],
-            "queries": [{"text": text, "instance_ids": ids} for text, ids in self.queries],
+            "image_size": [self.cameras[0].width, self.cameras[0].height],
+            "views": len(self.names),
+            "instances": [asdict(instance) for instance in self.instances],
+            "semantics": {str(instance.semantic_id): instance.category for instance in self.instances},
+            "queries": queries,
+            "asked": self.asked,
         }
-        (self.folder / "scene.json").write_text(json.dumps(scene, indent=1))
-        (self.folder / "transforms.json").write_text(json.dumps(_transforms(self.names, self.cameras), indent=1))
-        _write_points(self.folder / "gt_points.ply", self)
+        (self.folder / "scene.json").write_text(json.dumps(scene, indent=1), encoding="utf-8")
+        transforms = _transforms(self.photos, self.names, self.cameras)
+        (self.folder / "transforms.json").write_text(json.dumps(transforms, indent=1), encoding="utf-8")
+        semantic = np.zeros(len(self.instances) + 1, np.int32)
+        semantic[[instance.id for instance in self.instances]] = [i.semantic_id for i in self.instances]
+        labels = {"instance_id": self.instance_ids, "semantic_id": semantic[self.instance_ids]}
+        cloud = PointCloud(self.points, self.colors, self.normals, labels=labels)
+        write_cloud(self.folder / "gt_points.ply", cloud)
 
 
 def load_truth(folder: Path | str) -> DemoTruth:
@@ -78,72 +105,40 @@ def load_truth(folder: Path | str) -> DemoTruth:
     folder = Path(folder)
     if not (folder / "scene.json").is_file():
         raise InputError(f"{folder}: holds no scene.json; expected the truth folder of `perception demo`")
-    scene = json.loads((folder / "scene.json").read_text())
-    views = json.loads((folder / "transforms.json").read_text())
+    scene = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
+    views = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
     K = np.array([[views["fl_x"], 0, views["cx"]], [0, views["fl_y"], views["cy"]], [0, 0, 1.0]])
     cameras = [
         Camera(K, np.linalg.inv(np.array(frame["transform_matrix"]) @ FLIP), views["w"], views["h"])
         for frame in views["frames"]
     ]
-    raw = (folder / "gt_points.ply").read_bytes()
-    data = np.frombuffer(raw[raw.index(b"end_header\n") + 11 :], _VERTEX)
-    points, normals, colors = (np.stack([data[name] for name in group], -1) for group in _GROUPS)
+    cloud = read_cloud(folder / "gt_points.ply")
+    assert cloud.normals is not None and cloud.colors is not None
+    photos = [Path(frame["file_path"]) for frame in views["frames"]]
     return DemoTruth(
         [Truth(**instance) for instance in scene["instances"]],
-        [(query["text"], query["instance_ids"]) for query in scene["queries"]],
-        [Path(frame["file_path"]).name for frame in views["frames"]],
+        scene["asked"],
+        [photo.name for photo in photos],
         cameras,
-        points,
-        normals,
-        colors,
-        data["instance_id"].astype(np.int32),
+        cloud.points,
+        cloud.normals,
+        cloud.colors,
+        cloud.labels["instance_id"],
         folder,
+        photos[0].parent.as_posix(),
     )
 
 
-def _transforms(names: list[str], cameras: list[Camera]) -> dict[str, Any]:
-    first = cameras[0]
+def _transforms(photos: str, names: list[str], cameras: list[Camera]) -> dict[str, Any]:
     frames = [
         {
-            "file_path": f"images/{name}",
+            "file_path": f"{photos}/{name}",
             "transform_matrix": (np.linalg.inv(camera.camera_from_world) @ FLIP).tolist(),
+            "depth_file_path": f"depth/{Path(name).stem}.png",
+            "instance_file_path": f"masks_gt/{Path(name).stem}.png",
         }
         for name, camera in zip(names, cameras, strict=True)
     ]
-    K = first.K
-    intrinsics = {
-        "fl_x": K[0, 0],
-        "fl_y": K[1, 1],
-        "cx": K[0, 2],
-        "cy": K[1, 2],
-        "w": first.width,
-        "h": first.height,
-    }
-    return {"camera_model": "OPENCV", **intrinsics, "frames": frames}
-
-
-_GROUPS = (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"))
-_VERTEX = np.dtype(
-    [(name, "<f4") for group in _GROUPS[:2] for name in group]
-    + [(name, "u1") for name in _GROUPS[2]]
-    + [("instance_id", "<i4")]
-)
-
-
-def _write_points(path: Path, truth: DemoTruth) -> None:
-    data = np.empty(len(truth.points), _VERTEX)
-    for group, array in zip(_GROUPS, (truth.points, truth.normals, truth.colors), strict=True):
-        for k, name in enumerate(group):
-            data[name] = array[:, k]
-    data["instance_id"] = truth.instance_ids
-    types = {"<f4": "float", "|u1": "uchar", "<i4": "int"}
-    lines = [f"property {types[_VERTEX[name].str]} {name}" for name in _VERTEX.names or ()]
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(data)}",
-        *lines,
-        "end_header",
-        "",
-    ]
-    path.write_bytes("\n".join(header).encode() + data.tobytes())
+    K, width, height = cameras[0].K, cameras[0].width, cameras[0].height
+    lens = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": width, "h": height}
+    return {"camera_model": "OPENCV", **lens, "depth_unit_scale_factor": 0.001, "frames": frames}

@@ -1,4 +1,4 @@
-"""`perception demo`: makes photos of a tabletop, maps them as photos, and scores the map against the truth it knows."""
+"""`perception demo`: makes photos of a scene, maps them as photos, and scores the map against the truth it knows."""
 
 from __future__ import annotations
 
@@ -26,15 +26,30 @@ SETTINGS = ["train.iterations=2000", "train.budget=40000"]
 """The demo's own settings: a small scene within four minutes on two cores."""
 
 
-def run_demo(output: Path, progress: Progress | None = None) -> tuple[dict[str, Any], str]:
+def write_scene(folder: Path, scene: str, seed: int) -> tuple[dict[str, Any], str]:
+    """Photos of a made scene in `folder`/images, poses and truth beside them: figures, and a text."""
+    _require_empty(folder)
+    truth = make_photos(folder / "images", scene=scene, seed=seed, truth_folder=folder)
+    facts = {"scene": str(folder), "photos": len(truth.names), "instances": len(truth.instances)}
+    facts |= {"prompts": len(truth.queries), "points": len(truth.points)}
+    return facts, "{photos} photos, {instances} instances, {prompts} prompts in {scene}".format(**facts)
+
+
+def _require_empty(folder: Path) -> None:
+    if folder.exists() and any(folder.iterdir()):
+        raise InputError(f"{folder}: is not empty; choose another folder or remove it first")
+
+
+def run_demo(
+    output: Path, progress: Progress | None = None, scene: str = "tabletop", seed: int = 0
+) -> tuple[dict[str, Any], str]:
     """Photos → SfM → masks → map → export → queries, all in `output`; returns figures and a text for people."""
     progress = progress or Progress()
     started = time.monotonic()
-    if output.exists() and any(output.iterdir()):
-        raise InputError(f"{output}: is not empty; choose another -o or remove it first")
+    _require_empty(output)
     photos, map_path = output / "photos", output / "demo.gsmap"
-    progress.log(f"making photos of a tabletop in {photos}")
-    truth = make_photos(photos)
+    progress.log(f"making photos of a {scene} in {photos}")
+    truth = make_photos(photos, scene=scene, seed=seed)
     made = time.monotonic() - started
 
     config: MapConfig = load_config(None, SETTINGS)
@@ -47,7 +62,8 @@ def run_demo(output: Path, progress: Progress | None = None) -> tuple[dict[str, 
     scored = evaluate(
         labels, {entry["id"]: entry["score"] for entry in gmap.instances}, truth.instance_ids.astype(np.int64)
     )
-    queries = [_ask(gmap, text, ids, truth, labels) for text, ids in truth.queries]
+    answers = dict(truth.queries)
+    queries = [_ask(gmap, text, answers.get(text, []), truth, labels) for text in truth.asked]
     facts = {
         "map": str(map_path),
         "seconds": {"photos": round(made, 1), "total": round(time.monotonic() - started, 1)},
@@ -65,7 +81,7 @@ def run_demo(output: Path, progress: Progress | None = None) -> tuple[dict[str, 
     facts["report"] = str(write_map_report(gmap, output / "report.html", [query["text"] for query in queries]))
     from PIL import Image
 
-    Image.fromarray(map_picture(gmap, truth.queries[0][0])).save(output / "demo.jpg", quality=88)
+    Image.fromarray(map_picture(gmap, truth.asked[0])).save(output / "demo.jpg", quality=88)
     (output / "demo.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     return facts, demo_text(facts)
 

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from perception.demo.shapes import (
+    Box,
     Ellipsoid,
     Lathe,
     Shape,
     Sheet,
     Tube,
+    placed,
     rotation_from_axes,
     to_local,
     to_world,
@@ -20,6 +22,7 @@ from perception.demo.shapes import (
 BULB = Lathe(np.array([(0, 0), (0.4, 0.1), (0.5, 0.6), (0.2, 0.9), (0.25, 1.0), (0.0, 1.0)]))
 HOOK = Tube(0.6, -1.0, 1.4, np.array([0.08, 0.12, 0.15, 0.1]))
 EGG = Ellipsoid(np.array([0.5, 0.3, 0.8]))
+CRATE = Box(np.array([0.9, 0.5, 1.2]))
 
 
 def _inside_bulb(p: np.ndarray) -> np.ndarray:
@@ -40,6 +43,10 @@ def _inside_egg(p: np.ndarray) -> np.ndarray:
     return ((p / EGG.radii) ** 2).sum(-1) < 1
 
 
+def _inside_crate(p: np.ndarray) -> np.ndarray:
+    return (np.abs(p) < CRATE.extent / 2).all(-1)
+
+
 def _rays(count: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(5)
     start = rng.standard_normal((count, 3))
@@ -50,7 +57,7 @@ def _rays(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(
     ("shape", "inside", "tolerance"),
-    [(BULB, _inside_bulb, 0.004), (HOOK, _inside_hook, 0.01), (EGG, _inside_egg, 0.004)],
+    [(BULB, _inside_bulb, 0.004), (HOOK, _inside_hook, 0.01), (EGG, _inside_egg, 0.004), (CRATE, _inside_crate, 0.004)],
 )
 def test_first_crossing_is_where_a_dense_walk_enters(shape: Shape, inside, tolerance: float) -> None:
     origins, directions = _rays(150)
@@ -77,7 +84,7 @@ def test_sphere_and_plane_have_their_closed_forms() -> None:
     assert np.isinf(sheet.hit(np.array([[1.01, 0, 3.0]]), np.array([[0, 0, -1.0]]))[0][0])
 
 
-@pytest.mark.parametrize("shape", [BULB, HOOK, EGG, Sheet(0.8, 0.5)])
+@pytest.mark.parametrize("shape", [BULB, HOOK, EGG, CRATE, Sheet(0.8, 0.5)])
 def test_a_hit_and_its_chart_agree(shape: Shape) -> None:
     origins, directions = _rays(400)
     t, u, v = shape.hit(origins, directions)
@@ -96,3 +103,24 @@ def test_local_frames_are_rigid() -> None:
     shape = Sheet(1, 1, rotation, np.array([1.0, 2, 3]))
     points = np.random.default_rng(0).standard_normal((10, 3))
     np.testing.assert_allclose(to_world(shape, to_local(shape, points)), points, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [BULB, HOOK, EGG, CRATE, Sheet(0.8, 0.5)])
+def test_a_placed_shape_is_the_shape_moved(shape: Shape) -> None:
+    """Scaled, turned and moved points of the surface are the surface of the placed shape."""
+    turn, shift = rotation_from_axes([1, 2, 0.3], [0.2, -0.1, 0.7]), np.array([3.0, -1, 0.5])
+    moved = placed(shape, turn, shift, 1.7)
+    u, v = np.random.default_rng(1).random((2, 50))
+    points, normals = shape.point_normal(u, v)
+    again, turned = moved.point_normal(u, v)
+    np.testing.assert_allclose(to_world(moved, again), 1.7 * points @ turn.T + shift, atol=1e-9)
+    np.testing.assert_allclose(turned @ moved.rotation.T, normals @ turn.T, atol=1e-9)
+
+
+def test_the_faces_of_a_box_have_the_charts_they_say() -> None:
+    sizes = CRATE.face_sizes()
+    assert sizes.tolist() == [[0.9, 0.5], [0.9, 0.5], [0.9, 1.2], [0.5, 1.2], [0.9, 1.2], [0.5, 1.2]]
+    _, normals = CRATE.point_normal(np.full(6, 0.5), (np.arange(6) + 0.5) / 6)
+    assert normals.tolist() == [[0, 0, 1], [0, 0, -1], [0, -1, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0]]
+    top, _ = CRATE.point_normal(np.array([0.5]), np.array([(2 + 0.011) / 6]))  # upper edge of the face to -y
+    assert top[0, 2] == pytest.approx(0.6, abs=0.002)

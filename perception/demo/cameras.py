@@ -1,0 +1,90 @@
+"""Cameras of the demo's scenes: arcs around the front of a table, and a walk through a room."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera: K [3, 3] pixels (centres at +0.5), camera_from_world [4, 4] (x right, y down, z forward)."""
+
+    K: np.ndarray
+    camera_from_world: np.ndarray
+    width: int
+    height: int
+
+    @property
+    def center(self) -> np.ndarray:
+        rotation = self.camera_from_world[:3, :3]
+        return -rotation.T @ self.camera_from_world[:3, 3]
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """World points [N, 3] -> pixels [N, 2], depth [N] along the optical axis."""
+        local = points @ self.camera_from_world[:3, :3].T + self.camera_from_world[:3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return (local @ self.K.T)[:, :2] / local[:, 2:], local[:, 2]
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """[4, 4] camera_from_world of an upright camera at `eye` that looks at `target` (z up in the world)."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
+    return pose
+
+
+def intrinsics(width: int, height: int, focal_35mm: float) -> np.ndarray:
+    """[3, 3] of a lens of that focal length (mm) on a 36 mm wide frame."""
+    focal = focal_35mm / 36 * max(width, height)
+    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+
+
+def orbit(views: int, width: int, height: int, focal_35mm: float) -> list[Camera]:
+    """`views` cameras on three arcs around the front of a table, in the order taken, neighbours overlapping."""
+    K = intrinsics(width, height, focal_35mm)
+    arcs = [  # (share of the views, half the swing in degrees, radius, height, aim)
+        (0.36, 82.0, 0.98, 0.42, (0.0, 0.02, 0.05)),
+        (0.34, 74.0, 0.86, 0.70, (0.0, 0.0, 0.0)),
+        (0.30, 64.0, 0.62, 0.34, (0.0, 0.0, 0.05)),
+    ]
+    counts = [max(1, round(share * views)) for share, *_ in arcs[:-1]]
+    counts.append(max(views - sum(counts), 0))
+    cameras: list[Camera] = []
+    for k, ((_, swing, radius, lift, aim), count) in enumerate(zip(arcs, counts, strict=True)):
+        angles = np.radians(np.linspace(-swing, swing, count) if count > 1 else np.zeros(count))
+        for i, angle in enumerate(angles[:: -1 if k % 2 else 1]):
+            sway = 0.03 * np.sin(2.1 * i + k)  # nobody's hand draws a perfect circle
+            eye = np.array([(radius + sway) * np.sin(angle), -(radius + sway) * np.cos(angle), lift + 0.6 * sway])
+            target = np.array(aim) + np.array([0.12 * np.sin(angle) * (k == 2), 0, 0.4 * sway])
+            cameras.append(Camera(K, look_at(eye, target), width, height))
+    return cameras[:views]
+
+
+def walk(views: int, width: int, height: int, focal_35mm: float, half: np.ndarray) -> list[Camera]:
+    """`views` cameras at 1.2 to 1.6 m in a room that reaches `half` [2] metres from the origin, on three rounds: across
+    the room, at the walls from near, and down at the furniture."""
+    K = intrinsics(width, height, focal_35mm)
+    rounds = [  # (share of the views, where on the way from the middle to the walls, eye height, aim there, aim height)
+        (0.40, 0.46, 1.45, -0.75, 0.75),
+        (0.36, 0.20, 1.30, 1.00, 0.95),
+        (0.24, 0.42, 1.58, 0.85, 0.25),
+    ]
+    counts = [round(share * views) for share, *_ in rounds[:-1]]
+    counts.append(views - sum(counts))
+    cameras = []
+    for k, ((_, out, lift, aim, level), count) in enumerate(zip(rounds, counts, strict=True)):
+        for i in range(count):
+            angle = 2 * np.pi * (i + 0.35 * k) / max(count, 1)
+            heading = np.array([np.cos(angle), np.sin(angle)])
+            sway = 0.04 * np.sin(2.1 * i + k)  # nobody walks a perfect ellipse
+            eye = np.array([*(out + sway) * half * heading, lift + 0.8 * sway])
+            across = angle + 0.25 * np.sin(3 * angle + k)  # looks left and right of straight ahead
+            target = np.array([*aim * half * [np.cos(across), np.sin(across)], level + 2 * sway])
+            cameras.append(Camera(K, look_at(eye, target), width, height))
+    return cameras
