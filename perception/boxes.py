@@ -56,16 +56,6 @@ def instance_boxes(points: np.ndarray, labels: np.ndarray, trim: float = 0.0) ->
     return boxes
 
 
-BOX_EDGES = ((0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7))
-"""Pairs of `box_corners` that an edge joins."""
-
-
-def box_corners(box: OrientedBox) -> np.ndarray:
-    """The eight corners [8, 3] of a box; corner 4i + 2j + k lies at the far end of axis 0, 1, 2 where i, j, k is 1."""
-    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
-    return np.asarray(box.center + (signs * box.extent / 2) @ box.rotation)
-
-
 def _sides(axes: np.ndarray, points: np.ndarray, trim: float) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest coordinates [C, 3] of points along the rows of axes [C, 3, 3]."""
     local = np.einsum("cij,pj->cpi", axes, points)

@@ -3,14 +3,12 @@ uint8 RGB."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
-from perception.boxes import BOX_EDGES, box_corners
 from perception.colors import instance_palette
-from perception.types import OrientedBox
 
 
 def colorize_instances(ids: np.ndarray) -> np.ndarray:
@@ -57,57 +55,6 @@ def outline(
     out = np.where(mask[..., None], photo, np.round(photo * 0.55)).astype(np.uint8)
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return cv2.drawContours(np.ascontiguousarray(out), contours, -1, color, thickness, cv2.LINE_AA)
-
-
-def draw_boxes(
-    image: np.ndarray,
-    boxes: Mapping[int, OrientedBox],
-    K: np.ndarray,
-    camera_from_world: np.ndarray,
-    depth: np.ndarray | None = None,
-    names: Mapping[int, str] | None = None,
-) -> np.ndarray:
-    """A copy of a view's picture with the edges of boxes (by instance id, in the world frame) in instance colours.
-
-    K [3, 3], pixel centres at +0.5; camera_from_world [4, 4]. depth [H, W], 0 = unknown: edges behind it are drawn
-    thin. names: written beside the box.
-    """
-    out = np.ascontiguousarray(image).copy()
-    colors = instance_palette(list(boxes))
-    for color, (i, box) in zip(colors.tolist(), boxes.items(), strict=True):
-        corners = box_corners(box) @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-        for a, b in BOX_EDGES:
-            _draw_edge(out, corners[a], corners[b], K, depth, color)
-        if names is not None and corners[:, 2].min() > 0:
-            pixels = corners @ K.T
-            u, v = (pixels[:, :2] / pixels[:, 2:])[(pixels[:, 1] / pixels[:, 2]).argmin()]
-            place = (int(np.clip(u, 2, out.shape[1] - 20)), int(np.clip(v - 4, 10, out.shape[0] - 2)))
-            cv2.putText(out, names[i], place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 3, cv2.LINE_AA)
-            cv2.putText(out, names[i], place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
-    return out
-
-
-def _draw_edge(
-    out: np.ndarray, a: np.ndarray, b: np.ndarray, K: np.ndarray, depth: np.ndarray | None, color: Sequence[int]
-) -> None:
-    """One edge between camera points, in short pieces so that what is hidden can be told piece by piece."""
-    steps = np.linspace(0, 1, 33)[:, None]
-    points = a * (1 - steps) + b * steps
-    pixels = points @ K.T
-    for start, end in zip(range(32), range(1, 33), strict=True):
-        if min(points[start, 2], points[end, 2]) <= 1e-6:
-            continue
-        (x0, y0), (x1, y1) = pixels[start, :2] / pixels[start, 2], pixels[end, :2] / pixels[end, 2]
-        if max(abs(x0), abs(y0), abs(x1), abs(y1)) > 1e5:  # beyond what OpenCV's fixed point can hold
-            continue
-        hidden = False
-        x, y = int((x0 + x1) / 2), int((y0 + y1) / 2)
-        if depth is not None and 0 <= y < out.shape[0] and 0 <= x < out.shape[1]:
-            middle = (points[start, 2] + points[end, 2]) / 2
-            hidden = bool(0 < depth[y, x] < 0.98 * middle)
-        ends = [(round((x0 - 0.5) * 16), round((y0 - 0.5) * 16)), (round((x1 - 0.5) * 16), round((y1 - 0.5) * 16))]
-        weight = [c * 0.7 for c in color] if hidden else color
-        cv2.line(out, ends[0], ends[1], weight, 1 if hidden else 2, cv2.LINE_AA, shift=4)
 
 
 def features_to_rgb(features: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:

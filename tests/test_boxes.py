@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from perception.boxes import BOX_EDGES, box_corners, oriented_box
+from perception.boxes import oriented_box
 
 
 def test_recovers_a_rotated_box() -> None:
@@ -30,16 +30,6 @@ def test_contains_every_point_and_ignores_order() -> None:
 def test_degenerate_sets() -> None:
     assert np.allclose(oriented_box(np.ones((1, 3))).extent, 0)
     assert np.allclose(sorted(oriented_box(np.array([[0, 0, 0], [0, 2.0, 0]])).extent), [0, 0, 2])
-
-
-def test_edges_join_corners_along_one_axis() -> None:
-    points = np.random.default_rng(3).normal(size=(40, 3)) * [3, 2, 1]
-    box = oriented_box(points)
-    corners = box_corners(box)
-    lengths = sorted(np.linalg.norm(corners[a] - corners[b]) for a, b in BOX_EDGES)
-    assert np.allclose(lengths, sorted(np.repeat(box.extent, 4)))
-    again = oriented_box(corners)
-    assert np.allclose(again.extent.prod(), box.extent.prod()) and np.allclose(again.center, box.center)
 
 
 def test_longest_side_first_and_strays_are_trimmed() -> None:

@@ -11,8 +11,6 @@ from skimage.color import deltaE_ciede2000, rgb2lab
 
 from perception import pictures
 from perception.colors import GREY, instance_palette, rgb8_from_sh, rgb_from_sh, sh_from_rgb
-from perception.pictures import draw_boxes
-from perception.types import OrientedBox
 
 
 def test_palette_is_stable_separated_and_grey_for_none() -> None:
@@ -86,17 +84,3 @@ def test_outline_and_montage() -> None:
     sheet = pictures.montage([photo, drawn, photo[:20, :30]], 2, ["one", "two", "three"])
     assert sheet.shape == (2 * (40 + 22 + 6) + 6, 2 * 66 + 6, 3)
     np.testing.assert_array_equal(sheet[28:68, 72:132], drawn)
-
-
-def test_boxes_are_drawn_where_their_edges_project() -> None:
-    box = OrientedBox(np.array([0.0, 0.0, 4.0]), np.eye(3), np.array([2.0, 2.0, 0.0]))
-    behind = OrientedBox(np.array([0.0, 0.0, -4.0]), np.eye(3), np.ones(3))
-    K = np.array([[100.0, 0, 100.5], [0, 100.0, 100.5], [0, 0, 1]])
-    black = np.zeros((201, 201, 3), np.uint8)
-    drawn = draw_boxes(black, {0: box, 1: behind}, K, np.eye(4))
-    rows, columns = np.nonzero(drawn.any(axis=2))
-    # Sides at ±1 of depth 4: 25 pixels from the centre of pixel (100, 100).
-    assert {rows.min(), columns.min()} <= {72, 73, 74} and {rows.max(), columns.max()} <= {126, 127, 128}
-    assert not drawn[80:120, 80:120].any() and not black.any()
-    hidden = draw_boxes(black, {0: box}, K, np.eye(4), np.full((201, 201), 2.0))
-    assert 0 < np.count_nonzero(hidden.any(axis=2)) < len(rows)  # thin behind what is nearer

@@ -59,9 +59,7 @@ def _add_render(commands: Any) -> None:
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("--cameras", type=Path, metavar="transforms.json", help="default: the map's held-out views")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
-    p.add_argument(
-        "--what", default="rgb", metavar="KINDS", help="comma-separated: rgb, depth, instances, features, boxes"
-    )
+    p.add_argument("--what", default="rgb", metavar="KINDS", help="comma-separated: rgb, depth, instances, features")
 
 
 def _render(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

@@ -91,35 +91,15 @@ def box_markers(
     length, so sides are at least `least`."""
     markers: list[dict[str, Any]] = [{"header": head, "action": _DELETE_ALL}]
     for i, (instance, box, words) in enumerate(boxes):
-        at = pose(box)
+        at, common = pose(box), {"header": head, "ns": namespace}
         size = {axis: max(side, least) for axis, side in _xyz(box.extent).items()}
-        tint = dict(zip("rgb", (instance_palette([instance])[0] / 255).tolist(), strict=True))
-        markers.append(
-            {
-                "header": head,
-                "ns": namespace,
-                "id": 2 * i,
-                "type": _CUBE,
-                "pose": at,
-                "scale": size,
-                "color": tint | {"a": 0.4},
-            }
-        )
-        above = {"position": at["position"], "orientation": {"w": 1.0}}
+        tint = dict(zip("rgb", (instance_palette([instance])[0] / 255).tolist(), strict=True)) | {"a": 0.4}
+        markers.append({**common, "id": 2 * i, "type": _CUBE, "pose": at, "scale": size, "color": tint})
+        upright = {"position": at["position"], "orientation": {"w": 1.0}}
         letters = {"z": max(0.25 * min(size.values()), 0.1 * max(size.values()))}
-        white = {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0}
-        markers.append(
-            {
-                "header": head,
-                "ns": namespace,
-                "id": 2 * i + 1,
-                "type": _TEXT,
-                "pose": above,
-                "scale": letters,
-                "color": white,
-                "text": words,
-            }
-        )
+        white = dict.fromkeys("rgba", 1.0)
+        text = {"type": _TEXT, "pose": upright, "scale": letters, "color": white, "text": words}
+        markers.append({**common, "id": 2 * i + 1, **text})
     return {"markers": markers}
 
 

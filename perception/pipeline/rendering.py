@@ -18,19 +18,19 @@ from perception.instances.silhouettes import render_silhouettes
 from perception.io.recentre import map_origin, moved
 from perception.io.safe_names import safe_name
 from perception.io.store import Map, read_map
-from perception.types import OrientedBox, View
+from perception.types import View
 
-KINDS = ("rgb", "depth", "instances", "features", "boxes")
+KINDS = ("rgb", "depth", "instances", "features")
 
 
 def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[str]) -> tuple[dict[str, Any], str]:
     """Writes one picture per camera and kind: `NAME.png` for a single kind, `KIND/NAME.png` for several.
 
     rgb: 8-bit PNG. depth: 16-bit PNG, thousandths of the map's unit along the optical axis, 0 = nothing. instances:
-    16-bit PNG of id + 1, 0 = none. features: 8-bit PNG of the three main components. boxes: rgb with the instances'
-    oriented boxes, hidden edges thin. cameras: a transforms.json in the coordinates of the map's input; None takes the
-    map's held-out views (all views if none were held out). A camera with lens distortion is rendered as that lens sees,
-    so that the picture lies over the photo it was given for.
+    16-bit PNG of id + 1, 0 = none. features: 8-bit PNG of the three main components.
+    cameras: a transforms.json in the coordinates of the map's input; None takes the map's held-out views (all views if
+    none were held out). A camera with lens distortion is rendered as that lens sees, so that the picture lies over the
+    photo it was given for. InputError for a name that leaves `output`.
     """
     for kind in what:
         if kind not in KINDS:
@@ -132,17 +132,7 @@ def _picture(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarr
 
         assert out.features is not None  # features were given
         return features_to_rgb(out.features[0].numpy())
-    if kind == "boxes":
-        return _boxed(_picture("rgb", gaussians, gmap, view), _picture("depth", gaussians, gmap, view), gmap, view)
     raise ValueError(f"unknown kind of picture: {kind}")
-
-
-def _boxed(image: np.ndarray, depth: np.ndarray, gmap: Map, view: View) -> np.ndarray:
-    from perception.pictures import draw_boxes
-
-    boxes = {entry["id"]: OrientedBox.from_json(entry["obb"]) for entry in gmap.instances}
-    names = {entry["id"]: entry.get("label") or str(entry["id"]) for entry in gmap.instances}
-    return draw_boxes(image, boxes, view.K, view.camera_from_world, depth / 1000, names)
 
 
 def _write(path: Path, image: np.ndarray) -> None:
