@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import shlex
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -52,10 +53,7 @@ def serve(
         (say or _say)(f"serving {path} at http://{url_host(settings.host)}:{sock.getsockname()[1]} (Ctrl-C stops)")
         if (trouble := engine.current.problem) is not None:
             (say or _say)(f"warning: prompts cannot be answered: {trouble}")
-        for folder in folders_needed(engine.current, (path, *settings.photos))[:3]:
-            (say or _say)(
-                f"note: photos in {folder} are not shown; --photos {shlex.quote(str(folder))} would show them"
-            )
+        threading.Thread(target=_tell_photos, args=(engine, settings, say or _say), daemon=True).start()
         connections = Connections(settings.timeout, _TOTAL_TIMEOUT)
         config = uvicorn.Config(
             connections.watched(build_app(engine, settings)),
@@ -68,6 +66,12 @@ def serve(
             timeout_graceful_shutdown=max(1, round(settings.timeout)),
         )
         uvicorn.Server(config).run(sockets=[sock])
+
+
+def _tell_photos(engine: QueryEngine, settings: ServeSettings, say: Callable[[str], None]) -> None:
+    """Runs in a thread of its own: the photos' disk may not answer."""
+    for folder in folders_needed(engine.current, (engine.path, *settings.photos))[:3]:
+        say(f"note: photos in {folder} are not shown; --photos {shlex.quote(str(folder))} would show them")
 
 
 def _say(line: str) -> None:
