@@ -7,6 +7,7 @@ import json
 import os
 import shlex
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib import import_module
 
@@ -18,6 +19,7 @@ _MODULES = (
     "mapping",
     "asking",
     "labels",
+    "maps",
     "clouds",
     "scoring",
     "serving",
@@ -46,11 +48,16 @@ def _resume(argv: Sequence[str] | None) -> str:
     return shlex.join(["perception", *words, *more])
 
 
+def _warn(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code: 0, 2 for bad usage or input, 130 on Ctrl-C."""
     # Threads of torch's OpenMP that spin while they wait would take the cores from the kernels' own threads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     args = argparse.Namespace()
+    warnings.showwarning = _warn  # type: ignore[assignment]
     try:
         args = build_parser().parse_args(argv)
         result, text = args.run(args)

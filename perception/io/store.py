@@ -127,6 +127,12 @@ def _write_instances(path: Path, files: MapFiles) -> None:
             _dump(facts, seal({**files.facts, "files": {**files.facts["files"], EDITABLE: facts_of(aside)}}))
 
 
+def write_facts(file: Path, facts: dict[str, Any]) -> None:
+    """Writes map.json with its own checksum; the caller holds the right to write."""
+    with atomic_file(file) as aside:
+        _dump(aside, seal(facts) if "files" in facts else facts)
+
+
 def _with_checksums(info: dict[str, Any], folder: Path) -> dict[str, Any]:
     facts = json.loads(json.dumps(info, allow_nan=False, default=_plain))
     return seal({**facts, "files": file_facts(folder)})

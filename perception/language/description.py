@@ -86,5 +86,5 @@ def check_encoder(stored: str, used: str) -> None:
     if stored != used:
         raise InputError(
             f"the map's embeddings were made by '{stored}', the encoder in use is '{used}'; "
-            "query with the first, or map again with the second"
+            "query with the first, or run: perception upgrade MAP"
         )

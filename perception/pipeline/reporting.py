@@ -225,8 +225,8 @@ def _best_crop(opened: QueryMap, index: int, album: _Album, whole: bool) -> np.n
 
 
 def _names(opened: QueryMap) -> list[list[str]]:
-    """Likeliest names of the instances; none for a map without language."""
-    return opened.likely_names() if opened.language else [[] for _ in opened.instances]
+    """Likeliest names of the instances; none for a map without embeddings or whose encoder is unknown."""
+    return opened.likely_names() if opened.problem is None else [[] for _ in opened.instances]
 
 
 def write_sheet(opened: QueryMap, path: Path) -> None:

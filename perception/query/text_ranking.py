@@ -15,6 +15,7 @@ from perception.errors import InputError
 from perception.io.map import Map
 from perception.language.base import Encoder
 from perception.language.encoders import make_encoder
+from perception.query.where import tidy
 
 if TYPE_CHECKING:
     from perception.language.ranking import Answer, Ranker
@@ -44,13 +45,21 @@ class TextRanking:
         return None
 
     def rank(self, text: str, min_score: float | None) -> Answer:
-        """See `perception.language.ranking`; InputError when the map has no words."""
+        """See `perception.language.ranking`; by labels alone when the map has no embeddings or its encoder is unknown.
+
+        InputError when it has none, and no instance is called `text`.
+        """
         key = (" ".join(text.split()), min_score)
         with self._lock:
             if key in self._ranked:
                 self._ranked.move_to_end(key)
                 return self._ranked[key]
-        ranker = self.ranker
+        try:
+            ranker = self.ranker
+        except InputError:
+            if (answer := self._by_label(text)) is not None:
+                return answer
+            raise
         with _one_thread():
             answer = ranker.rank(text, min_score)
         with self._lock:
@@ -58,6 +67,13 @@ class TextRanking:
             if len(self._ranked) > REMEMBERED:
                 self._ranked.popitem(last=False)
         return answer
+
+    def _by_label(self, text: str) -> Answer | None:
+        """The instances that a person gave this name; None when none has it. Needs neither embeddings nor encoder."""
+        from perception.language.ranking import Answer
+
+        same = [n for n, e in enumerate(self._gmap.instances) if tidy(e.get("label") or "") == tidy(text)]
+        return Answer(text, [(n, 1.0) for n in same], True) if same else None
 
     @property
     def ranker(self) -> Ranker:

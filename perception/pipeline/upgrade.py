@@ -1,0 +1,121 @@
+"""`perception upgrade`: an older map in the newest format, its instances embedded by the encoder in use now."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.instances.describe import describe_instances
+from perception.instances.silhouettes import render_silhouettes
+from perception.io.map import Map
+from perception.io.map_lock import writing
+from perception.io.map_views import StoredView, locate_photo, stored_view
+from perception.io.store import FORMAT_VERSION, read_info, read_map, write_map
+from perception.language.base import Encoder, reading_of
+from perception.language.description import from_arrays, to_arrays
+from perception.language.encoders import make_encoder
+from perception.pipeline.photos import training_view
+from perception.pipeline.rendering import as_gaussians
+from perception.progress import Progress
+
+
+def upgrade_map(
+    path: Path,
+    output: Path | None = None,
+    *,
+    encoders: Callable[[str], Encoder | None] = make_encoder,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Writes the map at `path` in the newest format, to `output` or in its own place; Gaussians, instances, names stay.
+
+    When its embeddings are another encoder's than the one its settings name now, every instance is embedded anew, from
+    the photos that the map lists for it and its silhouettes there; InputError naming the first of them that is missing.
+    Returns {"map", "format_version": [before, after], "encoder": [before, after]}.
+    """
+    target, progress = output or path, progress or Progress(quiet=True)
+    if output is not None and output.exists():
+        raise InputError(f"{output}: exists already; choose another -o or remove it first")
+    with writing(target):
+        before = int(read_info(path)["format_version"])
+        gmap = read_map(path)
+        old = str(gmap.language["encoder"]) if gmap.language else None
+        encoder = _encoder(gmap, encoders) if gmap.language else None
+        if encoder is not None and encoder.identity != old:
+            _embed_again(gmap, encoder, progress)
+        gmap.views = [  # version 1 recorded neither sizes nor paths relative to the map
+            view
+            if isinstance(view, StoredView) and view.photo_bytes is not None
+            else stored_view(view, target, view.held_out)
+            for view in gmap.views
+        ]
+        write_map(target, gmap, keep_report=True)
+    new = str(gmap.language["encoder"]) if gmap.language else None
+    return {"map": str(target), "format_version": [before, FORMAT_VERSION], "encoder": [old, new]}
+
+
+def _encoder(gmap: Map, encoders: Callable[[str], Encoder | None]) -> Encoder | None:
+    spec = gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
+    return encoders("conse" if spec == "auto" else spec)
+
+
+def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:
+    """Replaces `language` and, where there are some, the `language_` arrays of the parts."""
+    zooms = int(gmap.info.get("config", {}).get("language", {}).get("zooms") or reading_of(encoder).zooms)
+    ids = [entry["id"] for entry in gmap.instances]
+    gmap.language = _described(gmap, encoder, gmap.language, gmap.instance_ids, ids, zooms, progress)
+    prefix = "language_"
+    stored = {name[len(prefix) :]: array for name, array in gmap.parts.items() if name.startswith(prefix)}
+    if stored:
+        owners = gmap.parts["ids"]
+        known = sorted({int(i) for i in np.unique(owners) if i >= 0})
+        anew = _described(gmap, encoder, stored, owners, known, 1, progress)
+        gmap.parts = {"ids": owners, **{prefix + name: array for name, array in anew.items()}}
+
+
+def _described(
+    gmap: Map,
+    encoder: Encoder,
+    stored: dict[str, np.ndarray],
+    owners: np.ndarray,
+    ids: list[int],
+    zooms: int,
+    progress: Progress,
+) -> dict[str, np.ndarray]:
+    """Language arrays of the instances `ids`, each from the views that `stored` lists for it.
+
+    owners: [N] the instance of each Gaussian, −1 = none.
+    """
+    descriptions, _ = from_arrays(stored)
+    number = {view.name: n for n, view in enumerate(gmap.views)}
+    unknown = [name for d in descriptions for name in d.views if name not in number]
+    if unknown:
+        raise InputError(
+            f"{gmap.path}: lists the photo {unknown[0]!a}, which is none of its views; build the map again"
+        )
+    wanted = sorted({number[name] for d in descriptions for name in d.views})
+    # All photos are looked for before the work.
+    located = {n: replace(gmap.views[n], photo=locate_photo(gmap.views[n], gmap.path)) for n in wanted}
+    gaussians, side = as_gaussians(gmap), int(gmap.info["config"]["photos"]["max_side"])
+    rank = {instance: n for n, instance in enumerate(ids)}
+    positions = np.array([rank.get(int(i), -1) for i in owners], np.int32)
+
+    def load(n: int) -> tuple[np.ndarray, np.ndarray]:
+        view = training_view(located[n], side)
+        height, width = view.photo.shape[:2]
+        seen = render_silhouettes(gaussians, positions, view.camera_from_world, view.K, width, height)
+        return view.photo.numpy(), seen.ids
+
+    again = describe_instances(
+        encoder,
+        [np.array([number[name] for name in d.views], np.int64) for d in descriptions],
+        load,
+        [view.name for view in gmap.views],
+        levels=zooms,
+        progress=lambda done, of: progress.update("language", done, of),
+    )
+    return to_arrays(again, encoder.identity)
