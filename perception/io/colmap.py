@@ -11,11 +11,11 @@ from perception.errors import InputError
 from perception.io.colmap_check import check_binary_model
 from perception.io.features import Progress
 from perception.io.lens import lens_from_camera, load_pycolmap
-from perception.io.photos import photo_damage
+from perception.io.photos import why_left_out
 from perception.io.safe_names import safe_name
-from perception.io.triangulate import MIN_POINTS, cloud_of, triangulated_cloud
+from perception.io.triangulate import MIN_POINTS, cloud_of, posed_scene
 from perception.io.views import fit_lens, make_view
-from perception.types import Lens, Scene, View
+from perception.types import Scene, View
 
 
 def is_workspace(folder: Path) -> bool:
@@ -36,27 +36,15 @@ def read_workspace(folder: Path, workdir: Path, seed: int, progress: Progress, s
     views, missing, notes = views_of_model(model, _located(model, folder / "images", path), path, strict)
     if not views:
         raise InputError(f"{folder / 'images'}: none of the {model.num_reg_images()} photos of {path} is there")
-    report: dict[str, Any] = {
-        "input": "colmap",
-        "model": path.relative_to(folder).as_posix(),
-        "registered": len(views),
-        "left_out": missing,
-        "cameras": sorted({_camera_text(lens_from_camera(c)) for c in model.cameras.values()}),
-        "mean_reprojection_error_px": _reprojection_error(model),
-        "warnings": notes,
-        "seconds": {},
-    }
     if len(found) > 1:
         sizes = ", ".join(f"{p.name}: {m.num_reg_images()}" for p, m in found.items())
         notes.append(f"{folder}: {len(found)} sparse models (photos in {sizes}); the largest is used")
-    points, colors = cloud_of(model)
-    if len(points) < MIN_POINTS:
-        notes.append(f"{path}: the sparse model holds {len(points)} points; new ones are triangulated")
-        points, colors, facts = triangulated_cloud(views, workdir, seed, progress)
-        notes += facts.pop("warnings")
-        report.update(facts)
-    report["points"] = len(points)
-    return Scene(views, points, colors, report=report)
+    cloud = cloud_of(model)
+    if len(cloud[0]) < MIN_POINTS:
+        notes.append(f"{path}: the sparse model holds {len(cloud[0])} points; new ones are triangulated")
+    facts: dict[str, Any] = {"input": "colmap", "left_out": missing, "warnings": notes}
+    facts |= {"model": path.relative_to(folder).as_posix(), "mean_reprojection_error_px": _reprojection_error(model)}
+    return posed_scene(views, cloud, facts, workdir, seed, progress, least=MIN_POINTS)
 
 
 def _located(model: Any, images: Path, source: Path) -> dict[int, tuple[str, Path]]:
@@ -75,14 +63,9 @@ def views_of_model(
     lenses = {camera_id: lens_from_camera(camera) for camera_id, camera in model.cameras.items()}
     for image_id, (name, photo) in located.items():
         image = model.images[image_id]
-        if not photo.is_file():
-            missing.append({"name": name, "why": "in the sparse model, but the photo is missing"})
-            continue
-        damage = photo_damage(photo)
-        if damage is not None:
-            if strict:
-                raise damage
-            missing.append({"name": name, "why": str(damage)})
+        why = "in the sparse model, but the photo is missing" if not photo.is_file() else why_left_out(photo, strict)
+        if why is not None:
+            missing.append({"name": name, "why": why})
             continue
         lens, note = fit_lens(lenses[image.camera_id], photo, source)
         pose = np.eye(4)
@@ -92,10 +75,6 @@ def views_of_model(
             notes.add(note)
     views.sort(key=lambda view: view.name)
     return views, sorted(missing, key=lambda item: item["name"]), sorted(notes)
-
-
-def _camera_text(lens: Lens) -> str:
-    return f"{lens.model} {lens.width}×{lens.height} " + " ".join(f"{value:.6g}" for value in lens.params)
 
 
 def _reprojection_error(model: Any) -> float | None:

@@ -35,6 +35,11 @@ def lens_from_camera(camera: Any) -> Lens:
     return Lens(camera.model_name, tuple(float(x) for x in camera.params), int(camera.width), int(camera.height))
 
 
+def lens_text(lens: Lens) -> str:
+    """Model, size and parameters on one line, for reports."""
+    return f"{lens.model} {lens.width}×{lens.height} " + " ".join(f"{value:.6g}" for value in lens.params)
+
+
 def camera_from_lens(lens: Lens, camera_id: int = 1) -> Any:
     """The pycolmap camera of a lens."""
     pycolmap = load_pycolmap()

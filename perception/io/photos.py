@@ -100,6 +100,14 @@ def photo_damage(path: Path) -> InputError | None:
     return None
 
 
+def why_left_out(path: Path, strict: bool) -> str | None:
+    """None for a good photo, else what is wrong with it; strict raises that as InputError."""
+    damage = photo_damage(path)
+    if damage is not None and strict:
+        raise damage
+    return None if damage is None else str(damage)
+
+
 def read_photo(path: Path) -> np.ndarray:
     """The photo as uint8 [h, w, 3] RGB, rotated as EXIF says; (w, h) = photo_size(path).
 

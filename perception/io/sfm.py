@@ -16,7 +16,7 @@ from perception.io.atomic import atomic_directory, recover
 from perception.io.colmap import views_of_model
 from perception.io.features import FeatureStore, Progress, build_features
 from perception.io.incremental_sfm import map_photos
-from perception.io.lens import lens_from_camera, load_pycolmap
+from perception.io.lens import lens_from_camera, lens_text, load_pycolmap
 from perception.io.photo_folder import PhotoSet, choose_photos
 from perception.io.photos import photo_size
 from perception.io.sfm_checks import model_warnings
@@ -100,7 +100,6 @@ def _report(
     for name, photo in zip(store.names, shown, strict=True):
         if name not in inside[0]:
             left_out.append({"name": photo, "why": _reason(name, contradicted, inside[1:], matches)})
-    cameras = [lens_from_camera(best.cameras[key]) for key in sorted(best.cameras)]
     return {
         "input": "photos",
         "photos": len(shown),
@@ -110,7 +109,7 @@ def _report(
         "points": best.num_points3D(),
         "mean_reprojection_error_px": float(best.compute_mean_reprojection_error()),
         "mean_track_length": float(best.compute_mean_track_length()),
-        "cameras": [f"{c.model} {c.width}×{c.height} " + " ".join(f"{p:.6g}" for p in c.params) for c in cameras],
+        "cameras": [lens_text(lens_from_camera(best.cameras[key])) for key in sorted(best.cameras)],
         "pairs_matched": store.facts["pairs_matched"],
         "pairs_possible": store.facts["pairs_possible"],
         "seconds": seconds,

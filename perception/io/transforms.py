@@ -14,9 +14,9 @@ from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.documents import brief, read_json
 from perception.io.features import Progress
-from perception.io.photos import SUFFIXES, photo_damage, photo_size
+from perception.io.photos import SUFFIXES, photo_size, why_left_out
 from perception.io.safe_names import safe_name
-from perception.io.triangulate import triangulated_cloud
+from perception.io.triangulate import posed_scene
 from perception.io.views import fit_lens, make_view, rigid_pose
 from perception.types import Lens, Scene, View
 
@@ -50,24 +50,16 @@ def read_transforms(file: Path, workdir: Path, seed: int, progress: Progress, st
         raise InputError(f"{file}: none of the {len(frames)} photos it lists can be read (first: {first})")
     root = _common_root(list(photos.values()))
     views, notes = _views(file, data, frames, photos, root)
-    report: dict[str, Any] = {
+    cloud = _listed_cloud(file, data)
+    facts: dict[str, Any] = {
         "input": "transforms",
-        "registered": len(views),
         "left_out": missing,
         "warnings": notes,
-        "cameras": sorted({_summary(view) for view in views}),
         "mean_reprojection_error_px": None,
-        "seconds": {},
     }
-    points, colors = _listed_cloud(file, data)
-    if len(points):
-        report["points_from"] = str(data["ply_file_path"])
-    else:
-        points, colors, facts = triangulated_cloud(views, workdir, seed, progress)
-        notes += facts.pop("warnings")
-        report.update(facts)
-    report["points"] = len(points)
-    return Scene(views, points, colors, report=report)
+    if len(cloud[0]):
+        facts["points_from"] = str(data["ply_file_path"])
+    return posed_scene(views, cloud, facts, workdir, seed, progress, least=1)
 
 
 def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:
@@ -117,14 +109,11 @@ def _photos(file: Path, frames: list[dict[str, Any]], strict: bool) -> tuple[dic
     photos, missing = {}, []
     for index, frame in enumerate(frames):
         photo = _find(file.parent, str(frame["file_path"]))
-        if photo is None:
-            missing.append({"name": str(frame["file_path"]), "why": "listed, but the photo is missing"})
-        elif (damage := photo_damage(photo)) is None:
+        why = "listed, but the photo is missing" if photo is None else why_left_out(photo, strict)
+        if photo is not None and why is None:
             photos[index] = photo
-        elif strict:
-            raise damage
         else:
-            missing.append({"name": str(frame["file_path"]), "why": str(damage)})
+            missing.append({"name": str(frame["file_path"]), "why": str(why)})
     return photos, missing
 
 
@@ -215,12 +204,6 @@ def _number(values: dict[str, Any], key: str, what: str) -> float | None:
             if math.isfinite(number := float(value)):
                 return number
     raise InputError(f"{what}: {key} must be a finite number, found {brief(value)}")
-
-
-def _summary(view: View) -> str:
-    if view.lens is None:
-        return f"PINHOLE {view.width}×{view.height}"
-    return f"{view.lens.model} {view.lens.width}×{view.lens.height}"
 
 
 def _listed_cloud(file: Path, data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:

@@ -11,8 +11,8 @@ import numpy as np
 
 from perception.geometry import inverse_se3
 from perception.io.features import Progress, build_features
-from perception.io.lens import camera_from_lens, load_pycolmap
-from perception.types import Lens, View
+from perception.io.lens import camera_from_lens, lens_text, load_pycolmap
+from perception.types import Lens, Scene, View
 
 MIN_POINTS = 50
 FALLBACK_POINTS = 5000
@@ -24,6 +24,29 @@ def view_lens(view: View) -> Lens:
         return view.lens
     K = view.K
     return Lens("PINHOLE", tuple(map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))), view.width, view.height)
+
+
+def posed_scene(
+    views: list[View],
+    cloud: tuple[np.ndarray, np.ndarray],
+    facts: dict[str, Any],
+    workdir: Path,
+    seed: int,
+    progress: Progress,
+    least: int,
+) -> Scene:
+    """The Scene of views whose poses are given. cloud: points [P, 3] and colors [P, 3] that the input brings.
+
+    With fewer than `least` points, triangulated ones take their place. facts: of the report, "warnings" among them.
+    """
+    cameras = sorted({lens_text(view_lens(view)) for view in views})
+    report = {**facts, "registered": len(views), "cameras": cameras, "seconds": {}}
+    points, colors = cloud
+    if len(points) < least:
+        points, colors, found = triangulated_cloud(views, workdir, seed, progress)
+        report |= {**found, "warnings": [*facts["warnings"], *found["warnings"]]}
+    report["points"] = len(points)
+    return Scene(views, points, colors, report=report)
 
 
 def triangulated_cloud(

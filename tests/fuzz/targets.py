@@ -229,12 +229,12 @@ def _colmap_binary() -> dict[str, bytes]:
 
 def _without_photos() -> None:
     """Points that a file lacks are found in its photos, which is no reading: random ones take their place here."""
-    from perception.io import colmap, transforms, triangulate
+    from perception.io import triangulate
 
     def random(views: list[Any], work: Path, seed: int, progress: Any) -> tuple[Any, Any, dict[str, Any]]:
         return (*triangulate.random_cloud(views, seed), {"warnings": []})
 
-    colmap.triangulated_cloud = transforms.triangulated_cloud = random  # type: ignore[assignment]
+    triangulate.triangulated_cloud = random  # type: ignore[assignment]
 
 
 def _png(width: int = 8, height: int = 6, mode: str = "RGB") -> bytes:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fuzz.core import SHELL, CoreTarget, guarded, intact
 from fuzz.run import LONGEST, load, names
-from perception.io import colmap, transforms
+from perception.io import triangulate
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 target_of = cache(load)
@@ -22,11 +22,9 @@ target_of = cache(load)
 @pytest.fixture(scope="module", autouse=True)
 def as_it_was() -> Iterator[None]:
     """The targets put random points in place of triangulation; the tests of other files want it back."""
-    modules = colmap, transforms
-    before = [module.triangulated_cloud for module in modules]
+    before = triangulate.triangulated_cloud
     yield
-    for module, function in zip(modules, before, strict=True):
-        module.triangulated_cloud = function
+    triangulate.triangulated_cloud = before
 
 
 def edits(size: int, words: list[str]) -> st.SearchStrategy[list[tuple[int, int, bytes]]]:
