@@ -1,10 +1,27 @@
 """Segments into instances by what the masks of all photos agree on: a merge tree, its best cut, and parts below it.
 
-Two segments belong together as far as photos that show both put them into one mask. Merging the pair that agrees most,
-again and again, gives a tree (average linkage, with the evidence pooled anew at each merge). The tree is cut where
-its nodes' silhouettes match the masks best: a whole that photos show as one mask beats its parts, parts that photos
-mostly keep apart beat a whole that few masks hold. What is below the cut and singled out by masks of its own is kept
-as parts. So an error of the segmenter in some photos is outvoted by the others.
+i, j: segments or groups of them; v: a view; m ∈ v: its masks; P_im: pixels of mask m that i fills; B_iv: pixels of v
+without a mask that i fills; A_m: pixels of mask m; z_i: mean feature (a distance of 1 is the loss's margin).
+
+Affinity of two segments: the mean over views that show both of the cosine between what is labelled of them, with the
+features as a weak prior between neighbours in space:
+    T_iv = Σ_{m∈v} P_im + B_iv                      pixels that v shows of i
+    s_iv = T_iv / max_v T_iv                        the same, as a share of its best view
+    l_iv = 1 − B_iv / T_iv                          share of it that is labelled
+    c_ijv = Σ_{m∈v} P_im P_jm / (|P_i|_v |P_j|_v)   1: one mask holds both, 0: no mask does; |·|_v: norm over m ∈ v
+    w_ijv = min(s_iv, s_jv), but 0 up to LEAST_SHARE
+    both = l_iv l_jv,   one = l_iv + l_jv − 2 both  a view that labels one of the two speaks against the pair
+    p_ij = near_ij · max(0, 1 − |z_i − z_j|²)
+    a_ij = (Σ_v w both c + PRIOR p_ij) / (Σ_v w (both + ONE_SIDED one) + PRIOR)
+
+The pair of largest a_ij is merged, again and again; P, B and z of the merged segment are pooled (average linkage).
+How well a group g matches the masks, and the cut of the tree that matches best:
+    IoU_gm = P_gm / (T_gv + A_m − P_gm)
+    matched_g = Σ_m P_gm IoU_gm
+    best_g = max(matched_g, Σ_{children h of g} best_h)
+A whole that photos show as one mask beats its parts, parts that photos mostly keep apart beat a whole that few masks
+hold, and errors of the segmenter in some photos are outvoted by the others. Nodes below the cut that masks of their own
+single out are kept as parts.
 """
 
 from __future__ import annotations
@@ -15,10 +32,14 @@ import numpy as np
 
 from perception.instances.votes import Table
 
-GLIMPSE = 0.1  # of its best view: what shows less of a segment is no evidence about it
-ONE_SIDED = 0.5  # of a common view's weight, where it labels one of the two only
-PRIOR = 0.5  # views that the features' own evidence weighs as much as
-SUPPORT = 0.6  # IoU with a mask from which on a photo singles a node out
+LEAST_SHARE = 0.1  # of its best view: a view that shows less of a segment is no evidence about it
+ONE_SIDED = 0.5  # weight of a view that labels one of the two only, of that of a view that labels both
+PRIOR = 0.5  # views that the features count as much as
+LOWEST = 0.05  # affinity of the last pair that is merged
+SUPPORT = 0.6  # IoU with a mask from which on a photo singles a group out
+LEAST_PIXELS = 8.0  # under masks, for a view to show a group
+LARGEST_PART = 0.8  # of the whole's pixels: a part is not the whole once more
+PART_VIEWS = 2  # photos that must single a part out
 
 
 @dataclass(frozen=True)
@@ -34,112 +55,107 @@ class MergeTree:
         below = set(self.children.ravel().tolist())
         return [node for node in range(self.leaves + len(self.children)) if node not in below]
 
-    def kids(self, node: int) -> list[int]:
+    def children_of(self, node: int) -> list[int]:
         return [] if node < self.leaves else self.children[node - self.leaves].tolist()
 
-    def under(self, node: int) -> list[int]:
-        """The leaves of a node."""
+    def leaves_of(self, node: int) -> list[int]:
         stack, found = [node], []
         while stack:
             at = stack.pop()
-            stack += self.kids(at)
+            stack += self.children_of(at)
             found += [at] if at < self.leaves else []
         return sorted(found)
 
 
-class _Merger:
-    """The state of the agglomeration. Tables lie mask-major, so that the few masks a segment is in are whole rows."""
+class _Affinities:
+    """a_ij of all pairs of S segments, kept up to date while they merge.
 
-    def __init__(self, table: Table, prototypes: np.ndarray, sizes: np.ndarray, near: np.ndarray):
+    P [M, S], B and s and l [V, S], z [S, D] are stored mask-major, so that the few masks of a segment are whole rows;
+    unit: P_im / |P_i|_v. Merged segments have a_ij = −1.
+    """
+
+    def __init__(self, table: Table, z: np.ndarray, sizes: np.ndarray, near: np.ndarray):
         count, self.views = table.void.shape
         self.view = table.view
-        self.table = np.ascontiguousarray(table.pixels.T, np.float32)
-        self.void = np.ascontiguousarray(table.void.T, np.float32)
-        self.blank = np.zeros_like(self.void)
-        self.share = np.zeros_like(self.table)
-        self.seen = np.zeros((self.views, count), np.float32)
-        self.prototypes, self.sizes = prototypes.astype(np.float64), sizes.astype(np.float64)
-        self.near = near.copy()
+        self.P = np.ascontiguousarray(table.pixels.T, np.float32)
+        self.B = np.ascontiguousarray(table.void.T, np.float32)
+        self.unlabelled = np.zeros_like(self.B)
+        self.unit = np.zeros_like(self.P)
+        self.s = np.zeros((self.views, count), np.float32)
+        self.z, self.sizes, self.near = z.astype(np.float64), sizes.astype(np.float64), near.copy()
         self.alive = np.ones(count, bool)
-        for segment in range(count):
-            self._normalise(segment)
-        self.affinity = np.stack([self._row(segment) for segment in range(count)]) if count else np.zeros((0, 0))
+        for i in range(count):
+            self._update(i)
+        self.a = np.stack([self._row(i) for i in range(count)]) if count else np.zeros((0, 0))
 
-    def _normalise(self, i: int) -> None:
-        """The segment's unit direction over the masks of each view, how much of it each view shows, and the share of
-        that which no mask covers."""
-        column, void = self.table[:, i], self.void[:, i]
-        total = np.bincount(self.view, column, self.views) + void
-        length = np.sqrt(np.bincount(self.view, column**2, self.views))
-        self.share[:, i] = column / np.maximum(length[self.view], 1e-12)
-        self.seen[:, i] = total / max(float(total.max(initial=0)), 1e-12)
-        self.blank[:, i] = void / np.maximum(total, 1e-12)
+    def _update(self, i: int) -> None:
+        """unit, s and 1 − l of segment i from its P and B."""
+        P, B = self.P[:, i], self.B[:, i]
+        T = np.bincount(self.view, P, self.views) + B
+        norm = np.sqrt(np.bincount(self.view, P**2, self.views))
+        self.unit[:, i] = P / np.maximum(norm[self.view], 1e-12)
+        self.s[:, i] = T / max(float(T.max(initial=0)), 1e-12)
+        self.unlabelled[:, i] = B / np.maximum(T, 1e-12)
 
     def _row(self, i: int) -> np.ndarray:
-        """Affinity [S] of segment i to all: mean over common views, weighted by how much they show, of the cosine
-        between what is labelled of both. A view that labels one and not the other speaks against them, half as loud."""
-        masks = np.flatnonzero(self.share[:, i] > 0)
-        same = np.zeros_like(self.seen)
+        """a_ij [S] of segment i with every j."""
+        masks = np.flatnonzero(self.unit[:, i] > 0)
+        c = np.zeros_like(self.s)
         if len(masks):
             views, first = np.unique(self.view[masks], return_index=True)
-            same[views] = np.add.reduceat(self.share[masks] * self.share[masks, i][:, None], first, axis=0)
-        common = np.minimum(self.seen, self.seen[:, i][:, None])
-        common = np.where(common > GLIMPSE, common, 0)
-        mine, theirs = 1 - self.blank[:, i][:, None], 1 - self.blank
-        both, one = mine * theirs, mine + theirs - 2 * mine * theirs
-        agreed = (common * both * same).sum(axis=0)
-        weight = (common * (both + ONE_SIDED * one)).sum(axis=0)
-        distance = ((self.prototypes - self.prototypes[i]) ** 2).sum(axis=1)
-        prior = np.clip(1 - distance, 0, 1) * self.near[i]
-        row = (agreed + PRIOR * prior) / (weight + PRIOR)
-        row[~self.alive] = -1
-        row[i] = -1
-        return row
+            c[views] = np.add.reduceat(self.unit[masks] * self.unit[masks, i][:, None], first, axis=0)
+        w = np.minimum(self.s, self.s[:, i][:, None])
+        w = np.where(w > LEAST_SHARE, w, 0)
+        l_i, l_j = 1 - self.unlabelled[:, i][:, None], 1 - self.unlabelled
+        both, one = l_i * l_j, l_i + l_j - 2 * l_i * l_j
+        p = np.clip(1 - ((self.z - self.z[i]) ** 2).sum(axis=1), 0, 1) * self.near[i]
+        agreement, weight = (w * both * c).sum(axis=0), (w * (both + ONE_SIDED * one)).sum(axis=0)
+        a = (agreement + PRIOR * p) / (weight + PRIOR)
+        a[~self.alive] = -1
+        a[i] = -1
+        return a
 
-    def join(self, i: int, j: int) -> None:
-        """Segment j goes into i."""
-        whole = self.sizes[i] + self.sizes[j]
-        self.prototypes[i] = (self.prototypes[i] * self.sizes[i] + self.prototypes[j] * self.sizes[j]) / whole
-        self.sizes[i] = whole
-        self.table[:, i] += self.table[:, j]
-        self.void[:, i] += self.void[:, j]
+    def merge(self, i: int, j: int) -> None:
+        """Segment j becomes part of i."""
+        size = self.sizes[i] + self.sizes[j]
+        self.z[i] = (self.z[i] * self.sizes[i] + self.z[j] * self.sizes[j]) / size
+        self.sizes[i] = size
+        self.P[:, i] += self.P[:, j]
+        self.B[:, i] += self.B[:, j]
         self.near[i] |= self.near[j]
         self.near[:, i] |= self.near[:, j]
-        self.share[:, j] = self.seen[:, j] = 0
+        self.unit[:, j] = self.s[:, j] = 0
         self.alive[j] = False
-        self._normalise(i)
-        self.affinity[j] = self.affinity[:, j] = -1
-        self.affinity[i] = self.affinity[:, i] = self._row(i)
+        self._update(i)
+        self.a[j] = self.a[:, j] = -1
+        self.a[i] = self.a[:, i] = self._row(i)
 
 
-def merge_tree(
-    table: Table, prototypes: np.ndarray, sizes: np.ndarray, near: np.ndarray, lowest: float = 0.05
-) -> MergeTree:
-    """Merges the most agreeing pair until none agrees by `lowest`.
+def merge_tree(table: Table, prototypes: np.ndarray, sizes: np.ndarray, near: np.ndarray) -> MergeTree:
+    """Merges the pair of largest affinity until none reaches LOWEST.
 
-    table: of the S segments. prototypes [S, D] mean features (a distance of 1 is the loss's margin), sizes [S]
-    Gaussians, near [S, S] bool. Features decide only where photos do not: for neighbours, with half a view's weight.
+    table: of the S segments; prototypes [S, D]: z; sizes [S]: Gaussians; near [S, S] bool: neighbours in space.
     """
-    state = _Merger(table, prototypes, sizes, near)
+    state = _Affinities(table, prototypes, sizes, near)
     count = len(sizes)
     node = np.arange(count)
-    best = state.affinity.max(axis=1, initial=-1)
+    best = state.a.max(axis=1, initial=-1)
     children, affinity = [], []
-    while len(best) and (top := int(best.argmax())) >= 0 and best[top] >= lowest:
-        other = int(state.affinity[top].argmax())
+    while len(best) and (top := int(best.argmax())) >= 0 and best[top] >= LOWEST:
+        other = int(state.a[top].argmax())
         i, j = min(top, other), max(top, other)
         affinity.append(float(best[top]))
         children.append((node[i], node[j]))
-        state.join(i, j)
+        state.merge(i, j)
         node[i] = count + len(children) - 1
-        best = state.affinity.max(axis=1)
+        best = state.a.max(axis=1)
     return MergeTree(count, np.array(children, np.int64).reshape(-1, 2), np.array(affinity))
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Of each group: pixels under masks; matched: the sum over them of the IoU between the group and the pixel's mask;
-    views that show it; fit [·, V]: IoU with the best mask of each view, 0 where the view shows too little of it."""
+    """Of G groups. pixels [G]: Σ_m P_gm; matched [G]: see the module; views [G] int: that show it; fit [G, V]: the
+    largest IoU_gm of each view, 0 where the view shows too little of the group."""
 
     pixels: np.ndarray
     matched: np.ndarray
@@ -148,42 +164,36 @@ class Evidence:
 
     @property
     def support(self) -> np.ndarray:
-        """[·] views in which one mask singles it out."""
+        """[G] views in which one mask singles the group out."""
         return np.asarray((self.fit >= SUPPORT).sum(axis=1))
 
     @property
     def agreement(self) -> np.ndarray:
-        """[·] in [0, 1]: mean over its pixels of the IoU with the pixel's mask; 0 where no mask covers it."""
+        """[G] in [0, 1]: mean over the group's pixels of the IoU with the pixel's mask; 0 where no mask covers it."""
         return self.matched / np.maximum(self.pixels, 1e-12)
 
 
-def evidence(table: Table, smallest: float = 8.0) -> Evidence:
-    """Of each row of a table; a view shows what fills at least `smallest` pixels of its masks.
+def evidence(table: Table) -> Evidence:
+    """Of the groups of a table; a view shows what fills at least LEAST_PIXELS of its masks.
 
-    A pixel scores the IoU of its own mask, not of the best one: a small thing on a large one is not carried along by
-    the match of the large one, and views outvote each other pixel by pixel. What no mask covers is part of a group's
-    extent, so a mask that ends at a thing's border speaks for that border even where the thing itself is unlabelled.
+    Each pixel scores the IoU of its own mask, not of the best one, so a small thing on a large one does not profit from
+    the match of the large one. T_gv holds pixels without a mask too: a mask that ends at a thing's border is evidence
+    for that border even where the thing itself is unlabelled.
     """
     if table.pixels.shape[1] == 0:
         none = np.zeros(len(table.pixels))
         return Evidence(none, none, none.astype(np.int64), none.reshape(-1, 1)[:, :0])
     starts = np.flatnonzero(np.diff(table.view, prepend=-1) > 0)
-    rows = table.pixels.astype(np.float64)
-    each = table.by_view.astype(np.float64)
-    extent = (each + table.void)[:, table.view]
-    iou = rows / np.maximum(extent + table.area - rows, 1e-12)
-    shown = each >= smallest
-    best = np.maximum.reduceat(iou, starts, axis=1)
-    return Evidence(
-        each.sum(axis=1),
-        (rows * iou).sum(axis=1),
-        shown.sum(axis=1),
-        np.where(shown, best, 0),
-    )
+    P, labelled = table.pixels.astype(np.float64), table.by_view.astype(np.float64)
+    T = (labelled + table.void)[:, table.view]
+    iou = P / np.maximum(T + table.area - P, 1e-12)
+    shown = labelled >= LEAST_PIXELS
+    fit = np.where(shown, np.maximum.reduceat(iou, starts, axis=1), 0)
+    return Evidence(labelled.sum(axis=1), (P * iou).sum(axis=1), shown.sum(axis=1), fit)
 
 
 def node_evidence(tree: MergeTree, table: Table) -> Evidence:
-    """Evidence of all nodes of a tree over the leaves' table."""
+    """Evidence of all nodes of a tree, from the table of its leaves."""
     whole = [evidence(table)]
     rows = {leaf: table.row(leaf) for leaf in range(tree.leaves)}
     for number, (a, b) in enumerate(tree.children.tolist()):
@@ -202,26 +212,25 @@ def best_cut(tree: MergeTree, matched: np.ndarray) -> list[int]:
     chosen, stack = [], tree.roots
     while stack:
         node = stack.pop()
-        kids = tree.kids(node)
-        if not kids or matched[node] >= best[kids].sum() * (1 - 1e-9):
+        children = tree.children_of(node)
+        if not children or matched[node] >= best[children].sum() * (1 - 1e-9):
             chosen.append(node)
         else:
-            stack += kids
+            stack += children
     return sorted(chosen)
 
 
-def parts_of(tree: MergeTree, node: int, found: Evidence, largest: float = 0.8, least_views: int = 2) -> list[int]:
-    """Parts of an instance: the highest nodes below it that masks single out in `least_views` photos or more, and fit
-    better there than any fits the whole.
+def parts_of(tree: MergeTree, node: int, found: Evidence) -> list[int]:
+    """The highest nodes below an instance that masks single out in PART_VIEWS photos or more, better than the whole.
 
-    A part fills at most `largest` of the whole's pixels: it is not the whole once more.
+    A part fills at most LARGEST_PART of the pixels of the whole.
     """
-    parts, stack = [], tree.kids(node)
+    parts, stack = [], tree.children_of(node)
     while stack:
         at = stack.pop()
         single = (found.fit[at] >= SUPPORT) & (found.fit[at] > found.fit[node])
-        if single.sum() >= least_views and found.pixels[at] <= largest * found.pixels[node]:
+        if single.sum() >= PART_VIEWS and found.pixels[at] <= LARGEST_PART * found.pixels[node]:
             parts.append(at)
         else:
-            stack += tree.kids(at)
+            stack += tree.children_of(at)
     return sorted(parts)

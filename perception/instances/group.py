@@ -112,9 +112,9 @@ def _cut(tree: MergeTree, found: Evidence) -> tuple[np.ndarray, np.ndarray, np.n
     instance, part = np.full(tree.leaves, -1, np.int32), np.full(tree.leaves, -1, np.int64)
     parents: list[int] = []
     for number, node in enumerate(best_cut(tree, found.matched)):
-        instance[tree.under(node)] = number
+        instance[tree.leaves_of(node)] = number
         for piece in parts_of(tree, node, found):
-            part[tree.under(piece)] = len(parents)
+            part[tree.leaves_of(piece)] = len(parents)
             parents.append(number)
     return instance, part, np.array(parents, np.int64)
 

@@ -1,31 +1,52 @@
 """What the shape of an instance says of its kind: floor, wall, table, picture on a wall, rug, ball, box.
 
-No classifier of single objects knows walls and floors, but a map knows geometry: which way is up (photographers
-hold cameras level), which planes are level or upright, what lies lowest, what hangs flat on a wall. All lengths are
-shares of the scene's own size, so maps without a metric scale are served as well.
+A classifier of single pictures knows no walls and floors, but a map has geometry: which way is up, which planes are
+level or upright, what lies lowest, what is flat on a wall. All lengths are compared with the scene's own, so no metric
+scale is needed. With ramp(x; p, q) rising linearly from 0 at p to 1 at q, [·] one or zero, and of each instance
+
+    n, z, a, t: normal, height of the middle, area and thickness of its best plane; h: its height from low to high
+    top, s, rests: height and share of points of its fullest level slab, and the number of smaller things on it
+    gap: distance to the nearest parallel wall
+
+and of the scene
+
+    span: height of all instances together; e: median height of the cameras
+    a_max, a_up, a_typ: largest area, largest upright one, typical one
+    ground: height of the lowest large level plane, if nothing lies much lower
+
+the scores are
+
+    flat = ramp(t; .35, .2)   level = flat ramp(|n_z|; .85, .95)   upright = flat ramp(|n_z|; .3, .15)
+    wall = upright ramp(a / a_up; .15, .35) ramp(h; .2 span, .4 span)
+    picture = upright (1 − wall) ramp(gap / span; .1, .05)
+    floor = level [the largest of those at the ground]
+    rug = level [on the ground, not the floor] ramp(a; a_typ, 2 a_typ)
+    ceiling = level ramp(z; e, e + .1 span) ramp(a; .1 a_max, .3 a_max)
+    table = [upright < ½] ramp(s; .25, .45) ramp(a; a_typ, 3 a_typ) (½ + ½ ramp(rests; 0, 2))
+            · ramp(top; e + .05 span, e − .05 span) · ramp(top; ground + .05 span, ground + .12 span)
+    ball: see `roundness`   box: see `boxiness`
+
+The floor may also be a table top, seen from close by: it scores half as a table, wherever its top is.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from perception.geometry import camera_centres
 from perception.language.shape_words import KINDS
 
-LEVEL = 0.12  # most mean square roll of the cameras at which "level" is believed
+LEVEL = 0.12  # largest mean square of the cameras' roll (its sine) at which they count as held level
 SAMPLES = 1000  # points of an instance that are looked at
+LEAST = 20  # points; fewer have no shape
 
 
 @dataclass(frozen=True)
 class Body:
-    """An instance's points less outliers, measured. Heights along up; sizes in map units.
-
-    normal [3] unit: of the best plane; thickness: spread along it over the spread within it. low, high: heights;
-    area: of the best plane's bounding rectangle. center [3]. top_share: share of points in the level slab that holds
-    most; top: its height; footprint: low and high corner [2, 2] of its bounding rectangle in the level plane.
-    """
+    """An instance's points [P, 3] without outliers, measured in a frame with z up; names as in the module."""
 
     points: np.ndarray
     center: np.ndarray
@@ -36,7 +57,7 @@ class Body:
     high: float
     top: float
     top_share: float
-    footprint: np.ndarray
+    footprint: np.ndarray  # low and high corner [2, 2] of the slab's bounding rectangle
 
 
 def up_from_cameras(camera_from_world: np.ndarray) -> np.ndarray | None:
@@ -49,7 +70,7 @@ def up_from_cameras(camera_from_world: np.ndarray) -> np.ndarray | None:
     right, down = camera_from_world[:, 0, :3], camera_from_world[:, 1, :3]
     values, vectors = np.linalg.eigh(right.T @ right / len(right))
     up = vectors[:, 0]
-    if values[1] < 2 * values[0] + 1e-3:  # a walk without turns: only the cameras' own upright axes are left
+    if values[1] < 2 * values[0] + 1e-3:  # a walk without turns: right-hand axes are all alike
         up = -down.mean(axis=0)
         up /= max(float(np.linalg.norm(up)), 1e-9)
     if float(((right @ up) ** 2).mean()) > LEVEL or abs(float((down @ up).mean())) < 0.3:
@@ -62,23 +83,22 @@ def shape_scores(
 ) -> np.ndarray:
     """How much each instance of `wanted` looks like each of shape_words.KINDS: [I, K] in [0, 1].
 
-    means [N, 3], instance_ids [N]; camera_from_world [C, 4, 4]. Without a known up only balls are told.
+    means [N, 3], instance_ids [N]; camera_from_world [C, 4, 4]. Where up is not known, only balls are told.
     """
     scores = np.zeros((len(wanted), len(KINDS)))
     up = up_from_cameras(camera_from_world)
     frame = level_frame(np.array([0.0, 0.0, 1.0]) if up is None else up)
-    bodies = {
-        n: body for n, i in enumerate(wanted) if (body := measure(means[instance_ids == i] @ frame.T)) is not None
-    }
-    for n, body in bodies.items():
-        scores[n, KINDS.index("ball")] = roundness(body.points)
-    if up is None or not bodies:
+    measured = [measure(means[instance_ids == i] @ frame.T) for i in wanted]
+    rows = [n for n, body in enumerate(measured) if body is not None]
+    bodies = [body for body in measured if body is not None]
+    if not bodies:
         return scores
-    centres = camera_centres(camera_from_world) @ frame.T
-    for name, values in _room(bodies, centres).items():
-        scores[list(values), KINDS.index(name)] = list(values.values())
-    for n, body in bodies.items():
-        scores[n, KINDS.index("box")] = boxiness(body.points)
+    found = {"ball": np.array([roundness(body.points) for body in bodies])}
+    if up is not None:
+        found["box"] = np.array([boxiness(body.points) for body in bodies])
+        found |= room_scores(bodies, float(np.median((camera_centres(camera_from_world) @ frame.T)[:, 2])))
+    for kind, values in found.items():
+        scores[rows, KINDS.index(kind)] = values
     return scores
 
 
@@ -91,8 +111,12 @@ def level_frame(up: np.ndarray) -> np.ndarray:
 
 
 def measure(points: np.ndarray) -> Body | None:
-    """A Body of points [P, 3] in a frame with z up; None for fewer than 20 points."""
-    if len(points) < 20:
+    """A Body of points [P, 3] in a frame with z up; None for fewer than LEAST.
+
+    thickness = Q(n) / √(Q(u) Q(v)), Q: interquartile range along the plane's normal n and its axes u, v.
+    area = E(u) E(v), E: extent from the 3rd to the 97th percentile.
+    """
+    if len(points) < LEAST:
         return None
     points = points[:: max(1, len(points) // SAMPLES)].astype(np.float64)
     low, high = np.percentile(points, [2, 98], axis=0)
@@ -111,7 +135,11 @@ def measure(points: np.ndarray) -> Body | None:
 
 
 def roundness(points: np.ndarray) -> float:
-    """1 for points [P, 3] on a sphere (or most of one), 0 for anything else: the residual of the best sphere."""
+    """1 for points x [P, 3] on a sphere or most of one, 0 for anything else.
+
+    The best sphere (o, r) by least squares:  2 x · o + (r² − |o|²) = |x|²;  then
+    ramp(smallest extent / 2r; .6, .8) · ramp(mean | |x − o| − r | / r; .10, .05)
+    """
     rows = np.concatenate([2 * points, np.ones((len(points), 1))], axis=1)
     solution, *_ = np.linalg.lstsq(rows, (points**2).sum(axis=1), rcond=None)
     radii = np.linalg.norm(points - solution[:3], axis=1)
@@ -122,7 +150,11 @@ def roundness(points: np.ndarray) -> float:
 
 
 def boxiness(points: np.ndarray) -> float:
-    """1 for points [P, 3] on the faces of an upright box (z up), 0 for round or ragged things."""
+    """1 for points [P, 3] on the faces of an upright box (z up), 0 for round or ragged things.
+
+    Of the upright boxes that hold the points, that of smallest ground area, turned in steps of 5°, with sides S:
+    ramp(mean distance to the nearest face / √(min S · median S); .11, .06) · ramp(share near upright edges; .02, .08)
+    """
     best = None
     for angle in np.radians(np.arange(0, 90, 5)):
         c, s = np.cos(angle), np.sin(angle)
@@ -139,56 +171,45 @@ def boxiness(points: np.ndarray) -> float:
     return ramp(float(nearest.mean()), 0.11, 0.06) * ramp(float(corners.mean()), 0.02, 0.08)
 
 
-def ramp(x: float, zero: float, one: float) -> float:
-    """0 at `zero`, 1 at `one`, linear between and clipped beyond."""
-    return float(np.clip((x - zero) / (one - zero), 0.0, 1.0))
+def ramp(x: Any, zero: float, one: float) -> Any:
+    """0 at `zero`, 1 at `one`, linear between and clipped beyond; of a number or an array."""
+    return np.clip((x - zero) / (one - zero), 0.0, 1.0)
 
 
-def _room(bodies: dict[int, Body], cameras: np.ndarray) -> dict[str, dict[int, float]]:
-    """Scores of the kinds that need the other instances for comparison, by name and position."""
-    flat = {n: ramp(b.thickness, 0.35, 0.2) for n, b in bodies.items()}
-    level = {n: flat[n] * ramp(abs(float(b.normal[2])), 0.85, 0.95) for n, b in bodies.items()}
-    upright = {n: flat[n] * ramp(abs(float(b.normal[2])), 0.3, 0.15) for n, b in bodies.items()}
-    span = max(b.high for b in bodies.values()) - min(b.low for b in bodies.values()) + 1e-9
-    eye = float(np.median(cameras[:, 2]))
-    largest = max((b.area for n, b in bodies.items() if upright[n] > 0.5), default=0.0)
-    wide = max(b.area for b in bodies.values())
-    below = [b.center[2] for n, b in bodies.items() if level[n] > 0.5 and b.center[2] < eye and b.area > 0.1 * wide]
-    lowest = float(np.percentile(np.concatenate([b.points[:, 2] for b in bodies.values()]), 2))
-    ground = min(below, default=None)
-    if ground is not None and ground > lowest + 0.1 * span:
-        ground = None  # something lies deeper: a table top, and the floor is not in the map
-    scores: dict[str, dict[int, float]] = {kind: {} for kind in KINDS}
-    walls = [b for n, b in bodies.items() if upright[n] > 0.5 and b.area >= 0.3 * largest]
-    floors = [
-        n for n, b in bodies.items() if ground is not None and level[n] > 0.5 and b.center[2] < ground + 0.05 * span
-    ]
-    floor = max(floors, key=lambda n: bodies[n].area, default=None)
-    typical = min(float(np.median([b.area for b in bodies.values()])), 0.03 * wide)
-    for n, b in bodies.items():
-        size = b.area / max(largest, 1e-9)
-        scores["wall"][n] = upright[n] * ramp(size, 0.15, 0.35) * ramp(b.high - b.low, 0.2 * span, 0.4 * span)
-        near = min((_gap(b, wall) for wall in walls if wall is not b), default=np.inf) / span
-        scores["picture"][n] = upright[n] * (1 - scores["wall"][n]) * ramp(near, 0.1, 0.05)
-        scores["floor"][n] = level[n] * float(n == floor)
-        lies = float(ground is not None and n != floor and b.high < ground + 0.08 * span and b.area < 0.8 * wide)
-        scores["rug"][n] = level[n] * lies * ramp(b.area, typical, 2 * typical)
-        scores["ceiling"][n] = (
-            level[n] * ramp(b.center[2], eye, eye + 0.1 * span) * ramp(b.area, 0.1 * wide, 0.3 * wide)
-        )
-        raised = 1.0 if ground is None or n == floor else ramp(b.top, ground + 0.05 * span, ground + 0.12 * span)
-        rests = sum(_rests_on(other, b, span) for m, other in bodies.items() if m != n)
-        lone = 0.5 if n == floor else 1.0  # the lowest plane of a close-up may be a table top as well as a floor
-        scores["table"][n] = (
-            lone
-            * raised
-            * ramp(b.top_share, 0.25, 0.45)
-            * ramp(b.area, typical, 3 * typical)
-            * (0.5 + 0.5 * ramp(rests, 0, 2))
-            * ramp(b.top, eye + 0.05 * span, eye - 0.05 * span)
-            * float(upright[n] < 0.5)
-        )
-    return scores
+def room_scores(bodies: list[Body], e: float) -> dict[str, np.ndarray]:
+    """Scores [B] of the kinds that need the other instances for comparison; e: median height of the cameras."""
+    n_z = np.abs([body.normal[2] for body in bodies])
+    z = np.array([body.center[2] for body in bodies])
+    t, a, low, high, top, s = (
+        np.array([getattr(body, name) for body in bodies])
+        for name in ("thickness", "area", "low", "high", "top", "top_share")
+    )
+    flat = ramp(t, 0.35, 0.2)
+    level, upright = flat * ramp(n_z, 0.85, 0.95), flat * ramp(n_z, 0.3, 0.15)
+    span = high.max() - low.min() + 1e-9
+    a_max, a_up = a.max(), max(a[upright > 0.5].max(initial=0.0), 1e-9)
+    a_typ = min(float(np.median(a)), 0.03 * a_max)
+    ground = z[(level > 0.5) & (z < e) & (a > 0.1 * a_max)].min(initial=np.inf)
+    if ground > float(np.percentile(np.concatenate([body.points[:, 2] for body in bodies]), 2)) + 0.1 * span:
+        ground = np.inf  # something lies deeper: a table top, and the floor is not in the map
+    known = bool(np.isfinite(ground))
+    at_ground = (level > 0.5) & (z < ground + 0.05 * span) & known
+    floor = at_ground & (np.arange(len(a)) == np.where(at_ground, a, -1).argmax())
+    on_ground = known & ~floor & (high < ground + 0.08 * span) & (a < 0.8 * a_max)
+    walls = [body for body, u, area in zip(bodies, upright, a, strict=True) if u > 0.5 and area >= 0.3 * a_up]
+    gap = np.array([min((_gap(body, w) for w in walls if w is not body), default=np.inf) for body in bodies])
+    rests = np.array([sum(_rests_on(other, body, span) for other in bodies if other is not body) for body in bodies])
+    raised = np.where(floor, 0.5, ramp(top, ground + 0.05 * span, ground + 0.12 * span) if known else 1.0)
+    wall = upright * ramp(a / a_up, 0.15, 0.35) * ramp(high - low, 0.2 * span, 0.4 * span)
+    table = ramp(s, 0.25, 0.45) * ramp(a, a_typ, 3 * a_typ) * (0.5 + 0.5 * ramp(rests, 0, 2))
+    return {
+        "wall": wall,
+        "picture": upright * (1 - wall) * ramp(gap / span, 0.1, 0.05),
+        "floor": level * floor,
+        "rug": level * on_ground * ramp(a, a_typ, 2 * a_typ),
+        "ceiling": level * ramp(z, e, e + 0.1 * span) * ramp(a, 0.1 * a_max, 0.3 * a_max),
+        "table": (upright < 0.5) * table * ramp(top, e + 0.05 * span, e - 0.05 * span) * raised,
+    }
 
 
 def _plane_normal(points: np.ndarray, center: np.ndarray) -> np.ndarray:
@@ -222,7 +243,7 @@ def _rests_on(upper: Body, lower: Body, span: float) -> bool:
 
 
 def _gap(body: Body, wall: Body) -> float:
-    """Distance of a body's middle from a wall's plane where both are parallel, else infinite."""
+    """Distance of a body's middle from a wall's plane if both are parallel, else infinite."""
     if abs(float(body.normal @ wall.normal)) < 0.95:
         return float("inf")
     return float(abs((body.center - wall.center) @ wall.normal))
