@@ -77,8 +77,8 @@ class _Affinities:
     def __init__(self, table: Table, z: np.ndarray, sizes: np.ndarray, near: np.ndarray):
         count, self.views = table.void.shape
         self.view = table.view
-        self.P = np.ascontiguousarray(table.pixels.T, np.float32)
-        self.B = np.ascontiguousarray(table.void.T, np.float32)
+        self.P = np.array(table.pixels.T, np.float32, order="C")  # a copy: `merge` writes into it
+        self.B = np.array(table.void.T, np.float32, order="C")
         self.unlabelled = np.zeros_like(self.B)
         self.unit = np.zeros_like(self.P)
         self.s = np.zeros((self.views, count), np.float32)

@@ -1,8 +1,8 @@
-"""Colours as measured, and colours as words.
+"""Colours of instances as measured, and colour words.
 
-An instance keeps a palette: the commonest colours of its own pixels in CIELAB, with their shares. A colour
-word is a few sRGB examples; how much of an instance it names is the share of the palette near any of them.
-Lightness counts less than hue, because exposure and shade move it.
+An instance has a palette: the commonest colours of its own pixels in CIELAB, with their shares. A colour word is a few
+sRGB examples e. With d² = (LIGHTNESS ΔL*)² + Δa*² + Δb*² to the nearest example, the share of an instance that it names
+is Σ share · exp(−d² / 2 SIGMA²) over the palette. Lightness counts less than hue, because exposure and shade change it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 PALETTE = 24  # colours kept per instance
 BIN = 8.0  # CIELAB units per histogram cell
-SIGMA = 15.0  # CIELAB distance at which a colour still carries 60 % of its name
+SIGMA = 15.0  # CIELAB distance at which a colour counts 60 %
 LIGHTNESS = 0.6  # weight of a lightness difference against one of hue or chroma
 
 # Examples of the English colour words, sRGB 0–255; several where a word covers a wide range.
@@ -52,9 +52,7 @@ _NOT_A_COLOR = {
 
 
 def color_words(text: str) -> list[str]:
-    """Colour words of a text in canonical spelling, in order, without repeats ("many" for colourful
-    things).
-    """
+    """Colour words of a text in canonical spelling, in order, without repeats ("many" for colourful things)."""
     words = [word.lower() for word in _PATTERN.findall(text)]
     found: list[str] = []
     for n, word in enumerate(words):
@@ -84,8 +82,7 @@ def without_color_words(text: str) -> str:
 
 
 def palette(pixels: np.ndarray) -> np.ndarray:
-    """The commonest colours of sRGB pixels [P, 3] uint8: float32 [PALETTE, 4] rows (L*, a*, b*, share),
-    largest first.
+    """The commonest colours of sRGB pixels [P, 3] uint8: float32 [PALETTE, 4] rows (L*, a*, b*, share), falling.
 
     Shares sum to 1 (rows of zeros pad short palettes); no pixels give all zeros.
     """
@@ -132,9 +129,7 @@ def color_share(palettes: np.ndarray, word: str) -> np.ndarray:
 
 
 def color_match(palettes: np.ndarray, words: Sequence[str]) -> np.ndarray:
-    """How well each instance fits all the colour words: [I] in [0, 1]; half an object in the colour is a
-    full match.
-    """
+    """How well each instance fits all the colour words: [I] in [0, 1]; 1 where half of it has the colour."""
     match = np.ones(len(palettes))
     for word in words:
         match *= np.minimum(1.0, color_share(palettes, word) / (0.5 / len(words)))

@@ -43,9 +43,7 @@ def unseen(dim: int) -> InstanceDescription:
 
 
 def to_arrays(descriptions: Sequence[InstanceDescription], encoder: str) -> dict[str, np.ndarray]:
-    """Descriptions as plain arrays for one .npz (no pickles), with the identity of the encoder that made
-    them.
-    """
+    """Descriptions as plain arrays for one .npz (no pickles), with the identity of their encoder."""
     dim = len(descriptions[0].embedding) if descriptions else 0
     views = [name for d in descriptions for name in d.views]
     boxes = [box for d in descriptions for box in d.boxes]

@@ -16,9 +16,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Preprocess:
-    """Resize to `size` (shortest edge, then centre crop; or squash to a square), scale to [0, 1],
-    normalise.
-    """
+    """Resize to `size` (shortest edge, then centre crop; or squash to a square), scale to [0, 1], normalise."""
 
     size: int = 224
     mode: Literal["shortest", "squash"] = "shortest"
@@ -57,9 +55,7 @@ MOBILECLIP = Preprocess(size=256, resample="bilinear", mean=(0.0, 0.0, 0.0), std
 
 
 def find_preprocess(model: Path, input_side: int | None) -> Preprocess:
-    """Preprocessing from the config files beside a model, else from its name; the model's own input size
-    wins.
-    """
+    """Preprocessing from the config files beside a model, else from its name; input_side: of the model, if fixed."""
     found = _from_configs(model) or _from_name(model)
     return replace(found, size=input_side) if input_side else found
 

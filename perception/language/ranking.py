@@ -43,9 +43,7 @@ LABEL_MARGIN = 2.0  # a label means the prompt from 2 + Φ⁻¹(score) spreads a
 
 @dataclass(frozen=True)
 class Answer:
-    """Ranked (position of the instance, score in [0, 1]), best first, and whether the best reaches the
-    threshold.
-    """
+    """Ranked (position of the instance, score in [0, 1]), best first; whether the best reaches the threshold."""
 
     text: str
     hits: list[tuple[int, float]]
@@ -146,9 +144,7 @@ class Ranker:
         return 1.0 / (1.0 + np.exp(TEMPERATURE * (rival - self._plain @ row[0])))
 
     def _with_labels(self, scores: np.ndarray, text: str) -> np.ndarray:
-        """The better of picture and label: 1 where the label is the prompt, Φ(z − margin) where it means
-        it.
-        """
+        """The better of picture and label: 1 where the label is the prompt, Φ(z − margin) where it means the same."""
         if not len(self._named):
             return scores
         z = (self._label_rows @ self._encode([text])[0] - self._label_null[0]) / self._label_null[1]
@@ -196,25 +192,12 @@ class Ranker:
         return unit_rows(rows.mean(axis=0))
 
     def _best_of_absent(self, probe_rows: np.ndarray) -> tuple[float, float]:
-        """Median of the probes' best relevancies in this map, and the spread that puts their quantile at
-        .8.
-        """
+        """m and s of the module: the median of the probes' best relevancies in this map, and their spread."""
         if not self.seen.any():
             return 0.0, 1.0
         best = self._relevancy(probe_rows)[:, self.seen].max(axis=1)
         middle, high = np.quantile(best, [0.5, QUANTILE])
         return float(middle), max(float(high - middle) / NORMAL_QUANTILE, 1e-6)
-
-
-def rank(
-    prompt: str,
-    descriptions: Sequence[InstanceDescription],
-    encoder: Encoder,
-    labels: Sequence[str | None] | None = None,
-    min_score: float | None = None,
-) -> Answer:
-    """One prompt against a map; for several prompts make a `Ranker` once."""
-    return Ranker(descriptions, encoder, labels).rank(prompt, min_score)
 
 
 def probes() -> list[str]:

@@ -22,7 +22,7 @@ from perception.errors import InputError  # noqa: E402
 from perception.language.clip import ClipEncoder  # noqa: E402
 from perception.language.encoders import make_encoder  # noqa: E402
 from perception.language.preprocess import CLIP, MOBILECLIP, SIGLIP, find_preprocess  # noqa: E402
-from perception.language.tokenizer import Tokenizer, clip_bpe, clip_vocabulary  # noqa: E402
+from perception.language.tokenizer import find_tokenizer  # noqa: E402
 
 MERGES = [("r", "e"), ("re", "d</w>"), ("m", "u"), ("mu", "g</w>"), ("c", "u"), ("cu", "p</w>"), ("t", "h")]
 TEXTS = ["red mug", "a cup, two cups & the MUG's handle", "чашка 杯子 ☕", "x" * 400]
@@ -57,7 +57,15 @@ def _export(module: Any, example: Any, path: Path, inputs: list[str], outputs: l
 
 
 def _vocabulary() -> dict[str, int]:
-    return clip_vocabulary(MERGES)
+    """Ids in OpenAI's order: 256 bytes, the same ending a word, the merges, then the two marks."""
+    printable = [*range(0x21, 0x7F), *range(0xA1, 0xAD), *range(0xAE, 0x100)]
+    letters = [chr(b) for b in printable] + [chr(256 + n) for n in range(256 - len(printable))]
+    words = letters + [letter + "</w>" for letter in letters] + ["".join(pair) for pair in MERGES]
+    return {word: n for n, word in enumerate([*words, "<|startoftext|>", "<|endoftext|>"])}
+
+
+def _reference_tokenizer() -> Any:
+    return transformers.CLIPTokenizer(vocab=_vocabulary(), merges=MERGES)
 
 
 def _pictures() -> list[np.ndarray]:
@@ -94,8 +102,7 @@ def clip_folder(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
     )
     ids = torch.full((1, 77), words["<|endoftext|>"])
     _export(_Tower(model, False), ids, folder / "text_model.onnx", ["input_ids"], ["text_embeds"])
-    (folder / "vocab.json").write_text(json.dumps(words))
-    (folder / "merges.txt").write_text("#version: 0.2\n" + "\n".join(" ".join(pair) for pair in MERGES))
+    _reference_tokenizer().save_pretrained(folder)
     return folder, model
 
 
@@ -107,7 +114,7 @@ def test_clip_pair_matches_transformers(clip_folder: tuple[Path, Any]) -> None:
     processor = (processor or transformers.CLIPImageProcessor)(
         size={"shortest_edge": SIDE}, crop_size={"height": SIDE, "width": SIDE}
     )
-    tokenizer = transformers.CLIPTokenizer(vocab=_vocabulary(), merges=MERGES)
+    tokenizer = _reference_tokenizer()
     with torch.no_grad():
         pixels = processor(_pictures(), return_tensors="pt")["pixel_values"]
         images = _Tower(model, True)(pixels).numpy()
@@ -144,7 +151,7 @@ def test_combined_export_equals_the_pair(clip_folder: tuple[Path, Any], tmp_path
             out = self.model(input_ids=input_ids, pixel_values=pixel_values, attention_mask=attention_mask)
             return out.logits_per_image, out.logits_per_text, out.text_embeds, out.image_embeds
 
-    for name in ("vocab.json", "merges.txt"):
+    for name in ("tokenizer.json", "tokenizer_config.json"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     ids = torch.full((2, 77), _vocabulary()["<|endoftext|>"])
     inputs = ["input_ids", "pixel_values", "attention_mask"]
@@ -188,7 +195,7 @@ def test_siglip_pair_matches_transformers(clip_folder: tuple[Path, Any], tmp_pat
         ["input_ids"],
         ["pooler_output"],
     )
-    backend = clip_bpe(words, MERGES)
+    backend = _reference_tokenizer().backend_tokenizer
     backend.save(str(folder / "tokenizer.json"))
     (folder / "tokenizer_config.json").write_text(json.dumps({"pad_token": "u"}))
     encoder = ClipEncoder.from_spec(str(folder))
@@ -202,16 +209,18 @@ def test_siglip_pair_matches_transformers(clip_folder: tuple[Path, Any], tmp_pat
     assert np.all(_cosines(encoder.encode_images(_pictures()), images) > 1 - 1e-3)
 
 
-def test_tokenizer_equals_transformers() -> None:
-    words = _vocabulary()
-    reference = transformers.CLIPTokenizer(vocab=words, merges=MERGES)
-    ours = Tokenizer(clip_bpe(words, MERGES), 77, words["<|endoftext|>"], words["<|endoftext|>"])
+def test_tokenizer_equals_transformers(clip_folder: tuple[Path, Any], tmp_path: Path) -> None:
+    """Padding, cutting and the mark at the end, with the `tokenizer.json` of an export."""
+    words, reference = _vocabulary(), _reference_tokenizer()
+    ours = find_tokenizer(clip_folder[0] / "text_model.onnx", 77)
     texts = [*TEXTS, "it's  RED,\tdon't\n'll 12345 café naïve ﬁ 🙂🙂", "a"]
     expected = reference(texts, padding="max_length", truncation=True, max_length=77)
     ids, mask = ours(texts)
     assert ids.tolist() == expected["input_ids"]
     assert mask.tolist() == expected["attention_mask"]
     assert ids[3, 0] == words["<|startoftext|>"] and ids[3, -1] == words["<|endoftext|>"]
+    with pytest.raises(InputError, match=r"no tokenizer\.json in"):
+        find_tokenizer(tmp_path / "alone" / "text_model.onnx", 77)
 
 
 def test_preprocessing_by_name_and_by_config(tmp_path: Path) -> None:

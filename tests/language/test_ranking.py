@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from itertools import chain
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,10 +28,14 @@ from perception.language.description import (
     to_arrays,
     unseen,
 )
-from perception.language.ranking import Ranker, probes, rank
+from perception.language.ranking import Answer, Ranker, probes
 from perception.language.shape_words import KINDS
 
 DIM = 24
+
+
+def rank(prompt: str, things: list[InstanceDescription], encoder: Any, labels: Any = None) -> Answer:
+    return Ranker(things, encoder, labels).rank(prompt)
 
 
 class Table:
