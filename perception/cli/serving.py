@@ -47,7 +47,7 @@ def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         watch=args.watch,
         photos=tuple(args.photos),
     )
-    from perception.serve.run import serve
+    from perception.serve.server import serve
 
     serve(args.map, settings)
     return {}, ""

@@ -41,26 +41,28 @@ class NodeClient:
 
     def __init__(self, config: NodeConfig | None = None, retry: float = 2.0) -> None:
         self._config, self._retry = config or NodeConfig(), retry
-        self._seat = Participant(self._config.domain_id, self._config.network)
+        self._participant = Participant(self._config.domain_id, self._config.network)
         space = self._config.namespace
         query = channels.QUERY
         # The network tells of readers in the order they are made: who answers on the last of them knows them all.
-        self._replies = self._seat.reader(f"rr/{query.path(space)}Reply", f"{query.kind}_Response", headed=True)
+        self._replies = self._participant.reader(f"rr/{query.path(space)}Reply", f"{query.kind}_Response", headed=True)
         self._answers = {
-            topic: self._seat.reader(f"rt/{topic.path(space)}", topic.kind)
+            topic: self._participant.reader(f"rt/{topic.path(space)}", topic.kind)
             for topic in (channels.POINTS, channels.BOXES, channels.MARKS, channels.ANSWER)
         }
-        self._requests = self._seat.writer(f"rq/{query.path(space)}Request", f"{query.kind}_Request", headed=True)
-        self._prompts = self._seat.writer(f"rt/{channels.PROMPT.path(space)}", channels.PROMPT.kind)
-        self._reply_wait = self._seat.wait_set([self._replies])
-        self._answer_wait = self._seat.wait_set(list(self._answers.values()))
+        self._requests = self._participant.writer(
+            f"rq/{query.path(space)}Request", f"{query.kind}_Request", headed=True
+        )
+        self._prompts = self._participant.writer(f"rt/{channels.PROMPT.path(space)}", channels.PROMPT.kind)
+        self._reply_wait = self._participant.wait_set([self._replies])
+        self._answer_wait = self._participant.wait_set(list(self._answers.values()))
         self._identity = int.from_bytes(os.urandom(8), "little")
         self._number = 0
         self._lock = threading.Lock()
 
     def close(self) -> None:
         """Leaves the network."""
-        self._seat.close()
+        self._participant.close()
 
     def wait_for_node(self, timeout: float = 10.0) -> None:
         """Returns once a node is there that sees this client too; TimeoutError otherwise.

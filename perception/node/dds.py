@@ -25,31 +25,33 @@ class DdsTransport:
 
     def __init__(self, config: NodeConfig) -> None:
         self._config = config
-        self._seat = Participant(config.domain_id, config.network)
+        self._participant = Participant(config.domain_id, config.network)
         self._figures: Counter[str] = Counter()
         self._answer_name = f"rt/{channels.ANSWER.path(config.namespace)}"
 
     def others(self) -> int:
         """Nodes of this name that were on the network `discovery_seconds` after this one came."""
         end = time.monotonic() + self._config.discovery_seconds
-        while time.monotonic() < end and not self._seat.writers_elsewhere(self._answer_name):
+        while time.monotonic() < end and not self._participant.writers_elsewhere(self._answer_name):
             time.sleep(0.02)
-        return self._seat.writers_elsewhere(self._answer_name)
+        return self._participant.writers_elsewhere(self._answer_name)
 
     def open(self) -> None:
         """Shows the node to the network."""
         space = self._config.namespace
         self._writers = {
-            topic: self._seat.writer(f"rt/{topic.path(space)}", topic.kind, latched=topic.latched)
+            topic: self._participant.writer(f"rt/{topic.path(space)}", topic.kind, latched=topic.latched)
             for topic in channels.OUTPUTS
         }
         self._replies = {
-            service: self._seat.writer(f"rr/{service.path(space)}Reply", f"{service.kind}_Response", headed=True)
+            service: self._participant.writer(f"rr/{service.path(space)}Reply", f"{service.kind}_Response", headed=True)
             for service in channels.SERVICES
         }
-        self._prompts = self._seat.reader(f"rt/{channels.PROMPT.path(space)}", channels.PROMPT.kind)
+        self._prompts = self._participant.reader(f"rt/{channels.PROMPT.path(space)}", channels.PROMPT.kind)
         self._requests = {
-            service: self._seat.reader(f"rq/{service.path(space)}Request", f"{service.kind}_Request", headed=True)
+            service: self._participant.reader(
+                f"rq/{service.path(space)}Request", f"{service.kind}_Request", headed=True
+            )
             for service in channels.SERVICES
         }
 
@@ -61,7 +63,7 @@ class DdsTransport:
 
     def warnings(self) -> list[str]:
         """What is wrong now."""
-        others = self._seat.writers_elsewhere(self._answer_name)
+        others = self._participant.writers_elsewhere(self._answer_name)
         return [f"{others} other node(s) answer on {self._config.namespace}"] if others else []
 
     def figures(self) -> dict[str, Any]:
@@ -72,11 +74,11 @@ class DdsTransport:
 
     def close(self) -> None:
         """Leaves the network."""
-        self._seat.close()
+        self._participant.close()
 
     def serve(self, core: Core, stop: threading.Event) -> None:
         """Hands what arrives to the core, and lets it tell its health, until `stop`."""
-        waiting = self._seat.wait_set([self._prompts, *self._requests.values()])
+        waiting = self._participant.wait_set([self._prompts, *self._requests.values()])
         due = time.monotonic()
         while not stop.is_set():
             waiting.wait(int(_LOOK_SECONDS * _NS))

@@ -1,6 +1,6 @@
-"""A seat on the DDS network under ROS 2's conventions: writers and readers by ROS name and type, raw CDR in and out.
+"""A DDS participant under ROS 2's conventions: writers and readers by ROS name and type, raw CDR in and out.
 
-Both the node and its clients in Python sit here. Topics are `rt/NAME`; a service is `rq/NAMERequest` and
+The node and its clients in Python use it. Topics are `rt/NAME`; a service is `rq/NAMERequest` and
 `rr/NAMEReply`, whose messages carry rmw_cyclonedds' header: the client's id (uint64) and the request's number (int64).
 """
 
@@ -19,7 +19,7 @@ from perception.node.channels import DEPTH
 from perception.node.idl import sample_type
 
 _HEADER = struct.Struct("<Qq")
-_MOST_BYTES = 256 << 20
+_MAX_BYTES = 256 << 20
 """Of one message, in or out; a larger one is dropped by the network layer, unread."""
 _BLOCKED_MS = 100
 """How long a writer may wait for readers that are behind before it gives the message up."""
@@ -162,7 +162,7 @@ def network_settings(network: str | None) -> str:
         f"<CycloneDDS><Domain><General>{interfaces}<MaxMessageSize>65500B</MaxMessageSize>"
         f"<FragmentSize>60000B</FragmentSize></General>{discovery}"
         "<Compatibility><AllowInvalidTryConstruct>true</AllowInvalidTryConstruct></Compatibility>"
-        f"<Internal><MaxSampleSize>{_MOST_BYTES}B</MaxSampleSize></Internal></Domain></CycloneDDS>"
+        f"<Internal><MaxSampleSize>{_MAX_BYTES}B</MaxSampleSize></Internal></Domain></CycloneDDS>"
     )
 
 

@@ -11,7 +11,7 @@ from perception.errors import InputError
 from perception.query import AnswerTimeout, EngineBusy, EngineClosed, Request
 from perception.query.bodies import QueryBody, parse
 
-MOST_BYTES = 64 * 1024
+MAX_BYTES = 64 * 1024
 """Of one prompt, JSON included; longer ones are refused unread."""
 _SHOWN = 80
 
@@ -29,8 +29,8 @@ class Question:
 def read_questions(data: str) -> list[Question]:
     """The questions in a prompt: one for a plain text, one for each text of a JSON object. InputError when bad."""
     size = len(data.encode("utf-8", "surrogatepass"))
-    if size > MOST_BYTES:
-        raise InputError(f"prompt: has {size} bytes, expected at most {MOST_BYTES}")
+    if size > MAX_BYTES:
+        raise InputError(f"prompt: has {size} bytes, expected at most {MAX_BYTES}")
     if not data.lstrip().startswith("{"):
         return [Question(Request(data))]
     try:
@@ -47,7 +47,7 @@ def read_questions(data: str) -> list[Question]:
 
 def identity_of(data: str) -> str | None:
     """The id of a prompt that was refused, when it can be made out, so that its asker still hears of it."""
-    if len(data) > MOST_BYTES:
+    if len(data) > MAX_BYTES:
         return None
     try:
         identity = json.loads(data).get("id")

@@ -15,8 +15,8 @@ from perception.serve.settings import ServeSettings
 
 OPEN = {"/", "/page.js", "/page.css", "/openapi.json", "/health"}
 """Paths that tell nothing of the map without a token; /health then says only its status."""
-_MOST_CLIENTS = 4096
-_MOST_DROPPED = 8 << 20
+_MAX_CLIENTS = 4096
+_MAX_DROPPED = 8 << 20
 _HEADERS = [
     (b"x-content-type-options", b"nosniff"),
     (b"referrer-policy", b"no-referrer"),
@@ -92,7 +92,7 @@ class Guard:
         level = min(most, level + (now - before) * rate)
         short = max(0.0, (1 - level) / rate)
         self._buckets[client] = (level if short else level - 1, now)
-        if len(self._buckets) > _MOST_CLIENTS:
+        if len(self._buckets) > _MAX_CLIENTS:
             self._buckets.popitem(last=False)
         return short
 
@@ -105,7 +105,7 @@ class Guard:
         most, kept, size = self.settings.max_body, bytearray(), 0
         deadline = time.monotonic() + self.settings.timeout
         more = True
-        while more and size <= _MOST_DROPPED:
+        while more and size <= _MAX_DROPPED:
             try:
                 message = await asyncio.wait_for(receive(), max(0.01, deadline - time.monotonic()))
             except (TimeoutError, asyncio.TimeoutError):

@@ -5,12 +5,26 @@ from __future__ import annotations
 import re
 import string
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from perception.viewer.paint import MODES
+from perception.viewer.session import Session
 
-if TYPE_CHECKING:
-    from perception.viewer.app import Viewer
+
+class Page(Protocol):
+    """What the panel needs of the page it belongs to."""
+
+    session: Session
+    server: Any
+
+    def guarded(self, action: Callable[[], object], client: Any = None, edited: bool = False) -> None:
+        """Runs an action of a control; shows an InputError, redraws."""
+
+    def redraw(self) -> None:
+        """Sends colours and opacities anew."""
+
+    def overlay(self, kind: str, on: bool) -> None:
+        """Shows or hides "cameras", "boxes" or "names"."""
 
 
 def escaped(text: str) -> str:
@@ -26,7 +40,7 @@ def escaped(text: str) -> str:
 class Panel:
     """Builds viser's controls and keeps their words true."""
 
-    def __init__(self, viewer: Viewer):
+    def __init__(self, viewer: Page):
         self.viewer = viewer
         self.session = viewer.session
         self.gui = viewer.server.gui

@@ -407,7 +407,7 @@ def test_settings_out_of_range_are_refused(settings: dict[str, Any]) -> None:
 def test_without_the_packages_the_install_line_is_told(
     path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("perception.serve.run.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("perception.serve.server.importlib.util.find_spec", lambda name: None)
     assert main(["serve", str(path)]) == 2
     assert 'pip install ".[serve]"' in capsys.readouterr().err
 
