@@ -7,7 +7,6 @@
 #include <stdexcept>
 
 #include "../common/arguments.h"
-#include "density.h"
 #include "felzenszwalb.h"
 #include "kdtree.h"
 #include "neighborhood.h"
@@ -86,25 +85,6 @@ void plane_normals(Points points, Lists neighbors, Array<float, nb::shape<-1, 3>
                                    normals.data());
 }
 
-void densest(Points points, Points means, Array<const float, nb::shape<-1, 6>> precisions,
-             Array<const float, nb::shape<-1>> opacities, Array<const std::int32_t, nb::shape<-1>> instances,
-             Lists candidates, Array<std::int32_t, nb::shape<-1>> labels, int threads) {
-  require_aligned("points", points, "means", means, "precisions", precisions, "opacities", opacities);
-  require_aligned("instances", instances, "candidates", candidates, "labels", labels);
-  const std::size_t n = means.shape(0), count = points.shape(0);
-  if (precisions.shape(0) != n || opacities.shape(0) != n || instances.shape(0) != n) {
-    throw nb::value_error("means, precisions, opacities and instances must have one row a Gaussian");
-  }
-  if (candidates.shape(0) != count || labels.shape(0) != count) {
-    throw nb::value_error("candidates [P, k] and labels [P] must have one row a point");
-  }
-  if (!within(candidates, n)) throw nb::value_error("candidates: an index lies outside the Gaussians");
-  const perception::graph::Gaussians gaussians{means.data(), precisions.data(), opacities.data(), instances.data()};
-  nb::gil_scoped_release release;
-  perception::graph::densest(gaussians, points.data(), candidates.data(), count, candidates.shape(1), threads,
-                             labels.data());
-}
-
 }  // namespace
 
 void bind_graph(nb::module_ &m) {
@@ -121,8 +101,4 @@ void bind_graph(nb::module_ &m) {
   m.def("plane_normals", &plane_normals, nb::arg("points").noconvert(), nb::arg("neighbors").noconvert(),
         nb::arg("normals").noconvert(), nb::arg("threads") = 1,
         "Normals [Q, 3] of the planes through neighbour lists [Q, k] of points [N, 3]; zero where there is none.");
-  m.def("densest", &densest, nb::arg("points").noconvert(), nb::arg("means").noconvert(),
-        nb::arg("precisions").noconvert(), nb::arg("opacities").noconvert(), nb::arg("instances").noconvert(),
-        nb::arg("candidates").noconvert(), nb::arg("labels").noconvert(), nb::arg("threads") = 1,
-        "Instance with the largest summed density at each point; see perception.export.likelihood.");
 }

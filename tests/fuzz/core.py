@@ -223,17 +223,8 @@ def _plane_normals(dice: Dice) -> Call:
     }
 
 
-def _densest(dice: Dice) -> Call:
-    return _core.densest, {
-        "points": normal(dice, (6, 3), np.float32), "means": normal(dice, (6, 3), np.float32),
-        "precisions": np.tile(np.array([1, 0, 0, 1, 0, 1], np.float32), (6, 1)),
-        "opacities": np.ones(6, np.float32), "instances": np.arange(6, dtype=np.int32),
-        "candidates": _neighbors(dice, 6), "labels": guarded((6,), np.int32), "threads": 2,
-    }  # fmt: skip
-
-
 FUNCTIONS = [_photometric, _assign, _prototypes, _spread, _separation, _sum, _scale, _adam, _tree, _knn]
-FUNCTIONS += [_felzenszwalb, _undirected, _plane_normals, _densest]
+FUNCTIONS += [_felzenszwalb, _undirected, _plane_normals]
 _LEVELLED = (_photometric, _prototypes, _spread, _sum, _adam)
 
 # ------------------------------------------------------------------ spoiling
