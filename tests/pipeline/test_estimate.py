@@ -30,6 +30,12 @@ def test_the_estimate_is_near_what_was_read(name: str) -> None:
     assert 0.5 < needed.training_seconds / seconds < 2 and needed.poses_seconds == 0
 
 
+@pytest.mark.parametrize(("count", "size", "seconds"), [(50, (270, 480), 96), (62, (640, 480), 64)])
+def test_the_estimate_of_structure_from_motion(count: int, size: tuple[int, int], seconds: float) -> None:
+    needed = estimate(PhotoSizes([size] * count, False, ""), load_config(None, []))
+    assert 0.5 < needed.poses_seconds / seconds < 2
+
+
 def test_what_grows_the_estimate() -> None:
     base = PhotoSizes([(640, 480)] * 50, True, "50 photos")
     config = load_config(None, [])
