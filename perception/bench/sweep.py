@@ -102,11 +102,12 @@ class SweepScene:
     def photos(self, max_side: int) -> tuple[list[Any], list[Any]]:
         """(training, held-out) views without labels."""
         from perception.pipeline.photos import load_all, split_views
+        from perception.progress import Progress
 
         if max_side not in self._views:
             self._views = {}
             parts = split_views(self.scene().views, self.held_out_every)
-            self._views[max_side] = tuple(load_all(part, max_side, _silent) for part in parts)
+            self._views[max_side] = tuple(load_all(part, max_side, Progress(quiet=True)) for part in parts)
         return self._views[max_side]
 
     def training(self, max_side: int, masks: str | None) -> list[Any]:
@@ -137,7 +138,7 @@ def run_variant(scene: SweepScene, variant: Variant, config: MapConfig) -> dict[
     import torch
 
     from perception.gaussians.train import Trainer
-    from perception.pipeline.instances import find_instances
+    from perception.pipeline.instances import describe, group_gaussians
     from perception.pipeline.mapping import initial_gaussians, score_views
     from perception.pipeline.photos import split_views
     from perception.pipeline.record import PeakMemory, Stages
@@ -153,10 +154,12 @@ def run_variant(scene: SweepScene, variant: Variant, config: MapConfig) -> dict[
         trainer = Trainer(initial_gaussians(scene.scene(), config), views, config, held)
         began, cpu = time.monotonic(), time.process_time()
         with stages("train"):
-            trainer.run(lambda trainer, figures: None)
+            trainer.run()
         cpu = time.process_time() - cpu
         with stages("instances"):
-            found = find_instances(trainer.gaussians, views, scene.scene(), config, Progress(quiet=True))
+            quiet = Progress(quiet=True)
+            grouped = group_gaussians(trainer.gaussians, views, config, quiet)
+            found = describe(trainer.gaussians, grouped, views, config.language, None, quiet)
         seconds = time.monotonic() - began
         quality = score_views(trainer.gaussians, held)
         record = trainer.record
@@ -266,7 +269,3 @@ def pareto(points: Sequence[tuple[float, float | None]]) -> list[int]:
             kept.append(index)
             best = -loss
     return kept
-
-
-def _silent(done: int, total: int) -> None:
-    """Progress that is not shown."""

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from perception.cli.parser import command
 from perception.errors import InputError
+
+if TYPE_CHECKING:
+    from perception.progress import Progress
 
 
 def register(commands: Any) -> None:
@@ -70,22 +77,47 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     given = [f"{key}={getattr(args, name)}" for name, key in _SHORTCUTS.items() if getattr(args, name) is not None]
     config = load_config(args.config, args.pairs + given, args.preset)
-    from perception.pipeline.run import run_map
+    from perception.pipeline.mapping import build_map
+    from perception.pipeline.summary import map_facts, profile_text
     from perception.progress import Progress
 
-    with Progress() as progress:
-        gmap = run_map(
-            args.input,
-            args.output,
-            config,
-            resume=args.resume,
-            progress=progress,
-            labels_from=args.labels_from,
+    with sigterm_as_interrupt(), Progress() as progress:
+        gmap = build_map(
+            args.input, args.output, config, resume=args.resume, progress=progress, labels_from=args.labels_from
         )
-    from perception.pipeline.summary import map_facts, profile_text
+        _write_own_report(args.output, progress)
 
     facts = map_facts(args.output, gmap.info, len(gmap), len(gmap.instances))
     return facts, profile_text(gmap.info) if args.profile else ""
+
+
+def _write_own_report(path: Path, progress: Progress) -> None:
+    """report.html inside the map. A failure is a warning: the map is whole, `perception report` makes it again."""
+    from perception.io.store import REPORT
+    from perception.pipeline.reporting import write_map_report
+    from perception.query import load_map
+
+    try:
+        write_map_report(load_map(path), path / REPORT, [])
+    except InputError as error:
+        progress.log(f"warning: no report: {error}")
+
+
+@contextmanager
+def sigterm_as_interrupt() -> Iterator[None]:
+    """SIGTERM is Ctrl-C inside the block: what was done is kept, and the exit code is 130."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
 def _add_info(commands: Any) -> None:
@@ -143,5 +175,5 @@ def _demo(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         raise InputError(f"--seed: found {args.seed}, expected 0 or more")
     if args.photos_only is not None:
         return write_scene(args.photos_only, args.scene, args.seed)
-    with Progress() as progress:
+    with sigterm_as_interrupt(), Progress() as progress:
         return run_demo(args.output, progress, args.scene, args.seed)

@@ -1,16 +1,16 @@
-"""What a training run tells of itself."""
+"""What a training run records of itself: its curve, its decisions, and where its seconds went."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 
 @dataclass
 class TrainRecord:
-    """What training spent and what it bought; JSON-able.
-
-    profile: seconds by part. pairs: contributing (Gaussian, pixel) pairs of all training renders.
-    """
+    """JSON-able. profile: wall-clock seconds by part. pairs: contributing (Gaussian, pixel) pairs of all renders."""
 
     curve: list[dict[str, float]] = field(default_factory=list)
     decisions: list[str] = field(default_factory=list)
@@ -19,3 +19,12 @@ class TrainRecord:
     seconds: float = 0.0
     iterations: int = 0
     skipped_gradients: int = 0
+
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        """Adds the seconds of its block to `part` of the profile. A block inside another belongs to both."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.profile[part] = self.profile.get(part, 0.0) + time.perf_counter() - start

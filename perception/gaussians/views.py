@@ -11,6 +11,9 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.rasterize import Rasterization
 from perception.gaussians.render import render
 
+BEST_PSNR = 100.0
+"""dB of two equal pictures, as in `evaluate.images`: a finite number, for means and for JSON."""
+
 
 @dataclass(frozen=True)
 class TrainingView:
@@ -79,4 +82,4 @@ def psnr(image: torch.Tensor, photo: torch.Tensor) -> float:
     """Peak signal-to-noise ratio in dB of image [H, W, 3] in [0, 1] against photo uint8."""
     # In numpy: torch adds up in as many parts as it has threads, and decisions about growth hang on these bits.
     error = float(np.square(image.detach().numpy() - photo.numpy() / np.float64(255)).mean())
-    return float("inf") if error == 0 else -10 * float(np.log10(error))
+    return BEST_PSNR if error == 0 else min(BEST_PSNR, -10 * float(np.log10(error)))

@@ -14,6 +14,7 @@ from perception.instances.crops import crop_levels, mask_box
 from perception.language.base import Encoder, unit_rows
 from perception.language.colors import palette
 from perception.language.description import InstanceDescription, unseen
+from perception.progress import Progress
 
 COLOR_SAMPLES = 2000  # pixels of a mask that its palette is made from, per view
 Load = Callable[[int], tuple[np.ndarray, np.ndarray]]
@@ -25,12 +26,12 @@ def describe_instances(
     load: Load,
     view_names: Sequence[str],
     levels: int = 3,
-    progress: Callable[[int, int], Any] | None = None,
+    progress: Progress | None = None,
 ) -> list[InstanceDescription]:
     """Descriptions of the I instances whose views `choices` lists (see `crops.choose_views`).
 
     load(view) → photo [H, W, 3] uint8 and instance image [H, W] int32 (silhouettes with occlusion; value = position in
-    `choices`, −1 = none). One photo at a time is in memory. progress(done, all) is called after every photo.
+    `choices`, −1 = none). One photo at a time is in memory.
     """
     wanted: dict[int, list[tuple[int, int]]] = {}
     for instance, views in enumerate(choices):
@@ -50,7 +51,7 @@ def describe_instances(
                 seen[instance][rank] = (view_names[view], mask_box(mask), rows, _color_sample(photo, mask))
             start += len(group)
         if progress:
-            progress(done + 1, len(wanted))
+            progress.update("language", done + 1, len(wanted))
     return [_summary(found, encoder.dim) for found in seen]
 
 

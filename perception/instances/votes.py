@@ -7,7 +7,7 @@ rendered mask indicator with respect to features, and one backward pass yields 1
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from scipy import sparse
 from perception.gaussians.model import Gaussians
 from perception.gaussians.rasterize import Settings, rasterize_backward, rasterize_forward
 from perception.gaussians.train import TrainingView
+from perception.progress import Progress
 
 BLOCK = 16  # masks a pass: a feature width the kernel is specialised for
 FAINTEST = 0.02  # pixels; less than that is no evidence and only fills the matrix
@@ -77,7 +78,7 @@ def mask_votes(
     views: Sequence[TrainingView],
     *,
     half_resolution: bool = True,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> MaskVotes:
     """The votes of all masks of all views; label 0 (unlabelled) says nothing.
 
@@ -97,7 +98,7 @@ def mask_votes(
             areas.append(area[1:])
             owner.append(np.full(len(area) - 1, len(owner), np.int64))
         if progress is not None:
-            progress(index + 1, len(views))
+            progress.update("mask votes", index + 1, len(views))
     if not parts:
         none = sparse.csr_matrix((len(gaussians), 0), dtype=np.float32)
         return MaskVotes(none, none, np.zeros(0, np.int64), np.zeros(0))

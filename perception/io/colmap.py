@@ -9,12 +9,12 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.colmap_check import check_binary_model
-from perception.io.features import Progress
 from perception.io.lens import lens_from_camera, load_pycolmap
 from perception.io.photos import why_left_out
 from perception.io.safe_names import safe_name
 from perception.io.triangulate import MIN_POINTS, cloud_of, posed_scene
 from perception.io.views import fit_lens, make_view
+from perception.progress import Progress
 from perception.types import Scene, View
 
 

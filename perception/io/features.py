@@ -6,7 +6,6 @@ import hashlib
 import json
 import sqlite3
 import time
-from collections.abc import Callable
 from contextlib import closing
 from itertools import combinations
 from pathlib import Path
@@ -18,9 +17,8 @@ from perception.io.atomic import atomic_directory, recover
 from perception.io.lens import load_pycolmap
 from perception.io.photos import exif_of, open_photo, photo_size
 from perception.io.staging import stage_photos
+from perception.progress import Progress
 from perception.types import Lens
-
-Progress = Callable[[str, float], None]
 
 MAX_IMAGE_SIDE = 1600
 """Larger photos are shrunk for feature extraction only; keypoints come back in full-resolution pixels."""
@@ -124,7 +122,7 @@ def _extract(
             options.sift.first_octave = -1
             pycolmap.extract_features(database, root, poor, pycolmap.CameraMode.SINGLE, reader, options)
         done += len(members)
-        progress("features", done / len(photos))
+        progress.update("poses: features", done, len(photos))
 
 
 def _forget_poor(database: Path, names: list[str]) -> list[str]:
@@ -152,7 +150,7 @@ def _match(database: Path, pair_file: Path, names: list[str], seed: int, progres
     pycolmap = load_pycolmap()
     pairs = _select_pairs(database, names)
     pair_file.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs))
-    progress("matching", 0.0)
+    progress.update("poses: matching", 0, 1)
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     verification = pycolmap.TwoViewGeometryOptions()
@@ -162,7 +160,7 @@ def _match(database: Path, pair_file: Path, names: list[str], seed: int, progres
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = pair_file
     pycolmap.match_image_pairs(database, matching, pairing, verification)
-    progress("matching", 1.0)
+    progress.update("poses: matching", 1, 1)
     return len(pairs), len(names) * (len(names) - 1) // 2
 
 

@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from perception.io.features import MIN_INLIERS, FeatureStore, Progress
+from perception.io.features import MIN_INLIERS, FeatureStore
 from perception.io.lens import load_pycolmap
 from perception.io.sfm_checks import MAX_CONTRADICTED, Pair, outvoted_photos, stronger_contradictions, verified_pairs
+from perception.progress import Progress
 
 MIN_MODEL_SIZE = 3
 REPEATABLE_PHOTOS = 150
@@ -123,7 +124,7 @@ class _Mapping:
             nonlocal registered
             registered += 1
             self.told = max(self.told, min(1.0, registered / self.count))
-            self.progress("mapping", self.told)
+            self.progress.update("poses: mapping", round(100 * self.told), 100)
 
         found = pycolmap.incremental_mapping(
             database,

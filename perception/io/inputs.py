@@ -9,7 +9,7 @@ from pathlib import Path
 
 from perception.errors import InputError
 from perception.io.camera_file import read_camera
-from perception.io.features import Progress
+from perception.progress import Progress
 from perception.types import Lens, Scene
 
 EXPECTED = "a folder of photos, a video, a COLMAP workspace or a transforms.json"
@@ -31,7 +31,7 @@ def load_scene(
     other folder is photos, posed by structure from motion. `workdir` keeps features and models so that a second call
     is quick. camera_file: ROS camera_info with the intrinsics of all photos, for photos and videos only. strict: a
     damaged photo is an InputError, else it is left out. frames: folder for the frames of a video (None:
-    workdir/frames); it must last as long as the map. progress(stage, fraction) is called as stages advance.
+    workdir/frames); it must last as long as the map.
     """
     from perception.io.colmap import is_workspace, read_workspace
     from perception.io.photo_folder import VIDEO_SUFFIXES
@@ -39,7 +39,7 @@ def load_scene(
     from perception.io.transforms import read_transforms
 
     source, workdir = Path(source), Path(workdir)
-    tell = progress or (lambda stage, fraction: None)
+    tell = progress or Progress(quiet=True)
     started = time.perf_counter()
     if not source.exists():
         raise InputError(f"{source}: no such file or folder; expected {EXPECTED}")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import signal
+import threading
 from functools import lru_cache
 from typing import Any
 
@@ -19,12 +21,15 @@ def load_pycolmap() -> Any:
     """Import pycolmap, quietly. Every import of pycolmap goes through here.
 
     PIL's compiled module must be loaded first: pycolmap 4.2's wheel exports its own zlib, and PIL loaded after it
-    crashes when it writes a PNG. Its log is silent unless GLOG_minloglevel is set.
+    crashes when it writes a PNG. Its log is silent unless GLOG_minloglevel is set. Its glog takes SIGTERM over to print
+    a native stack trace; the handler that Python knows is put back.
     """
     from PIL import _imaging  # type: ignore[attr-defined]  # noqa: F401
 
     import pycolmap  # isort: skip
 
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
     if "GLOG_minloglevel" not in os.environ:
         pycolmap.logging.minloglevel = 3
     return pycolmap

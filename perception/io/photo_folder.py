@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ from PIL import Image
 from perception.errors import InputError
 from perception.io.frame_choice import THUMBNAIL, motion_between
 from perception.io.photos import SUFFIXES, decode, open_photo, photo_size, upright
+from perception.progress import Progress
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
 FRAMES_RECORD = "frames.json"
@@ -95,7 +95,7 @@ def view_name(photo: Path, folder: Path) -> str:
     return "".join(plain)
 
 
-def choose_photos(folder: Path, strict: bool, progress: Callable[[str, float], None]) -> PhotoSet:
+def choose_photos(folder: Path, strict: bool, progress: Progress) -> PhotoSet:
     """The photos under `folder` that serve structure from motion; every photo is read once, by several threads.
 
     Left out with the reason: damaged photos, panoramas (no pinhole sees them), and doubles: all but the sharpest of
@@ -113,7 +113,7 @@ def choose_photos(folder: Path, strict: bool, progress: Callable[[str, float], N
                 look.name += "_"
             taken.add(look.name)
             looks.append(look)
-            progress("photos", done / len(paths))
+            progress.update("poses: photos", done, len(paths))
     _leave_out_panoramas([look for look in looks if look.why is None])
     _leave_out_doubles([look for look in looks if look.why is None])
     kept = [look for look in looks if look.why is None]

@@ -14,13 +14,14 @@ from typing import Any
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory, recover
 from perception.io.colmap import views_of_model
-from perception.io.features import FeatureStore, Progress, build_features
+from perception.io.features import FeatureStore, build_features
 from perception.io.incremental_sfm import map_photos
 from perception.io.lens import lens_from_camera, lens_text, load_pycolmap
 from perception.io.photo_folder import PhotoSet, choose_photos
 from perception.io.photos import photo_size
 from perception.io.sfm_checks import model_warnings
 from perception.io.triangulate import cloud_of
+from perception.progress import Progress
 from perception.types import Lens, Scene
 
 MIN_PHOTOS = 3

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from PIL import Image
 
 from perception.io.photos import LARGE_PIXELS, exif_of, open_photo, read_photo
+from perception.progress import Progress
 
 _PLAIN = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}
 """Formats that pycolmap reads as they are (MPO: a JPEG that other pictures follow)."""
@@ -23,7 +23,7 @@ _FOCAL_LENGTH = (0x920A, 0xA405, 0xA20E, 0xA20F, 0xA210)
 """EXIF tags: focal length in mm, the same for 35 mm film, resolution of the focal plane in x and y and its unit."""
 
 
-def stage_photos(folder: Path, photos: list[Path], progress: Callable[[str, float], None]) -> list[str]:
+def stage_photos(folder: Path, photos: list[Path], progress: Progress) -> list[str]:
     """Names of the photos in the new `folder`, in their order; names sort as the photos do.
 
     Upright JPEG and PNG are linked. Others are written as PNG, which keeps the pixels of every 8-bit format (16 bits
@@ -40,7 +40,7 @@ def stage_photos(folder: Path, photos: list[Path], progress: Callable[[str, floa
             _link(photo.resolve(), folder / names[-1])
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
         for done, _ in enumerate(pool.map(_convert, *zip(*converted, strict=True)) if converted else (), start=1):
-            progress("turning and converting photos", done / len(converted))
+            progress.update("poses: turning and converting photos", done, len(converted))
     return names
 
 

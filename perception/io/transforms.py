@@ -13,11 +13,11 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.documents import brief, read_json
-from perception.io.features import Progress
 from perception.io.photos import SUFFIXES, photo_size, why_left_out
 from perception.io.safe_names import safe_name
 from perception.io.triangulate import posed_scene
 from perception.io.views import fit_lens, make_view, rigid_pose
+from perception.progress import Progress
 from perception.types import Lens, Scene, View
 
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")

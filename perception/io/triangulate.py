@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from perception.geometry import inverse_se3
-from perception.io.features import Progress, build_features
+from perception.io.features import build_features
 from perception.io.lens import camera_from_lens, lens_text, load_pycolmap
+from perception.progress import Progress
 from perception.types import Lens, Scene, View
 
 MIN_POINTS = 50

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -13,6 +13,7 @@ from perception.errors import InputError
 from perception.io.atomic import atomic_directory
 from perception.io.frame_choice import Chooser
 from perception.io.photo_folder import FRAMES_RECORD
+from perception.progress import Progress
 
 MOST_FRAMES = 200
 LOOKS_PER_SECOND = 15.0
@@ -20,7 +21,7 @@ LOOKS_PER_SECOND = 15.0
 JPEG_QUALITY = 95
 
 
-def video_frames(video: Path, folder: Path, progress: Callable[[str, float], None]) -> dict[str, object]:
+def video_frames(video: Path, folder: Path, progress: Progress) -> dict[str, object]:
     """Writes the chosen frames of `video` to the new `folder` as JPEG, upright, named by frame number.
 
     Frames are chosen as `perception frames` does, at most MOST_FRAMES. Rotation told by the file is applied. A folder
@@ -38,7 +39,7 @@ def video_frames(video: Path, folder: Path, progress: Callable[[str, float], Non
     for number, share, frame in _frames(video, None):
         chooser.show(frame)
         numbers.append(number)
-        progress("choosing frames", share)
+        progress.update("poses: choosing frames", round(100 * share), 100)
     chosen = [numbers[index] for index in chooser.chosen(MOST_FRAMES)]
     if not chosen:
         raise InputError(f"{video}: not a readable video; expected .mp4, .mov or another that OpenCV's FFmpeg decodes")
@@ -46,7 +47,7 @@ def video_frames(video: Path, folder: Path, progress: Callable[[str, float], Non
     with atomic_directory(folder) as aside:
         for number, share, frame in _frames(video, set(chosen)):
             cv2.imwrite(str(aside / f"{number:06d}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-            progress("writing frames", share)
+            progress.update("poses: writing frames", round(100 * share), 100)
         (aside / FRAMES_RECORD).write_text(json.dumps(record), encoding="utf-8")
     return record
 

@@ -15,6 +15,7 @@ from perception.masks.stereo import measure_depths
 from perception.masks.stereo_views import StereoView, make_stereo_view
 from perception.masks.surface import Surface, SurfaceBuilder, to_world, voxel_side
 from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
+from perception.progress import Progress
 from perception.types import View
 
 VERSION = 7  # raised whenever the label images change, so that cached ones are made anew
@@ -48,7 +49,7 @@ class BuiltinSegmentation:
         views: list[View],
         load_photo: Callable[[View], np.ndarray],
         load_depth: Callable[[View], np.ndarray],
-        progress: Callable[[int, int], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         """Segments the surface that all photos show together; load_depth gives [h, w] z-depths, 0 = none.
 

@@ -12,6 +12,7 @@ import numpy as np
 from perception.config import read_toml
 from perception.errors import InputError
 from perception.io.model_store import default_model
+from perception.progress import Progress
 from perception.types import View
 
 
@@ -42,7 +43,7 @@ class GeometryMaskSource(MaskSource, Protocol):
         views: list[View],
         load_photo: Callable[[View], np.ndarray],
         load_depth: Callable[[View], np.ndarray],
-        progress: Callable[[int, int], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         """Looks at all photos together, once; load_depth: view -> [h, w] z-depth, 0 = none."""
         ...

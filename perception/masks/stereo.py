@@ -9,12 +9,12 @@ that no neighbour confirms are left out.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from perception.masks.stereo_views import StereoView
+from perception.progress import Progress
 
 PLANES = 96
 NEIGHBOURS = 6
@@ -26,7 +26,7 @@ _CONFIRMED = 2  # photos that must agree with a depth for it to shape the surfac
 _AGREE = 0.03  # relative difference of depths that confirm each other
 
 
-def measure_depths(views: list[StereoView], progress: Callable[[int, int], None] | None = None) -> None:
+def measure_depths(views: list[StereoView], progress: Progress | None = None) -> None:
     """Replaces the depths of all views by those of stereo, and says where other views confirm them."""
     chosen = choose_neighbours(views)
 
@@ -39,7 +39,7 @@ def measure_depths(views: list[StereoView], progress: Callable[[int, int], None]
         for done, depth in enumerate(pool.map(depth_of, range(len(views))), start=1):
             depths.append(depth)
             if progress is not None:
-                progress(done, len(views))
+                progress.update("masks (stereo)", done, len(views))
     finally:
         pool.shutdown(cancel_futures=True)  # Ctrl-C waits for the photos begun, not for all
     for view, depth, near in zip(views, depths, chosen, strict=True):

@@ -20,6 +20,7 @@ from perception.errors import InputError
 from perception.io.safe_names import safe_name
 from perception.masks.label_folder import read_labels, read_png_header
 from perception.masks.source import GeometryMaskSource, MaskSource
+from perception.progress import Progress
 from perception.types import View
 
 _KEY = "perception-masks"
@@ -30,13 +31,13 @@ def compute_masks(
     source: MaskSource,
     load_photo: Callable[[View], np.ndarray],
     folder: Path,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
     load_depth: Callable[[View], np.ndarray] | None = None,
     depth_key: str = "",
 ) -> dict[str, Any]:
     """Writes the label image of every view below `folder`, skipping those already there; returns a report.
 
-    load_photo: view -> [h, w, 3] uint8 RGB, undistorted. progress(done, total) is called after every photo.
+    load_photo: view -> [h, w, 3] uint8 RGB, undistorted.
     load_depth: view -> [h, w] z-depth, 0 = none, needed by a GeometryMaskSource. depth_key: changes whenever the depth
     does.
     Report: source, identity, photos, skipped, seconds, masks (mean per photo), empty (names), warnings.
@@ -60,7 +61,7 @@ def compute_masks(
         if not labels.any():
             empty.append(view.name)
         if progress is not None:
-            progress(done, len(views))
+            progress.update(f"masks ({source.name})", done, len(views))
     if empty:
         warnings = [
             *warnings,

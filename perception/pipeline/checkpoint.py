@@ -1,4 +1,16 @@
-"""Training state on disk, written whole or not at all, and refused when the settings have changed."""
+"""What a run keeps of its training, and what each stage depends on, so that `--resume` repeats only what has changed.
+
+    stage      depends on                                                 kept in the work folder as
+    poses      input, photos.camera and strict, seed                           poses-MARK/
+    masks      source of masks, photo, size (and the map's depth)         masks/, a key in each PNG
+    optimise   poses, photos.*, train.*, densify.*, losses.*; and masks   before_masks.pt, checkpoint.pt
+    group      optimise, instances.*                                      nothing: it takes seconds
+    describe   group, language.*                                          nothing
+
+When to stop (train.time_limit, train.stop_psnr) is left out: giving more time to a stopped run is the point. Other
+settings of the optimisation than those of the checkpoint are refused, so that no hours of work are thrown away by a
+flag that was forgotten; other masks begin again where masks enter.
+"""
 
 from __future__ import annotations
 
@@ -6,25 +18,117 @@ import hashlib
 import io
 import json
 import pickle
+import time
 from pathlib import Path
 from typing import Any
 
 from perception.config import MapConfig
 from perception.errors import InputError
+from perception.gaussians.train import Trainer
 from perception.io.atomic import atomic_file
+from perception.pipeline.record import peak_memory_mib
+from perception.progress import Progress
+
+CHECKPOINT = "checkpoint.pt"
+BEFORE_MASKS = "before_masks.pt"
+CHECKPOINT_SECONDS = 20.0
+"""Between two checkpoints; so much work is lost at most."""
+DRAWN_SECONDS = 0.5
+LATER = ("masks", "instances", "language")
+"""Settings that the optimisation as such does not depend on."""
 
 
 def fingerprint(source: Path, config: MapConfig) -> str:
-    """What a checkpoint depends on. When to stop is left out: giving more time to a stopped run is the point."""
+    """Of a whole map: two runs with the same one make the same map."""
     settings = config.to_json()
     for name in ("time_limit", "stop_psnr"):
         del settings["train"][name]
-    text = json.dumps([str(source.resolve()), settings], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return _digest(str(source.resolve()), settings)
+
+
+def poses_mark(source: Path, config: MapConfig) -> str:
+    """Of the poses and the sparse cloud."""
+    return _digest(str(source.resolve()), config.photos.camera, config.photos.strict, config.seed)
+
+
+def training_mark(source: Path, config: MapConfig) -> str:
+    """Of the optimisation, masks aside."""
+    usual = MapConfig()
+    return fingerprint(source, config.model_copy(update={name: getattr(usual, name) for name in LATER}))
+
+
+def _digest(*parts: Any) -> str:
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+class TrainingObserver:
+    """Follows one training: draws its progress, and keeps its checkpoints in folder `work`.
+
+    mark: see `training_mark`. masks: identity of the masks' source. masks_enter: progress up to which the state does
+    not depend on masks; the state at that point is kept on its own.
+    """
+
+    def __init__(self, work: Path, mark: str, masks: str, masks_enter: float, progress: Progress):
+        self.work, self.mark, self.masks, self.masks_enter, self.progress = work, mark, masks, masks_enter, progress
+        self.entered = False
+        self.saved = self.drawn = time.monotonic()
+        self.loss: float | None = None
+        self.first: tuple[float, int] | None = None
+
+    def take_up(self, trainer: Trainer) -> None:
+        """Goes on from the latest checkpoint that fits, if there is one. InputError when it is of other settings."""
+        for name in (CHECKPOINT, BEFORE_MASKS):
+            state = load_checkpoint(self.work / name, self.mark)
+            if state is None:
+                continue
+            if state["masks"] == self.masks or (state["masks"] is None and state["masks_enter"] <= self.masks_enter):
+                trainer.load(state["trainer"])
+                self.progress.log(f"resuming at iteration {trainer.iteration}")
+                break
+            self.progress.log(f"{self.work / name}: was trained on other masks, which enter again")
+        self.entered = trainer.progress >= self.masks_enter
+
+    def after_step(self, trainer: Trainer, loss: float) -> None:
+        now = time.monotonic()
+        self.loss = loss if self.loss is None else 0.95 * self.loss + 0.05 * loss
+        self.first = self.first or (now, trainer.iteration)
+        if now - self.drawn > DRAWN_SECONDS or trainer.progress >= 1:
+            self.drawn = now
+            self._draw(trainer, now)
+        if not self.entered and trainer.progress >= self.masks_enter:
+            self._save(trainer, BEFORE_MASKS)
+            self.entered = True
+        if now - self.saved > CHECKPOINT_SECONDS:
+            self._save(trainer, CHECKPOINT)
+            self.saved = time.monotonic()
+
+    def after_leg(self, trainer: Trainer) -> None:
+        self._save(trainer, CHECKPOINT)
+
+    def _save(self, trainer: Trainer, name: str) -> None:
+        masks = self.masks if self.entered else None
+        state = {"masks": masks, "masks_enter": self.masks_enter, "trainer": trainer.state()}
+        save_checkpoint(self.work / name, state, self.mark)
+
+    def _draw(self, trainer: Trainer, now: float) -> None:
+        assert self.first is not None
+        speed = (trainer.iteration - self.first[1]) / max(now - self.first[0], 1e-6)
+        total, curve = trainer.expected_iterations, trainer.record.curve
+        self.progress.update(
+            "train",
+            trainer.iteration,
+            total,
+            f"loss {self.loss:.3f}",
+            f"{curve[-1]['psnr']:.1f} dB" if curve else "- dB",
+            f"{len(trainer.gaussians) / 1000:.3g}k Gaussians",
+            f"{speed:.1f} it/s",
+            f"{round((total - trainer.iteration) / max(speed, 1e-6))} s left",
+            f"{round(peak_memory_mib())} MiB",
+        )
 
 
 def save_checkpoint(path: Path, state: dict[str, Any], mark: str) -> None:
-    """Writes `state` under the settings' fingerprint `mark`."""
+    """Writes `state` under the settings' fingerprint `mark`, whole or not at all."""
     import torch
 
     buffer = io.BytesIO()  # torch's own file writer ends the process where the disk is full

@@ -1,4 +1,4 @@
-"""From trained Gaussians to described instances: cluster, render silhouettes, score, embed."""
+"""From trained Gaussians to described instances: group (§3.2.1), then silhouettes, views and embeddings (§3.2.2)."""
 
 from __future__ import annotations
 
@@ -8,16 +8,20 @@ from typing import Any
 import numpy as np
 
 from perception.boxes import oriented_box
-from perception.config import MapConfig
-from perception.errors import InputError
+from perception.config import LanguageConfig, MapConfig
 from perception.gaussians.model import Gaussians
 from perception.gaussians.train import TrainingView
+from perception.instances.crops import choose_views, view_scores
+from perception.instances.describe import describe_instances
 from perception.instances.group import Grouping, group
 from perception.instances.silhouettes import Silhouettes, render_silhouettes
 from perception.instances.votes import mask_votes
-from perception.language.base import Encoder
+from perception.language.base import Encoder, reading_of
+from perception.language.description import to_arrays
 from perception.progress import Progress
-from perception.types import Scene
+
+BOX_TRIM = 0.01
+"""Share of an instance's Gaussians left out of its oriented box at either end of each axis: strays stretch boxes."""
 
 
 @dataclass
@@ -27,49 +31,20 @@ class FoundInstances:
 
     ids: np.ndarray
     membership: np.ndarray
-    instances: list[dict[str, Any]]
+    instances: list[dict[str, Any]] = field(default_factory=list)
     language: dict[str, np.ndarray] = field(default_factory=dict)
     report: dict[str, Any] = field(default_factory=dict)
     parts: dict[str, np.ndarray] = field(default_factory=dict)
 
 
-def find_instances(
-    gaussians: Gaussians, views: list[TrainingView], scene: Scene, config: MapConfig, progress: Progress
-) -> FoundInstances:
-    """Clusters the Gaussians and says of every instance where, how sure, and what it looks like."""
-    means = gaussians.means.detach().numpy()
-    opacities = gaussians.opacities.detach().numpy()
-    has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
-    if not has_labels:
-        empty = np.full(len(means), -1, np.int32)
-        return FoundInstances(empty, np.zeros(len(means), np.float32), [], {}, {"warnings": ["no photo has masks"]})
-
-    progress.log(f"grouping {len(means)} Gaussians")
-    grouped = group_gaussians(gaussians, views, config, progress)
-    seen = _silhouettes(gaussians, grouped.ids, views, "silhouettes", progress) if grouped.count else []
-    instances = _entries(grouped, means, opacities, seen)
-    words, encoder = config.language, _encoder(config, progress) if grouped.count else None
-    language = {}
-    if encoder is not None:
-        language = _embed(encoder, grouped.ids, seen, views, words.views, words.zooms, progress)
-    report = {
-        "count": grouped.count,
-        "parts": len(grouped.parents),
-        "noise_share": float(np.mean(grouped.ids < 0)),
-        "encoder": str(language["encoder"]) if language else None,
-    }
-    parts = _parts(encoder, gaussians, grouped, views, config, progress) if grouped.parents else {}
-    return FoundInstances(grouped.ids, grouped.membership, instances, language, report, parts)
-
-
-def group_gaussians(gaussians: Gaussians, views: list[TrainingView], config: MapConfig, progress: Progress) -> Grouping:
-    """The votes of all masks, and the instances they and the features make."""
-    votes = mask_votes(
-        gaussians,
-        views,
-        half_resolution=config.losses.half_resolution,
-        progress=lambda done, of: progress.update("mask votes", done, of),
-    )
+def group_gaussians(
+    gaussians: Gaussians, views: list[TrainingView], config: MapConfig, progress: Progress
+) -> Grouping | None:
+    """The votes of all masks, and the instances they and the features make (§3.2.1); None where no photo has masks."""
+    if not any(view.labels is not None and bool((view.labels > 0).any()) for view in views):
+        return None
+    progress.log(f"grouping {len(gaussians)} Gaussians")
+    votes = mask_votes(gaussians, views, half_resolution=config.losses.half_resolution, progress=progress)
     return group(
         gaussians.means.detach().numpy(),
         gaussians.scales.detach().numpy(),
@@ -80,6 +55,39 @@ def group_gaussians(gaussians: Gaussians, views: list[TrainingView], config: Map
         margin=config.losses.margin,
         seed=config.seed,
     )
+
+
+def describe(
+    gaussians: Gaussians,
+    grouped: Grouping | None,
+    views: list[TrainingView],
+    words: LanguageConfig,
+    encoder: Encoder | None,
+    progress: Progress,
+) -> FoundInstances:
+    """Where each instance is, how sure, and, with an encoder, what it looks like (§3.2.2)."""
+    count = len(gaussians)
+    if grouped is None:
+        report = {"warnings": ["no photo has masks"]}
+        return FoundInstances(np.full(count, -1, np.int32), np.zeros(count, np.float32), report=report)
+    seen = _silhouettes(gaussians, grouped.ids, views, "silhouettes", progress) if grouped.count else []
+    found = FoundInstances(grouped.ids, grouped.membership, _entries(grouped, gaussians, seen))
+    if encoder is not None and grouped.count:
+        found.language = _embed(encoder, grouped.ids, seen, views, words.views, words.zooms, progress)
+    if grouped.parents:
+        local = np.where(grouped.part_ids >= 0, grouped.part_ids - grouped.count, -1).astype(np.int32)
+        language: dict[str, np.ndarray] = {}
+        if encoder is not None:
+            seen = _silhouettes(gaussians, local, views, "silhouettes of parts", progress)
+            language = _embed(encoder, local, seen, views, min(2, words.views), 1, progress)
+        found.parts = {"ids": grouped.part_ids, **{f"language_{name}": array for name, array in language.items()}}
+    found.report = {
+        "count": grouped.count,
+        "parts": len(grouped.parents),
+        "noise_share": float(np.mean(grouped.ids < 0)) if count else 0.0,
+        "encoder": str(found.language["encoder"]) if found.language else None,
+    }
+    return found
 
 
 def _silhouettes(
@@ -93,50 +101,24 @@ def _silhouettes(
     return seen
 
 
-def _entries(
-    grouped: Grouping, means: np.ndarray, opacities: np.ndarray, seen: list[Silhouettes]
-) -> list[dict[str, Any]]:
+def _entries(grouped: Grouping, gaussians: Gaussians, seen: list[Silhouettes]) -> list[dict[str, Any]]:
     """instances.json's list, the parts of each instance inside its entry."""
     views = np.sum([view.pixels > 0 for view in seen], axis=0) if seen else np.zeros(grouped.count)
     entries = [
-        _describe(i, means, opacities, grouped.ids, float(grouped.scores[i]), int(views[i]))
-        for i in range(grouped.count)
+        _entry(i, gaussians, grouped.ids == i, float(grouped.scores[i]), int(views[i])) for i in range(grouped.count)
     ]
     for number, parent in enumerate(grouped.parents):
+        part = grouped.count + number
         score, shown = grouped.part_scores[number], grouped.part_views[number]
-        part = _describe(grouped.count + number, means, opacities, grouped.part_ids, score, shown)
-        entries[parent].setdefault("parts", []).append({**part, "parent": parent})
+        entry = _entry(part, gaussians, grouped.part_ids == part, score, shown)
+        entries[parent].setdefault("parts", []).append({**entry, "parent": parent})
     return entries
 
 
-def _parts(
-    encoder: Encoder | None,
-    gaussians: Gaussians,
-    grouped: Grouping,
-    views: list[TrainingView],
-    config: MapConfig,
-    progress: Progress,
-) -> dict[str, np.ndarray]:
-    """The arrays of parts.npz: whose part each Gaussian is and, with an encoder, what the parts look like."""
-    local = np.where(grouped.part_ids >= 0, grouped.part_ids - grouped.count, -1).astype(np.int32)
-    language: dict[str, np.ndarray] = {}
-    if encoder is not None:
-        seen = _silhouettes(gaussians, local, views, "silhouettes of parts", progress)
-        language = _embed(encoder, local, seen, views, min(2, config.language.views), 1, progress)
-    return {"ids": grouped.part_ids, **{f"language_{name}": array for name, array in language.items()}}
-
-
-BOX_TRIM = 0.01
-"""Share of an instance's Gaussians left out of its oriented box at either end of each axis: strays stretch boxes."""
-
-
-def _describe(
-    instance: int, means: np.ndarray, opacities: np.ndarray, ids: np.ndarray, score: float, views: int
-) -> dict[str, Any]:
-    rows = ids == instance
-    points = means[rows].astype(np.float64)
-    weights = opacities[rows].astype(np.float64)
-    box = oriented_box(points, BOX_TRIM)
+def _entry(instance: int, gaussians: Gaussians, rows: np.ndarray, score: float, views: int) -> dict[str, Any]:
+    """instances.json's entry of the Gaussians that `rows` [N] bool selects; lengths in world units."""
+    points = gaussians.means.detach().numpy()[rows].astype(np.float64)
+    weights = gaussians.opacities.detach().numpy()[rows].astype(np.float64)
     return {
         "id": instance,
         "label": None,
@@ -144,23 +126,9 @@ def _describe(
         "num_gaussians": int(rows.sum()),
         "views": views,
         "centroid": (weights @ points / weights.sum()).tolist(),
-        "obb": box.to_json(),
+        "obb": oriented_box(points, BOX_TRIM).to_json(),
         "aabb": {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()},
     }
-
-
-def _encoder(config: MapConfig, progress: Progress) -> Encoder | None:
-    """What turns pictures into words' vectors; None where none is wanted, or "auto" finds none."""
-    from perception.language.encoders import make_encoder
-
-    spec = config.language.encoder
-    try:
-        return make_encoder("conse" if spec == "auto" else spec)
-    except InputError as error:
-        if spec != "auto":
-            raise
-        progress.log(f"warning: no language: {error}")
-        return None
 
 
 def _embed(
@@ -172,23 +140,20 @@ def _embed(
     zooms: int,
     progress: Progress,
 ) -> dict[str, np.ndarray]:
-    """Language arrays of all instances from their `best` views (eq. 11), `zooms` crops of each (0: as suits)."""
-    from perception.instances.crops import choose_views, view_scores
-    from perception.instances.describe import describe_instances
-    from perception.language.base import reading_of
-    from perception.language.description import to_arrays
+    """Language arrays of all instances (eq. 11) from their `best` views (eq. 10), `zooms` crops of each.
 
+    zooms 0: as many as suit the encoder.
+    """
     pixels = np.stack([view.pixels for view in seen], axis=1)
     total = np.maximum(np.bincount(ids[ids >= 0], minlength=len(pixels)), 1)
     visible = np.stack([view.visible for view in seen], axis=1) / total[:, None]
     sizes = np.array([view.photo.shape[0] * view.photo.shape[1] for view in views])
-    chosen = choose_views(view_scores(pixels, sizes, visible), best)
     descriptions = describe_instances(
         encoder,
-        chosen,
+        choose_views(view_scores(pixels, sizes, visible), best),
         lambda index: (views[index].photo.numpy(), seen[index].ids),
         [view.name for view in views],
         levels=zooms or reading_of(encoder).zooms,
-        progress=lambda done, of: progress.update("language", done, of),
+        progress=progress,
     )
     return to_arrays(descriptions, encoder.identity)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -13,6 +12,7 @@ from perception.errors import InputError
 from perception.gaussians.train import TrainingView
 from perception.io.photos import load_photo, scaled_K
 from perception.masks.store import load_labels
+from perception.progress import Progress
 from perception.types import View
 
 
@@ -61,10 +61,10 @@ def with_labels(decoded: TrainingView, view: View, folder: Path) -> TrainingView
     return replace(decoded, labels=torch.from_numpy(labels))
 
 
-def load_all(views: list[View], max_side: int, progress: Callable[[int, int], None]) -> list[TrainingView]:
+def load_all(views: list[View], max_side: int, progress: Progress) -> list[TrainingView]:
     """All of `views`, decoded; memory is 3 bytes a pixel."""
     loaded = []
     for done, view in enumerate(views, start=1):
         loaded.append(training_view(view, max_side))
-        progress(done, len(views))
+        progress.update("photos", done, len(views))
     return loaded

@@ -116,6 +116,6 @@ def _described(
         load,
         [view.name for view in gmap.views],
         levels=zooms,
-        progress=lambda done, of: progress.update("language", done, of),
+        progress=progress,
     )
     return to_arrays(again, encoder.identity)

@@ -18,6 +18,7 @@ from unittest.mock import patch
 import numpy as np
 
 from perception.errors import InputError
+from perception.progress import Progress
 
 Data = bytes
 ALLOWED: tuple[type[Exception], ...] = (InputError,)
@@ -257,7 +258,7 @@ def _colmap(binary: bool) -> Target:
     variants = [(name, same, content) for name, content in files.items()]
 
     def read(folder: Path, name: str) -> None:
-        scene = read_workspace(folder / name[:3], folder / "work", 0, lambda stage, fraction: None)
+        scene = read_workspace(folder / name[:3], folder / "work", 0, Progress(quiet=True))
         assert scene.views and all(np.isfinite(view.camera_from_world).all() for view in scene.views)
         assert np.isfinite(scene.points).all()
 
@@ -306,7 +307,7 @@ def _transforms() -> Target:
             read_frames(file)
         except InputError as error:
             _refuse_memory_errors(error)
-        scene = read_transforms(file, folder / "work", 0, lambda stage, fraction: None)
+        scene = read_transforms(file, folder / "work", 0, Progress(quiet=True))
         assert all(np.isfinite(v.camera_from_world).all() and np.isfinite(v.K).all() for v in scene.views)
 
     words = [*lens, *angle, "frames", "file_path", "transform_matrix", "NaN", "Infinity", "null", "k1", "k4", "p1"]

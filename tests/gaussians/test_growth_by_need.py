@@ -35,7 +35,7 @@ def trained(views: list[TrainingView], held: list[TrainingView], *more: str) -> 
     start = from_points(points, np.full((300, 3), 150, np.uint8), feature_dim=1, seed=0)
     pairs = ["train.iterations=400", "densify.every=20", "train.budget=6000", "train.sh_degree=0", *more]
     trainer = Trainer(start, views, load_config(None, pairs), held)
-    trainer.run(lambda trainer, figures: None)
+    trainer.run()
     return trainer
 
 

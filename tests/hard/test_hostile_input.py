@@ -27,6 +27,7 @@ from perception.io.ply import read_ply
 from perception.io.transforms import read_frames, read_transforms
 from perception.io.views import rigid_pose
 from perception.masks.store import load_labels, stored_key
+from perception.progress import Progress
 from perception.types import View
 
 
@@ -36,7 +37,7 @@ def refused(reader: Any, *arguments: Any, match: str) -> None:
     assert "\n" not in str(told.value)
 
 
-def quiet(stage: str, fraction: float) -> None: ...
+quiet = Progress(quiet=True)
 
 
 # ------------------------------------------------------------------ the compiled core

@@ -19,6 +19,7 @@ from perception.instances.crops import (
 )
 from perception.instances.describe import describe_instances
 from perception.language.colors import palette
+from support.progress import Told
 
 
 class MeanColor:
@@ -91,10 +92,10 @@ def test_description_is_the_mean_over_crops_whatever_the_order_of_photos() -> No
 
     choices = [np.array([2, 0]), np.array([3]), np.array([], np.int64)]
     names = [f"{v}.jpg" for v in range(4)]
-    told: list[tuple[int, int]] = []
-    found = describe_instances(MeanColor(), choices, load, names, progress=lambda a, b: told.append((a, b)))
+    told = Told()
+    found = describe_instances(MeanColor(), choices, load, names, progress=told)
     assert loaded == [0, 2, 3]
-    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert told.updates == [("language", done, 3) for done in (1, 2, 3)]
     rows = [MeanColor().encode_images(crop_levels(photos[v], ids[v] == 0, 3)).astype(np.float64) for v in (2, 0)]
     mean = np.mean(list(itertools.chain(*rows)), axis=0)
     assert np.allclose(found[0].embedding, mean / np.linalg.norm(mean), atol=1e-6)

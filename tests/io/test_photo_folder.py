@@ -21,9 +21,7 @@ from perception.io.photos import photo_damage, photo_size, read_photo
 from perception.io.safe_names import safe_name
 from perception.io.views import fit_lens
 from perception.types import Lens
-
-
-def quiet(stage: str, fraction: float) -> None: ...
+from support.progress import Told
 
 
 def texture(seed: int, size: tuple[int, int] = (160, 120)) -> np.ndarray:
@@ -71,12 +69,12 @@ def test_any_file_name_keeps_its_matches(tmp_path: Path) -> None:
     wide = texture(0, (640, 240))
     for index, name in enumerate(NAMES):
         Image.fromarray(wide[:, 40 * index : 40 * index + 320]).save(tmp_path / name)
-    chosen = choose_photos(tmp_path, True, quiet)
+    chosen = choose_photos(tmp_path, True, Told())
     assert len(set(chosen.names)) == len(NAMES)
     assert {safe_name(name, "test") for name in chosen.names} == set(chosen.names)
     expected = {"#first.png", "line%0Aend.png", "blank and tab%09.png", "latin%E9.png", "%41.png", "plain.png"}
     assert set(chosen.names) == expected
-    store = build_features(chosen.photos, [None] * len(NAMES), tmp_path / "work", 0, quiet)
+    store = build_features(chosen.photos, [None] * len(NAMES), tmp_path / "work", 0, Told())
     db = load_pycolmap().Database.open(store.database)
     pairs, geometries = db.read_two_view_geometries()
     matched = {
@@ -92,7 +90,7 @@ def test_any_file_name_keeps_its_matches(tmp_path: Path) -> None:
 def test_escaped_names_do_not_collide(tmp_path: Path) -> None:
     save(tmp_path / "a%0A.png", 0)
     save(tmp_path / "a\n.png", 1)
-    assert len(set(choose_photos(tmp_path, True, quiet).names)) == 2
+    assert len(set(choose_photos(tmp_path, True, Told()).names)) == 2
     assert view_name(tmp_path / "a%\n.png", tmp_path) == "a%25%0A.png"
 
 
@@ -102,12 +100,12 @@ def test_a_broken_photo_is_left_out_and_told(tmp_path: Path) -> None:
         save(tmp_path / f"{index}.jpg", index)
     data = (tmp_path / "2.jpg").read_bytes()
     (tmp_path / "2.jpg").write_bytes(data[: len(data) // 2])
-    chosen = choose_photos(tmp_path, False, quiet)
+    chosen = choose_photos(tmp_path, False, Told())
     assert chosen.names == ["0.jpg", "1.jpg", "3.jpg"]
     assert [entry["name"] for entry in chosen.left_out] == ["2.jpg"] and "damaged" in chosen.left_out[0]["why"]
     assert any(note.startswith("warning: 1 of 4 photos cannot be read") for note in chosen.notes)
     with pytest.raises(InputError, match=r"2\.jpg: the photo is truncated"):
-        choose_photos(tmp_path, True, quiet)
+        choose_photos(tmp_path, True, Told())
 
 
 def test_bursts_and_copies_keep_one_photo(tmp_path: Path) -> None:
@@ -119,7 +117,7 @@ def test_bursts_and_copies_keep_one_photo(tmp_path: Path) -> None:
         picture = picture.filter(ImageFilter.GaussianBlur(1)) if index in (0, 1) else picture
         picture.save(tmp_path / f"{index}.png")
     wide.crop((60, 0, 360, 300)).save(tmp_path / "copy of 3.png")
-    chosen = choose_photos(tmp_path, True, quiet)
+    chosen = choose_photos(tmp_path, True, Told())
     assert chosen.names == ["2.png", "3.png", "4.png"]
     assert {entry["name"]: entry["why"].split()[-1] for entry in chosen.left_out} == {
         "0.png": "2.png",
@@ -136,7 +134,7 @@ def test_panoramas_are_left_out_and_blurred_photos_told(tmp_path: Path) -> None:
         save(tmp_path / f"{index}.png", index, (320, 240))
     save(tmp_path / "pano.png", 9, (900, 240))
     Image.fromarray(texture(8, (320, 240))).filter(ImageFilter.GaussianBlur(6)).save(tmp_path / "soft.png")
-    chosen = choose_photos(tmp_path, True, quiet)
+    chosen = choose_photos(tmp_path, True, Told())
     assert chosen.left_out[0]["name"] == "pano.png" and "900×240" in chosen.left_out[0]["why"]
     assert "soft.png" in chosen.names
     assert any("blurred" in note and note.endswith("soft.png") for note in chosen.notes)
@@ -145,7 +143,7 @@ def test_panoramas_are_left_out_and_blurred_photos_told(tmp_path: Path) -> None:
 def test_wide_cameras_are_no_panoramas(tmp_path: Path) -> None:
     for index in range(4):
         save(tmp_path / f"{index}.png", index, (620, 188))
-    assert len(choose_photos(tmp_path, True, quiet).photos) == 4
+    assert len(choose_photos(tmp_path, True, Told()).photos) == 4
 
 
 def test_videos_beside_photos_are_told(tmp_path: Path) -> None:
@@ -153,7 +151,7 @@ def test_videos_beside_photos_are_told(tmp_path: Path) -> None:
         save(tmp_path / f"IMG_{index}.jpg", index)
     for name in ("IMG_0.MOV", "IMG_1.mov", "kitchen.mp4"):
         (tmp_path / name).write_bytes(b"x")
-    (note,) = choose_photos(tmp_path, True, quiet).notes
+    (note,) = choose_photos(tmp_path, True, Told()).notes
     assert note.startswith("3 videos beside the photos are not read, 2 of them belong to Live Photos")
 
 
@@ -190,11 +188,11 @@ def test_turned_photos_are_staged_with_their_very_pixels(tmp_path: Path) -> None
         save(tmp_path / f"{index}.jpg", index, exif=exif, quality=90)
     save(tmp_path / "3.png", 3)
     photos = list_photos(tmp_path)
-    told: list[tuple[str, float]] = []
-    store = build_features(photos, [None] * 4, tmp_path / "work", 0, lambda *step: told.append(step))
+    told = Told()
+    store = build_features(photos, [None] * 4, tmp_path / "work", 0, told)
     for photo, name in zip(photos, store.names, strict=True):
         np.testing.assert_array_equal(np.asarray(Image.open(store.image_root / name)), read_photo(photo))
-    assert [share for stage, share in told if stage.startswith("turning")] == pytest.approx([1 / 3, 2 / 3, 1])
+    assert [update[1:] for update in told.updates if "turning" in update[0]] == [(1, 3), (2, 3), (3, 3)]
     db = load_pycolmap().Database.open(store.database)
     (focal,) = {camera.params[0] for camera in db.read_all_cameras() if camera.has_prior_focal_length}
     db.close()
@@ -225,7 +223,7 @@ def test_heic_without_its_reader_names_the_line_that_installs_it(
     for index in range(3):
         save(tmp_path / f"{index}.jpg", index)
     (tmp_path / "IMG_1.HEIC").write_bytes(b"x")
-    chosen = choose_photos(tmp_path, False, quiet)
+    chosen = choose_photos(tmp_path, False, Told())
     assert chosen.names == ["0.jpg", "1.jpg", "2.jpg"]
     assert any('pip install ".[heic]"' in note for note in chosen.notes)
     for index in range(3):

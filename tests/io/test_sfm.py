@@ -15,6 +15,7 @@ from perception.io import features, sfm_checks
 from perception.io.inputs import load_scene
 from perception.io.lens import load_pycolmap
 from perception.io.sfm_checks import Pair
+from support.progress import Told
 
 WIDTH, HEIGHT, FOCAL, VIEWS = 320, 240, 300.0, 10
 
@@ -60,9 +61,9 @@ def corner(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(corner, tmp_path_factory):
-    told = []
+    told = Told()
     workdir = tmp_path_factory.mktemp("work")
-    return load_scene(corner[0], workdir, progress=lambda *args: told.append(args)), told, workdir
+    return load_scene(corner[0], workdir, progress=told), told.updates, workdir
 
 
 def errors(scene, truth):
@@ -85,17 +86,18 @@ def test_poses_are_the_true_ones(corner, run):
     assert center < 0.02 and turned < 0.5
     assert scene.views[0].K[0, 0] == pytest.approx(FOCAL, rel=0.03)
     assert len(scene.points) > 200 and not scene.metric
-    assert list(dict.fromkeys(stage for stage, _ in told)) == ["photos", "features", "matching", "mapping"]
-    for stage in ("photos", "features", "matching", "mapping"):
-        shares = [share for name, share in told if name == stage]
+    stages = [f"poses: {name}" for name in ("photos", "features", "matching", "mapping")]
+    assert list(dict.fromkeys(stage for stage, *_ in told)) == stages
+    for stage in stages:
+        shares = [done / total for name, done, total in told if name == stage]
         assert shares == sorted(shares) and shares[-1] == 1.0
 
 
 def test_finished_work_is_used_again(corner, run):
     scene, _, workdir = run
-    told = []
-    again = load_scene(corner[0], workdir, progress=lambda *args: told.append(args))
-    assert {stage for stage, _ in told} == {"photos"}  # looked at again, nothing else
+    told = Told()
+    again = load_scene(corner[0], workdir, progress=told)
+    assert {stage for stage, *_ in told.updates} == {"poses: photos"}  # looked at again, nothing else
     for a, b in zip(scene.views, again.views, strict=True):
         np.testing.assert_array_equal(a.camera_from_world, b.camera_from_world)
 
@@ -153,7 +155,7 @@ def test_photos_with_few_features_are_upsampled(corner, tmp_path, monkeypatch):
         monkeypatch.setattr(features, "MIN_FEATURES", least)
         database = tmp_path / f"{least}.db"
         photos = [corner[0] / name for name in names]
-        features._extract(database, corner[0], photos, names, [None] * 3, lambda *args: None)
+        features._extract(database, corner[0], photos, names, [None] * 3, Told())
         db = load_pycolmap().Database.open(database)
         assert db.num_cameras() == 1 and db.num_images() == 3
         count[least] = db.num_keypoints()

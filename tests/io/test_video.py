@@ -14,10 +14,8 @@ from perception.errors import InputError
 from perception.io.inputs import load_scene
 from perception.io.photo_folder import list_photos
 from perception.io.video import frame_size, video_frames
+from support.progress import Told
 from support.videos import turn_video, write_video
-
-
-def quiet(stage: str, fraction: float) -> None: ...
 
 
 def pan(count: int, step: int = 4, blurred: tuple[int, ...] = ()) -> list[np.ndarray]:
@@ -32,14 +30,14 @@ def test_frames_are_sharp_and_well_spaced(tmp_path: Path) -> None:
     """30 frames a second, every second looked at: 8 pixels of 160 are 5 % of the width, one stretch of 8 % or two."""
     blurred = tuple(range(0, 120, 4))
     video = write_video(tmp_path / "v.mp4", pan(120, blurred=blurred))
-    record = video_frames(video, tmp_path / "frames", quiet)
+    record = video_frames(video, tmp_path / "frames", Told())
     numbers = [int(photo.stem) for photo in list_photos(tmp_path / "frames")]
     assert record["frames"] == 119 or record["frames"] == 120
     assert len(numbers) == record["chosen"] and 25 <= len(numbers) <= 65
     assert np.diff(numbers).min() >= 2 and np.diff(numbers).max() <= 8
     assert len(set(numbers) & set(blurred)) <= 1
     (tmp_path / "frames" / numbers_name(numbers[0])).unlink()
-    assert video_frames(video, tmp_path / "frames", quiet) == record  # used again
+    assert video_frames(video, tmp_path / "frames", Told()) == record  # used again
 
 
 def numbers_name(number: int) -> str:
@@ -51,7 +49,7 @@ def test_a_video_held_upright_gives_upright_frames(tmp_path: Path) -> None:
     video = write_video(tmp_path / "v.mov", frames)
     turn_video(video, 120)
     assert frame_size(video) == (120, 160)
-    video_frames(video, tmp_path / "frames", quiet)
+    video_frames(video, tmp_path / "frames", Told())
     for photo in list_photos(tmp_path / "frames"):
         expected = np.rot90(frames[int(photo.stem)], -1).astype(float)
         assert np.abs(np.asarray(Image.open(photo)) - expected).mean() < 12  # two lossy codecs
@@ -85,4 +83,4 @@ def test_a_record_that_is_none_is_no_record(tmp_path: Path) -> None:
     for content in ("[", json.dumps([1])):
         (tmp_path / "frames" / "frames.json").write_text(content)
         with pytest.raises(InputError, match="exists already"):
-            video_frames(video, tmp_path / "frames", quiet)
+            video_frames(video, tmp_path / "frames", Told())

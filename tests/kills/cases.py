@@ -119,9 +119,9 @@ class Mapping(Case):
         return words if earlier is None else [*words, "--labels-from", str(earlier)]
 
     def work(self, place: Path, trial: int) -> int:
-        from perception.pipeline import mapping
+        from perception.pipeline import checkpoint
 
-        mapping.CHECKPOINT_SECONDS = 0.2
+        checkpoint.CHECKPOINT_SECONDS = 0.2
         return command(*self.words(place / "out.gsmap", place / "earlier.gsmap"))
 
     def again(self, place: Path, trial: int) -> int:

@@ -90,7 +90,7 @@ def _warm() -> None:
     import perception.export
     import perception.io.sfm
     import perception.pipeline.exporting
-    import perception.pipeline.run  # noqa: F401
+    import perception.pipeline.mapping  # noqa: F401
 
 
 def _cases(folder: Path, args: argparse.Namespace) -> dict[str, Case]:

@@ -13,6 +13,7 @@ from perception.io import photos
 from perception.masks import make_source
 from perception.masks.store import compute_masks, label_file, load_labels, write_labels
 from perception.types import Lens, View
+from support.progress import Told
 
 WIDTH, HEIGHT = 24, 16
 
@@ -209,9 +210,9 @@ def test_photo_in_which_nothing_is_found_is_reported(tmp_path):
 
 
 def test_progress_counts_every_photo(tmp_path):
-    seen: list[tuple[int, int]] = []
-    compute_masks([view("a.jpg"), view("b.jpg")], Counting(), photo, tmp_path, lambda *done: seen.append(done))
-    assert seen == [(1, 2), (2, 2)]
+    told = Told()
+    compute_masks([view("a.jpg"), view("b.jpg")], Counting(), photo, tmp_path, told)
+    assert [update[1:] for update in told.updates] == [(1, 2), (2, 2)]
 
 
 def test_ids_beyond_16_bit_are_renumbered_without_merging(tmp_path):

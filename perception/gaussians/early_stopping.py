@@ -1,17 +1,14 @@
-"""What more is worth its time: harmonics, Gaussians, iterations. One rate decides, told in the run record.
+"""Early stopping: growth, harmonics and iterations end when what they gain no longer pays for their time.
 
 The course of training is cut into trials of 5 %. At the end of each the held-out PSNR is taken (of training views where
-nothing is held out), and time is counted in iterations, so that a run repeats. The exchange rate is the dB that 10 %
-more time must buy.
+nothing is held out). Time is counted in iterations, so that a run repeats. `train.exchange_db` is the dB that 10 % more
+time must gain.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
-from typing import Any
-
-from perception.config import MapConfig
+from dataclasses import dataclass, field
 
 TRIAL = 0.05
 """Length of a trial, as a share of the whole course."""
@@ -24,30 +21,21 @@ HARMONICS_GAIN = 0.05
 
 
 @dataclass
-class Economy:
-    """What was measured and decided so far; `state` and `load` round-trip it through a checkpoint.
+class EarlyStopping:
+    """What was measured and decided so far; its fields are plain values and go into a checkpoint as they are.
 
-    scores, counts: PSNR in dB and number of Gaussians at the end of each trial. growing: Gaussians may be added.
-    settled: the degree of harmonics is decided. finished: only the cool-down is left.
+    asked_db: dB that 10 % more time must gain. scores, counts: PSNR in dB and number of Gaussians at the end of each
+    trial. growing: Gaussians may be added. degree_decided: the degree of harmonics is final. finished: only the
+    cool-down is left. due: progress at which the next trial ends.
     """
 
-    config: MapConfig
+    asked_db: float
     scores: list[float] = field(default_factory=list)
     counts: list[int] = field(default_factory=list)
     growing: bool = True
-    settled: bool = False
+    degree_decided: bool = False
     finished: bool = False
     due: float = TRIAL
-
-    def state(self) -> dict[str, Any]:
-        """Plain values for a checkpoint."""
-        values = asdict(self)
-        del values["config"]
-        return values
-
-    def load(self, values: dict[str, Any]) -> None:
-        """Takes up `state()`."""
-        vars(self).update(values)
 
     def gain(self) -> float | None:
         """dB that the best PSNR gained over the last two trials, up to CEILING; None before there are three."""
@@ -58,19 +46,19 @@ class Economy:
     def growth_pays(self, allowed: int) -> str | None:
         """None while growth pays; else why it ends. allowed: Gaussians at the end of the next trial, at most.
 
-        All that two trials gained, by growth and by mere training, bounds what growth gained in them; when even that
-        is less than the next trial's growth costs at the exchange rate, growth does not pay. The next trial is taken
-        to add as many as the last: where little wants to grow, far fewer than are allowed.
+        All that two trials gained, by growth and by training alone, bounds what growth gained in them; when even that
+        is less than the next trial's growth costs, growth does not pay. The next trial is taken to add as many as the
+        last: where little wants to grow, far fewer than are allowed.
         """
         gain = self.gain()
-        if gain is None or len(self.counts) < 2:  # a checkpoint of an earlier version has no counts
+        if gain is None:
             return None
         before, gaussians = self.counts[-2:]
         next_count = min(allowed, 2 * gaussians - before)
         if next_count <= gaussians:
             return None
         tenths = ((next_count / gaussians) ** COST_EXPONENT - 1) / 0.1
-        asked = self.config.train.exchange_db * tenths
+        asked = self.asked_db * tenths
         if gain / 2 >= asked:
             return None
         self.growing = False
@@ -82,20 +70,20 @@ class Economy:
         if gain is None:
             return None
         tenths = 2 * TRIAL / (0.1 * progress)
-        if gain >= self.config.train.exchange_db * tenths:
+        if gain >= self.asked_db * tenths:
             return None
-        return f"stop: 10 % more time gains {gain / tenths:.3f} dB, {self.config.train.exchange_db:g} are asked"
+        return f"stop: 10 % more time gains {gain / tenths:.3f} dB, {self.asked_db:g} are asked"
 
-    def harmonics_step(self, degree: int, score: Callable[[int], float]) -> tuple[int, str | None]:
-        """The degree to go on with after a trial, and what was decided, if anything.
+    def next_degree(self, degree: int, highest: int, score: Callable[[int], float]) -> tuple[int, str | None]:
+        """The degree of harmonics to go on with after a trial, and what was decided, if anything.
 
-        A trial adds a degree. One trial after the last, `score` tells the held-out PSNR with the colours cut to a
-        degree, and the highest degree goes when it is worth less than HARMONICS_GAIN; then the next is looked at.
-        What a degree gains in its own first trial says little: harmonics learn slowly, and the others make room.
+        A trial adds a degree up to `highest`. One trial after the last, `score` gives the held-out PSNR with the
+        colours cut to a degree, and the highest degree goes while it is worth less than HARMONICS_GAIN. What a degree
+        gains in its own first trial says little: harmonics learn slowly, and the others make room.
         """
-        if degree < self.config.train.sh_degree:
+        if degree < highest:
             return degree + 1, None
-        self.settled = True
+        self.degree_decided = True
         worth = [score(d) for d in range(degree + 1)]
         kept = degree
         while kept and worth[kept] - worth[kept - 1] < HARMONICS_GAIN:

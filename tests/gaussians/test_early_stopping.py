@@ -14,9 +14,10 @@ import torch
 
 from perception.cli import _resume, main
 from perception.config import load_config
-from perception.gaussians.economy import COST_EXPONENT, Economy
+from perception.gaussians.early_stopping import COST_EXPONENT, EarlyStopping
 from perception.gaussians.model import from_points
 from perception.gaussians.rates import cooling
+from perception.gaussians.schedule import Schedule
 from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView
 from perception.io.cloud import read_cloud, write_cloud
@@ -25,19 +26,19 @@ from perception.pipeline.summary import shares, speed
 from perception.types import PointCloud
 
 
-def economy(rate: float, scores: list[float], counts: list[int] | None = None) -> Economy:
-    return Economy(load_config(None, [f"train.exchange_db={rate}"]), scores=scores, counts=counts or [])
+def stopping(rate: float, scores: list[float], counts: list[int] | None = None) -> EarlyStopping:
+    return EarlyStopping(rate, scores, counts or [])
 
 
 def test_a_plateau_is_where_ten_percent_more_time_gains_less_than_asked() -> None:
     # At progress .8 the last two trials (.1) were 12.5 % more time; .05 dB in them are .04 dB per 10 %.
     scores = [20.0, 25.0, 25.02, 25.05]
-    assert economy(0.039, scores).plateau(0.8) is None
-    told = economy(0.041, scores).plateau(0.8)
+    assert stopping(0.039, scores).plateau(0.8) is None
+    told = stopping(0.041, scores).plateau(0.8)
     assert told is not None and "0.040 dB" in told
-    assert economy(9.0, scores[:2]).plateau(0.8) is None  # too early to tell
-    assert economy(0.0, [25.0, 26.0, 25.5, 25.9]).plateau(0.8) is None  # at no price, not even a loss ends it
-    assert economy(0.001, [25.0, 26.0, 25.5, 25.9]).plateau(0.8) is not None  # a dip that recovers is no gain
+    assert stopping(9.0, scores[:2]).plateau(0.8) is None  # too early to tell
+    assert stopping(0.0, [25.0, 26.0, 25.5, 25.9]).plateau(0.8) is None  # at no price, not even a loss ends it
+    assert stopping(0.001, [25.0, 26.0, 25.5, 25.9]).plateau(0.8) is not None  # a dip that recovers is no gain
 
 
 def test_growth_ends_where_all_that_was_gained_would_not_pay_for_it() -> None:
@@ -45,12 +46,11 @@ def test_growth_ends_where_all_that_was_gained_would_not_pay_for_it() -> None:
     grew = [10, 500, 1000]  # by 500 in the last trial, and so in the next where 2000 are allowed
     tenths = (1.5**COST_EXPONENT - 1) / 0.1
     for allowed, next_tenths in ((2000, tenths), (1200, (1.2**COST_EXPONENT - 1) / 0.1)):
-        assert economy(1.1 / next_tenths * 0.99, scores, grew).growth_pays(allowed) is None
-        ended = economy(1.1 / next_tenths * 1.01, scores, grew)
+        assert stopping(1.1 / next_tenths * 0.99, scores, grew).growth_pays(allowed) is None
+        ended = stopping(1.1 / next_tenths * 1.01, scores, grew)
         assert "1000 Gaussians" in str(ended.growth_pays(allowed)) and not ended.growing
-    assert economy(100.0, scores, grew).growth_pays(1000) is None  # nothing to pay for
-    assert economy(100.0, scores, [10, 1000, 1000]).growth_pays(2000) is None
-    assert economy(100.0, scores, [1000]).growth_pays(2000) is None  # resumed from a checkpoint without counts
+    assert stopping(100.0, scores, grew).growth_pays(1000) is None  # nothing to pay for
+    assert stopping(100.0, scores, [10, 1000, 1000]).growth_pays(2000) is None
 
 
 @pytest.mark.parametrize(
@@ -62,12 +62,12 @@ def test_growth_ends_where_all_that_was_gained_would_not_pay_for_it() -> None:
     ],
 )
 def test_the_highest_harmonics_go_while_they_are_worth_less_than_asked(cut: tuple[float, ...], kept: int) -> None:
-    held, degree = economy(0.0, []), 0
+    held, degree = stopping(0.0, []), 0
     for expected in (1, 2, 3):
-        degree, told = held.harmonics_step(degree, cut.__getitem__)
-        assert degree == expected and told is None and not held.settled
-    degree, told = held.harmonics_step(degree, cut.__getitem__)
-    assert degree == kept and held.settled and str(told).startswith(f"harmonics: degree {kept} kept")
+        degree, told = held.next_degree(degree, 3, cut.__getitem__)
+        assert degree == expected and told is None and not held.degree_decided
+    degree, told = held.next_degree(degree, 3, cut.__getitem__)
+    assert degree == kept and held.degree_decided and str(told).startswith(f"harmonics: degree {kept} kept")
 
 
 def test_rates_cool_down_over_the_last_share_only() -> None:
@@ -145,31 +145,31 @@ def small_trainer(*pairs: str) -> Trainer:
 def test_a_trial_is_scored_before_growth_sets_the_picture_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scored after it, most trials of a short run gained nothing, and growth ended .6 dB too early (tabletop_a)."""
     trainer = small_trainer("train.iterations=40", "densify.every=4", "train.exchange_db=0")
-    order = follow(monkeypatch, trainer, "score", "_grow", "_end_trial")
-    trainer.run(lambda trainer, figures: None)
+    order = follow(monkeypatch, trainer.schedule, "score", "_grow", "_end_trial")
+    trainer.run()
     grown = [n for n in range(40) if {"_grow", "_end_trial"} <= set(order.get(n, []))]
     assert len(grown) > 3 and all(order[n][:3] == ["score", "_grow", "_end_trial"] for n in grown)
 
 
 def test_holes_are_filled_after_growth_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = small_trainer("train.iterations=40", "densify.every=4", "train.exchange_db=0")
-    trainer.economy.growing = False
-    order = follow(monkeypatch, trainer, "_grow", "_fill")
-    trainer.run(lambda trainer, figures: None)
+    trainer.schedule.stopping.growing = False
+    order = follow(monkeypatch, trainer.schedule, "_grow", "_fill")
+    trainer.run()
     assert [name for names in order.values() for name in names] == ["_fill"] * 2  # turns 0 and 5 of .05 to .6
 
 
-def follow(monkeypatch: pytest.MonkeyPatch, trainer: Trainer, *names: str) -> dict[int, list[str]]:
+def follow(monkeypatch: pytest.MonkeyPatch, schedule: Schedule, *names: str) -> dict[int, list[str]]:
     """The calls of these methods from now on, by iteration."""
     told: dict[int, list[str]] = {}
     for name in names:
-        original = getattr(trainer, name)
+        original = getattr(schedule, name)
 
         def called(*args: Any, name: str = name, original: Callable[..., Any] = original, **more: Any) -> Any:
-            told.setdefault(trainer.iteration, []).append(name)
+            told.setdefault(schedule.trainer.iteration, []).append(name)
             return original(*args, **more)
 
-        monkeypatch.setattr(trainer, name, called)
+        monkeypatch.setattr(schedule, name, called)
     return told
 
 
@@ -179,10 +179,13 @@ def test_the_time_between_two_legs_is_not_training(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     trainer = small_trainer("train.iterations=10")
 
-    def a_second_later(trainer: Trainer, figures: dict[str, float]) -> None:
-        now[0] += 1
+    class Clock:
+        def after_step(self, trainer: Trainer, loss: float) -> None:
+            now[0] += 1
 
-    trainer.run(a_second_later, until=0.3)
+        def after_leg(self, trainer: Trainer) -> None: ...
+
+    trainer.run(Clock(), until=0.3)
     now[0] += 1000
     assert trainer.elapsed == 3
-    assert trainer.run(a_second_later).seconds == trainer.record.iterations == 10
+    assert trainer.run(Clock()).seconds == trainer.record.iterations == 10

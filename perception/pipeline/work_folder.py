@@ -1,0 +1,75 @@
+"""Where an unfinished run keeps what it has done, and what becomes of it when the run ends."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from perception.errors import InputError
+from perception.io.inputs import EXPECTED
+from perception.io.map_lock import writing
+from perception.pipeline.checkpoint import CHECKPOINT
+
+WORK_SUFFIX = ".work"
+LEAST_DISK = 256 << 20
+"""Bytes a small run writes to its work folder: features, masks, checkpoint, map."""
+
+
+def work_folder(output: Path) -> Path:
+    """A sibling of the map."""
+    return output.with_name(output.name + WORK_SUFFIX)
+
+
+@contextmanager
+def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
+    """The work folder of a run that makes `output`, locked against other writers; it goes when the block ends well.
+
+    It stays after any error, so that `--resume` goes on from there, unless bad input was found before the training
+    began. InputError for a source that is missing, an output or an unfinished run that is in the way, a full disk.
+    """
+    fresh = not work_folder(output).exists()
+    work = _prepare(source, output, resume)
+    with writing(output):
+        try:
+            yield work
+            shutil.rmtree(work, ignore_errors=True)
+        except OSError as error:
+            if error.errno != errno.ENOSPC:
+                raise
+            raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
+        except InputError:
+            if fresh and not (work / CHECKPOINT).exists():
+                shutil.rmtree(work, ignore_errors=True)
+            raise
+
+
+def clear_work(output: Path) -> None:
+    """Removes what a run left that was killed after its map took its place: its lock and its work folder."""
+    with writing(output):
+        shutil.rmtree(work_folder(output), ignore_errors=True)
+
+
+def _prepare(source: Path, output: Path, resume: bool) -> Path:
+    if not source.exists():
+        raise InputError(f"{source}: does not exist; give {EXPECTED}")
+    if output.exists():
+        raise InputError(f"{output}: exists already; choose another -o or remove it first")
+    work = work_folder(output)
+    if work.exists() and not resume:
+        raise InputError(f"{work}: an unfinished run lies there; go on with --resume or remove the folder")
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{work}: cannot be made ({error.strerror}); choose a writable -o") from error
+    # Libraries below abort the process when the disk fills up under them, so it is looked at first.
+    free = shutil.disk_usage(work).free
+    if free < LEAST_DISK:
+        if not any(work.iterdir()):
+            work.rmdir()
+        raise InputError(
+            f"{output}: the disk has {free >> 20} MiB free, at least {LEAST_DISK >> 20} are needed; free some"
+        )
+    return work
