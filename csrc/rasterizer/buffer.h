@@ -7,7 +7,8 @@
 
 namespace perception {
 
-void *aligned_allocate(std::size_t bytes);  // throws std::bad_alloc
+// Frees `old` and returns memory for bytes at a multiple of 64, its content undefined. Throws std::bad_alloc.
+void *renew(void *old, std::size_t bytes);
 
 template <class T>
 class Buffer {
@@ -22,12 +23,11 @@ class Buffer {
   ~Buffer() { std::free(data_); }
 
   // At least n elements; what was there is lost when it grows.
-  T *reserve(std::size_t n) {
+  __attribute__((always_inline)) T *reserve(std::size_t n) {
     if (n > capacity_) {
-      std::free(std::exchange(data_, nullptr));
+      const std::size_t grown = n + n / 4 + 16;
       capacity_ = 0;
-      std::size_t grown = n + n / 4 + 16;
-      data_ = static_cast<T *>(aligned_allocate(grown * sizeof(T)));
+      data_ = static_cast<T *>(renew(std::exchange(data_, nullptr), grown * sizeof(T)));
       capacity_ = grown;
     }
     return data_;

@@ -1,7 +1,10 @@
 // The geometry shared by both passes: a 64x64-pixel tile has 16 tiles of 16x16, each of these 16 granules of 4x4
 // pixels, so one test of 16 boxes serves every level and gives a 16-bit mask.
 #pragma once
-#include "project_stage.h"
+#include <cstring>
+
+#include "constants.h"
+#include "rasterizer.h"
 #include "simd.h"
 
 namespace perception::PERCEPTION_LEVEL {
@@ -94,16 +97,14 @@ inline void granule_pixels(int tile_x, int tile_y, int g, uint32_t inside, T *px
   for (int i = 0; i < 16; ++i) px[i] = inside >> i & 1 ? x + T(i & 3) : kFar<T>, py[i] = y + T(i >> 2);
 }
 
-// Row `row` of a 16x16 tile (16 pixels) to and from four granules, whose channel stands `stride` numbers apart.
-template <class T>
-inline void row_to_granules(const T *row_values, int row, T *channel, std::size_t stride) {
-  for (int q = 0; q < 4; ++q)
-    std::memcpy(channel + ((row >> 2) * 4 + q) * stride + (row & 3) * 4, row_values + 4 * q, 4 * sizeof(T));
+// Row `row` of a 16x16 tile (16 pixels) to and from the four granules it crosses; granule(g) is the channel of one.
+template <class T, class Granule>
+inline void row_to_granules(const T *values, int row, Granule &&granule) {
+  for (int q = 0; q < 4; ++q) std::memcpy(granule((row >> 2) * 4 + q) + (row & 3) * 4, values + 4 * q, 4 * sizeof(T));
 }
-template <class T>
-inline void row_from_granules(const T *channel, std::size_t stride, int row, T *row_values) {
-  for (int q = 0; q < 4; ++q)
-    std::memcpy(row_values + 4 * q, channel + ((row >> 2) * 4 + q) * stride + (row & 3) * 4, 4 * sizeof(T));
+template <class T, class Granule>
+inline void row_from_granules(Granule &&granule, int row, T *values) {
+  for (int q = 0; q < 4; ++q) std::memcpy(values + 4 * q, granule((row >> 2) * 4 + q) + (row & 3) * 4, 4 * sizeof(T));
 }
 
 }  // namespace perception::PERCEPTION_LEVEL

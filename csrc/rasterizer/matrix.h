@@ -10,6 +10,11 @@ constexpr int padded(int n) {
   return (n + Vec<T>::kLanes - 1) / Vec<T>::kLanes * Vec<T>::kLanes;
 }
 
+// A feature row is e = f - shift and, with the variance, e² after it. The shift is a granule's own (its first splat's
+// value), so that neither sum cancels however large the features are against their spread.
+template <class T, int NF, bool VAR>
+constexpr int kFeatureRow = padded<T>(NF * (VAR ? 2 : 1));
+
 // [ROWS, COLUMNS] to [COLUMNS, ROWS], both multiples of 4.
 template <int ROWS, int COLUMNS, class T>
 void transpose(const T *from, T *to) {

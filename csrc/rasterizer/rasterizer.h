@@ -1,6 +1,7 @@
 // The CPU rasterizer's interface, in plain arrays: no torch, no Python. Everything is templated on float and double;
 // the double build is the oracle of the float build.
 #pragma once
+#include <chrono>
 #include <cstdint>
 #include <memory>
 #include <string>
@@ -29,6 +30,8 @@ struct Inputs {
   int width, height;
   T near_plane;
   T eps2d;  // px², > 0
+
+  int color_width() const { return sh_degree < 0 ? 3 : 3 * sh_stride; }
 };
 
 template <class T>
@@ -86,6 +89,14 @@ enum Stage { kProject, kSort, kBin, kBlend, kBlendBackward, kReduce, kStages };
 struct Stats {
   uint64_t evaluated = 0, contributing = 0;
   double seconds[kStages] = {};  // wall clock by stage
+
+  // Runs one stage and adds its time.
+  template <class Body>
+  void timed(Stage stage, Body &&body) {
+    const auto start = std::chrono::steady_clock::now();
+    body();
+    seconds[stage] += std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+  }
 };
 
 struct Options {
@@ -109,18 +120,6 @@ struct ScratchDelete {
 };
 template <class T>
 using ScratchPtr = std::unique_ptr<Scratch<T>, ScratchDelete<T>>;
-
-// One SIMD level.
-template <class T>
-struct Kernels {
-  // Projects, sorts and bins camera `camera` into frame.
-  NonFinite (*prepare)(const Inputs<T> &, int camera, const Options &, Frame<T> &, Scratch<T> &, const Outputs<T> &,
-                       Stats &);
-  void (*forward)(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Scratch<T> &, const Outputs<T> &,
-                  Stats &);
-  void (*backward)(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Scratch<T> &, const Outputs<T> &,
-                   const Cotangents<T> &, const Gradients<T> &, Stats &);
-};
 
 // What a forward call keeps for its backward call: one frame a camera. Returned to a pool when destroyed.
 template <class T>

@@ -4,7 +4,6 @@
 #include <type_traits>
 #include <vector>
 
-#include "../common/parallel.h"
 #include "rasterizer.h"
 
 namespace perception {

@@ -1,10 +1,78 @@
-// Vec<T> and Mask<T>: one native register of the level this file is compiled for, with the few operations the
-// kernels need. AVX-512 and AVX2 use intrinsics; the baseline uses GCC's vector extensions (any processor).
+// Vec<T> and Mask<T>: one native register of the level this file is compiled for, with the few operations the kernels
+// need. AVX-512 and AVX2 use intrinsics, for float; the baseline uses GCC's vector extensions (any processor).
 #pragma once
 #include <cstdint>
 #include <cstring>
 #include <type_traits>
 
+#if defined(PERCEPTION_LEVEL_avx512) || defined(PERCEPTION_LEVEL_avx2)
+#include <immintrin.h>
+#endif
+
+namespace perception::PERCEPTION_LEVEL {
+
+template <class T>
+struct Native;  // the register Real and what a comparison gives, Bits
+#if defined(PERCEPTION_LEVEL_avx512)
+template <>
+struct Native<float> {
+  using Real = __m512;
+  using Bits = __mmask16;
+};
+#elif defined(PERCEPTION_LEVEL_avx2)
+template <>
+struct Native<float> {
+  using Real = __m256;
+  using Bits = __m256;
+};
+#else
+template <>
+struct Native<float> {
+  typedef float Real __attribute__((vector_size(16)));
+  typedef int32_t Bits __attribute__((vector_size(16)));  // all ones or all zeros
+};
+template <>
+struct Native<double> {
+  typedef double Real __attribute__((vector_size(16)));
+  typedef int64_t Bits __attribute__((vector_size(16)));
+};
+#endif
+
+template <class T>
+struct Mask {
+  typename Native<T>::Bits m;
+};
+
+template <class T>
+struct Vec {
+  using Real = typename Native<T>::Real;
+  static constexpr int kLanes = sizeof(Real) / sizeof(T);
+  Real v;
+  Vec() = default;
+  Vec(Real x) : v(x) {}
+  explicit Vec(T x) : v(x - Real{}) {}
+  static Vec load(const T *p) {
+    Real r;
+    std::memcpy(&r, p, sizeof r);
+    return r;
+  }
+  void store(T *p) const { std::memcpy(p, &v, sizeof v); }
+  friend Vec operator+(Vec a, Vec b) { return a.v + b.v; }
+  friend Vec operator-(Vec a, Vec b) { return a.v - b.v; }
+  friend Vec operator*(Vec a, Vec b) { return a.v * b.v; }
+};
+
+}  // namespace perception::PERCEPTION_LEVEL
+
+// What differs from level to level:
+//   fma(a, b, c) = a b + c, fnma(a, b, c) = c - a b, min, max, comparisons >= and <
+//   fraction(a, whole): a - floor(a), and the rest in the form that scale_by_power_of_two(p, whole) = p 2^whole wants
+//   reciprocal(a): relative error below 2e-7 in float
+//   &, |, and_not(a, b) = a and not b, bits(m): lane j as bit j, any(m)
+//   keep(m, a) = m ? a : 0, select(m, a, b) = m ? a : b
+//   sum(a) over the lanes; transpose_sum(v): lane j is the sum over the lanes of v[j]
+//   append_to_lists(masks, ids, lists, stride, counts): for j < 16, where bit g of masks[j] is set, appends ids[j] to
+//     list g, of counts[g] numbers at lists + g stride. Writes up to 16 numbers past the end of each list.
 #if defined(PERCEPTION_LEVEL_avx512)
 #include "simd_avx512.h"
 #elif defined(PERCEPTION_LEVEL_avx2)
@@ -31,6 +99,7 @@ inline Vec<float> exp2_nonpositive(Vec<float> x) {
   return scale_by_power_of_two(p, whole);
 }
 
+#if defined(PERCEPTION_LEVEL_baseline)
 inline Vec<double> exp2_nonpositive(Vec<double> x) {
   // ln(2)^k / k!, from k = 17 down to 1
   constexpr double kTaylor[] = {5.533046532458238e-18,  1.357024794875514e-16,  3.132436707088427e-15,
@@ -45,6 +114,7 @@ inline Vec<double> exp2_nonpositive(Vec<double> x) {
   p = fma(p, r, Vec<double>(1.0));
   return scale_by_power_of_two(p, whole);
 }
+#endif
 
 // Two registers side by side: they share what is broadcast and hide each other's latency.
 template <class T>

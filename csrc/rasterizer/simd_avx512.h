@@ -1,32 +1,10 @@
 #pragma once
-#include <immintrin.h>
+#include "simd.h"
 
 namespace perception::avx512 {
 
-template <class T>
-struct Vec;
-template <class T>
-struct Mask;
-
-template <>
-struct Mask<float> {
-  __mmask16 m;
-};
-template <>
-struct Vec<float> {
-  static constexpr int kLanes = 16;
-  __m512 v;
-  Vec() = default;
-  Vec(__m512 x) : v(x) {}
-  explicit Vec(float x) : v(_mm512_set1_ps(x)) {}
-  static Vec load(const float *p) { return _mm512_loadu_ps(p); }
-  void store(float *p) const { _mm512_storeu_ps(p, v); }
-};
 using VF = Vec<float>;
 using MF = Mask<float>;
-inline VF operator+(VF a, VF b) { return _mm512_add_ps(a.v, b.v); }
-inline VF operator-(VF a, VF b) { return _mm512_sub_ps(a.v, b.v); }
-inline VF operator*(VF a, VF b) { return _mm512_mul_ps(a.v, b.v); }
 inline VF fma(VF a, VF b, VF c) { return _mm512_fmadd_ps(a.v, b.v, c.v); }
 inline VF fnma(VF a, VF b, VF c) { return _mm512_fnmadd_ps(a.v, b.v, c.v); }
 inline VF min(VF a, VF b) { return _mm512_min_ps(a.v, b.v); }
@@ -35,7 +13,7 @@ inline VF fraction(VF a, VF &whole) {
   return whole = a, _mm512_reduce_ps(a.v, _MM_FROUND_TO_NEG_INF);
 }  // scalef floors
 inline VF scale_by_power_of_two(VF p, VF whole) { return _mm512_scalef_ps(p.v, whole.v); }
-inline VF reciprocal(VF a) {  // one Newton step: relative error below 2e-7
+inline VF reciprocal(VF a) {  // one Newton step
   __m512 r = _mm512_rcp14_ps(a.v);
   return _mm512_mul_ps(r, _mm512_fnmadd_ps(a.v, r, _mm512_set1_ps(2.f)));
 }
@@ -43,13 +21,12 @@ inline MF operator>=(VF a, VF b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_
 inline MF operator<(VF a, VF b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LT_OQ)}; }
 inline MF operator&(MF a, MF b) { return {static_cast<__mmask16>(a.m & b.m)}; }
 inline MF operator|(MF a, MF b) { return {static_cast<__mmask16>(a.m | b.m)}; }
-inline MF and_not(MF a, MF b) { return {static_cast<__mmask16>(a.m & ~b.m)}; }  // a and not b
+inline MF and_not(MF a, MF b) { return {static_cast<__mmask16>(a.m & ~b.m)}; }
 inline uint32_t bits(MF a) { return a.m; }
 inline bool any(MF a) { return a.m != 0; }
-inline VF keep(MF m, VF a) { return _mm512_maskz_mov_ps(m.m, a.v); }              // m ? a : 0
-inline VF select(MF m, VF a, VF b) { return _mm512_mask_mov_ps(b.v, m.m, a.v); }  // m ? a : b
+inline VF keep(MF m, VF a) { return _mm512_maskz_mov_ps(m.m, a.v); }
+inline VF select(MF m, VF a, VF b) { return _mm512_mask_mov_ps(b.v, m.m, a.v); }
 inline float sum(VF a) { return _mm512_reduce_add_ps(a.v); }
-// lane j of the result is the sum over the lanes of v[j]
 inline VF transpose_sum(const VF *in) {
   __m512 a[8], b[4], c[2];
   for (int i = 0; i < 8; ++i)  // lanes of every 128-bit quarter: v[i] v[i+8] v[i] v[i+8]
@@ -65,54 +42,6 @@ inline VF transpose_sum(const VF *in) {
   return _mm512_permutexvar_ps(order, d);
 }
 
-template <>
-struct Mask<double> {
-  __mmask8 m;
-};
-template <>
-struct Vec<double> {
-  static constexpr int kLanes = 8;
-  __m512d v;
-  Vec() = default;
-  Vec(__m512d x) : v(x) {}
-  explicit Vec(double x) : v(_mm512_set1_pd(x)) {}
-  static Vec load(const double *p) { return _mm512_loadu_pd(p); }
-  void store(double *p) const { _mm512_storeu_pd(p, v); }
-};
-using VD = Vec<double>;
-using MD = Mask<double>;
-inline VD operator+(VD a, VD b) { return _mm512_add_pd(a.v, b.v); }
-inline VD operator-(VD a, VD b) { return _mm512_sub_pd(a.v, b.v); }
-inline VD operator*(VD a, VD b) { return _mm512_mul_pd(a.v, b.v); }
-inline VD fma(VD a, VD b, VD c) { return _mm512_fmadd_pd(a.v, b.v, c.v); }
-inline VD fnma(VD a, VD b, VD c) { return _mm512_fnmadd_pd(a.v, b.v, c.v); }
-inline VD min(VD a, VD b) { return _mm512_min_pd(a.v, b.v); }
-inline VD max(VD a, VD b) { return _mm512_max_pd(a.v, b.v); }
-inline VD fraction(VD a, VD &whole) { return whole = a, _mm512_reduce_pd(a.v, _MM_FROUND_TO_NEG_INF); }
-inline VD scale_by_power_of_two(VD p, VD whole) { return _mm512_scalef_pd(p.v, whole.v); }
-inline VD reciprocal(VD a) { return _mm512_div_pd(_mm512_set1_pd(1.0), a.v); }
-inline MD operator>=(VD a, VD b) { return {_mm512_cmp_pd_mask(a.v, b.v, _CMP_GE_OQ)}; }
-inline MD operator<(VD a, VD b) { return {_mm512_cmp_pd_mask(a.v, b.v, _CMP_LT_OQ)}; }
-inline MD operator&(MD a, MD b) { return {static_cast<__mmask8>(a.m & b.m)}; }
-inline MD operator|(MD a, MD b) { return {static_cast<__mmask8>(a.m | b.m)}; }
-inline MD and_not(MD a, MD b) { return {static_cast<__mmask8>(a.m & ~b.m)}; }
-inline uint32_t bits(MD a) { return a.m; }
-inline bool any(MD a) { return a.m != 0; }
-inline VD keep(MD m, VD a) { return _mm512_maskz_mov_pd(m.m, a.v); }
-inline VD select(MD m, VD a, VD b) { return _mm512_mask_mov_pd(b.v, m.m, a.v); }
-inline double sum(VD a) { return _mm512_reduce_add_pd(a.v); }
-inline VD transpose_sum(const VD *v) {
-  alignas(64) double s[8];
-  for (int i = 0; i < 8; ++i) s[i] = sum(v[i]);
-  return _mm512_load_pd(s);
-}
-
-template <class T>
-Mask<T> mask_from_bits(uint32_t b) {
-  return {static_cast<decltype(Mask<T>::m)>(b)};
-}
-
-// masks[j] bit g set: append ids[j] to list g. Writes up to 16 entries past each list's end.
 inline void append_to_lists(const uint16_t *masks, const uint32_t *ids, uint32_t *lists, int stride, uint32_t *counts) {
   __m256i rows = _mm256_loadu_si256(reinterpret_cast<const __m256i *>(masks));
   __m512i id = _mm512_loadu_si512(ids);

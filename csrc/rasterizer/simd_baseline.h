@@ -1,57 +1,48 @@
 // 128-bit registers through GCC's vector extensions: compiles for any processor.
 #pragma once
+#include "simd.h"
 
 namespace perception::baseline {
 
 template <class T>
-struct Lanes;
-template <>
-struct Lanes<float> {
-  using Integer = int32_t;
-  typedef float Real __attribute__((vector_size(16)));
-  typedef int32_t Int __attribute__((vector_size(16)));
-  static constexpr int kMantissa = 23;
-};
-template <>
-struct Lanes<double> {
-  using Integer = int64_t;
-  typedef double Real __attribute__((vector_size(16)));
-  typedef int64_t Int __attribute__((vector_size(16)));
-  static constexpr int kMantissa = 52;
-};
+constexpr int kMantissa = sizeof(T) == 4 ? 23 : 52;
 
 template <class T>
-struct Mask {
-  typename Lanes<T>::Int m;  // all ones or all zeros
-};
+inline Vec<T> fma(Vec<T> a, Vec<T> b, Vec<T> c) {
+  return a.v * b.v + c.v;
+}
 template <class T>
-struct Vec {
-  static constexpr int kLanes = 16 / sizeof(T);
-  using Real = typename Lanes<T>::Real;
-  Real v;
-  Vec() = default;
-  Vec(Real x) : v(x) {}
-  explicit Vec(T x) : v(x - Real{}) {}
-  static Vec load(const T *p) {
-    Real r;
-    std::memcpy(&r, p, sizeof r);
-    return r;
-  }
-  void store(T *p) const { std::memcpy(p, &v, sizeof v); }
-  friend Vec operator+(Vec a, Vec b) { return a.v + b.v; }
-  friend Vec operator-(Vec a, Vec b) { return a.v - b.v; }
-  friend Vec operator*(Vec a, Vec b) { return a.v * b.v; }
-  friend Vec fma(Vec a, Vec b, Vec c) { return a.v * b.v + c.v; }
-  friend Vec fnma(Vec a, Vec b, Vec c) { return c.v - a.v * b.v; }
-  friend Vec min(Vec a, Vec b) { return a.v < b.v ? a.v : b.v; }
-  friend Vec max(Vec a, Vec b) { return a.v > b.v ? a.v : b.v; }
-  friend Vec reciprocal(Vec a) { return (Real{} + 1) / a.v; }
-  friend Mask<T> operator>=(Vec a, Vec b) { return {a.v >= b.v}; }
-  friend Mask<T> operator<(Vec a, Vec b) { return {a.v < b.v}; }
-  friend Vec keep(Mask<T> m, Vec a) { return m.m ? a.v : Real{}; }
-  friend Vec select(Mask<T> m, Vec a, Vec b) { return m.m ? a.v : b.v; }
-};
-
+inline Vec<T> fnma(Vec<T> a, Vec<T> b, Vec<T> c) {
+  return c.v - a.v * b.v;
+}
+template <class T>
+inline Vec<T> min(Vec<T> a, Vec<T> b) {
+  return a.v < b.v ? a.v : b.v;
+}
+template <class T>
+inline Vec<T> max(Vec<T> a, Vec<T> b) {
+  return a.v > b.v ? a.v : b.v;
+}
+template <class T>
+inline Vec<T> reciprocal(Vec<T> a) {
+  return (typename Vec<T>::Real{} + 1) / a.v;
+}
+template <class T>
+inline Vec<T> keep(Mask<T> m, Vec<T> a) {
+  return m.m ? a.v : typename Vec<T>::Real{};
+}
+template <class T>
+inline Vec<T> select(Mask<T> m, Vec<T> a, Vec<T> b) {
+  return m.m ? a.v : b.v;
+}
+template <class T>
+inline Mask<T> operator>=(Vec<T> a, Vec<T> b) {
+  return {a.v >= b.v};
+}
+template <class T>
+inline Mask<T> operator<(Vec<T> a, Vec<T> b) {
+  return {a.v < b.v};
+}
 template <class T>
 Mask<T> operator&(Mask<T> a, Mask<T> b) {
   return {a.m & b.m};
@@ -77,28 +68,22 @@ bool any(Mask<T> a) {
   return (words[0] | words[1]) != 0;
 }
 template <class T>
-Mask<T> mask_from_bits(uint32_t b) {
-  Mask<T> r;
-  for (int i = 0; i < Vec<T>::kLanes; ++i) r.m[i] = b >> i & 1 ? -1 : 0;
-  return r;
-}
-template <class T>
 Vec<T> fraction(Vec<T> a, Vec<T> &whole) {  // for |a| below 2^31; other lanes are arbitrary
   Vec<T> clamped = max(min(a, Vec<T>(T(1e9))), Vec<T>(T(-1e9)));
-  typename Lanes<T>::Int i = __builtin_convertvector(clamped.v, typename Lanes<T>::Int);
-  typename Lanes<T>::Real r = __builtin_convertvector(i, typename Lanes<T>::Real);
+  typename Native<T>::Bits i = __builtin_convertvector(clamped.v, typename Native<T>::Bits);
+  typename Vec<T>::Real r = __builtin_convertvector(i, typename Vec<T>::Real);
   whole = r > a.v ? r - 1 : r;
   return a - whole;
 }
 template <class T>
 Vec<T> scale_by_power_of_two(Vec<T> p, Vec<T> whole) {
-  using Int = typename Lanes<T>::Int;
-  using Element = typename Lanes<T>::Integer;
+  using Int = typename Native<T>::Bits;
+  using Element = std::conditional_t<sizeof(T) == 4, int32_t, int64_t>;
   Vec<T> exponent = max(whole, Vec<T>(T(-100)));  // lanes below carry no meaning
-  Int b, e = __builtin_convertvector(min(exponent, Vec<T>(T(0))).v, Int) * (Element(1) << Lanes<T>::kMantissa);
+  Int b, e = __builtin_convertvector(min(exponent, Vec<T>(T(0))).v, Int) * (Element{1} << kMantissa<T>);
   std::memcpy(&b, &p.v, 16);
   b += e;
-  typename Lanes<T>::Real r;
+  typename Vec<T>::Real r;
   std::memcpy(&r, &b, 16);
   return r;
 }
@@ -108,7 +93,6 @@ T sum(Vec<T> a) {
   for (int i = 0; i < Vec<T>::kLanes; ++i) s += a.v[i];
   return s;
 }
-// lane j of the result is the sum over the lanes of v[j]
 template <class T>
 Vec<T> transpose_sum(const Vec<T> *v) {
   Vec<T> r;
@@ -116,7 +100,6 @@ Vec<T> transpose_sum(const Vec<T> *v) {
   return r;
 }
 
-// masks[j] bit g set: append ids[j] to list g.
 inline void append_to_lists(const uint16_t *masks, const uint32_t *ids, uint32_t *lists, int stride, uint32_t *counts) {
   for (int j = 0; j < 16; ++j)
     for (uint32_t m = masks[j]; m; m &= m - 1) {

@@ -89,6 +89,12 @@ PERCEPTION_HD void sh_color_vjp_of(const T *v, const T *coefficients, const T *g
   gv[0] = (g[0] - x * along) * r, gv[1] = (g[1] - y * along) * r, gv[2] = (g[2] - z * along) * r;
 }
 
+// Vector from the camera's centre -Rᵀt to the Gaussian.
+template <class T>
+PERCEPTION_HD void view_vector(const Camera<T> &cam, const T *mean, T *v) {
+  for (int i = 0; i < 3; ++i) v[i] = mean[i] + cam.R[i] * cam.t[0] + cam.R[3 + i] * cam.t[1] + cam.R[6 + i] * cam.t[2];
+}
+
 // v: vector from the camera to the Gaussian. coefficients [(degree + 1)², 3].
 template <class T>
 PERCEPTION_HD void sh_color(int degree, const T *v, const T *coefficients, T *rgb) {

@@ -2,13 +2,9 @@
 // to the kernel's width, and distributes them over its 16 tiles of 16x16.
 #pragma once
 #include "granule.h"
+#include "kernels.h"
 
 namespace perception::PERCEPTION_LEVEL {
-
-// The slice of feature channels one pass blends.
-struct Slice {
-  int begin, count;
-};
 
 // A row of count <= NF channels; the whole width as a copy of constant size.
 template <int NF, class T>

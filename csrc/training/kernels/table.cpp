@@ -13,8 +13,10 @@ constexpr Kernels<T> kTable = {photometric_tile<T>, absolute_row<T>,  accumulate
                                sum_row<T, false>,   sum_row<T, true>, adam<T>};
 
 extern const Kernels<float> float_kernels;
-extern const Kernels<double> double_kernels;
 const Kernels<float> float_kernels = kTable<float>;
+#ifdef PERCEPTION_LEVEL_baseline
+extern const Kernels<double> double_kernels;
 const Kernels<double> double_kernels = kTable<double>;
+#endif
 
 }  // namespace perception::training::PERCEPTION_LEVEL

@@ -1,32 +1,34 @@
 // Stage 4: front-to-back blending. Granule by granule, so that a granule's state stays in registers while its list
 // of splats runs by; feature channels follow as a product of the kept weights with the splats' feature rows.
-#pragma once
+#include "kernels.h"
 #include "matrix.h"
 #include "supertile.h"
 
 namespace perception::PERCEPTION_LEVEL {
+namespace {
 
-// A feature row is e = f - shift and, with the variance, e² after it. The shift is a granule's own (its first splat's
-// value), so that neither sum cancels however large the features are against their spread.
-template <class T, int NF, bool VAR>
-constexpr int kFeatureRow = padded<T>(NF * (VAR ? 2 : 1));
-
-template <class T, int NF, bool VAR, bool DEPTH>
-struct ForwardTile {
-  static constexpr int kChunk = NF ? 128 : 256, kColors = DEPTH ? 4 : 3, kRow = kFeatureRow<T, NF, VAR>;
+// A 16x16 tile. Chunks of its list are worked on at a time.
+template <class T, bool FEATURES>
+struct ColorTile {
+  static constexpr int kChunk = FEATURES ? 128 : 256;
   alignas(64) T px[16][16], py[16][16], transmittance[16][16];
-  alignas(64) T colors[16][kColors][16];                     // red, green, blue, depth
-  alignas(64) T features[16][NF ? 16 : 1][kRow ? kRow : 1];  // a row a pixel
-  T shift[16][NF ? NF : 1];
+  alignas(64) T colors[16][4][16];  // red, green, blue, depth
   uint32_t counts[16];
   uint32_t lists[16][kChunk + 32];
-  alignas(64) T weights[NF ? kChunk : 1][16];
-  alignas(64) T rows[NF ? kChunk : 1][kRow ? kRow : 1];
+  alignas(64) T weights[FEATURES ? kChunk : 1][16];
+};
+
+template <class T, int NF, bool VAR>
+struct ForwardTile : ColorTile<T, (NF > 0)> {
+  static constexpr int kRow = kFeatureRow<T, NF, VAR>;
+  alignas(64) T features[16][NF ? 16 : 1][kRow ? kRow : 1];  // a row a pixel
+  T shift[16][NF ? NF : 1];
+  alignas(64) T rows[NF ? ColorTile<T, (NF > 0)>::kChunk : 1][kRow ? kRow : 1];
 };
 
 // Runs some of a granule's pixels over a list of splats. False when none of them is open any more.
-template <class T, int NF, bool VAR, bool DEPTH>
-inline bool blend_list(Worker<T> &w, int n, int g, int lane, ForwardTile<T, NF, VAR, DEPTH> &tile) {
+template <bool DEPTH, class T, bool FEATURES>
+[[gnu::noinline]] bool blend_list(Worker<T> &w, int n, int g, int lane, ColorTile<T, FEATURES> &tile) {
   using P = Pack<T>;
   const Splat<T> *splats = w.splats.data();
   uint16_t *touched = w.touched.data();
@@ -47,7 +49,7 @@ inline bool blend_list(Worker<T> &w, int n, int g, int lane, ForwardTile<T, NF, 
     t = b.next;
     red = fma(b.weight, P(s.r), red), green = fma(b.weight, P(s.g), green), blue = fma(b.weight, P(s.b), blue);
     if constexpr (DEPTH) depth = fma(b.weight, P(s.z), depth);
-    if constexpr (NF > 0) b.weight.store(tile.weights[i - 1] + lane);
+    if constexpr (FEATURES) b.weight.store(tile.weights[i - 1] + lane);
     const uint32_t mask = bits(P(T(0)) < b.weight);
     touched[at] |= static_cast<uint16_t>(mask);
     pairs += __builtin_popcount(mask);
@@ -61,14 +63,14 @@ inline bool blend_list(Worker<T> &w, int n, int g, int lane, ForwardTile<T, NF, 
   t.store(tile.transmittance[g] + lane);
   red.store(tile.colors[g][0] + lane), green.store(tile.colors[g][1] + lane), blue.store(tile.colors[g][2] + lane);
   if constexpr (DEPTH) depth.store(tile.colors[g][3] + lane);
-  if constexpr (NF > 0)
+  if constexpr (FEATURES)
     for (; i < n; ++i) P(T(0)).store(tile.weights[i] + lane);
   return open;
 }
 
 // Adds granule g's list to its pixels' feature sums.
-template <class T, int NF, bool VAR, bool DEPTH>
-inline void blend_features(const T *features, int n, int g, ForwardTile<T, NF, VAR, DEPTH> &tile) {
+template <class T, int NF, bool VAR>
+inline void blend_features(const T *features, int n, int g, ForwardTile<T, NF, VAR> &tile) {
   const uint32_t *list = tile.lists[g];
   const T *shift = tile.shift[g];
   for (int k = 0; k < n; ++k) {
@@ -100,10 +102,10 @@ void list_granules(const Worker<T> &w, int x, int y, const uint32_t *list, int b
 }
 
 // (x, y): the 16x16 tile relative to its 64x64 tile. open: granules with a pixel in the image.
-template <class T, int NF, bool VAR, bool DEPTH>
-void forward_tile(Worker<T> &w, int x, int y, const uint32_t *list, int n, uint32_t open,
-                  ForwardTile<T, NF, VAR, DEPTH> &tile) {
-  constexpr int kChunk = ForwardTile<T, NF, VAR, DEPTH>::kChunk;
+template <class T, int NF, bool VAR>
+void forward_tile(Worker<T> &w, bool depth, int x, int y, const uint32_t *list, int n, uint32_t open,
+                  ForwardTile<T, NF, VAR> &tile) {
+  constexpr int kChunk = ForwardTile<T, NF, VAR>::kChunk;
   uint32_t fresh = 0xffff;  // granules that have no shift yet
   for (int begin = 0; begin < n && open; begin += kChunk) {
     list_granules(w, x, y, list, begin, n < begin + kChunk ? n : begin + kChunk, tile.lists[0], kChunk + 32,
@@ -112,7 +114,11 @@ void forward_tile(Worker<T> &w, int x, int y, const uint32_t *list, int n, uint3
       const int g = __builtin_ctz(rest), count = static_cast<int>(tile.counts[g]);
       if (!count) continue;
       bool still_open = false;
-      for (int lane = 0; lane < 16; lane += Pack<T>::kLanes) still_open |= blend_list(w, count, g, lane, tile);
+      for (int lane = 0; lane < 16; lane += Pack<T>::kLanes) {
+        auto &colors = static_cast<ColorTile<T, (NF > 0)> &>(tile);
+        still_open |=
+            depth ? blend_list<true>(w, count, g, lane, colors) : blend_list<false>(w, count, g, lane, colors);
+      }
       if constexpr (NF > 0) {
         if (fresh >> g & 1)
           std::memcpy(tile.shift[g], w.features.data() + static_cast<std::size_t>(tile.lists[g][0]) * NF,
@@ -138,39 +144,37 @@ inline void write_features(const T *sums, const T *shift, T t, Count count, T *f
       const T offset = sums[c] * inverse, mean = shift[c] + offset, m2 = sums[NF + c] - sums[c] * offset;
       var[c] = (m2 > 0 ? m2 : T(0)) + a * t * mean * mean;
     }
-    std::memcpy(variance, var, count * sizeof(T));
+    if (variance) std::memcpy(variance, var, count * sizeof(T));
   }
   std::memcpy(features, sum, count * sizeof(T));
 }
 
 // Row `row` of a tile, `columns` of it inside the image (a constant 16 but at the right edge).
-template <class T, int NF, bool VAR, bool DEPTH, class Columns, class Count>
+template <class T, int NF, bool VAR, class Columns, class Count>
 inline void write_row(const Inputs<T> &in, const T *background, int64_t pixel, int row, Columns columns, Slice slice,
-                      Count count, const ForwardTile<T, NF, VAR, DEPTH> &tile, const Outputs<T> &out) {
-  using Tile = ForwardTile<T, NF, VAR, DEPTH>;
+                      Count count, const ForwardTile<T, NF, VAR> &tile, const Outputs<T> &out) {
   T t[16], color[4][16];
-  row_from_granules(tile.transmittance[0], 16, row, t);
+  row_from_granules([&](int g) { return tile.transmittance[g]; }, row, t);
   if (slice.begin == 0) {
-    for (int c = 0; c < Tile::kColors; ++c) row_from_granules(tile.colors[0][c], Tile::kColors * 16, row, color[c]);
+    for (int c = 0; c < 4; ++c) row_from_granules([&](int g) { return tile.colors[g][c]; }, row, color[c]);
     for (int i = 0; i < columns; ++i) {
       for (int c = 0; c < 3; ++c) out.colors[3 * (pixel + i) + c] = color[c][i] + t[i] * background[c];
       out.alphas[pixel + i] = 1 - t[i];
     }
-    if constexpr (DEPTH)
-      if (out.depths)
-        for (int i = 0; i < columns; ++i) out.depths[pixel + i] = color[3][i];
+    if (out.depths)
+      for (int i = 0; i < columns; ++i) out.depths[pixel + i] = color[3][i];
   }
   if constexpr (NF > 0)
     for (int i = 0; i < columns; ++i) {
       const int g = (row >> 2) * 4 + (i >> 2);
       const int64_t at = (pixel + i) * in.dims + slice.begin;
       write_features<T, NF, VAR>(tile.features[g][(row & 3) * 4 + (i & 3)], tile.shift[g], t[i], count,
-                                 out.features + at, VAR ? out.variance + at : nullptr);
+                                 out.features + at, out.variance ? out.variance + at : nullptr);
     }
 }
 
-template <class T, int NF, bool VAR, bool DEPTH>
-void write_tile(const Inputs<T> &in, int camera, int x, int y, Slice slice, const ForwardTile<T, NF, VAR, DEPTH> &tile,
+template <class T, int NF, bool VAR>
+void write_tile(const Inputs<T> &in, int camera, int x, int y, Slice slice, const ForwardTile<T, NF, VAR> &tile,
                 const Outputs<T> &out) {
   T background[3] = {};
   if (in.background) std::memcpy(background, in.background + 3 * camera, sizeof background);
@@ -184,10 +188,10 @@ void write_tile(const Inputs<T> &in, int camera, int x, int y, Slice slice, cons
   }
 }
 
-template <class T, int NF, bool VAR, bool DEPTH>
-void forward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int index, Slice slice, Worker<T> &w,
-                       const Outputs<T> &out) {
-  using Tile = ForwardTile<T, NF, VAR, DEPTH>;
+template <class T, int NF, bool VAR>
+void forward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int index, Slice slice, bool depth,
+                       Worker<T> &w, const Outputs<T> &out) {
+  using Tile = ForwardTile<T, NF, VAR>;
   load_supertile<NF, NF>(in, f, index, slice, w);
   std::memset(w.touched.reserve(w.n + 1), 0, w.n * sizeof(uint16_t));
   Tile &tile = *reinterpret_cast<Tile *>(w.tile.reserve(sizeof(Tile) / sizeof(T) + 1));
@@ -205,11 +209,32 @@ void forward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int i
       granule_pixels(x, y, g, inside, tile.px[g], tile.py[g]);
       for (T &t : tile.transmittance[g]) t = 1;
     }
-    forward_tile(w, x, y, w.lists.data() + q * static_cast<std::size_t>(w.stride), w.counts[q], open, tile);
+    forward_tile(w, depth, x, y, w.lists.data() + q * static_cast<std::size_t>(w.stride), w.counts[q], open, tile);
     write_tile(in, camera, x0 + x, y0 + y, slice, tile, out);
   }
   for (int j = 0; j < w.n; ++j)
     if (w.touched[j]) __atomic_store_n(&out.visible[in.n * camera + f.splats[w.source[j]].id], 1, __ATOMIC_RELAXED);
 }
+
+}  // namespace
+
+template <class T>
+void forward(const Inputs<T> &in, int camera, const Options &opt, const Frame<T> &f, Slice slice, Scratch<T> &scratch,
+             const Outputs<T> &out) {
+  with_shape<T>(slice, opt.variance, [&](auto width, auto variance) {
+    parallel_for(opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
+      forward_supertile<T, width(), variance()>(in, camera, f, f.tile_order[i], slice, opt.depth,
+                                                scratch.workers[worker], out);
+    });
+  });
+}
+
+#define INSTANTIATE(T)                                                                                  \
+  template void forward(const Inputs<T> &, int, const Options &, const Frame<T> &, Slice, Scratch<T> &, \
+                        const Outputs<T> &);
+INSTANTIATE(float)
+#ifdef PERCEPTION_LEVEL_baseline
+INSTANTIATE(double)
+#endif
 
 }  // namespace perception::PERCEPTION_LEVEL

@@ -7,32 +7,35 @@
 // first splat, so that large common offsets do not cancel), e = f - c:
 //   g S + v V has dL/dw = (g - 2 v (S - c)) e + v e² + const,  const = c g + v (c² - 2 S c),
 // and a constant channel is the accumulated alpha, whose gradient is const T_final / (1 - alpha).
-#pragma once
-#include "blend_forward.h"
+#include "kernels.h"
+#include "matrix.h"
+#include "records.h"
+#include "supertile.h"
 
 namespace perception::PERCEPTION_LEVEL {
+namespace {
 
-// A record is what one splat gathers over one 64x64 tile:
-// [0] Σ h, [1] Σ h u, [2] Σ h dy, [3] Σ h u², [4] Σ h u dy, [5] Σ h dy² (h = dL/d ln alpha), [6..8] Σ w g_rgb, [9] Σ w
-// g_z, then from kGeometry on Σ w g' and, with the variance, Σ w v for every feature channel.
-constexpr int kGeometry = 16;
-
-template <class T, int NF, bool VAR, bool DEPTH>
-struct BackwardTile {
-  static constexpr int kChunk = NF ? 64 : 128, kBase = DEPTH ? 4 : 3, kFeatures = NF * (VAR ? 2 : 1);
-  static constexpr int kRow = kFeatureRow<T, NF, VAR>, kRecord = kGeometry + kRow;
+// A 16x16 tile, its state a lane a pixel. Chunks of its list are worked on at a time.
+template <class T, bool FEATURES>
+struct ColorTile {
+  static constexpr int kChunk = FEATURES ? 64 : 128;
   alignas(64) T px[16][16], py[16][16], transmittance[16][16];
-  alignas(64) T behind[16][16];                     // R
-  alignas(64) T cotangent[16][kBase][16];           // of red, green, blue, depth
-  alignas(64) T by_channel[16][NF ? kRow : 1][16];  // cotangents of e, e²: a row of pixels a channel
-  alignas(64) T by_pixel[16][16][NF ? kRow : 1];    // the same, a row of channels a pixel
-  alignas(
-      64) T products[NF ? 16 : 1][NF ? kChunk + 32 : 1][16];  // per granule and splat: first Σ_c e g, then the weights
-  uint32_t open;                                              // granules with a pixel that takes light
-  uint32_t counts[16], done[16];                              // splats listed, splats blended
+  alignas(64) T behind[16][16];                                               // R
+  alignas(64) T cotangent[16][4][16];                                         // of red, green, blue, depth
+  alignas(64) T products[FEATURES ? 16 : 1][FEATURES ? kChunk + 32 : 1][16];  // per granule and splat: first Σ_c e g,
+                                                                              // then the weights
+  uint32_t open;                                                              // granules with a pixel that takes light
+  uint32_t counts[16], done[16];                                              // splats listed, splats blended
   uint32_t lists[16][kChunk + 64];
   uint32_t splats[kChunk];      // of the chunk, those that touch a granule
   uint16_t masks[kChunk + 16];  // and which
+};
+
+template <class T, int NF, bool VAR>
+struct BackwardTile : ColorTile<T, (NF > 0)> {
+  static constexpr int kFeatures = NF * (VAR ? 2 : 1), kRow = kFeatureRow<T, NF, VAR>, kRecord = kGeometry + kRow;
+  alignas(64) T by_channel[16][NF ? kRow : 1][16];  // cotangents of e, e²: a row of pixels a channel
+  alignas(64) T by_pixel[16][16][NF ? kRow : 1];    // the same, a row of channels a pixel
 };
 
 // Sum of NF (a power of two) numbers, in pairs; overwrites them.
@@ -73,11 +76,10 @@ inline T load_pixel_features(int64_t at, Count count, const T *shift, T a, const
 
 // Cotangents and R before the first splat of row `row`, `columns` of it inside the image (a constant 16 but at the
 // edge).
-template <class T, int NF, bool VAR, bool DEPTH, class Columns, class Count>
+template <class T, int NF, bool VAR, class Columns, class Count>
 inline void load_row(const Inputs<T> &in, const T *background, int64_t pixel, int row, Columns columns, Slice slice,
                      Count count, const T *shift, const Outputs<T> &out, const Cotangents<T> &grad,
-                     BackwardTile<T, NF, VAR, DEPTH> &tile) {
-  using Tile = BackwardTile<T, NF, VAR, DEPTH>;
+                     BackwardTile<T, NF, VAR> &tile) {
   T constant[16] = {}, behind[16] = {}, cotangent[4][16] = {};
   if (slice.begin == 0) {
     if (grad.alphas)
@@ -90,12 +92,11 @@ inline void load_row(const Inputs<T> &in, const T *background, int64_t pixel, in
           behind[i] += g * (out.colors[3 * (pixel + i) + c] - t * background[c]);
           constant[i] -= g * background[c];
         }
-    if constexpr (DEPTH)
-      if (grad.depths)
-        for (int i = 0; i < columns; ++i) {
-          cotangent[3][i] = grad.depths[pixel + i];
-          behind[i] += cotangent[3][i] * out.depths[pixel + i];
-        }
+    if (grad.depths)
+      for (int i = 0; i < columns; ++i) {
+        cotangent[3][i] = grad.depths[pixel + i];
+        behind[i] += cotangent[3][i] * out.depths[pixel + i];
+      }
   }
   if constexpr (NF > 0)
     for (int i = 0; i < columns; ++i)
@@ -103,14 +104,14 @@ inline void load_row(const Inputs<T> &in, const T *background, int64_t pixel, in
           (pixel + i) * in.dims + slice.begin, count, shift, out.alphas[pixel + i], out, grad,
           tile.by_pixel[(row >> 2) * 4 + (i >> 2)][(row & 3) * 4 + (i & 3)], constant[i]);
   for (int i = 0; i < columns; ++i) behind[i] -= constant[i] * (1 - out.alphas[pixel + i]);
-  row_to_granules(behind, row, tile.behind[0], 16);
-  for (int c = 0; c < Tile::kBase; ++c) row_to_granules(cotangent[c], row, tile.cotangent[0][c], Tile::kBase * 16);
+  row_to_granules(behind, row, [&](int g) { return tile.behind[g]; });
+  for (int c = 0; c < 4; ++c) row_to_granules(cotangent[c], row, [&](int g) { return tile.cotangent[g][c]; });
 }
 
 // (x, y): the 16x16 tile relative to its 64x64 tile at (x0, y0).
-template <class T, int NF, bool VAR, bool DEPTH>
+template <class T, int NF, bool VAR>
 void load_tile(const Inputs<T> &in, int camera, int x0, int y0, int x, int y, Slice slice, const T *shift,
-               const Outputs<T> &out, const Cotangents<T> &grad, BackwardTile<T, NF, VAR, DEPTH> &tile) {
+               const Outputs<T> &out, const Cotangents<T> &grad, BackwardTile<T, NF, VAR> &tile) {
   T background[3] = {};
   if (in.background) std::memcpy(background, in.background + 3 * camera, sizeof background);
   const bool full = x0 + x + 16 <= in.width && y0 + y + 16 <= in.height;
@@ -136,7 +137,7 @@ void load_tile(const Inputs<T> &in, int camera, int x0, int y0, int x, int y, Sl
   }
   if constexpr (NF > 0)
     for (int g = 0; g < 16; ++g)
-      transpose<16, BackwardTile<T, NF, VAR, DEPTH>::kRow>(tile.by_pixel[g][0], tile.by_channel[g][0]);
+      transpose<16, BackwardTile<T, NF, VAR>::kRow>(tile.by_pixel[g][0], tile.by_channel[g][0]);
 }
 
 // The sums over pixels that one splat gathers, a lane a pixel.
@@ -160,9 +161,9 @@ struct Moments {
 };
 
 // One splat over some pixels of granule g. product: the features' part of cg on entry, the weights on return.
-template <class T, int NF, bool VAR, bool DEPTH>
-inline void backward_step(const Splat<T> &s, bool clamps, int g, int lane, T *product,
-                          BackwardTile<T, NF, VAR, DEPTH> &tile, Moments<T, DEPTH> &m) {
+template <class T, bool FEATURES, bool DEPTH>
+inline void backward_step(const Splat<T> &s, bool clamps, int g, int lane, T *product, ColorTile<T, FEATURES> &tile,
+                          Moments<T, DEPTH> &m) {
   using P = Pack<T>;
   P px = P::load(tile.px[g] + lane);
   bool stopped = false;
@@ -178,7 +179,7 @@ inline void backward_step(const Splat<T> &s, bool clamps, int g, int lane, T *pr
   const P red = P::load(tile.cotangent[g][0] + lane), green = P::load(tile.cotangent[g][1] + lane),
           blue = P::load(tile.cotangent[g][2] + lane);
   P cg;
-  if constexpr (NF > 0) {
+  if constexpr (FEATURES) {
     cg = fma(P(s.r), red, P::load(product + lane));
     w.store(product + lane);
   } else {
@@ -203,9 +204,9 @@ inline void backward_step(const Splat<T> &s, bool clamps, int g, int lane, T *pr
 }
 
 // Splats [begin, end) of the list that touch an open granule, with their masks; returns how many.
-template <class T, int NF, bool VAR, bool DEPTH>
-inline int list_splats(const Worker<T> &w, int x, int y, const uint32_t *list, int begin, int end,
-                       BackwardTile<T, NF, VAR, DEPTH> &tile) {
+template <class T, bool FEATURES>
+int list_splats(const Worker<T> &w, int x, int y, const uint32_t *list, int begin, int end,
+                ColorTile<T, FEATURES> &tile) {
   int n = 0;
   for (int j = begin; j < end; ++j) {
     const Splat<T> &s = w.splats[list[j]];
@@ -217,9 +218,9 @@ inline int list_splats(const Worker<T> &w, int x, int y, const uint32_t *list, i
 }
 
 // products[g][k] = Σ_c e_c g_c at the pixels of granule g for the k-th of the splats that touch it.
-template <class T, int NF, bool VAR, bool DEPTH>
-inline void feature_products(const Worker<T> &w, int n, BackwardTile<T, NF, VAR, DEPTH> &tile) {
-  constexpr int kRow = BackwardTile<T, NF, VAR, DEPTH>::kRow;
+// by_channel [16, kRow, 16].
+template <int kRow, class T>
+[[gnu::noinline]] void feature_products(const Worker<T> &w, int n, const T *by_channel, ColorTile<T, true> &tile) {
   std::memset(tile.counts, 0, sizeof tile.counts), std::memset(tile.done, 0, sizeof tile.done);
   std::memset(tile.masks + n, 0, 16 * sizeof *tile.masks);
   for (int i = 0; i < n; i += 16)
@@ -231,64 +232,63 @@ inline void feature_products(const Worker<T> &w, int n, BackwardTile<T, NF, VAR,
     for (int k = 0; k < 16; ++k) list[tile.counts[g] + k] = w.n;  // a spare row
     multiply_rows<kRow, 16, false>(
         tile.counts[g], [&](int k) { return w.features.data() + static_cast<std::size_t>(list[k]) * kRow; },
-        tile.by_channel[g][0], [&](int k) { return tile.products[g][k]; });
+        by_channel + g * kRow * 16, [&](int k) { return tile.products[g][k]; });
   }
 }
 
-// Adds to the splats' records Σ over a granule's pixels of the weight times the row of feature cotangents.
-template <class T, int NF, bool VAR, bool DEPTH>
-inline void feature_gradients(const Worker<T> &w, BackwardTile<T, NF, VAR, DEPTH> &tile) {
-  using Tile = BackwardTile<T, NF, VAR, DEPTH>;
+// Adds to the splats' records Σ over a granule's pixels of the weight times the row of feature cotangents, of which
+// by_pixel [16, 16, kRow] has one a pixel.
+template <int kRow, class T>
+[[gnu::noinline]] void feature_gradients(const Worker<T> &w, const T *by_pixel, ColorTile<T, true> &tile) {
   for (int g = 0; g < 16; ++g) {
     uint32_t *list = tile.lists[g];
     for (int k = 0; k < 16; ++k) list[tile.done[g] + k] = w.n;  // a spare record
-    multiply_rows<16, Tile::kRow, true>(
-        tile.done[g], [&](int k) { return tile.products[g][k]; }, tile.by_pixel[g][0],
-        [&](int k) { return w.records.data() + static_cast<std::size_t>(list[k]) * Tile::kRecord + kGeometry; });
+    multiply_rows<16, kRow, true>(
+        tile.done[g], [&](int k) { return tile.products[g][k]; }, by_pixel + g * 16 * kRow,
+        [&](int k) { return w.records.data() + static_cast<std::size_t>(list[k]) * (kGeometry + kRow) + kGeometry; });
   }
 }
 
-template <class T, int NF, bool VAR, bool DEPTH>
-void backward_tile(Worker<T> &w, int x, int y, const uint32_t *list, int n, BackwardTile<T, NF, VAR, DEPTH> &tile) {
-  using Tile = BackwardTile<T, NF, VAR, DEPTH>;
-  for (int begin = 0; begin < n && tile.open; begin += Tile::kChunk) {
-    const int count = list_splats(w, x, y, list, begin, n < begin + Tile::kChunk ? n : begin + Tile::kChunk, tile);
-    if constexpr (NF > 0) feature_products(w, count, tile);
-    for (int j = 0; j < count; ++j) {
-      uint32_t mask = tile.masks[j] & tile.open;
-      if (!mask) continue;
-      const uint32_t at = tile.splats[j];
-      const Splat<T> &s = w.splats[at];
-      const bool clamps = s.log_opacity > T(-0.002);  // log2 of a little less than the largest alpha
-      Moments<T, DEPTH> m;
-      for (; mask; mask &= mask - 1) {
-        const int g = __builtin_ctz(mask);
-        T *product = NF > 0 ? tile.products[g][tile.done[g]++] : nullptr;
-        for (int lane = 0; lane < 16; lane += Pack<T>::kLanes) backward_step(s, clamps, g, lane, product, tile, m);
-      }
-      T *record = w.records.data() + static_cast<std::size_t>(at) * Tile::kRecord;
-      const bool first = !w.touched[at];
-      m.store(record, first);
-      if (NF > 0 && first) std::memset(record + kGeometry, 0, Tile::kRow * sizeof(T));
-      w.touched[at] = 1;
+// Blends the splats of a chunk, of records of `size` numbers.
+template <bool DEPTH, class T, bool FEATURES>
+[[gnu::noinline]] void blend_chunk(Worker<T> &w, int count, int size, ColorTile<T, FEATURES> &tile) {
+  for (int j = 0; j < count; ++j) {
+    uint32_t mask = tile.masks[j] & tile.open;
+    if (!mask) continue;
+    const uint32_t at = tile.splats[j];
+    const Splat<T> &s = w.splats[at];
+    const bool clamps = s.log_opacity > T(-0.002);  // log2 of a little less than the largest alpha
+    Moments<T, DEPTH> m;
+    for (; mask; mask &= mask - 1) {
+      const int g = __builtin_ctz(mask);
+      T *product = FEATURES ? tile.products[g][tile.done[g]++] : nullptr;
+      for (int lane = 0; lane < 16; lane += Pack<T>::kLanes) backward_step(s, clamps, g, lane, product, tile, m);
     }
-    if constexpr (NF > 0) feature_gradients(w, tile);
+    T *record = w.records.data() + static_cast<std::size_t>(at) * size;
+    const bool first = !w.touched[at];
+    m.store(record, first);
+    if (FEATURES && first) std::memset(record + kGeometry, 0, (size - kGeometry) * sizeof(T));
+    w.touched[at] = 1;
   }
 }
 
-// How many tiles of a splat's box come before tile `tile` in row-major order.
-template <class T>
-inline uint64_t box_tiles_before(const Splat<T> &s, int tiles_x, int tile) {
-  auto within = [](int value, int limit) { return value < 0 ? 0 : value > limit ? limit : value; };
-  const int width = s.x1 - s.x0 + 1, height = s.y1 - s.y0 + 1, row = tile / tiles_x - s.y0;
-  const int in_row = row >= 0 && row < height ? within(tile % tiles_x - s.x0, width) : 0;
-  return static_cast<uint64_t>(within(row, height)) * width + in_row;
+template <class T, int NF, bool VAR>
+void backward_tile(Worker<T> &w, bool depth, int x, int y, const uint32_t *list, int n,
+                   BackwardTile<T, NF, VAR> &tile) {
+  using Tile = BackwardTile<T, NF, VAR>;
+  auto &colors = static_cast<ColorTile<T, (NF > 0)> &>(tile);
+  for (int begin = 0; begin < n && tile.open; begin += Tile::kChunk) {
+    const int count = list_splats(w, x, y, list, begin, n < begin + Tile::kChunk ? n : begin + Tile::kChunk, colors);
+    if constexpr (NF > 0) feature_products<Tile::kRow>(w, count, tile.by_channel[0][0], colors);
+    depth ? blend_chunk<true>(w, count, Tile::kRecord, colors) : blend_chunk<false>(w, count, Tile::kRecord, colors);
+    if constexpr (NF > 0) feature_gradients<Tile::kRow>(w, tile.by_pixel[0][0], colors);
+  }
 }
 
 // Writes one splat's record to its slot: the geometry's moments, then the feature gradient Σ w (g' + 2 v e).
-template <class T, int NF, bool VAR, bool DEPTH>
+template <class T, int NF, bool VAR>
 inline void store_record(const Worker<T> &w, int j, uint64_t slot, Scratch<T> &scratch) {
-  using Tile = BackwardTile<T, NF, VAR, DEPTH>;
+  using Tile = BackwardTile<T, NF, VAR>;
   const T *from = w.records.data() + static_cast<std::size_t>(j) * Tile::kRecord;
   const T *e = w.features.data() + static_cast<std::size_t>(j) * Tile::kRow;
   T *to = scratch.records.data() + slot * (kGeometry + NF);
@@ -300,14 +300,14 @@ inline void store_record(const Worker<T> &w, int j, uint64_t slot, Scratch<T> &s
 
 // Writes the records of one 64x64 tile to their slots, one a splat and tile it touches. Slots lie far apart in memory:
 // each is asked for some splats before it is written.
-template <class T, int NF, bool VAR, bool DEPTH>
+template <class T, int NF, bool VAR>
 void store_records(const Frame<T> &f, int index, const Worker<T> &w, Scratch<T> &scratch) {
   constexpr int kAhead = 8, kSize = kGeometry + NF;
   const int tx = index % f.tiles_x, ty = index / f.tiles_x;
   uint64_t slots[kAhead];
   for (int j = 0; j < w.n + kAhead; ++j) {
     uint64_t &slot = slots[j % kAhead];
-    if (j >= kAhead && w.touched[j - kAhead]) store_record<T, NF, VAR, DEPTH>(w, j - kAhead, slot, scratch);
+    if (j >= kAhead && w.touched[j - kAhead]) store_record<T, NF, VAR>(w, j - kAhead, slot, scratch);
     if (j >= w.n || !w.touched[j]) continue;
     const Splat<T> &s = w.splats[j];
     const uint64_t place = static_cast<uint64_t>(ty - s.y0) * (s.x1 - s.x0 + 1) + (tx - s.x0);
@@ -318,10 +318,10 @@ void store_records(const Frame<T> &f, int index, const Worker<T> &w, Scratch<T> 
   }
 }
 
-template <class T, int NF, bool VAR, bool DEPTH>
+template <class T, int NF, bool VAR>
 void backward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int index, Slice slice, Scratch<T> &scratch,
                         Worker<T> &w, const Outputs<T> &out, const Cotangents<T> &grad) {
-  using Tile = BackwardTile<T, NF, VAR, DEPTH>;
+  using Tile = BackwardTile<T, NF, VAR>;
   load_supertile<NF, Tile::kRow>(in, f, index, slice, w);
   if (!w.n) return;
   T shift[NF ? NF : 1] = {};
@@ -345,9 +345,33 @@ void backward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int 
     const int x = (q & 3) * 16, y = (q >> 2) * 16;
     if (x0 + x >= in.width || y0 + y >= in.height || !w.counts[q]) continue;
     load_tile(in, camera, x0, y0, x, y, slice, shift, out, grad, tile);
-    backward_tile(w, x, y, w.lists.data() + q * static_cast<std::size_t>(w.stride), w.counts[q], tile);
+    backward_tile(w, grad.depths != nullptr, x, y, w.lists.data() + q * static_cast<std::size_t>(w.stride), w.counts[q],
+                  tile);
   }
-  store_records<T, NF, VAR, DEPTH>(f, index, w, scratch);
+  store_records<T, NF, VAR>(f, index, w, scratch);
 }
+
+}  // namespace
+
+template <class T>
+void backward(const Inputs<T> &in, int camera, const Options &opt, const Frame<T> &f, Slice slice, TileRange range,
+              Scratch<T> &scratch, const Outputs<T> &out, const Cotangents<T> &grad) {
+  with_shape<T>(slice, opt.variance, [&](auto width, auto variance) {
+    parallel_for(opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
+      const int tile = f.tile_order[i];
+      if (tile < range.begin || tile >= range.end) return;
+      backward_supertile<T, width(), variance()>(in, camera, f, tile, slice, scratch, scratch.workers[worker], out,
+                                                 grad);
+    });
+  });
+}
+
+#define INSTANTIATE(T)                                                                                              \
+  template void backward(const Inputs<T> &, int, const Options &, const Frame<T> &, Slice, TileRange, Scratch<T> &, \
+                         const Outputs<T> &, const Cotangents<T> &);
+INSTANTIATE(float)
+#ifdef PERCEPTION_LEVEL_baseline
+INSTANTIATE(double)
+#endif
 
 }  // namespace perception::PERCEPTION_LEVEL

@@ -1,24 +1,13 @@
 // Stage 1: projects all Gaussians, drops those no pixel can see, keeps the rest in order of their index.
-#pragma once
-#include <cstring>
 #include <limits>
 
-#include "../common/parallel.h"
-#include "scratch.h"
+#include "constants.h"
+#include "kernels.h"
 #include "simd.h"
 #include "spherical_harmonics.h"
 
 namespace perception::PERCEPTION_LEVEL {
-
-constexpr int kBlock = 256;
-template <class T>
-constexpr T kLog2E = T(1.4426950408889634);
-template <class T>
-constexpr T kLogThreshold = T(-7.994353436858858);  // log2(1/255)
-template <class T>
-constexpr T kMaxAlpha = T(0.999);
-template <class T>
-constexpr T kMinTransmittance = T(1e-4);
+namespace {
 
 template <class T>
 inline T clamp(T x, T low, T high) {
@@ -91,12 +80,6 @@ bool make_splat(const Camera<T> &cam, const ProjectionBlock<T> &b, int j, Splat<
   return true;
 }
 
-// Vector from the camera's centre -Rᵀt to the Gaussian.
-template <class T>
-void view_vector(const Camera<T> &cam, const T *mean, T *v) {
-  for (int i = 0; i < 3; ++i) v[i] = mean[i] + cam.R[i] * cam.t[0] + cam.R[3 + i] * cam.t[1] + cam.R[6 + i] * cam.t[2];
-}
-
 template <class T>
 void set_color(const Inputs<T> &in, const Camera<T> &cam, int64_t i, Splat<T> &s) {
   T rgb[3], v[3];
@@ -134,24 +117,19 @@ bool all_finite(const T *values, int64_t n) {
   return rest == 0;
 }
 
-// Width of a Gaussian's row of colours or SH coefficients.
-template <class T>
-int color_width(const Inputs<T> &in) {
-  return in.sh_degree < 0 ? 3 : 3 * in.sh_stride;
-}
-
 // Colours and features of Gaussians [i0, i0 + n).
 template <class T>
 bool attributes_finite(const Inputs<T> &in, int64_t i0, int n) {
-  const int64_t width = color_width(in);
+  const int64_t width = in.color_width();
   return all_finite(in.colors + width * i0, width * n) &&
          (!in.features || all_finite(in.features + in.dims * i0, static_cast<int64_t>(in.dims) * n));
 }
 
-// Gaussians [begin, end) into splats[begin...]; returns how many, or the first bad index through `bad`.
+}  // namespace
+
 template <class T>
-uint32_t project_range(const Inputs<T> &in, const Frame<T> &f, int64_t begin, int64_t end, bool check,
-                       DepthKey<T> *keys, T *radii, int64_t &bad) {
+uint32_t project(const Inputs<T> &in, const Frame<T> &f, int64_t begin, int64_t end, bool check, DepthKey<T> *keys,
+                 T *radii, int64_t &bad) {
   ProjectionBlock<T> b;
   uint32_t out = static_cast<uint32_t>(begin);
   for (int64_t i0 = begin; i0 < end; i0 += kBlock) {
@@ -178,48 +156,11 @@ uint32_t project_range(const Inputs<T> &in, const Frame<T> &f, int64_t begin, in
   return out - static_cast<uint32_t>(begin);
 }
 
-// The first offender at or after Gaussian `from`.
-template <class T>
-NonFinite find_non_finite(const Inputs<T> &in, int64_t from) {
-  struct Argument {
-    const char *name;
-    const T *data;
-    int width;
-  } arguments[] = {{"means", in.means, 3},
-                   {"quats", in.quats, 4},
-                   {"scales", in.scales, 3},
-                   {"opacities", in.opacities, 1},
-                   {"colors", in.colors, color_width(in)},
-                   {"features", in.features, in.features ? in.dims : 0}};
-  for (int64_t i = from; i < in.n; ++i)
-    for (const Argument &a : arguments)
-      for (int c = 0; c < a.width; ++c)
-        if (!std::isfinite(a.data[a.width * i + c])) return {a.name, i};
-  return {};
-}
-
-// Contiguous ranges, one a thread, then closed up: the result does not depend on the number of threads.
-template <class T>
-NonFinite project_all(const Inputs<T> &in, const Options &opt, Frame<T> &f, Scratch<T> &scratch, bool check, T *radii) {
-  f.splats.reserve(in.n);
-  DepthKey<T> *keys = scratch.keys[0].reserve(in.n);
-  const int64_t blocks = (in.n + kBlock - 1) / kBlock;
-  const int parts = static_cast<int>(blocks < opt.threads ? (blocks ? blocks : 1) : opt.threads);
-  uint32_t *counts = scratch.histograms.reserve(parts);
-  std::vector<int64_t> bad(parts, -1);
-  auto begin = [&](int64_t part) { return part == parts ? in.n : blocks * part / parts * kBlock; };
-  parallel_for(opt.threads, parts, [&](std::size_t part, int) {
-    counts[part] = project_range(in, f, begin(part), begin(part + 1), check, keys, radii, bad[part]);
-  });
-  for (int64_t i : bad)
-    if (i >= 0) return find_non_finite(in, i);
-  f.count = counts[0];
-  for (int part = 1; part < parts; ++part) {
-    std::memmove(f.splats.data() + f.count, f.splats.data() + begin(part), counts[part] * sizeof(Splat<T>));
-    std::memmove(keys + f.count, keys + begin(part), counts[part] * sizeof(*keys));
-    f.count += counts[part];
-  }
-  return {};
-}
+template uint32_t project(const Inputs<float> &, const Frame<float> &, int64_t, int64_t, bool, uint32_t *, float *,
+                          int64_t &);
+#ifdef PERCEPTION_LEVEL_baseline
+template uint32_t project(const Inputs<double> &, const Frame<double> &, int64_t, int64_t, bool, uint64_t *, double *,
+                          int64_t &);
+#endif
 
 }  // namespace perception::PERCEPTION_LEVEL

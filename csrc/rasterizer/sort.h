@@ -1,9 +1,10 @@
 // Stage 2: splats from front to back. A stable radix sort on the bits of the depth (positive, so its bits order as
 // it does); equal depths keep the order of the Gaussians' index.
 #pragma once
+#include "../common/parallel.h"
 #include "scratch.h"
 
-namespace perception::PERCEPTION_LEVEL {
+namespace perception {
 
 // On return scratch.order[0] holds splat indices by rising depth.
 template <class T>
@@ -51,4 +52,4 @@ void sort_by_depth(const Options &opt, uint32_t n, Scratch<T> &scratch) {
   }
 }
 
-}  // namespace perception::PERCEPTION_LEVEL
+}  // namespace perception

@@ -1,36 +1,12 @@
 // Stage 6: sums every splat's records in a fixed order and takes the gradient from the picture plane back to the
 // Gaussian's own parameters and the camera.
-#pragma once
-#include "blend_backward.h"
+#include "constants.h"
+#include "kernels.h"
+#include "records.h"
+#include "spherical_harmonics.h"
 
 namespace perception::PERCEPTION_LEVEL {
-
-// Tiles [begin, end), in row-major order.
-struct TileRange {
-  int begin, end;
-};
-
-// Slots: splat i owns as many records as its box has tiles in the range. Returns how many there are.
-template <class T>
-uint64_t assign_slots(const Frame<T> &f, TileRange range, Scratch<T> &scratch) {
-  uint64_t *slots = scratch.slots.reserve(f.count + 1), total = 0;
-  scratch.first_tile = range.begin;
-  for (uint32_t i = 0; i < f.count; ++i) {
-    const Splat<T> &s = f.splats[i];
-    slots[i] = total;
-    total += box_tiles_before(s, f.tiles_x, range.end) - box_tiles_before(s, f.tiles_x, range.begin);
-  }
-  slots[f.count] = total;
-  return total;
-}
-
-// The longest range from `begin` on whose splats need no more than `limit` records; at least one tile.
-template <class T>
-TileRange next_range(const Frame<T> &f, int begin, uint64_t limit) {
-  int end = begin + 1;
-  while (end < f.tiles_x * f.tiles_y && f.offsets[end + 1] - f.offsets[begin] <= limit) ++end;
-  return {begin, end};
-}
+namespace {
 
 // Sum of splat i's records; false when no tile touched it.
 template <class T>
@@ -43,30 +19,6 @@ bool sum_records(const Scratch<T> &scratch, uint32_t i, int size, T *sum) {
     found = true;
   }
   return found;
-}
-
-// Adds the records of a range to one sum a splat.
-template <class T>
-void add_records(const Options &opt, const Frame<T> &f, int size, Scratch<T> &scratch) {
-  const std::size_t blocks = (f.count + kBlock - 1) / kBlock;
-  parallel_for(opt.threads, blocks, [&](std::size_t block, int) {
-    const uint32_t end = static_cast<uint32_t>(std::min<std::size_t>(f.count, (block + 1) * kBlock));
-    T sum[kGeometry + 16];
-    for (uint32_t i = static_cast<uint32_t>(block * kBlock); i < end; ++i) {
-      if (!sum_records(scratch, i, size, sum)) continue;
-      T *to = scratch.sums.data() + static_cast<std::size_t>(i) * size;
-      for (int c = 0; c < size; ++c) to[c] = scratch.sum_touched[i] ? to[c] + sum[c] : sum[c];
-      scratch.sum_touched[i] = 1;
-    }
-  });
-}
-
-// Makes the sums the records, one a splat.
-template <class T>
-void take_sums(const Frame<T> &f, Scratch<T> &scratch) {
-  for (uint32_t i = 0; i <= f.count; ++i) scratch.slots[i] = i;
-  std::swap(scratch.records, scratch.sums);
-  std::swap(scratch.touched, scratch.sum_touched);
 }
 
 template <class T>
@@ -169,10 +121,28 @@ void flush_block(const Inputs<T> &in, const Frame<T> &f, int camera, const T (*c
   b.n = 0;
 }
 
+}  // namespace
+
+// Adds the records of a range to one sum a splat.
+template <class T>
+void add_records(const Options &opt, const Frame<T> &f, int size, Scratch<T> &scratch) {
+  const std::size_t blocks = (f.count + kBlock - 1) / kBlock;
+  parallel_for(opt.threads, blocks, [&](std::size_t block, int) {
+    const uint32_t end = static_cast<uint32_t>(std::min<std::size_t>(f.count, (block + 1) * kBlock));
+    T sum[kGeometry + 16];
+    for (uint32_t i = static_cast<uint32_t>(block * kBlock); i < end; ++i) {
+      if (!sum_records(scratch, i, size, sum)) continue;
+      T *to = scratch.sums.data() + static_cast<std::size_t>(i) * size;
+      for (int c = 0; c < size; ++c) to[c] = scratch.sum_touched[i] ? to[c] + sum[c] : sum[c];
+      scratch.sum_touched[i] = 1;
+    }
+  });
+}
+
 // Blocks of consecutive splats, each by one worker; the camera's gradient is summed over the blocks in order.
 template <class T>
-void reduce_gradients(const Inputs<T> &in, const Options &opt, const Frame<T> &f, int camera, Slice slice, int width,
-                      Scratch<T> &scratch, const Gradients<T> &out) {
+void reduce(const Inputs<T> &in, const Options &opt, const Frame<T> &f, int camera, Slice slice, int width,
+            Scratch<T> &scratch, const Gradients<T> &out) {
   const int size = kGeometry + width;
   const std::size_t blocks = (f.count + kBlock - 1) / kBlock;
   double *camera_sums = scratch.camera_sums.reserve(12 * (blocks + 1));
@@ -208,5 +178,14 @@ void reduce_gradients(const Inputs<T> &in, const Options &opt, const Frame<T> &f
     viewmat[4 * r + 3] += static_cast<T>(total[9 + r]);
   }
 }
+
+#define INSTANTIATE(T)                                                                                      \
+  template void add_records(const Options &, const Frame<T> &, int size, Scratch<T> &);                     \
+  template void reduce(const Inputs<T> &, const Options &, const Frame<T> &, int, Slice, int, Scratch<T> &, \
+                       const Gradients<T> &);
+INSTANTIATE(float)
+#ifdef PERCEPTION_LEVEL_baseline
+INSTANTIATE(double)
+#endif
 
 }  // namespace perception::PERCEPTION_LEVEL

@@ -4,9 +4,10 @@
 #include <stdexcept>
 #include <string>
 
+#include "../common/parallel.h"
 #include "scratch.h"
 
-namespace perception::PERCEPTION_LEVEL {
+namespace perception {
 
 // How many tiles the splats' boxes touch in all; refuses more than the lists may hold.
 template <class T>
@@ -66,4 +67,4 @@ void bin_splats(const Options &opt, Frame<T> &f, Scratch<T> &scratch) {
   });
 }
 
-}  // namespace perception::PERCEPTION_LEVEL
+}  // namespace perception

@@ -1,0 +1,63 @@
+// What is compiled once per SIMD level. float has every level; double, the oracle of the float build, has the baseline
+// only, where no intrinsics are.
+#pragma once
+#include <type_traits>
+
+#include "../common/parallel.h"
+#include "records.h"
+#include "scratch.h"
+
+namespace perception {
+
+// The slice of feature channels one pass blends.
+struct Slice {
+  int begin, count;
+};
+
+// Width of the kernel that a slice goes through.
+template <class T>
+constexpr int slice_width(Slice slice) {
+  return slice.count == 0 ? 0 : slice.count <= 8 && sizeof(T) == 4 ? 8 : 16;
+}
+
+// Calls body(NF, VAR) with the shape of the kernel for a slice as compile-time constants. double has one shape with
+// features and one without.
+template <class T, class Body>
+inline __attribute__((always_inline)) void with_shape(Slice slice, bool variance, Body &&body) {
+  using std::integral_constant;
+  if (slice.count == 0) return body(integral_constant<int, 0>(), std::false_type());
+  if constexpr (sizeof(T) == 8) return body(integral_constant<int, 16>(), std::true_type());
+  if (slice.count <= 8)
+    variance ? body(integral_constant<int, 8>(), std::true_type())
+             : body(integral_constant<int, 8>(), std::false_type());
+  else
+    variance ? body(integral_constant<int, 16>(), std::true_type())
+             : body(integral_constant<int, 16>(), std::false_type());
+}
+
+// project: Gaussians [begin, end) into frame.splats[begin...], with the keys of their depths, radii where not null.
+//   Returns how many are in view; `bad` becomes the index of a Gaussian that is not finite, or of the first of a block
+//   whose colours or features are not (looked at where `check`).
+// forward: blends one slice of the channels of all tiles.
+// backward: the records of one slice, of the tiles in a range; scratch.slots say where they go.
+// add_records: adds them, `size` numbers each, to one sum a splat.
+// reduce: from one slice's records (16 + width numbers) to gradients of the Gaussians and the camera.
+#define PERCEPTION_RASTERIZER_KERNELS                                                                              \
+  template <class T>                                                                                               \
+  uint32_t project(const Inputs<T> &, const Frame<T> &, int64_t begin, int64_t end, bool check, DepthKey<T> *keys, \
+                   T *radii, int64_t &bad);                                                                        \
+  template <class T>                                                                                               \
+  void forward(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Slice, Scratch<T> &,              \
+               const Outputs<T> &);                                                                                \
+  template <class T>                                                                                               \
+  void backward(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Slice, TileRange, Scratch<T> &,  \
+                const Outputs<T> &, const Cotangents<T> &);                                                        \
+  template <class T>                                                                                               \
+  void add_records(const Options &, const Frame<T> &, int size, Scratch<T> &);                                     \
+  template <class T>                                                                                               \
+  void reduce(const Inputs<T> &, const Options &, const Frame<T> &, int camera, Slice, int width, Scratch<T> &,    \
+              const Gradients<T> &);
+
+PERCEPTION_DECLARE_LEVELS(PERCEPTION_RASTERIZER_KERNELS)
+
+}  // namespace perception

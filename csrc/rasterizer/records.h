@@ -1,0 +1,55 @@
+// Gradient records: what one splat gathers over one 64x64 tile, in memory that is held for a range of tiles at a time.
+#pragma once
+#include "scratch.h"
+
+namespace perception {
+
+// [0] Σ h, [1] Σ h u, [2] Σ h dy, [3] Σ h u², [4] Σ h u dy, [5] Σ h dy² (h = dL/d ln alpha), [6..8] Σ w g_rgb,
+// [9] Σ w g_z, then from kGeometry on Σ w g' and, with the variance, Σ w v for every feature channel.
+constexpr int kGeometry = 16;
+
+// Tiles [begin, end), in row-major order.
+struct TileRange {
+  int begin, end;
+};
+
+// How many tiles of a splat's box come before tile `tile` in row-major order.
+template <class T>
+inline __attribute__((always_inline)) uint64_t box_tiles_before(const Splat<T> &s, int tiles_x, int tile) {
+  auto within = [](int value, int limit) { return value < 0 ? 0 : value > limit ? limit : value; };
+  const int width = s.x1 - s.x0 + 1, height = s.y1 - s.y0 + 1, row = tile / tiles_x - s.y0;
+  const int in_row = row >= 0 && row < height ? within(tile % tiles_x - s.x0, width) : 0;
+  return static_cast<uint64_t>(within(row, height)) * width + in_row;
+}
+
+// Slots: splat i owns as many records as its box has tiles in the range. Returns how many there are.
+template <class T>
+uint64_t assign_slots(const Frame<T> &f, TileRange range, Scratch<T> &scratch) {
+  uint64_t *slots = scratch.slots.reserve(f.count + 1), total = 0;
+  scratch.first_tile = range.begin;
+  for (uint32_t i = 0; i < f.count; ++i) {
+    const Splat<T> &s = f.splats[i];
+    slots[i] = total;
+    total += box_tiles_before(s, f.tiles_x, range.end) - box_tiles_before(s, f.tiles_x, range.begin);
+  }
+  slots[f.count] = total;
+  return total;
+}
+
+// The longest range from `begin` on whose splats need no more than `limit` records; at least one tile.
+template <class T>
+TileRange next_range(const Frame<T> &f, int begin, uint64_t limit) {
+  int end = begin + 1;
+  while (end < f.tiles_x * f.tiles_y && f.offsets[end + 1] - f.offsets[begin] <= limit) ++end;
+  return {begin, end};
+}
+
+// Makes the sums the records, one a splat.
+template <class T>
+void take_sums(const Frame<T> &f, Scratch<T> &scratch) {
+  for (uint32_t i = 0; i <= f.count; ++i) scratch.slots[i] = i;
+  std::swap(scratch.records, scratch.sums);
+  std::swap(scratch.touched, scratch.sum_touched);
+}
+
+}  // namespace perception
