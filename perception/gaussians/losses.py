@@ -21,7 +21,7 @@ from torch.autograd.function import once_differentiable
 from perception import _core
 from perception.errors import InputError
 
-_kernels = _core.training  # type: ignore[attr-defined]
+_kernels: Any = _core.training  # takes tensors through DLPack where its stub says arrays
 _LARGEST_ID = 2**31 - 1
 VarianceForm = Literal["paper", "channels", "plain"]
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from perception import _core
 from perception.errors import InputError
 
-_kernels = _core.training  # type: ignore[attr-defined]
+_kernels: Any = _core.training  # takes tensors through DLPack where its stub says arrays
 Rate = float | Tensor
 
 

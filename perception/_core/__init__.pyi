@@ -1,0 +1,82 @@
+"""Compiled kernels of perception."""
+
+from typing import Annotated
+
+import numpy
+from numpy.typing import NDArray
+
+from perception._core import training as training
+
+
+def simd_levels() -> list[str]:
+    """SIMD levels that this processor has, best first."""
+
+class RasterizerFrames_f32:
+    """What a backward call needs of its forward call."""
+
+    @property
+    def evaluated(self) -> int: ...
+
+    @property
+    def contributing(self) -> int: ...
+
+    @property
+    def seconds(self) -> dict: ...
+
+class RasterizerInputs_f32:
+    def __init__(self, means: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu', writable=False)], features: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu', writable=False)] | None, viewmats: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu', writable=False)], Ks: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu', writable=False)], background: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu', writable=False)] | None, width: int, height: int, sh_degree: int, near_plane: float, eps2d: float, threads: int, depth: bool, variance: bool, max_records: int) -> None: ...
+
+def rasterize_forward_f32(inputs: RasterizerInputs_f32, colors: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')], alphas: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')], depths: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None, features: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None, variance: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None, visible: Annotated[NDArray[numpy.uint8], dict(order='C', device='cpu')], radii: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None, simd: str) -> RasterizerFrames_f32: ...
+
+def rasterize_backward_f32(inputs: RasterizerInputs_f32, frames: RasterizerFrames_f32, colors: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')], alphas: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')], depths: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None, features: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None, variance: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None, g_colors: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu', writable=False)] | None, g_alphas: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu', writable=False)] | None, g_depths: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu', writable=False)] | None, g_features: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu', writable=False)] | None, g_variance: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu', writable=False)] | None, d_means: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None, d_quats: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None, d_scales: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None, d_opacities: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None, d_colors: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None, d_features: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None, d_viewmats: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None, d_mean2d: Annotated[NDArray[numpy.float32], dict(order='C', device='cpu')] | None) -> None: ...
+
+class RasterizerFrames_f64:
+    """What a backward call needs of its forward call."""
+
+    @property
+    def evaluated(self) -> int: ...
+
+    @property
+    def contributing(self) -> int: ...
+
+    @property
+    def seconds(self) -> dict: ...
+
+class RasterizerInputs_f64:
+    def __init__(self, means: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu', writable=False)], features: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu', writable=False)] | None, viewmats: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu', writable=False)], Ks: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu', writable=False)], background: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu', writable=False)] | None, width: int, height: int, sh_degree: int, near_plane: float, eps2d: float, threads: int, depth: bool, variance: bool, max_records: int) -> None: ...
+
+def rasterize_forward_f64(inputs: RasterizerInputs_f64, colors: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')], alphas: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')], depths: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None, features: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None, variance: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None, visible: Annotated[NDArray[numpy.uint8], dict(order='C', device='cpu')], radii: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None, simd: str) -> RasterizerFrames_f64: ...
+
+def rasterize_backward_f64(inputs: RasterizerInputs_f64, frames: RasterizerFrames_f64, colors: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')], alphas: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')], depths: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None, features: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None, variance: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None, g_colors: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu', writable=False)] | None, g_alphas: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu', writable=False)] | None, g_depths: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu', writable=False)] | None, g_features: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu', writable=False)] | None, g_variance: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu', writable=False)] | None, d_means: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None, d_quats: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None, d_scales: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None, d_opacities: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None, d_colors: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None, d_features: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None, d_viewmats: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None, d_mean2d: Annotated[NDArray[numpy.float64], dict(order='C', device='cpu')] | None) -> None: ...
+
+def rasterizer_release_memory() -> None:
+    """Frees the buffers kept between calls."""
+
+class KdTree:
+    """Exact nearest neighbours in 3D; see perception.export.neighbors."""
+
+    def __init__(self, points: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], threads: int = 1) -> None: ...
+
+    def knn(self, queries: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], indices: Annotated[NDArray[numpy.int32], dict(shape=(None, None), order='C', device='cpu')], squared: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')], max_distance: float, threads: int = 1) -> None: ...
+
+    def __len__(self) -> int: ...
+
+def felzenszwalb(edges: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C', device='cpu', writable=False)], weights: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], k: float, min_size: int, labels: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu')]) -> int:
+    """
+    Felzenszwalb-Huttenlocher on a graph; fills labels [nodes] int32 and returns the number of segments.
+    """
+
+def undirected(neighbors: Annotated[NDArray[numpy.int32], dict(shape=(None, None), order='C', device='cpu', writable=False)], edges: Annotated[NDArray[numpy.int32], dict(shape=(None, 2), order='C', device='cpu')]) -> int:
+    """
+    Pairs of neighbour lists [N, k], each once; fills edges and returns how many there are.
+    """
+
+def plane_normals(points: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], neighbors: Annotated[NDArray[numpy.int32], dict(shape=(None, None), order='C', device='cpu', writable=False)], normals: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], threads: int = 1) -> None:
+    """
+    Normals [Q, 3] of the planes through neighbour lists [Q, k] of points [N, 3]; zero where there is none.
+    """
+
+def densest(points: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], precisions: Annotated[NDArray[numpy.float32], dict(shape=(None, 6), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], instances: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu', writable=False)], candidates: Annotated[NDArray[numpy.int32], dict(shape=(None, None), order='C', device='cpu', writable=False)], labels: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu')], threads: int = 1) -> None:
+    """
+    Instance with the largest summed density at each point; see perception.export.likelihood.
+    """
