@@ -124,21 +124,20 @@ def add_model(
     sources: Sequence[str],
     *,
     sha256: Sequence[str] = (),
-    offline: bool = False,
     default: bool = False,
     progress: Progress | None = None,
 ) -> StoredModel:
     """Puts files (or all files of a folder, or web addresses) into the store under `name`, whole or not at all.
 
-    sha256: expected digests, as many as sources or none. offline: a web address is an InputError unless this
-    very file is in the store under that name already. default: `--masks auto` takes this model from now on.
+    sha256: expected digests, as many as sources or none. A web address that is in the store under that name already is
+    not fetched again. default: `--masks auto` takes this model from now on.
     """
     check_name(name)
     expected = _expected(sources, sha256)
     known = find_model(name)
     if known is None or not _same(known, sources, expected):
         parts = models_folder() / _PARTS
-        files = [file for source in sources for file in _local(source, expected.get(source), offline, parts, progress)]
+        files = [file for source in sources for file in _local(source, expected.get(source), parts, progress)]
         _install(name, files, expected)
         known = find_model(name)
         _forget(parts, sources)
@@ -165,13 +164,9 @@ def _same(model: StoredModel, sources: Sequence[str], expected: dict[str, str]) 
     return whole and all(expected.get(f["source"], f["sha256"]) == f["sha256"] for f in model.files)
 
 
-def _local(
-    source: str, expected: str | None, offline: bool, parts: Path, progress: Progress | None
-) -> list[tuple[str, Path, str]]:
+def _local(source: str, expected: str | None, parts: Path, progress: Progress | None) -> list[tuple[str, Path, str]]:
     """(file name, where it lies now, source): a download, a file with its side files, or a folder's files."""
     if is_url(source):
-        if offline:
-            raise InputError(f"{source}: not in the store, and --offline forbids to fetch it; give a local file")
         file_name = Path(unquote(urlparse(source).path)).name.lstrip(".") or "model.onnx"
         part = _part(parts, source)
         download(source, part, None if progress is None else lambda done, of: progress(file_name, done, of))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import socket
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -183,7 +182,7 @@ def test_add_fetches_checks_and_is_found_by_name(server: Server, sam: tuple[Path
     assert not list((models_folder() / ".parts").iterdir())
     assert make_source("sam:tiny").name.startswith("sam (SAM")
     asked = len(server.asked)
-    add_model("tiny", urls, sha256=digests, offline=True)  # it is there: nothing is fetched
+    add_model("tiny", urls, sha256=digests)  # it is there: nothing is fetched
     assert len(server.asked) == asked
 
 
@@ -196,16 +195,6 @@ def test_a_wrong_checksum_leaves_nothing(server: Server, sam: tuple[Path, Path])
         add_model("tiny", [str(sam[0])], sha256=["12"])
     with pytest.raises(InputError, match="2 digests for 1 files"):
         add_model("tiny", [str(sam[0])], sha256=["0" * 64] * 2)
-
-
-def test_offline_never_touches_the_network(sam: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise AssertionError("the network was touched")
-
-    monkeypatch.setattr(socket.socket, "connect", refuse)
-    with pytest.raises(InputError, match="--offline forbids"):
-        add_model("tiny", ["https://example.org/sam.onnx"], offline=True)
-    assert add_model("tiny", [str(sam[0].parent)], offline=True).family == "SAM"
 
 
 def test_a_stored_default_is_what_auto_means(sam: tuple[Path, Path]) -> None:

@@ -19,7 +19,6 @@ def register(commands: Any) -> None:
     p.add_argument("name", metavar="NAME", help="use it as --masks sam:NAME or language.encoder=clip:NAME")
     p.add_argument("source", nargs="+", metavar="FILE-or-URL", help="encoder and decoder, or a folder")
     p.add_argument("--sha256", action="append", default=[], metavar="HEX", help="expected digest, one a source")
-    p.add_argument("--offline", action="store_true", help="never touch the network")
     p.add_argument("--default", action="store_true", help="--masks auto takes this model from now on")
 
 
@@ -56,7 +55,6 @@ def _add(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         args.name,
         args.source,
         sha256=args.sha256,
-        offline=args.offline,
         default=args.default,
         progress=Progress(quiet=args.json).update,
     )

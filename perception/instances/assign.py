@@ -1,4 +1,4 @@
-"""Gaussians one by one: how well each agrees with its instance, and which instance the undecided belong to."""
+"""Single Gaussians: how well the masks of each agree with its instance, and reassignment where they do not."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def memberships(ids: np.ndarray, votes: MaskVotes) -> np.ndarray:
     return np.clip(found, 0, 1)
 
 
-def settle(
+def reassign(
     ids: np.ndarray, means: np.ndarray, opacities: np.ndarray, votes: MaskVotes, min_opacity: float
 ) -> np.ndarray:
-    """Takes up undecided Gaussians and moves misplaced ones, where masks and neighbours in space agree on it.
+    """Assigns undecided Gaussians and moves misplaced ones where masks and neighbours in space agree.
 
     ids [N] int32 (−1 = none), means [N, 3], opacities [N]; Gaussians of `min_opacity` and more are voters. An undecided
     Gaussian (too faint to vote, say) joins the instance of at least half of its 8 nearest voters if its own masks
@@ -47,10 +47,10 @@ def settle(
     neighbours if the masks prefer that one clearly. Others stay as they are. Returns ids [N] int32.
     """
     count = int(ids.max(initial=-1)) + 1
-    settled = ids.astype(np.int32)
+    assigned = ids.astype(np.int32)
     voters = np.flatnonzero((ids >= 0) & (opacities >= min_opacity))
     if count == 0 or len(voters) < 2:
-        return settled
+        return assigned
     from scipy.spatial import cKDTree
 
     shares = mask_shares(votes.table(ids, count))
@@ -70,8 +70,8 @@ def settle(
         backed = (2 * support >= near - 1) & (pixels > 0) & (theirs >= LEAST_AGREEMENT)
         joins = backed & (own < 0) & (theirs >= affinity.max(axis=1) - MARGIN)
         moves = backed & (own >= 0) & (theirs >= mine + MARGIN)
-        settled[rows] = np.where(joins | moves, popular, own)
-    return settled
+        assigned[rows] = np.where(joins | moves, popular, own)
+    return assigned
 
 
 def _mode(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

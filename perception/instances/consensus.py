@@ -183,12 +183,11 @@ def evidence(table: Table) -> Evidence:
     if table.pixels.shape[1] == 0:
         none = np.zeros(len(table.pixels))
         return Evidence(none, none, none.astype(np.int64), none.reshape(-1, 1)[:, :0])
-    starts = np.flatnonzero(np.diff(table.view, prepend=-1) > 0)
     P, labelled = table.pixels.astype(np.float64), table.by_view.astype(np.float64)
     T = (labelled + table.void)[:, table.view]
     iou = P / np.maximum(T + table.area - P, 1e-12)
     shown = labelled >= LEAST_PIXELS
-    fit = np.where(shown, np.maximum.reduceat(iou, starts, axis=1), 0)
+    fit = np.where(shown, np.maximum.reduceat(iou, table.starts, axis=1), 0)
     return Evidence(labelled.sum(axis=1), (P * iou).sum(axis=1), shown.sum(axis=1), fit)
 
 

@@ -1,4 +1,4 @@
-"""Gaussians and masks to instances, their parts, and how sure each is: the stages in order, nothing of files."""
+"""Instances, their parts and their scores from Gaussians and the votes of the masks: the stages in order."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from perception.config import InstanceConfig
-from perception.instances.assign import memberships, settle
+from perception.instances.assign import memberships, reassign
 from perception.instances.cluster import MIN_OPACITY, by_falling_size, cluster_gaussians
 from perception.instances.confidence import calibrated, raw_scores
 from perception.instances.consensus import (
@@ -24,7 +24,7 @@ from perception.instances.votes import MaskVotes
 
 PER_SEGMENT = 16  # Gaussians; fewer make segments that photos say little about
 MAX_SEGMENTS = 1000  # the merge tree compares all pairs of them
-LEAST = 4  # Gaussians; below that an instance is a speck even if masks single it out
+LEAST = 4  # Gaussians; fewer are no instance even if masks single them out
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,10 @@ def group(
         parents = np.zeros(0, np.int64)
     else:
         ids, parts, parents = _by_consensus(means, opacities, features, votes, config, seed)
-    ids = settle(ids, means, opacities, votes, MIN_OPACITY)
-    ids = _without_specks(ids, votes, config)
-    ids = settle(ids, means, opacities, votes, MIN_OPACITY)
-    return _judged(ids, parts, parents, votes)
+    ids = reassign(ids, means, opacities, votes, MIN_OPACITY)
+    ids = _without_small(ids, votes, config)
+    ids = reassign(ids, means, opacities, votes, MIN_OPACITY)
+    return _scored(ids, parts, parents, votes)
 
 
 def _by_consensus(
@@ -119,9 +119,9 @@ def _cut(tree: MergeTree, found: Evidence) -> tuple[np.ndarray, np.ndarray, np.n
     return instance, part, np.array(parents, np.int64)
 
 
-def _without_specks(ids: np.ndarray, votes: MaskVotes, config: InstanceConfig) -> np.ndarray:
+def _without_small(ids: np.ndarray, votes: MaskVotes, config: InstanceConfig) -> np.ndarray:
     """ids with −1 for groups under `min_cluster_size` that fewer than two photos single out, and for those that none
-    does and that have under a quarter of the median group's Gaussians: what is left over between things."""
+    does and that have under a quarter of the median group's Gaussians."""
     count = int(ids.max(initial=-1)) + 1
     if count == 0:
         return ids
@@ -132,7 +132,7 @@ def _without_specks(ids: np.ndarray, votes: MaskVotes, config: InstanceConfig) -
     return np.where((ids >= 0) & np.append(kept, False)[ids], ids, -1)
 
 
-def _judged(ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: MaskVotes) -> Grouping:
+def _scored(ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: MaskVotes) -> Grouping:
     """Orders the instances by size and scores them and their parts."""
     before = ids
     ids = by_falling_size(before)
@@ -141,11 +141,11 @@ def _judged(ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: Mask
     membership = memberships(ids, votes)
     found = evidence(votes.table(ids, int(ids.max(initial=-1)) + 1))
     raw = raw_scores(ids, membership, found)
-    part_ids, owners, scores, views = _judged_parts(ids, parts, rename[:-1][parents], votes)
+    part_ids, owners, scores, views = _scored_parts(ids, parts, rename[:-1][parents], votes)
     return Grouping(ids, membership, raw, calibrated(raw), found, part_ids, owners, scores, views)
 
 
-def _judged_parts(
+def _scored_parts(
     ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: MaskVotes
 ) -> tuple[np.ndarray, list[int], list[float], list[int]]:
     """Part ids that follow the instances', and of each part its instance, score (agreement with masks) and views."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-ROUNDS = 12  # of Lloyd's algorithm; the groups are raw material, not the answer
+ROUNDS = 12  # of Lloyd's algorithm: the groups are merged afterwards, so they need not have converged
 SAMPLE = 50_000  # rows the centres are found on; all rows then take the nearest
 CHUNK = 1 << 15
 
@@ -13,7 +13,7 @@ def over_segment(means: np.ndarray, features: np.ndarray, count: int, seed: int 
     """Group [N] int64, 0 … S − 1 with S ≤ count, by k-means (Lloyd) on features beside positions.
 
     means [N, 3], features [N, D]. Positions are scaled so that nine tenths of the Gaussians lie within 1 of the median,
-    the margin that the loss keeps between features: far things part though their features agree.
+    the margin that the loss keeps between features: distant Gaussians are separated even where their features agree.
     """
     centred = means - np.median(means, axis=0)
     radius = float(np.quantile(np.linalg.norm(centred, axis=1), 0.9)) if len(means) else 1.0

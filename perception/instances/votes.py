@@ -1,7 +1,7 @@
-"""What the 2D masks say of every Gaussian: how much of it each mask of each photo shows.
+"""The weight of every Gaussian in every 2D mask of every photo.
 
-The weight of Gaussian n in mask m is Σ_{p ∈ m} w_n(p), w_n(p) = its alpha times the transmittance before it: the very
-weight with which its colour enters the picture. Rendering is linear in features, so these sums are the gradient of the
+The weight of Gaussian n in mask m is Σ_{p ∈ m} w_n(p), w_n(p) = its alpha times the transmittance before it: the
+weight of its colour in the rendered picture. Rendering is linear in features, so these sums are the gradient of the
 rendered mask indicator with respect to features, and one backward pass yields 16 masks for all Gaussians.
 """
 
@@ -40,11 +40,16 @@ class Table:
         return Table(self.pixels[group : group + 1], self.void[group : group + 1], self.view, self.area)
 
     @property
+    def starts(self) -> np.ndarray:
+        """[V] the first mask of each view, for `reduceat`."""
+        return np.flatnonzero(np.diff(self.view, prepend=-1) > 0)
+
+    @property
     def by_view(self) -> np.ndarray:
         """[R, V] pixels under masks."""
         if self.pixels.shape[1] == 0:
             return np.zeros((len(self.pixels), 0), np.float32)
-        return np.add.reduceat(self.pixels, np.flatnonzero(np.diff(self.view, prepend=-1) > 0), axis=1)
+        return np.add.reduceat(self.pixels, self.starts, axis=1)
 
 
 @dataclass(frozen=True)
@@ -59,11 +64,6 @@ class MaskVotes:
     void: sparse.csr_matrix
     view: np.ndarray
     area: np.ndarray
-
-    @property
-    def starts(self) -> np.ndarray:
-        """[V] the first mask of each view, for `np.add.reduceat`."""
-        return np.flatnonzero(np.diff(self.view, prepend=-1) > 0)
 
     def table(self, ids: np.ndarray, count: int) -> Table:
         """What the Gaussians of each id 0 … count − 1 (−1 = none) fill of each mask and of each view's void."""

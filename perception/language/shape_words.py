@@ -9,7 +9,7 @@ import re
 
 KINDS = ("floor", "ceiling", "wall", "table", "picture", "rug", "ball", "box")
 HINTS = ("ball", "box", "rug", "table")
-"""Kinds for which a shape is a hint and no proof: a football may be flat, a box open, a desk heaped."""
+"""Kinds for which shape raises the score but does not decide: a ball may be flat, a box open, a desk covered."""
 
 # Words of each kind. A carton is a box whose lid may be a gable; a desk is a table with another name.
 _WORDS = {

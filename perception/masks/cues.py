@@ -1,4 +1,4 @@
-"""What a pixel tells about region borders: colour and texture of the photo, steps and creases of depth."""
+"""Features of pixels that tell borders of objects: colour and texture of the photo, steps and creases of depth."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 
 _REACH = 4  # pixels to either side over which steps and creases are measured
-_COLOUR_BINS = (4, 6, 6)  # of L, a, b
-COLOUR_WORDS = 4 * 6 * 6
+_BINS = (4, 6, 6)  # of L, a, b
+COLOUR_BINS = 4 * 6 * 6
 
 
 @dataclass(frozen=True)
 class PhotoCues:
-    """lab: [h, w, 3], 8-bit scale; texture (log gradient), edge (gradient, σ = 2), word (colour): [h, w]."""
+    """lab: [h, w, 3], 8-bit scale; texture (log gradient), edge (gradient, σ = 2), colour_bin: [h, w]."""
 
     lab: np.ndarray
     texture: np.ndarray
     edge: np.ndarray
-    word: np.ndarray
+    colour_bin: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def photo_cues(photo: np.ndarray) -> PhotoCues:
     lab = cv2.cvtColor(photo, cv2.COLOR_RGB2LAB).astype(np.float32)
     fine = cv2.GaussianBlur(lab, (0, 0), 1.0)
     edge = 2.0 * _gradient(cv2.GaussianBlur(lab, (0, 0), 2.0))
-    return PhotoCues(lab, np.log1p(_gradient(fine)), edge, _colour_words(fine))
+    return PhotoCues(lab, np.log1p(_gradient(fine)), edge, _colour_bins(fine))
 
 
 def depth_cues(depth: np.ndarray, K: np.ndarray) -> DepthCues:
@@ -50,7 +50,7 @@ def depth_cues(depth: np.ndarray, K: np.ndarray) -> DepthCues:
     import cv2
 
     z = cv2.medianBlur(filled_depth(depth), 5)
-    z = np.exp(cv2.bilateralFilter(np.log(z), 9, 0.03, 4))  # noise goes, steps of more than 3 % stay
+    z = np.exp(cv2.bilateralFilter(np.log(z), 9, 0.03, 4))  # smooths noise, keeps steps of more than 3 %
     points = _unproject(z, K)
     normals = np.cross(_tangent(points, 1), _tangent(points, 0))
     normals = cv2.ximgproc.jointBilateralFilter(np.log(z), _unit(normals).astype(np.float32), 9, 0.02, 4)
@@ -68,11 +68,11 @@ def _gradient(image: np.ndarray) -> np.ndarray:
     return np.sqrt((x * x + y * y).sum(axis=-1))
 
 
-def _colour_words(lab: np.ndarray) -> np.ndarray:
-    """[h, w] int64 index of a coarse Lab bin; the corners of a and b, which no photo reaches, are cut."""
+def _colour_bins(lab: np.ndarray) -> np.ndarray:
+    """[h, w] int64 index of a coarse Lab bin; values beyond ±50 of a and b count to the last bin."""
     scaled = [lab[..., 0] / 256, (lab[..., 1] - 128) / 100 + 0.5, (lab[..., 2] - 128) / 100 + 0.5]
     index = np.zeros(lab.shape[:2], np.int64)
-    for value, bins in zip(scaled, _COLOUR_BINS, strict=True):
+    for value, bins in zip(scaled, _BINS, strict=True):
         index = index * bins + np.clip(value * bins, 0, bins - 1).astype(np.int64)
     return index
 

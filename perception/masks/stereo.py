@@ -20,8 +20,8 @@ PLANES = 96
 NEIGHBOURS = 6
 _WINDOW = 7  # pixels a side, of the correlation
 _BEST = 2  # neighbours that must agree with a plane; the others may be hidden from what it shows
-_LITTLE, _LARGE = 0.06, 0.6  # cost of a step to the next plane, and to any other, where the photo is even
-_DOUBT = (0.02, 0.16)  # cost of every plane away from the depth known so far, and its limit
+_P1, _P2 = 0.06, 0.6  # cost of a step to the next plane, and to any other, where the photo is even
+_PRIOR_COST = (0.02, 0.16)  # cost of every plane away from the depth known so far, and its limit
 _CONFIRMED = 2  # photos that must agree with a depth for it to shape the surface
 _AGREE = 0.03  # relative difference of depths that confirm each other
 
@@ -54,7 +54,9 @@ def sweep(view: StereoView, others: list[StereoView]) -> np.ndarray:
     volume = matching_cost(view, others, inverse)
     expected = (1 / np.where(view.prior > 0, view.prior, np.inf) - inverse[0]) / (inverse[1] - inverse[0])
     away = np.abs(expected[..., None] - np.arange(PLANES)).astype(np.float32)
-    volume += np.where(view.prior[..., None] > 0, np.minimum(_DOUBT[0] * away, _DOUBT[1]), 0).astype(np.float32)
+    volume += np.where(view.prior[..., None] > 0, np.minimum(_PRIOR_COST[0] * away, _PRIOR_COST[1]), 0).astype(
+        np.float32
+    )
     total = semi_global(volume, view.grey)
     return 1 / _between_planes(total, inverse)
 
@@ -85,7 +87,7 @@ def matching_cost(view: StereoView, others: list[StereoView], inverse: np.ndarra
             seen_mean = cv2.blur(seen, box)
             spread = np.sqrt(np.maximum(cv2.blur(seen * seen, box) - seen_mean * seen_mean, 0)) + 1.0
             score[:] = (cv2.blur(seen * view.grey, box) - seen_mean * mean) / (spread * deviation)
-            score[seen_mean < 0] = 0.0  # beyond the picture: no word either way
+            score[seen_mean < 0] = 0.0  # outside the picture: no evidence
         best = min(_BEST, len(others))
         chosen = np.partition(scores, len(others) - best, axis=0)[-best:]
         volume[..., plane] = 0.5 - 0.5 * chosen.mean(axis=0)
@@ -103,32 +105,37 @@ def homographies(view: StereoView, other: StereoView) -> tuple[np.ndarray, np.nd
 
 
 def semi_global(volume: np.ndarray, grey: np.ndarray) -> np.ndarray:
-    """[h, w, D] the costs `volume` with those of the cheapest smooth ways that lead to each pixel from 4 sides."""
+    """[h, w, D] sums over the directions r = left, right, up, down of the path costs (Hirschmüller 2008, eq. 13):
+
+    L_r(p, d) = C(p, d) + min(L_r(q, d), L_r(q, d ± 1) + P1, min_k L_r(q, k) + P2(p, q)) − min_k L_r(q, k),   q = p − r
+
+    volume: C [h, w, D]; grey: [h, w], whose gradient lowers P2.
+    """
     total = np.zeros_like(volume)
     for axis in (0, 1):
         step = np.abs(np.diff(grey, axis=axis))
-        large = np.maximum(_LARGE / (1 + step / 8), 1.5 * _LITTLE).astype(np.float32)
+        large = np.maximum(_P2 / (1 + step / 8), 1.5 * _P1).astype(np.float32)
         costs, sums = np.moveaxis(volume, axis, 0), np.moveaxis(total, axis, 0)
         jumps = np.moveaxis(large, axis, 0)[..., None]
         for order in (range(1, len(costs)), range(len(costs) - 2, -1, -1)):
-            way = costs[0 if order.step > 0 else -1].copy()
-            sums[0 if order.step > 0 else -1] += way
+            path = costs[0 if order.step > 0 else -1].copy()
+            sums[0 if order.step > 0 else -1] += path
             for i in order:
-                least = way.min(axis=1, keepdims=True)
-                best = np.minimum(way, least + jumps[i - 1 if order.step > 0 else i])
-                np.minimum(best[:, 1:], way[:, :-1] + _LITTLE, out=best[:, 1:])
-                np.minimum(best[:, :-1], way[:, 1:] + _LITTLE, out=best[:, :-1])
-                way = costs[i] + best - least
-                sums[i] += way
+                least = path.min(axis=1, keepdims=True)
+                best = np.minimum(path, least + jumps[i - 1 if order.step > 0 else i])
+                np.minimum(best[:, 1:], path[:, :-1] + _P1, out=best[:, 1:])
+                np.minimum(best[:, :-1], path[:, 1:] + _P1, out=best[:, :-1])
+                path = costs[i] + best - least
+                sums[i] += path
     return total
 
 
 def _between_planes(total: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """[h, w] inverse depth at the parabola's foot through the cheapest plane and its two neighbours."""
+    """[h, w] inverse depth at the vertex of the parabola through the cheapest plane and its two neighbours."""
     best = np.clip(total.argmin(axis=2), 1, len(inverse) - 2)[..., None]
     low, mid, high = (np.take_along_axis(total, best + d, axis=2)[..., 0] for d in (-1, 0, 1))
-    bow = low - 2 * mid + high
-    shift = np.clip(np.where(bow > 1e-6, 0.5 * (low - high) / np.maximum(bow, 1e-6), 0), -0.5, 0.5)
+    curvature = low - 2 * mid + high
+    shift = np.clip(np.where(curvature > 1e-6, 0.5 * (low - high) / np.maximum(curvature, 1e-6), 0), -0.5, 0.5)
     return inverse[best[..., 0]] + shift * (inverse[1] - inverse[0])
 
 

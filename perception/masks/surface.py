@@ -1,4 +1,4 @@
-"""The surface that all depth images show together: small cubes (voxels) with a place, a normal and a colour."""
+"""The surface that all depth images show together: voxels with a mean point, normal and colour."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from perception.masks.cues import DepthCues, PhotoCues
 
 _FOOTPRINTS = 4.0  # side of a voxel in pixels at the median depth: above the noise of depth
 _MOST = 400_000  # voxels; a larger scene takes larger ones
-_LEAST_PIXELS = 3  # that must fall into a voxel over all photos for it to be more than a stray
+_LEAST_PIXELS = 3  # over all photos that must fall into a voxel for it to be kept
 _OFFSET = 1 << 20  # makes voxel indices positive; 2^21 of them a side
 
 
@@ -38,7 +38,7 @@ class Surface:
 
 @dataclass
 class SurfaceBuilder:
-    """Sums up one photo after the other; memory grows with the surface, not with the photos."""
+    """Adds one photo after the other; memory grows with the surface, not with the number of photos."""
 
     size: float
     _keys: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -65,14 +65,14 @@ class SurfaceBuilder:
     def _coarsen(self) -> None:
         """Doubles the voxels' side: eight become one."""
         self.size *= 2
-        old, self._keys = parted(self._keys) // 2, np.zeros(0, np.int64)
-        keys, index = np.unique(joined(old), return_inverse=True)
+        old, self._keys = unpack_voxels(self._keys) // 2, np.zeros(0, np.int64)
+        keys, index = np.unique(pack_voxels(old), return_inverse=True)
         sums = np.stack([np.bincount(index, weights=column, minlength=len(keys)) for column in self._sums.T], axis=1)
         self._sums = np.zeros((0, sums.shape[1]))
         self._merge(keys, sums)
 
     def build(self) -> Surface:
-        """What was seen, without strays."""
+        """The voxels that enough pixels fell into."""
         rows = self._sums[:, 0] >= _LEAST_PIXELS
         sums = self._sums[rows]
         count = np.maximum(sums[:, :1], 1)
@@ -99,16 +99,16 @@ def to_world(points: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
 
 def voxel_keys(points: np.ndarray, size: float) -> np.ndarray:
     """[P] int64, equal for points [P, 3] in one voxel."""
-    return joined(np.floor(points / size).astype(np.int64))
+    return pack_voxels(np.floor(points / size).astype(np.int64))
 
 
-def joined(index: np.ndarray) -> np.ndarray:
+def pack_voxels(index: np.ndarray) -> np.ndarray:
     """Three voxel indices [P, 3] as one number [P]."""
     i = np.clip(index + _OFFSET, 0, 2 * _OFFSET - 1)
     return (i[:, 0] << 42) | (i[:, 1] << 21) | i[:, 2]
 
 
-def parted(keys: np.ndarray) -> np.ndarray:
-    """The three voxel indices [P, 3] of each key: the inverse of `joined`."""
+def unpack_voxels(keys: np.ndarray) -> np.ndarray:
+    """The three voxel indices [P, 3] of each key: the inverse of `pack_voxels`."""
     mask = (1 << 21) - 1
     return np.stack([(keys >> 42) & mask, (keys >> 21) & mask, keys & mask], axis=1) - _OFFSET

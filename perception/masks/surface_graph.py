@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from perception import _core
-from perception.masks.cues import COLOUR_WORDS, DepthCues, PhotoCues
+from perception.masks.cues import COLOUR_BINS, DepthCues, PhotoCues
 from perception.masks.surface import Surface
 
 FEATURES = 35
@@ -23,7 +23,7 @@ _SHARP = 12.0  # border gradient that counts as an edge
 
 # Columns of the sums over a patch's pixels and voxels, and over border pixels of two patches.
 _AREA, _LAB, _TEXTURE, _DEPTH = 0, slice(1, 4), 4, 5
-_VOXELS, _NORMAL, _POINT, _SQUARES, _WORDS = 6, slice(7, 10), slice(10, 13), slice(13, 19), slice(19, None)
+_VOXELS, _NORMAL, _POINT, _SQUARES, _COLOURS = 6, slice(7, 10), slice(10, 13), slice(13, 19), slice(19, None)
 _LENGTH, _EDGE, _SHARPS, _STEPS, _BROKEN, _CONCAVE, _CONVEX, _CONTACT = range(8)
 _UPPER = np.triu_indices(3)
 
@@ -64,8 +64,8 @@ class SurfaceGraph:
         local = (surface.points - surface.points.mean(axis=0)).astype(np.float64)
         squares = np.stack([local[:, i] * local[:, j] for i, j in zip(*_UPPER, strict=True)], axis=1)
         maps = [np.ones((len(patch), 1)), surface.normals, local, squares]
-        self.sums = np.zeros((count, _WORDS.start + COLOUR_WORDS))
-        self.sums[:, _VOXELS : _WORDS.start] = _sum_by(patch, np.concatenate(maps, axis=1), count)
+        self.sums = np.zeros((count, _COLOURS.start + COLOUR_BINS))
+        self.sums[:, _VOXELS : _COLOURS.start] = _sum_by(patch, np.concatenate(maps, axis=1), count)
         ends = patch[edges]
         ends = np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1).astype(np.int64)
         self._keys, contact = np.unique(ends[:, 0] * count + ends[:, 1], return_counts=True)
@@ -80,9 +80,9 @@ class SurfaceGraph:
         z = depth.points[..., 2]
         maps = [np.ones(len(flat)), *photo.lab[inside].T, photo.texture[inside], z[inside]]
         self.sums[:, :_VOXELS] += _sum_by(flat, np.stack(maps, axis=1), self.count)
-        words = flat.astype(np.int64) * COLOUR_WORDS + photo.word[inside]
-        words = np.bincount(words, minlength=self.count * COLOUR_WORDS)
-        self.sums[:, _WORDS] += words.reshape(self.count, COLOUR_WORDS)
+        words = flat.astype(np.int64) * COLOUR_BINS + photo.colour_bin[inside]
+        words = np.bincount(words, minlength=self.count * COLOUR_BINS)
+        self.sums[:, _COLOURS] += words.reshape(self.count, COLOUR_BINS)
         for axis in (0, 1):
             first, second = neighbours(regions, axis)
             cut = (first != second) & (first >= 0) & (second >= 0)
@@ -135,7 +135,7 @@ class SurfaceGraph:
                 np.log1p(border[:, _EDGE] / length),
                 sharp,
                 np.log1p(np.sqrt(colour)),
-                1 - np.minimum(look_a[_WORDS], look_b[:, _WORDS]).sum(axis=1),
+                1 - np.minimum(look_a[_COLOURS], look_b[:, _COLOURS]).sum(axis=1),
                 np.abs(look_a[_TEXTURE] - look_b[:, _TEXTURE]),
                 np.minimum(look_a[_TEXTURE], look_b[:, _TEXTURE]),
                 np.log(smaller) + 6,
@@ -184,7 +184,7 @@ class SurfaceGraph:
         border = self.borders[a].get(b)
         if border is not None:
             return bool(border[_SHARPS] < 0.5 * border[_LENGTH])
-        words = (self.sums[i, _WORDS] / max(self.sums[i, _AREA], 1) for i in (a, b))
+        words = (self.sums[i, _COLOURS] / max(self.sums[i, _AREA], 1) for i in (a, b))
         return bool(np.minimum(*words).sum() > _ALIKE)
 
     def merge(self, a: int, b: int) -> None:

@@ -14,7 +14,7 @@ from perception.masks.builtin import fuse, surface_graph
 from perception.masks.cues import depth_cues
 from perception.masks.stereo import confirmed, homographies, measure_depths, plane_depths, semi_global
 from perception.masks.stereo_views import StereoView, make_stereo_view
-from perception.masks.surface import joined, parted, to_world, voxel_keys
+from perception.masks.surface import pack_voxels, to_world, unpack_voxels, voxel_keys
 from perception.masks.surface_graph import SurfaceGraph, voxel_edges
 from perception.types import View
 from support.mask_scores import best_ious
@@ -161,8 +161,8 @@ def test_voxel_keys_tell_voxels_apart():
     points = np.random.default_rng(0).normal(0, 3, (500, 3))
     cells = np.floor(points / 0.25).astype(np.int64)
     keys = voxel_keys(points, 0.25)
-    np.testing.assert_array_equal(parted(keys), cells)
-    np.testing.assert_array_equal(joined(cells), keys)
+    np.testing.assert_array_equal(unpack_voxels(keys), cells)
+    np.testing.assert_array_equal(pack_voxels(cells), keys)
     assert len(np.unique(keys)) == len(np.unique(cells, axis=0))
 
 
