@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +35,8 @@ def write_map_report(
     opened: QueryMap, path: Path, queries: list[str], expected: dict[str, list[int]] | None = None
 ) -> Path:
     """The one-page report of a map, with the answers to `queries`; photos that are gone are left out."""
-    gaussians, info = as_gaussians(opened), opened.info
+    info, album = opened.info, _Album(opened)
     curve = info["training"]["curve"]
-    album = _Album(opened, gaussians)
     data = ReportData(
         title=(opened.path or path).stem,
         subtitle=f"from {info['source']}",
@@ -46,10 +47,13 @@ def write_map_report(
         gaussians_curve=[(entry["iteration"], entry["gaussians"]) for entry in curve],
         views=_view_rows(opened, album),
         overview=_overview(opened, album),
-        instances=[_instance_row(opened, i, album, names) for i, names in enumerate(_names(opened))],
+        instances=[
+            InstanceRow(e["id"], crop, e.get("label"), names, e["score"], e["obb"]["extent"], e["num_gaussians"])
+            for e, crop, names in _rows(opened, album)
+        ],
         metric=opened.metric,
         queries=[_query_row(opened, text, album, (expected or {}).get(text)) for text in queries],
-        warnings=_warnings(info, gaussians, list(album.views.values())),
+        warnings=_warnings(info, album.gaussians, list(album.views.values())),
         settings=_flat(info["config"]),
         command=rerun_command(info, opened.path or Path("MAP")),
     )
@@ -99,58 +103,63 @@ def _left_out(scene: dict[str, Any], most: int = 12) -> list[str]:
 
 
 class _Album:
-    """Photos, renders and silhouettes of the map's views, made when first asked for."""
+    """Photos, renders and silhouettes of the map's views at training size, made when first asked for.
 
-    def __init__(self, gmap: Map, gaussians: Gaussians):
-        self.gmap, self.gaussians = gmap, gaussians
+    `render`, `ids` and `features` are for views whose `photo` can be read.
+    """
+
+    def __init__(self, gmap: Map):
+        self.gmap, self.gaussians = gmap, as_gaussians(gmap)
         self.views = {view.name: view for view in gmap.views}
-        self.max_side = int(gmap.info["config"]["photos"]["max_side"])
-        self._photos: dict[str, np.ndarray | None] = {}
-        self._ids: dict[str, np.ndarray] = {}
+        self.photo, self.ids = cache(self._photo), cache(self._ids)
 
-    def photo(self, name: str) -> np.ndarray | None:
-        """[h, w, 3] uint8 at training size; None when it can no longer be read."""
-        if name not in self._photos:
-            try:
-                self._photos[name] = load_photo(self.gmap.with_photo(self.views[name]), self.max_side)
-            except InputError:
-                self._photos[name] = None
-        return self._photos[name]
+    def _photo(self, name: str) -> np.ndarray | None:
+        """[h, w, 3] uint8; None when it can no longer be read."""
+        try:
+            return load_photo(
+                self.gmap.with_photo(self.views[name]), int(self.gmap.info["config"]["photos"]["max_side"])
+            )
+        except InputError:
+            return None
 
-    def _camera(self, name: str, width: int, height: int) -> tuple[torch.Tensor, torch.Tensor]:
-        view = self.views[name]
-        pose = torch.from_numpy(view.camera_from_world.astype(np.float32))
-        return pose, torch.from_numpy(scaled_K(view, width, height).astype(np.float32))
+    def _camera(self, name: str) -> tuple[torch.Tensor, torch.Tensor, int, int]:
+        """camera_from_world [4, 4], K [3, 3], width and height of a view's photo as it was trained."""
+        view, photo = self.views[name], self.photo(name)
+        assert photo is not None  # see the class
+        height, width = photo.shape[:2]
+        pose, K = view.camera_from_world.astype(np.float32), scaled_K(view, width, height).astype(np.float32)
+        return torch.from_numpy(pose), torch.from_numpy(K), width, height
 
-    def render(self, name: str, photo: np.ndarray) -> np.ndarray:
-        """The map from the photo's place, uint8."""
-        pose, K = self._camera(name, photo.shape[1], photo.shape[0])
-        view = TrainingView(name, torch.from_numpy(photo), None, K, pose)
+    def render(self, name: str) -> np.ndarray:
+        """[h, w, 3] uint8: the map from the photo's place."""
+        pose, K, _, _ = self._camera(name)
+        view = TrainingView(name, torch.from_numpy(self.photo(name)), None, K, pose)
         return (render_view(self.gaussians, view) * 255 + 0.5).to(torch.uint8).numpy()
 
-    def ids(self, name: str, photo: np.ndarray) -> np.ndarray:
-        """Instance ids [h, w] from the photo's place, −1 = none."""
-        if name not in self._ids:
-            height, width = photo.shape[:2]
-            pose, K = self._camera(name, width, height)
-            found = render_silhouettes(self.gaussians, self.gmap.instance_ids, pose, K, width, height)
-            self._ids[name] = found.ids
-        return self._ids[name]
+    def _ids(self, name: str) -> np.ndarray:
+        """[h, w] instance ids from the photo's place, −1 = none."""
+        return render_silhouettes(self.gaussians, self.gmap.instance_ids, *self._camera(name)).ids
+
+    def features(self, name: str) -> np.ndarray:
+        """[h, w, 3] uint8: rendered features, coloured by their three main components."""
+        out = render(self.gaussians, *self._camera(name), features=self.gaussians.features)
+        assert out.features is not None  # features were given
+        return features_to_rgb(out.features[0].numpy())
 
 
 def map_picture(opened: QueryMap, text: str) -> np.ndarray:
     """Four pictures in a row from the photo that answers `text` best: photo, render, instances, answer."""
-    album = _Album(opened, as_gaussians(opened))
+    album = _Album(opened)
     hits = opened.query(text, top_k=1)
     names = list(album.views)
     name = hits[0].views[0] if hits and hits[0].views else names[len(names) // 2]
     photo = album.photo(name)
     if photo is None:
         raise InputError(f"{album.views[name].photo}: cannot be read any more; the picture needs the photo")
-    ids = album.ids(name, photo)
+    ids = album.ids(name)
     answer = outline(photo, ids == hits[0].instance_id) if hits else photo
     titles = ["photo", "the map from the same place", "instances", f'"{text}"']
-    return montage([photo, album.render(name, photo), overlay(photo, ids), answer], 4, titles)
+    return montage([photo, album.render(name), overlay(photo, ids), answer], 4, titles)
 
 
 def _figures(gmap: Map) -> dict[str, str]:
@@ -176,7 +185,7 @@ def _view_rows(gmap: Map, album: _Album) -> list[ViewRow]:
     rows = []
     for name, figures in scored.items():
         photo = album.photo(name) if name in shown else None
-        render = album.render(name, photo) if photo is not None else None
+        render = album.render(name) if photo is not None else None
         rows.append(ViewRow(name, figures["psnr"], figures["ssim"], photo, render, shown.get(name, "")))
     return rows
 
@@ -189,19 +198,10 @@ def _overview(gmap: Map, album: _Album) -> dict[str, np.ndarray]:
     if photo is None or not gmap.instances:
         return {}
     return {
-        f"instances in {name}": overlay(photo, album.ids(name, photo)),
+        f"instances in {name}": overlay(photo, album.ids(name)),
         "instances, top view": instances_top_view(gmap),
-        "instance features (main components)": feature_picture(album, name, photo),
+        "instance features (main components)": album.features(name),
     }
-
-
-def feature_picture(album: _Album, name: str, photo: np.ndarray) -> np.ndarray:
-    """Rendered features of a view, coloured by their three main components."""
-    height, width = photo.shape[:2]
-    pose, K = album._camera(name, width, height)
-    out = render(album.gaussians, pose, K, width, height, features=album.gaussians.features)
-    assert out.features is not None  # features were given
-    return features_to_rgb(out.features[0].numpy())
 
 
 def _best_crop(opened: QueryMap, index: int, album: _Album, whole: bool) -> np.ndarray | None:
@@ -212,7 +212,7 @@ def _best_crop(opened: QueryMap, index: int, album: _Album, whole: bool) -> np.n
     photo = album.photo(hit.views[0])
     if photo is None:
         return None
-    mask = album.ids(hit.views[0], photo) == hit.instance_id
+    mask = album.ids(hit.views[0]) == hit.instance_id
     if not mask.any():
         return None
     picture = outline(photo, mask)
@@ -224,9 +224,11 @@ def _best_crop(opened: QueryMap, index: int, album: _Album, whole: bool) -> np.n
     return picture[top : rows[-1] + margin, left : columns[-1] + margin]
 
 
-def _names(opened: QueryMap) -> list[list[str]]:
-    """Likeliest names of the instances; none for a map without embeddings or whose encoder is unknown."""
-    return opened.likely_names() if opened.problem is None else [[] for _ in opened.instances]
+def _rows(opened: QueryMap, album: _Album) -> Iterator[tuple[dict[str, Any], np.ndarray | None, list[str]]]:
+    """(entry of instances.json, best crop, likeliest names) of each instance; no names for a map without language."""
+    names = opened.likely_names() if opened.language else [[] for _ in opened.instances]
+    for i, entry in enumerate(opened.instances):
+        yield entry, _best_crop(opened, i, album, whole=False), names[i]
 
 
 def write_sheet(opened: QueryMap, path: Path) -> None:
@@ -247,31 +249,16 @@ def contact_sheet(opened: QueryMap, columns: int = 6, side: int = 240) -> np.nda
 
     from perception.instances.crops import letterbox
 
-    album = _Album(opened, as_gaussians(opened))
+    album = _Album(opened)
     pictures, titles = [], []
-    for i, names in enumerate(_names(opened)):
-        crop = _best_crop(opened, i, album, whole=False)
+    for entry, crop, names in _rows(opened, album):
         if crop is None:
             continue
-        entry = opened.instances[i]
         pictures.append(cv2.resize(letterbox(crop, 255), (side, side), interpolation=cv2.INTER_AREA))
         titles.append(f"{entry['id']}: {entry.get('label') or ', '.join(name[:18] for name in names)}")
     if not pictures:
         raise InputError(f"{opened.path}: no instance has a photo that can still be read; a sheet needs the photos")
     return montage(pictures, columns, titles)
-
-
-def _instance_row(opened: QueryMap, index: int, album: _Album, names: list[str]) -> InstanceRow:
-    entry = opened.instances[index]
-    return InstanceRow(
-        entry["id"],
-        _best_crop(opened, index, album, whole=False),
-        entry.get("label"),
-        names,
-        entry["score"],
-        entry["obb"]["extent"],
-        entry["num_gaussians"],
-    )
 
 
 def _query_row(opened: QueryMap, text: str, album: _Album, expected: list[int] | None) -> QueryRow:
