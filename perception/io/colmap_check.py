@@ -1,7 +1,7 @@
-"""What must hold of a binary COLMAP model before pycolmap reads it.
+"""Checks of a binary COLMAP model before pycolmap reads it.
 
-Its reader believes every count and waits for the end of every name: a damaged file makes it run for ever, or take all
-memory. Here the files are walked once, nothing but names and ids is kept, and damage is told by file and record.
+pycolmap trusts every count and looks for the end of every name, so a damaged file makes it run without end or ask for
+all memory. Here the files are read once, only ids are kept, and damage is reported by file and record.
 Layout: COLMAP's documentation, "Output Format"; little endian. Rigs and frames came with COLMAP 3.12.
 """
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from perception.errors import InputError
 
 _PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
-"""How many parameters a camera has, by COLMAP's number of its model."""
+"""Number of parameters of a camera, by COLMAP's model id."""
 _LONGEST_NAME = 4096
 
 

@@ -88,12 +88,7 @@ def _build(
 
 
 def _extract(
-    database: Path,
-    root: Path,
-    photos: list[Path],
-    names: list[str],
-    lenses: list[Lens | None],
-    progress: Progress,
+    database: Path, root: Path, photos: list[Path], names: list[str], lenses: list[Lens | None], progress: Progress
 ) -> None:
     pycolmap = load_pycolmap()
     groups: dict[Any, list[int]] = {}
@@ -114,10 +109,10 @@ def _extract(
             reader.camera_model = lens.model
             reader.camera_params = ", ".join(map(repr, lens.params))
         chosen = [names[i] for i in members]
-        # Extraction alone numbers photos as its threads finish, and later random choices hang on the numbers.
+        # Else extraction numbers photos as its threads finish, and later random choices depend on these numbers.
         pycolmap.import_images(database, root, pycolmap.CameraMode.SINGLE, chosen, reader)
         pycolmap.extract_features(database, root, chosen, pycolmap.CameraMode.SINGLE, reader, options)
-        poor = _forget_poor(database, chosen)
+        poor = _drop_poor(database, chosen)
         if poor:
             options.sift.first_octave = -1
             pycolmap.extract_features(database, root, poor, pycolmap.CameraMode.SINGLE, reader, options)
@@ -125,8 +120,11 @@ def _extract(
         progress.update("poses: features", done, len(photos))
 
 
-def _forget_poor(database: Path, names: list[str]) -> list[str]:
-    """The photos with few features, which are deleted (pycolmap extracts what has none; it cannot delete for one)."""
+def _drop_poor(database: Path, names: list[str]) -> list[str]:
+    """Deletes the features of photos that have fewer than MIN_FEATURES and returns those photos.
+
+    pycolmap extracts again what has no features, and has no call that deletes those of one image.
+    """
     db = load_pycolmap().Database.open(database)
     ids = {name: db.read_image_with_name(name).image_id for name in names}
     poor = [name for name in names if db.num_keypoints_for_image(ids[name]) < MIN_FEATURES]
@@ -214,18 +212,7 @@ def _mutual_matches(a: np.ndarray, b: np.ndarray, ratio: float = COARSE_RATIO) -
 
 
 def _key(photos: list[Path], lenses: list[Lens | None], seed: int) -> str:
-    facts = [
-        (str(p.resolve()), p.stat().st_size, p.stat().st_mtime_ns, repr(l)) for p, l in zip(photos, lenses, strict=True)
-    ]
-    options: tuple[float, ...] = (
-        MAX_IMAGE_SIDE,
-        MAX_FEATURES,
-        MIN_FEATURES,
-        PEAK_THRESHOLD,
-        MIN_INLIERS,
-        EXHAUSTIVE_BELOW,
-        NEIGHBORS,
-        seed,
-    )
-    options = (*options, COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS)
-    return hashlib.sha256(repr((facts, options)).encode()).hexdigest()[:12]
+    files = [(str(photo.resolve()), photo.stat().st_size, photo.stat().st_mtime_ns) for photo in photos]
+    extraction = (MAX_IMAGE_SIDE, MAX_FEATURES, MIN_FEATURES, PEAK_THRESHOLD)
+    pairing = (EXHAUSTIVE_BELOW, NEIGHBORS, COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS, MIN_INLIERS)
+    return hashlib.sha256(repr((files, lenses, extraction, pairing, seed)).encode()).hexdigest()[:12]

@@ -74,7 +74,11 @@ def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
         if identity in seen:
             continue
         seen.add(identity)
-        for path in here.iterdir():
+        try:
+            inside = list(here.iterdir())
+        except OSError:  # a folder that this user may not read
+            continue
+        for path in inside:
             if path.name.startswith("."):
                 continue
             if path.is_dir():
@@ -86,8 +90,10 @@ def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
 
 
 def view_name(photo: Path, folder: Path) -> str:
-    """The photo's path below `folder`; control characters and bytes that are no UTF-8 become %XX, "%" and "\\" too
-    where one of them occurs."""
+    """The photo's path below `folder`, as `safe_name` accepts it.
+
+    In a name with control characters, bytes that are no UTF-8, or a backslash, these and "%" become %XX (hexadecimal).
+    """
     name = photo.relative_to(folder).as_posix()
     if name.isprintable() and "\\" not in name:
         return name
@@ -106,9 +112,7 @@ def choose_photos(folder: Path, strict: bool, progress: Progress) -> PhotoSet:
     looks: list[_Look] = []
     taken: set[str] = set()
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        for done, look in enumerate(pool.map(lambda path: _look(path, folder), paths), start=1):
-            if look.error is not None and strict:
-                raise look.error
+        for done, look in enumerate(pool.map(lambda path: _look(path, folder, strict), paths), start=1):
             while look.name in taken:  # an escaped name that another photo has
                 look.name += "_"
             taken.add(look.name)
@@ -121,7 +125,7 @@ def choose_photos(folder: Path, strict: bool, progress: Progress) -> PhotoSet:
     return PhotoSet([k.path for k in kept], [k.name for k in kept], left_out, _notes(folder, looks, kept))
 
 
-def _look(path: Path, folder: Path) -> _Look:
+def _look(path: Path, folder: Path, strict: bool) -> _Look:
     look = _Look(path, view_name(path, folder))
     try:
         look.size = photo_size(path)
@@ -135,6 +139,8 @@ def _look(path: Path, folder: Path) -> _Look:
             grey = upright(small, path).convert("L")
             look.grey = np.array(grey.resize(_thumbnail_size(look.size), Image.Resampling.BOX))
     except InputError as error:
+        if strict:
+            raise
         look.error, look.why = error, str(error)
         return look
     look.sharpness = float(cv2.Laplacian(look.grey, cv2.CV_64F).var())
