@@ -122,7 +122,7 @@ class SweepScene:
     def _labelled(self, max_side: int, masks: str) -> list[Any]:
         from perception.io.photos import load_photo
         from perception.masks import make_source
-        from perception.masks.store import compute_masks
+        from perception.masks.label_images import compute_masks
         from perception.pipeline.photos import split_views, with_labels
 
         views, _ = split_views(self.scene().views, self.held_out_every)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
+from perception.masks.label_images import compute_masks, load_labels
 from perception.masks.source import GeometryMaskSource, MaskSource, make_source
-from perception.masks.store import compute_masks, load_labels
 
 __all__ = ["GeometryMaskSource", "MaskSource", "compute_masks", "load_labels", "make_source"]

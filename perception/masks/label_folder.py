@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import struct
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.documents import brief
 from perception.io.safe_names import safe_name
+from perception.masks.label_images import read_labels, read_png_header
 from perception.types import View
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGB with alpha"}
 
 
@@ -76,25 +73,6 @@ class LabelFolder:
         return flat if sharing == 1 and flat.is_file() else None
 
 
-@dataclass(frozen=True)
-class PngHeader:
-    """The IHDR chunk: size in pixels, bits per sample, colour type as PNG numbers it."""
-
-    width: int
-    height: int
-    bits: int
-    colour_type: int
-
-
-def read_png_header(file: Path) -> PngHeader:
-    """Reads 26 bytes, so thousands of label images are checked in an instant."""
-    with file.open("rb") as stream:
-        head = stream.read(26)
-    if len(head) < 26 or not head.startswith(_SIGNATURE):
-        raise InputError(f"{file}: not a PNG; label images are PNG, 8 or 16 bit, one channel")
-    return PngHeader(*struct.unpack(">IIBB", head[16:26]))
-
-
 def _check_header(file: Path, width: int, height: int) -> None:
     header = read_png_header(file)
     kind = _COLOUR_TYPES.get(header.colour_type, f"colour type {header.colour_type}")
@@ -105,22 +83,6 @@ def _check_header(file: Path, width: int, height: int) -> None:
             f"{file}: {header.width}×{header.height} pixels, but its photo has {width}×{height}; "
             "label images have the size of the original photo"
         )
-
-
-def read_labels(file: Path) -> np.ndarray:
-    """[H, W] int32. Pillow keeps palette indices, where OpenCV would turn them into colours."""
-    from PIL import Image
-
-    from perception.io.photos import DECODE_ERRORS
-
-    try:
-        with Image.open(file, formats=["PNG"]) as image:
-            labels = np.asarray(image)
-    except DECODE_ERRORS as error:
-        raise InputError(f"{file}: cannot be read ({brief(error)}); the PNG is damaged or cut short") from error
-    if labels.ndim != 2 or labels.dtype.kind not in "biu":
-        raise InputError(f"{file}: {labels.dtype} of shape {list(labels.shape)}; a label image has one channel")
-    return labels.astype(np.int32)
 
 
 def _photo_size(view: View) -> tuple[int, int]:

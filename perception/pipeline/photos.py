@@ -11,7 +11,7 @@ import torch
 from perception.errors import InputError
 from perception.gaussians.train import TrainingView
 from perception.io.photos import load_photo, scaled_K
-from perception.masks.store import load_labels
+from perception.masks.label_images import load_labels
 from perception.progress import Progress
 from perception.types import View
 

@@ -26,7 +26,7 @@ from perception.io.photos import photo_size, read_photo
 from perception.io.ply import read_ply
 from perception.io.transforms import read_frames, read_transforms
 from perception.io.views import rigid_pose
-from perception.masks.store import load_labels, stored_key
+from perception.masks.label_images import load_labels, stored_key
 from perception.progress import Progress
 from perception.types import View
 

@@ -11,7 +11,7 @@ import pytest
 from perception.errors import InputError
 from perception.io import photos
 from perception.masks import make_source
-from perception.masks.store import compute_masks, label_file, load_labels, write_labels
+from perception.masks.label_images import compute_masks, label_file, load_labels, write_labels
 from perception.types import Lens, View
 from support.progress import Told
 

@@ -11,7 +11,7 @@ import pytest
 
 from perception.errors import InputError
 from perception.io.store import write_map
-from perception.masks.store import label_file
+from perception.masks.label_images import label_file
 from perception.pipeline.rendering import render_map
 from perception.types import View
 from support.viewer_maps import small_map

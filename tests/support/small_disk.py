@@ -22,7 +22,7 @@ from perception.export import ExportOptions
 from perception.io.labels import give_names
 from perception.io.scene_cache import save_scene
 from perception.io.store import read_map, verify_map, write_map
-from perception.masks.store import write_labels
+from perception.masks.label_images import write_labels
 from perception.pipeline.checkpoint import save_checkpoint
 from perception.pipeline.exporting import Outputs, export_map
 from perception.types import Scene
