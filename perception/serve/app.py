@@ -43,6 +43,7 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
         description=_ABOUT,
         docs_url=None,  # these pages load scripts from elsewhere
         redoc_url=None,
+        redirect_slashes=False,
         responses={"default": {"model": answers.Problem}},
         exception_handlers=HANDLERS,
     )

@@ -46,9 +46,12 @@ async def told(request: Request, error: Exception) -> JSONResponse:
     if isinstance(error, HTTPException):
         if error.status_code == 400:
             return problem(400, "the request is no JSON")
-        known = {404: f"{request.url.path}: no such page; see /openapi.json", 405: f"{request.method} is not allowed"}
+        known = {
+            404: f"{request.scope['path'][:200]}: no such page; see /openapi.json",
+            405: f"{request.method} is not allowed",
+        }
         return problem(error.status_code, known.get(error.status_code, error.detail), error.headers)
-    _log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    _log.error("%s %s failed", request.method, request.scope["path"], exc_info=error)
     return problem(500, "the server failed on this request; its log says why")
 
 

@@ -1,4 +1,4 @@
-"""Fuzzes one reader or the compiled module: python tests/fuzz/run.py TARGET [--runs N] (--list names them).
+"""Fuzzes one reader, a server or the compiled module: python tests/fuzz/run.py TARGET [--runs N] (--list names them).
 
 Coverage-guided by atheris where it is installed (pip install atheris), else seeded mutation of the same seeds. A defect
 is everything but a clean refusal: another exception, a signal, a hang, or memory beyond --memory. Its input is kept.
@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -26,19 +27,23 @@ HANG = 20
 """Seconds of processor time after which one input counts as a hang."""
 
 
-def load(name: str) -> Any:
-    """The target of that name: `seeds()`, `run(data)`, `words`."""
+def _targets() -> dict[str, Callable[[], Any]]:
     from fuzz.core import CoreTarget
+    from fuzz.served import HttpTarget, ViewerTarget, served_map
     from fuzz.targets import TARGETS
 
-    return CoreTarget() if name == "core" else TARGETS[name]()
+    served = {"http": HttpTarget, "served-map": served_map, "viewer": ViewerTarget}
+    return {"core": CoreTarget, **TARGETS, **served}
+
+
+def load(name: str) -> Any:
+    """The target of that name: `seeds()`, `run(data)`, `words`."""
+    return _targets()[name]()
 
 
 def names() -> list[str]:
     """Every target there is."""
-    from fuzz.targets import TARGETS
-
-    return ["core", *TARGETS]
+    return list(_targets())
 
 
 def mutate(data: bytes, rng: random.Random, words: list[str], others: list[bytes]) -> bytes:

@@ -19,6 +19,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.progress import Progress
+from support.views_at import views_at
 
 Data = bytes
 ALLOWED: tuple[type[Exception], ...] = (InputError,)
@@ -484,6 +485,14 @@ def _photo() -> Target:
 # ------------------------------------------------------------------ the map
 
 
+def _small_language() -> dict[str, np.ndarray]:
+    from perception.language.description import InstanceDescription, to_arrays
+
+    row = np.ones(4, np.float32)
+    described = InstanceDescription(row, row[None], np.zeros((24, 4), np.float32), ["0.jpg"], [(0, 0, 9, 9)])
+    return to_arrays([described] * 2, "words")
+
+
 @cache
 def _small_map() -> dict[str, bytes]:
     from perception.io.store import Map, write_map
@@ -496,8 +505,8 @@ def _small_map() -> dict[str, bytes]:
     gmap = Map(
         *(np.zeros((n, k), np.float32) for k in (3, 4, 3)), np.zeros(n, np.float32), np.zeros((n, 4, 3), np.float32),
         np.zeros((n, 2), np.float32), np.array([0, 0, 1, -1], np.int32), np.ones(n, np.float32), instances,
-        {"frame": "map", "metric": False, "source": "photos"}, {"names": np.array(["a.jpg"]), "K": np.eye(3)[None]},
-        {"embeddings": np.ones((2, 4), np.float32)}, {"ids": np.array([2, 3, -1, -1], np.int32)},
+        {"frame": "map", "metric": False, "source": "photos"}, views_at([np.eye(4)]),
+        _small_language(), {"ids": np.array([2, 3, -1, -1], np.int32)},
     )  # fmt: skip
     with TemporaryDirectory() as folder:
         path = Path(folder, "a.gsmap")
@@ -505,7 +514,7 @@ def _small_map() -> dict[str, bytes]:
         return {file.name: file.read_bytes() for file in sorted(path.iterdir())}
 
 
-def _map_store() -> Target:
+def map_store() -> Target:
     from perception.io.store import read_map, verify_map
 
     sealed = _small_map()
@@ -556,5 +565,5 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "config": _config,
     "label-png": _label_png,
     "photo": _photo,
-    "map": _map_store,
+    "map": map_store,
 }
