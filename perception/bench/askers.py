@@ -10,13 +10,13 @@ from __future__ import annotations
 import http.client
 import json
 import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from perception.bench.processes import served
 
 Best = tuple[int, int] | None
 Ask = Callable[[str], Best]
@@ -51,15 +51,8 @@ def engine_askers(path: Path) -> Iterator[Served]:
 @contextmanager
 def http_askers(path: Path) -> Iterator[Served]:
     """`perception serve` in a process of its own on the loopback; each client keeps one connection."""
-    command = [sys.executable, "-m", "perception.cli", "serve", str(path), "--port", "0"]
-    options = ["--rate", "0", "--watch", "0", "--timeout", "60"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    server = subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True, env=environment)
-    try:
-        assert server.stderr is not None
-        told = server.stderr.readline()
-        if not told.startswith("serving "):
-            raise RuntimeError(f"the server did not start: {told}{server.stderr.read()}")
+    options = ["--port", "0", "--rate", "0", "--watch", "0", "--timeout", "60"]
+    with served("serve", str(path.resolve()), *options) as (told, process):
         port = int(told.rsplit(":", 1)[1].split()[0])
 
         def client() -> Ask:
@@ -77,10 +70,7 @@ def http_askers(path: Path) -> Iterator[Served]:
 
             return ask
 
-        yield Served(client, server.pid)
-    finally:
-        server.terminate()
-        server.wait()
+        yield Served(client, process)
 
 
 CONTENDERS: dict[str, Contender] = {"engine": engine_askers, "http": http_askers}

@@ -13,17 +13,15 @@ import argparse
 import importlib.util
 import json
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from perception.bench.children import child_options
 from perception.bench.memory import fresh_peak, status_mib
+from perception.bench.output import Column, bench_parser, finish, table
+from perception.bench.processes import run_python
 
 TREES = ("perception", "scipy", "open3d")
 LISTS = 12
@@ -124,52 +122,42 @@ def _task(task: str, tree: str, args: argparse.Namespace) -> Callable[[], Any]:
     return lambda: nearest(tree, points, means)
 
 
-def _in_child(task: str, tree: str, arguments: Sequence[str]) -> dict[str, Any]:
-    command = [sys.executable, "-m", "perception.bench.clouds", *arguments, "--one", task, tree]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, **child_options())
-    result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return result
+COLUMNS: tuple[Column, ...] = (
+    ("seconds", "seconds", ".2f"),
+    ("CPU s", "cpu_seconds", ".2f"),
+    ("peak MiB", "peak_mib", ".0f"),
+    ("mark", "mark", ".4f"),
+)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """Prints a table; --json FILE writes settings, versions and every turn."""
-    parser = argparse.ArgumentParser(prog="perception bench clouds", description=__doc__)
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Prints the least of all turns; every turn is kept in the JSON."""
+    parser = bench_parser("clouds", __doc__)
     parser.add_argument("--points", type=int, default=500_000)
     parser.add_argument("--gaussians", type=int, default=50_000)
     parser.add_argument("--turns", type=int, default=3)
     parser.add_argument("--tasks", default="assignment,smoothing,evaluation")
-    parser.add_argument("--json", type=Path, metavar="FILE")
     parser.add_argument("--one", nargs=2, metavar=("TASK", "TREE"), help=argparse.SUPPRESS)
-    args = parser.parse_args(argv)
-    if args.one:
-        print(json.dumps(measure(args.one[0], args.one[1], args)))
+    options = parser.parse_args(arguments)
+    if options.one:
+        print(json.dumps(measure(options.one[0], options.one[1], options)))
         return
-    sizes = ["--points", str(args.points), "--gaussians", str(args.gaussians)]
+    sizes = ["--points", str(options.points), "--gaussians", str(options.gaussians)]
     trees = [tree for tree in TREES if importlib.util.find_spec(tree)]
-    jobs = [(task, tree) for task in args.tasks.split(",") for tree in (trees if task != "evaluation" else trees[:1])]
+    tasks = options.tasks.split(",")
+    jobs = [(task, tree) for task in tasks for tree in (trees if task != "evaluation" else trees[:1])]
     turns: dict[tuple[str, str], list[dict[str, Any]]] = {job: [] for job in jobs}
-    for _ in range(args.turns):
+    for _ in range(options.turns):
         for job in jobs:
-            turns[job].append(_in_child(*job, sizes))
-    print(f"{args.points} points, {args.gaussians} Gaussians, {os.cpu_count()} cores, least of {args.turns} turns")
-    print(f"{'':24}{'seconds':>10}{'CPU s':>10}{'peak MiB':>10}{'mark':>16}")
-    for (task, tree), rows in turns.items():
-        best = {key: min(row[key] for row in rows) for key in ("seconds", "cpu_seconds", "peak_mib", "mark")}
-        print(
-            f"{task + ' ' + tree:24}{best['seconds']:>10.2f}{best['cpu_seconds']:>10.2f}{best['peak_mib']:>10.0f}"
-            f"{best['mark']:>16.4f}"
-        )
-    if args.json:
-        from perception.io.atomic import atomic_file
-        from perception.pipeline.record import versions
-
-        record = {
-            "arguments": {key: str(value) for key, value in vars(args).items()},
-            "versions": versions(),
-            "turns": {" ".join(job): rows for job, rows in turns.items()},
-        }
-        with atomic_file(args.json) as aside:
-            aside.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+            told = run_python("-m", "perception.bench.clouds", *sizes, "--one", *job)
+            turns[job].append(json.loads(told.splitlines()[-1]))
+    rows = [
+        {"task": task, "by": tree, **{key: min(turn[key] for turn in found) for _, key, _ in COLUMNS}}
+        for (task, tree), found in turns.items()
+    ]
+    text = f"{options.points} points, {options.gaussians} Gaussians, {os.cpu_count()} cores, least of {options.turns}\n"
+    text += table(rows, COLUMNS, ("task", "by"))
+    finish("clouds", options, {"rows": rows, "turns": {" ".join(job): found for job, found in turns.items()}}, text)
 
 
 if __name__ == "__main__":

@@ -7,13 +7,12 @@ seconds, as a planner would, so such an answer is late (see the 99 %) and not lo
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from perception.bench.askers import Ask, Best, Contender, Served
+from perception.bench.processes import served
 from perception.node.client import NodeClient, cloud_rows
 from perception.node.config import NodeConfig
 
@@ -26,20 +25,10 @@ def _node(path: Path) -> Iterator[tuple[NodeConfig, int]]:
     config = NodeConfig(
         namespace=f"bench{os.getpid()}", transport="dds", domain=20 + os.getpid() % 200, network="localhost"
     )
-    command = [sys.executable, "-m", "perception.cli", "node", str(path), "--transport", "dds"]
-    seat = ["--namespace", config.namespace, "--domain", str(config.domain), "--network", "localhost"]
+    place = ["--namespace", config.namespace, "--domain", str(config.domain), "--network", "localhost"]
     more = ["--set", f"timeout={_SECONDS}", "--set", "watch=3600", "--set", "discovery_seconds=0.2"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    node = subprocess.Popen([*command, *seat, *more], stderr=subprocess.PIPE, text=True, env=environment)
-    try:
-        assert node.stderr is not None
-        told = node.stderr.readline()
-        if not told.startswith("serving "):
-            raise RuntimeError(f"the node did not start: {told}{node.stderr.read()}")
-        yield config, node.pid
-    finally:
-        node.terminate()
-        node.wait()
+    with served("node", str(path.resolve()), "--transport", "dds", *place, *more) as (_, process):
+        yield config, process
 
 
 @contextmanager

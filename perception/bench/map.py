@@ -10,19 +10,23 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from perception.bench.sweep import Variant, pareto
-from perception.bench.sweep_cli import (
-    COSTS,
-    FIGURES,
-    chosen,
-    finish,
-    prepare,
-    save_plot,
-    sweep_parser,
-    table,
-    with_minutes,
-)
+from perception.bench.output import Column, finish, save_plot, table
+from perception.bench.sweep import Variant, chosen, pareto, prepare, sweep_parser, with_minutes
 
+FIGURES: tuple[Column, ...] = (
+    ("PSNR", "psnr", ".2f"),
+    ("SSIM", "ssim", ".4f"),
+    ("AP", "ap", ".3f"),
+    ("AP50", "ap50", ".3f"),
+    ("AP25", "ap25", ".3f"),
+    ("mIoU", "miou", ".3f"),
+)
+COSTS: tuple[Column, ...] = (
+    ("minutes", "minutes", ".2f"),
+    ("CPU min", "cpu_minutes", ".2f"),
+    ("Gaussians", "gaussians", "d"),
+    ("MiB", "peak_mib", ".0f"),
+)
 PRESET_NAMES = ("default", "fast", "quality")
 BUDGETS = (12_500, 25_000, 50_000, 200_000)
 ITERATIONS = (750, 1500, 6000)
@@ -48,11 +52,8 @@ def variants(masks: str | None) -> list[Variant]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line."""
     options = sweep_parser("map", __doc__).parse_args(arguments)
-    sweep, scenes, masks = prepare(options)
-    if masks is not None and not (scenes[0].root / masks).is_dir():
-        masks = None
-    rows = with_minutes(sweep.run(scenes[0], chosen(variants(masks), options.only)))
-    share_the_least_time(rows)
+    sweep, scene, masks = prepare(options)
+    rows = with_minutes(sweep.run(scene, chosen(variants(masks), options.only)))
     native = rows[0]["pixels"]
     for key in ("psnr", "ssim", "ap"):
         points = [(row["cpu_minutes"], row.get(key) if row["pixels"] == native else None) for row in rows]
@@ -62,47 +63,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for row in rows:
         row["front"] = " ".join(key for key in ("psnr", "ssim", "ap") if row[f"front_{key}"])
         row["note"] = row["front"] if row["pixels"] == native else "other resolution"
-    text = f"{scenes[0].name}; on the front (CPU minutes against ...):\n"
-    text += table(rows, (*FIGURES, *COSTS, ("front", "note", "s"))) + "\n" + "\n".join(where(rows))
-    _plot(options.output / "map.png", scenes[0].name, rows, native)
-    finish("map", options, {"scene": scenes[0].name, "rows": rows}, text)
+    text = f"{scene.name}; on the front (CPU minutes against ...):\n"
+    text += table(rows, (*FIGURES, *COSTS, ("front", "note", "s")))
+    _plot(options.output / "map.png", scene.name, rows, native)
+    finish("map", options, {"scene": scene.name, "rows": rows}, text)
     return 0
-
-
-def share_the_least_time(rows: Sequence[dict[str, Any]]) -> None:
-    """Settings that came to the same map did the same work: what sets their times apart is the machine, and must not
-    put one of them above the other.
-    """
-    same: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for row in rows:
-        figures = ("iterations", "gaussians", "sh_degree", "pixels", "psnr", "ssim", "ap")
-        same.setdefault(tuple(row.get(key) for key in figures), []).append(row)
-    for twins in same.values():
-        least = min(row["cpu_minutes"] for row in twins)
-        for row in twins:
-            row["cpu_minutes"] = least
-
-
-def where(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """A line a preset: on the front, or what beats it."""
-    lines = []
-    for row in rows:
-        if row["group"] != "preset" or row.get("psnr") is None:
-            continue
-        better = [
-            r
-            for r in rows
-            if r.get("psnr") is not None
-            and r["pixels"] == row["pixels"]
-            and r["cpu_minutes"] <= row["cpu_minutes"]
-            and r["psnr"] > row["psnr"]
-        ]
-        best = max(better, key=lambda r: r["psnr"], default=None)
-        place = "is on the front of PSNR" if best is None else f"is beaten by {best['group']} {best['name']}"
-        if best is not None:
-            place += f": {best['psnr'] - row['psnr']:+.2f} dB in {best['cpu_minutes'] - row['cpu_minutes']:+.2f} min"
-        lines.append(f"{row['name']} {place}")
-    return lines
 
 
 def _plot(path: Path, scene: str, rows: Sequence[dict[str, Any]], native: int) -> None:

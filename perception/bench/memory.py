@@ -1,4 +1,4 @@
-"""Memory of this process as Linux tells it, for benches that run many cases one after the other."""
+"""Memory of a process as Linux tells it."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def fresh_peak() -> None:
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # proc(5)
 
 
-def status_mib(key: str) -> float:
-    """A figure of /proc/self/status (VmRSS, VmHWM) in MiB; NaN where the system does not tell."""
+def status_mib(key: str, process: int | str = "self") -> float:
+    """A figure of /proc/PROCESS/status (VmRSS, VmHWM) in MiB; NaN where the system does not tell."""
     try:
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+        for line in Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines():
             if line.startswith(f"{key}:"):
                 return int(line.split()[1]) / 1024
     except OSError:

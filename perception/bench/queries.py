@@ -1,4 +1,4 @@
-"""How well a finished map answers text on a scene with exact truth: `perception bench queries MAP SCENE_DIR`.
+"""How well a finished map answers text on a scene with exact truth: `perception bench queries MAP SCENE`.
 
 A hit is right when the true object under most of the instance's exported points answers the prompt. Prompts
 are those of scene.json whose objects some photo shows. Absent prompts: 30 things of street, farm, sea and
@@ -7,8 +7,6 @@ museum, and household things that the scene does not name, which are the harder 
 
 from __future__ import annotations
 
-import argparse
-import json
 import re
 import time
 from collections.abc import Sequence
@@ -17,30 +15,27 @@ from typing import Any
 
 import numpy as np
 
+from perception.bench.output import bench_parser, finish
 from perception.bench.prompts import ABSENT, HOUSEHOLD, accuracy, chance, singular
+from perception.bench.truth import read_scene, read_truth_cloud
 from perception.errors import InputError
-from perception.language.description import InstanceDescription, from_arrays
 from perception.language.ranking import Ranker
 from perception.query import QueryMap, load_map
 
-MANY = 200
-
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Prints a table, or one JSON object with --json."""
-    parser = argparse.ArgumentParser(prog="perception bench queries", description=(__doc__ or "").split("\n")[0])
+    """Prints the figures, a line each; JSON goes to the output folder."""
+    parser = bench_parser("queries", __doc__)
     parser.add_argument("map", type=Path, metavar="MAP", help="a map in the frame of the scene's transforms.json")
-    parser.add_argument("scene", type=Path, metavar="SCENE_DIR", help="folder with scene.json and gt_points.ply")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="folder with scene.json and gt_points.ply")
     options = parser.parse_args(arguments)
     report = measure(options.map, options.scene)
-    print(json.dumps(report) if options.json else table(report))
+    shown = {key: ", ".join(map(str, value)) if isinstance(value, list) else value for key, value in report.items()}
+    finish("queries", options, report, "\n".join(f"{key:>26}: {value}" for key, value in shown.items()))
 
 
 def measure(map_path: Path, scene: Path) -> dict[str, Any]:
     """All figures by name. The cold query comes first, before anything else could warm it."""
-    from perception.pipeline.record import versions
-
     queries, unseen = read_queries(scene)
     start = time.perf_counter()
     opened = load_map(map_path)
@@ -50,20 +45,17 @@ def measure(map_path: Path, scene: Path) -> dict[str, Any]:
     if not opened.instances:
         raise InputError(f"{map_path}: holds no instances; map again with masks")
     owners = true_objects(opened, scene)
-    descriptions, _ = from_arrays(opened.language)
     report: dict[str, Any] = {"map": str(map_path), "scene": scene.name, "instances": len(opened.instances)}
     report |= {"encoder": str(opened.language["encoder"]), "prompts": len(queries), "unseen_prompts": unseen}
-    report |= _figures(opened.ranker, descriptions, owners, queries, read_words(scene))
+    report |= _figures(opened.ranker, owners, queries, read_words(scene))
     report |= {"load_ms": round(loaded * 1e3, 1), "cold_ms": round(cold * 1e3, 1)}
     report |= latency(opened.ranker, [text for text, _ in queries], "warm")
-    many = [descriptions[n % len(descriptions)] for n in range(MANY)]
-    report |= latency(opened.ranker.over(many), [text for text, _ in queries], f"warm_{MANY}")
-    return report | {"versions": versions()}
+    return report
 
 
 def read_queries(scene: Path) -> tuple[list[tuple[str, set[int]]], int]:
     """Prompts of scene.json with the true ids that answer them, and how many were left out as never seen."""
-    about = _about(scene)
+    about = read_scene(scene)
     visible = {entry["id"] for entry in about["instances"] if entry.get("gt_points", 1)}
     queries = [(query["text"], set(query["instance_ids"]) & visible) for query in about["queries"]]
     kept = [(text, ids) for text, ids in queries if ids]
@@ -72,20 +64,15 @@ def read_queries(scene: Path) -> tuple[list[tuple[str, set[int]]], int]:
 
 def read_words(scene: Path) -> set[str]:
     """Every word that scene.json uses for its objects: none of them may count as absent."""
-    texts = [query["text"] for query in _about(scene)["queries"]]
+    texts = [query["text"] for query in read_scene(scene)["queries"]]
     return {singular(word) for text in texts for word in re.findall(r"[a-z]+", text.lower())}
 
 
 def true_objects(opened: QueryMap, scene: Path) -> list[int]:
     """The true id under most exported points of each instance, −1 where none lies."""
-    from perception.export.transfer import check_overlap, export_labels
-    from perception.io.cloud import read_cloud
+    from perception.export.transfer import export_labels
 
-    cloud = read_cloud(scene / "gt_points.ply")
-    if "instance_id" not in cloud.labels:
-        raise InputError(f"{scene / 'gt_points.ply'}: expected a property instance_id, found none")
-    if check_overlap(opened.means, cloud.points) < 0.5:
-        raise InputError(f"{opened.path}: most of {scene.name}'s points lie outside it; map the scene with its poses")
+    cloud = read_truth_cloud(scene, opened.means)
     labels = export_labels(opened.means, opened.instance_ids, cloud)
     truth = cloud.labels["instance_id"]
     owners = []
@@ -97,7 +84,6 @@ def true_objects(opened: QueryMap, scene: Path) -> list[int]:
 
 def _figures(
     ranker: Ranker,
-    descriptions: list[InstanceDescription],
     owners: list[int],
     queries: list[tuple[str, set[int]]],
     words: set[str],
@@ -106,16 +92,12 @@ def _figures(
     answers = [ranker.rank(text) for text, _ in queries]
     found = [bool({i for i, _ in a.hits[:3]} & ids) for a, ids in zip(answers, right, strict=True)]
     top1, top3 = accuracy([[i for i, _ in a.hits] for a in answers], right)
-    grey = ranker.over([_colorless(d) for d in descriptions], ranker.shapes)
-    blind1, blind3 = accuracy([[i for i, _ in grey.rank(text).hits] for text, _ in queries], right)
     chance1, chance3 = chance([len(ids) for ids in right], len(owners))
     near = [t for t in HOUSEHOLD if not {singular(w) for w in t.split()} & words]
     wrong, wrong_near = ([t for t in texts if ranker.rank(t).present] for texts in (ABSENT, near))
     return {
         "top1": top1,
         "top3": top3,
-        "color_blind_top1": blind1,
-        "color_blind_top3": blind3,
         "random_top1": chance1,
         "random_top3": chance3,
         "answered_present": round(float(np.mean([a.present for a in answers])), 3),
@@ -140,23 +122,3 @@ def latency(ranker: Ranker, texts: Sequence[str], name: str) -> dict[str, float]
         seconds.append(time.perf_counter() - start)
     median, p99 = np.quantile(seconds, [0.5, 0.99]) * 1e3
     return {f"{name}_median_ms": round(float(median), 2), f"{name}_p99_ms": round(float(p99), 2)}
-
-
-def table(report: dict[str, Any]) -> str:
-    """The figures, a line each."""
-    shown = {key: value for key, value in report.items() if key != "versions"}
-    return "\n".join(
-        f"{key:>26}: {', '.join(map(str, value)) if isinstance(value, list) else value}" for key, value in shown.items()
-    )
-
-
-def _colorless(d: InstanceDescription) -> InstanceDescription:
-    return InstanceDescription(d.embedding, d.per_view, np.zeros_like(d.palette), d.views, d.boxes)
-
-
-def _about(scene: Path) -> dict[str, Any]:
-    file = scene / "scene.json"
-    if not file.is_file():
-        raise InputError(f"{scene}: no scene.json there; expected the folder of a scene with truth")
-    about: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-    return about

@@ -9,10 +9,6 @@ difference is a crossed answer and an exception a lost one. Memory: resident bef
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -24,25 +20,24 @@ import numpy as np
 
 from perception.bench.askers import CONTENDERS, Best, Contender
 from perception.bench.dds import DDS_CONTENDERS
+from perception.bench.memory import status_mib
+from perception.bench.output import bench_parser, finish, save_plot
+from perception.bench.processes import run_python
 from perception.bench.synthetic_map import write_synthetic_map
-from perception.errors import InputError, missing_extra
+from perception.errors import InputError
 
 _WAYS = {**CONTENDERS, **DDS_CONTENDERS}
 
 _COLD = """
 import sys, resource
+from perception.bench.memory import status_mib
 from perception.query import load_map
 gmap = load_map(sys.argv[1])
 opened = resource.getrusage(resource.RUSAGE_SELF)
 hits = gmap.query(sys.argv[2], 1)
 used = resource.getrusage(resource.RUSAGE_SELF)
-peak = used.ru_maxrss  # counts the parent's memory at the fork too, where /proc knows better
-try:
-    status = open("/proc/self/status").read()
-    peak = int(status.split("VmHWM:")[1].split()[0])
-except (OSError, IndexError):
-    pass
-print(hits[0].instance_id, opened.ru_utime + opened.ru_stime, used.ru_utime + used.ru_stime, peak / 1024)
+times = (opened.ru_utime + opened.ru_stime, used.ru_utime + used.ru_stime)
+print(hits[0].instance_id, *times, status_mib("VmHWM"))
 """
 
 
@@ -61,11 +56,9 @@ def prompts(count: int) -> list[str]:
 def cold_start(path: Path, name: str, expected: int, rounds: int) -> dict[str, Any]:
     """Seconds from the start of a process to its first answer, wall and processor; peak memory in MiB."""
     rows = []
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     for _ in range(rounds):
         start = time.perf_counter()
-        command = [sys.executable, "-c", _COLD, str(path), name]
-        out = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout.split()
+        out = run_python("-c", _COLD, str(path.resolve()), name).split()
         rows.append([time.perf_counter() - start, *map(float, out[1:])])
         if int(out[0]) != expected:
             raise RuntimeError(f"{name}: answered {out[0]}, expected {expected}")
@@ -74,7 +67,7 @@ def cold_start(path: Path, name: str, expected: int, rounds: int) -> dict[str, A
         "first_answer_s": round(float(wall), 2),
         "first_answer_cpu_s": round(float(used), 2),
         "until_map_open_cpu_s": round(float(opened), 2),
-        "peak_mib": round(float(peak)),
+        "peak_mib": round(float(peak)) if np.isfinite(peak) else None,
         "rounds": rounds,
     }
 
@@ -130,7 +123,7 @@ def warm(path: Path, names: Sequence[str], queries: int) -> tuple[dict[str, Any]
         hits = gmap.query(name, 1)
         first.append(time.perf_counter() - start)
         answers[name] = (hits[0].instance_id, len(hits[0].points)) if hits else None
-    before = resident_mib()
+    before = status_mib("VmRSS")
     for n in range(queries):
         start = time.perf_counter()
         gmap.query(names[n % len(names)], 1)
@@ -140,19 +133,10 @@ def warm(path: Path, names: Sequence[str], queries: int) -> tuple[dict[str, Any]
         "new_prompt": _spread(first),
         "repeated_prompt": _spread(again),
         "resident_before_mib": before,
-        "resident_after_mib": resident_mib(),
+        "resident_after_mib": status_mib("VmRSS"),
         "right_by_construction": f"{right} of {len(names)}",
     }
     return facts, answers
-
-
-def answers_alone(path: Path, names: Sequence[str]) -> dict[str, Best]:
-    """What a single thread is answered."""
-    from perception.query import load_map
-
-    gmap = load_map(path)
-    found = {name: gmap.query(name, 1) for name in names}
-    return {name: (hits[0].instance_id, len(hits[0].points)) if hits else None for name, hits in found.items()}
 
 
 def clients_at_once(contender: Contender, path: Path, answers: dict[str, Best], shares: list[list[str]]) -> Any:
@@ -172,11 +156,11 @@ def clients_at_once(contender: Contender, path: Path, answers: dict[str, Best], 
         return times, crossed, lost
 
     with contender(path) as served, ThreadPoolExecutor(len(shares)) as pool:
-        before, start = resident_mib(served.process), time.perf_counter()
+        before, start = status_mib("VmRSS", served.process), time.perf_counter()
         asked = [pool.submit(client, served.client(), share) for share in shares]
         results = [future.result() for future in asked]
         seconds = time.perf_counter() - start
-        after = resident_mib(served.process)
+        after = status_mib("VmRSS", served.process)
     times = [t for row, _, _ in results for t in row]
     return {
         "asked": sum(map(len, shares)),
@@ -194,70 +178,47 @@ def shares_of(names: Sequence[str], queries: int, clients: int) -> list[list[str
     return [[names[(n * 7 + c * 31) % len(names)] for n in range(queries // clients)] for c in range(clients)]
 
 
-def resident_mib(process: int | None = None) -> int | None:
-    """Resident memory of a process, this one by default; None where there is no /proc."""
-    try:
-        pages = int(Path(f"/proc/{process or os.getpid()}/statm").read_text(encoding="ascii").split()[1])
-    except OSError:
-        return None
-    return pages * os.sysconf("SC_PAGE_SIZE") >> 20
-
-
-def measure(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """All of it, as JSON."""
+def measure(options: argparse.Namespace, folder: Path) -> tuple[dict[str, Any], str]:
+    """All figures, and a text with the main ones."""
     from perception.language.encoders import make_encoder
-    from perception.pipeline.record import versions
 
     names, encoder = prompts(options.instances), make_encoder("conse")
-    report: dict[str, Any] = {
-        "versions": versions(),
-        "processors": os.cpu_count(),
-        "settings": {key: value for key, value in vars(options).items() if key not in ("json", "plot")},
-        "maps": {},
-    }
+    report: dict[str, Any] = {"maps": {}, "clients": {}}
+    lines = []
     for size in options.sizes:
         path = folder / f"{size}.gsmap"
         write_synthetic_map(path, names, encoder, gaussians=size)
         row = {**load_times(path, options.turns), **cold_start(path, names[0], 0, options.rounds)}
-        row |= place_times(path, options.turns)
-        report["maps"][size] = row
-        _say(f"{size:>9} Gaussians: load_map {row['load_map_ms']} ms, with points {row['load_map_and_points_ms']} ms")
-        _say(
-            f"{'':>9} process to first answer {row['first_answer_s']} s wall, {row['first_answer_cpu_s']} s processor "
-            f"({row['until_map_open_cpu_s']} s until the map was open), peak {row['peak_mib']} MiB"
-        )
-        places = ", ".join(f"{name} {row[f'{name}_ms']}" for name in ("nearest", "instance_at", "in_box", "describe"))
-        _say(f"{'':>9} places, ms: {places}")
+        report["maps"][size] = row | place_times(path, options.turns)
+        lines += [f"{size} Gaussians", *(f"  {key}: {value}" for key, value in report["maps"][size].items())]
     report["warm"], answers = warm(path, names, options.queries)
     for kind in ("new_prompt", "repeated_prompt"):
-        _say(f"one thread, {kind.replace('_', ' ')}: {_told(report['warm'][kind])}")
+        lines.append(f"one thread, {kind.replace('_', ' ')}: {_told(report['warm'][kind])}")
     before, after = report["warm"]["resident_before_mib"], report["warm"]["resident_after_mib"]
-    _say(f"resident before and after {options.queries} queries: {before}, {after} MiB")
-    _say(f"right by construction: {report['warm']['right_by_construction']}")
+    lines.append(f"resident before and after {options.queries} queries: {before:.0f}, {after:.0f} MiB")
+    lines.append(f"right by construction: {report['warm']['right_by_construction']}")
     new = [f"{a} on a {b}" for a, b in zip(names, names[1:] + names[:1], strict=True)][: options.new]
-    report["clients"] = {}
+    alone = warm(path, new, 0)[1]
     for name in options.via:
         repeated = shares_of(names, options.queries, options.clients)
+        shares = [new[c :: options.clients] for c in range(options.clients)]
         rows = {
-            "new prompts": clients_at_once(
-                _WAYS[name],
-                path,
-                answers_alone(path, new),
-                [new[c :: options.clients] for c in range(options.clients)],
-            ),
+            "new prompts": clients_at_once(_WAYS[name], path, alone, shares),
             "repeated prompts": clients_at_once(_WAYS[name], path, answers, repeated),
         }
         report["clients"][name] = rows
-        for kind, row in rows.items():
-            _say(
-                f"{options.clients} clients, {name}, {kind}: {_told(row)}, {row['per_second']} a second; "
-                f"{row['asked']} asked, {row['lost']} lost, {row['crossed']} crossed; server "
-                f"{row['server_before_mib']} MiB before, {row['server_after_mib']} after"
-            )
-    return report
+        lines += [
+            f"{options.clients} clients, {name}, {kind}: {_told(row)}, {row['per_second']} a second; "
+            f"{row['asked']} asked, {row['lost']} lost, {row['crossed']} crossed; "
+            f"server {row['server_after_mib']:.0f} MiB"
+            for kind, row in rows.items()
+        ]
+    return report, "\n".join(lines)
 
 
 def _spread(seconds: Sequence[float]) -> dict[str, float]:
+    if not seconds:
+        return {}
     low, median, high, last = np.percentile(seconds, [25, 50, 75, 99])
     return {"median_ms": _ms(median), "q25_ms": _ms(low), "q75_ms": _ms(high), "p99_ms": _ms(last)}
 
@@ -270,37 +231,29 @@ def _ms(seconds: Any) -> float:
     return round(1e3 * float(seconds), 3)
 
 
-def _say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
-
-
-def plot(report: dict[str, Any], path: Path) -> None:
+def _draw(report: dict[str, Any], clients: int) -> Callable[[Any], None]:
     """Median and 99 % latency of every way to ask, on a logarithmic axis."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise missing_extra("matplotlib", "bench") from error
     rows = {"new prompt": report["warm"]["new_prompt"], "asked again": report["warm"]["repeated_prompt"]}
-    clients = report["settings"]["clients"]
     for name, kinds in report["clients"].items():
         rows |= {f"{clients} clients,\n{name},\n{kind}": row for kind, row in kinds.items()}
-    figure = Figure(figsize=(8, 3.6), layout="constrained")
-    axes = figure.subplots()
-    places = np.arange(len(rows))
-    for shift, key, label in ((-0.2, "median_ms", "median"), (0.2, "p99_ms", "99 %")):
-        bars = axes.bar(places + shift, [row[key] for row in rows.values()], 0.4, label=label)
-        axes.bar_label(bars, fmt="%.3g", fontsize=8)
-    axes.set(yscale="log", ylabel="ms", xticks=places, title="One prompt, asked and answered")
-    axes.set_xticklabels(list(rows))
-    axes.legend(frameon=False, ncols=2, loc="upper left")
-    axes.margins(y=0.25)
-    figure.savefig(path, dpi=120)
+
+    def draw(figure: Any) -> None:
+        axes = figure.subplots()
+        places = np.arange(len(rows))
+        for shift, key, label in ((-0.2, "median_ms", "median"), (0.2, "p99_ms", "99 %")):
+            bars = axes.bar(places + shift, [row[key] for row in rows.values()], 0.4, label=label)
+            axes.bar_label(bars, fmt="%.3g", fontsize=8)
+        axes.set(yscale="log", ylabel="ms", xticks=places, title="One prompt, asked and answered")
+        axes.set_xticklabels(list(rows))
+        axes.legend(frameon=False, ncols=2, loc="upper left")
+        axes.margins(y=0.25)
+
+    return draw
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Prints the figures; --json and --plot keep them."""
-    parser = argparse.ArgumentParser(prog="perception bench query", description=__doc__)
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Prints the figures; JSON and a plot go to the output folder."""
+    parser = bench_parser("query", __doc__)
     parser.add_argument("--sizes", type=int, nargs="+", default=[200_000, 1_000_000], help="Gaussians of the maps")
     parser.add_argument("--instances", type=int, default=200)
     parser.add_argument("--queries", type=int, default=10_000)
@@ -309,19 +262,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--rounds", type=int, default=3, help="processes started for the cold figures")
     parser.add_argument("--turns", type=int, default=7, help="times each map is opened")
     parser.add_argument("--via", nargs="+", default=list(_WAYS), choices=list(_WAYS))
-    parser.add_argument("--json", type=Path, metavar="OUT.json")
-    parser.add_argument("--plot", type=Path, metavar="OUT.png")
     options = parser.parse_args(arguments)
     if min(*options.sizes, options.queries, options.new, options.clients, options.rounds, options.turns) < 1:
         raise InputError("bench query: sizes and counts must be at least 1")
     with tempfile.TemporaryDirectory() as folder:
-        report = measure(options, Path(folder))
-    if options.json:
-        options.json.write_text(json.dumps(report, indent=1), encoding="utf-8")
-    if options.plot:
-        plot(report, options.plot)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        report, text = measure(options, Path(folder))
+    save_plot(options.output / "query.png", _draw(report, options.clients), (8, 3.6))
+    finish("query", options, report, text)

@@ -7,7 +7,6 @@ nanoseconds are CPU time of all threads: of the median round, and of the least d
 
 from __future__ import annotations
 
-import argparse
 import math
 import statistics
 import time
@@ -17,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from perception.bench.memory import fresh_peak, status_mib
+from perception.bench.output import Column, bench_parser, finish, save_plot, table
 from perception.bench.splats import SPLAT_KEYS, load_scene, synthetic_scene
-from perception.bench.sweep_cli import Column, finish, save_plot, table
 from perception.errors import InputError
 
 if TYPE_CHECKING:
@@ -202,9 +201,8 @@ def _draw(rows: list[dict[str, Any]]) -> Any:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Prints the table; JSON and a plot go to the output folder."""
-    parser = argparse.ArgumentParser(prog="perception bench rasterizer", description=__doc__)
+    parser = bench_parser("rasterizer", __doc__)
     parser.add_argument("scenes", nargs="*", type=Path, help="splats .npz files; a synthetic scene when absent")
-    parser.add_argument("-o", "--output", type=Path, default=Path("bench-rasterizer"), help="folder for figures")
     parser.add_argument("--rounds", type=int, default=7, help="counted rounds, at least 1 (default 7)")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--dtypes", nargs="+", default=["float32", "float64"], choices=("float32", "float64"))
@@ -217,7 +215,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows += measure(
             path.stem if path else "synthetic", scene, cases(options.threads, options.dtypes), options.rounds
         )
-    options.output.mkdir(parents=True, exist_ok=True)
     heads = {row["scene"]: row for row in rows}.values()
     text = "\n".join(
         f"{row['scene']}: {row['gaussians']} Gaussians, {row['width']}×{row['height']}, "

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from perception.bench.sweep import Variant
-from perception.bench.sweep_cli import chosen, finish, prepare, save_plot, sweep_parser, table, with_minutes
+from perception.bench.output import finish, save_plot, table
+from perception.bench.sweep import Variant, chosen, prepare, sweep_parser, with_minutes
 
 BUDGETS = (25_000, 50_000, 100_000, 200_000)
 PIXELS = (1, 2, 4)
@@ -35,10 +35,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = sweep_parser("scaling", __doc__)
     parser.add_argument("--side", type=int, default=640, metavar="PX", help="long side at the most pixels")
     options = parser.parse_args(arguments)
-    sweep, scenes, masks = prepare(options)
+    sweep, scene, masks = prepare(options)
     threads = sorted({1, 2, os.cpu_count() or 1} & set(range(1, (os.cpu_count() or 1) + 1)))
     cells = chosen(variants(masks, options.side, threads), options.only)
-    rows = with_minutes(sweep.run(scenes[0], cells))
+    rows = with_minutes(sweep.run(scene, cells))
     columns = (
         ("Gaussians", "gaussians", "d"),
         ("s / 1000 it", "wall_per_1000", ".1f"),
@@ -47,10 +47,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ("PSNR", "psnr", ".2f"),
         ("load", "load", ".1f"),
     )
-    text = f"{scenes[0].name}; load: other work on the machine shows there, CPU seconds feel it less\n"
+    text = f"{scene.name}; load: other work on the machine shows there, CPU seconds feel it less\n"
     text += table(rows, columns)
-    _plot(options.output / "scaling.png", scenes[0].name, rows)
-    finish("scaling", options, {"scene": scenes[0].name, "rows": rows}, text)
+    _plot(options.output / "scaling.png", scene.name, rows)
+    finish("scaling", options, {"scene": scene.name, "rows": rows}, text)
     return 0
 
 

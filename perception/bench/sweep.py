@@ -6,9 +6,11 @@ makes a map), so a sweep that was stopped goes on where it was, and a row is nev
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
 import os
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -18,12 +20,15 @@ from typing import Any
 import numpy as np
 
 from perception.bench.memory import fresh_peak
+from perception.bench.output import bench_parser
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
 from perception.types import View
 
 _CODE = ("gaussians", "instances", "export", "evaluate", "config.py", "_core*")
+QUICK = {"shorten": 6.0, "max_side": 320, "budget": 20_000}
+"""--quick: a sixth of the iterations on small photos. Shows tendencies; a figure to quote comes from a full run."""
 TRUTH_CLOUD, TRUTH_MASKS = "gt_points.ply", "masks_gt"
 
 
@@ -241,6 +246,52 @@ class Sweep:
     def _key(self, scene: SweepScene, variant: Variant, config: MapConfig) -> str:
         parts = [str(scene.folder.resolve()), variant.masks, variant.threads, config.to_json(), self._code]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def sweep_parser(name: str, about: str | None) -> argparse.ArgumentParser:
+    """The options of a sweep over one scene."""
+    parser = bench_parser(name, about)
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="input of `map`")
+    parser.add_argument("--quick", action="store_true", help="a sixth of the iterations, 320 pixels, 20 k Gaussians")
+    parser.add_argument("--shorten", type=float, metavar="F", help="divide every variant's iterations by F")
+    parser.add_argument("--iterations", type=int, metavar="N")
+    parser.add_argument("--max-side", type=int, metavar="PX", help="most pixels a side, for every variant")
+    parser.add_argument("--budget", type=int, metavar="N", help="most Gaussians, for every variant")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
+    parser.add_argument("--masks", default="labels", metavar="DIR", help="label images inside SCENE, or none")
+    parser.add_argument("--only", metavar="TEXT", help="only variants with TEXT in their group or name")
+    return parser
+
+
+def limits_of(options: argparse.Namespace) -> Limits:
+    """--quick, and single options over it."""
+    quick = QUICK if options.quick else {}
+    given = {key: getattr(options, key) for key in ("shorten", "iterations", "max_side", "budget")}
+    values: dict[str, Any] = {**quick, **{key: value for key, value in given.items() if value is not None}}
+    if values.get("shorten", 1) <= 0:
+        raise InputError(f"--shorten: found {values['shorten']}, expected above 0")
+    return Limits(**values, settings=tuple(options.pairs))
+
+
+def prepare(options: argparse.Namespace) -> tuple[Sweep, SweepScene, str | None]:
+    """The sweep, its scene, and the folder of masks (None: photos alone). Progress goes to stderr."""
+    if not options.scene.exists():
+        raise InputError(f"{options.scene}: does not exist; give a scene as `perception map` takes it")
+    sweep = Sweep(options.output, limits_of(options), lambda text: print(text, file=sys.stderr, flush=True))
+    scene = SweepScene(options.scene, Path())
+    scene.work = options.output / "scenes" / scene.name
+    masks = options.masks if (scene.root / options.masks).is_dir() else None
+    return sweep, scene, masks
+
+
+def chosen(variants: Sequence[Any], only: str | None) -> list[Any]:
+    """Those whose group or name holds `only`; the first, which all are compared with, always."""
+    return [v for i, v in enumerate(variants) if i == 0 or only is None or only in f"{v.group} {v.name}"]
+
+
+def with_minutes(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Adds minutes of mapping (training and clustering) and CPU minutes of training."""
+    return [r | {"minutes": r["seconds"] / 60, "cpu_minutes": r["cpu_seconds"] / 60} for r in rows]
 
 
 def code_digest() -> str:

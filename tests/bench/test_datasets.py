@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception.bench import lerf_mask, lerf_ovs, scannetpp
+from perception.bench import instances, lerf_mask, lerf_ovs, queries, scannetpp
 from perception.bench.datasets import by_reference
 from perception.cli import main
 from perception.demo import load_truth
@@ -124,6 +124,21 @@ def test_lerf_ovs_from_download_to_table(ovs_run: Path, downloads: Path, capsys:
     protocol = result["protocol"]
     assert protocol["occlusion"] == "off" and "top-1" in protocol["selection"] and "held out" in protocol["test_views"]
     assert "occlusion: off" in capsys.readouterr().out
+
+
+def test_a_made_scene_is_a_truth_scene(ovs_run: Path, small_scene: Path, tmp_path: Path) -> None:
+    """bench instances and bench queries on the generator's truth and a map in its frame."""
+    scene, gmap = str(small_scene / "truth"), str(ovs_run / "maps" / "table.gsmap")
+    instances.main([scene, gmap, "-o", str(tmp_path)])
+    found = json.loads((tmp_path / "instances.json").read_text())
+    assert found["ap"]["all, calibrated"]["ap25"] > 0.3 and 0.2 < found["rendered_miou"] <= 1
+    assert found["truth"] == len(load_truth(small_scene / "truth").instances)
+    queries.main([gmap, scene, "-o", str(tmp_path)])
+    asked = json.loads((tmp_path / "queries.json").read_text())
+    assert asked["prompts"] > 20 and asked["absent_prompts"] == 30 and 0 < asked["random_top1"] < asked["random_top3"]
+    (tmp_path / "bare").mkdir()
+    with pytest.raises(InputError, match=r"no scene\.json"):
+        queries.main([gmap, str(tmp_path / "bare")])
 
 
 @pytest.mark.parametrize("select", ["truth", "reference", "query"])

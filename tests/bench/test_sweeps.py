@@ -15,8 +15,8 @@ import pytest
 from perception.bench import map as bench_map
 from perception.bench import scaling, sweep
 from perception.bench.memory import fresh_peak, status_mib
-from perception.bench.sweep import Limits, Sweep, SweepScene, Variant, pareto
-from perception.bench.sweep_cli import limits_of, sweep_parser, table
+from perception.bench.output import table
+from perception.bench.sweep import Limits, Sweep, SweepScene, Variant, limits_of, pareto, sweep_parser
 from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
@@ -35,16 +35,6 @@ def test_the_front_is_what_brute_force_says() -> None:
         }
         assert {points[i] for i in pareto(points)} == {p for i, p in enumerate(points) if i not in beaten}
     assert pareto([(1.0, None), (2.0, 3.0)]) == [1]
-
-
-def test_one_map_under_two_names_is_one_point() -> None:
-    rows = [
-        {"name": n, "iterations": 9, "gaussians": g, "sh_degree": 3, "pixels": 4, "psnr": 30.0, "cpu_minutes": t}
-        for n, g, t in (("default", 7, 1.2), ("harmonics 3", 7, 1.0), ("other", 8, 1.1))
-    ]
-    bench_map.share_the_least_time(rows)
-    assert [row["cpu_minutes"] for row in rows] == [1.0, 1.0, 1.1]
-    assert pareto([(row["cpu_minutes"], row["psnr"]) for row in rows]) == [0]
 
 
 @pytest.mark.parametrize(

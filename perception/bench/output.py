@@ -1,0 +1,97 @@
+"""What all benchmarks share: the parser, a table, where results go, the machine they were read on, a plot."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from perception.io.atomic import atomic_file
+
+Column = tuple[str, str, str]
+"""(head, key of the row, format)."""
+
+
+def bench_parser(name: str, about: str | None) -> argparse.ArgumentParser:
+    """A parser with what all benchmarks have: -o FOLDER and --json."""
+    parser = argparse.ArgumentParser(
+        prog=f"perception bench {name}", description=about, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    folder = Path(f"bench-{name}")
+    parser.add_argument("-o", "--output", type=Path, default=folder, metavar="DIR", help=f"for results ({folder})")
+    parser.add_argument("--json", action="store_true", help="print one JSON object in place of the table")
+    return parser
+
+
+def table(rows: Sequence[dict[str, Any]], columns: Sequence[Column], heads: Sequence[str] = ("group", "name")) -> str:
+    """Rows as aligned text; '-' where a figure is missing."""
+    cells = [[*heads, *(head for head, _, _ in columns)]]
+    for row in rows:
+        figures = ["-" if row.get(key) is None else format(row[key], form) for _, key, form in columns]
+        cells.append([str(row[head]) for head in heads] + figures)
+    widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
+    left = len(heads)
+    lines = [
+        "  ".join(c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(line, widths, strict=True)))
+        for line in cells
+    ]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores, and nanoseconds of one addition that waits for the last (numpy.cumsum of float64, the least
+    of five): three or four cycles, so it tells how fast this machine really was, shared or throttled as it may be."""
+    import numpy as np
+
+    numbers, least = np.ones(1_000_000), float("inf")
+    for _ in range(5):
+        start = time.thread_time_ns()
+        np.cumsum(numbers, out=numbers)
+        least = min(least, (time.thread_time_ns() - start) / numbers.size)
+        numbers[:] = 1
+    return {"processor": _processor(), "cores": os.cpu_count(), "serial_add_ns": least}
+
+
+def _processor() -> str:
+    """Name and the widest instruction set our kernels use on it."""
+    from perception.gaussians.rasterize import simd_levels
+
+    name = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        name = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass  # not Linux, or a processor that does not say
+    return f"{name}, {simd_levels()[0]}"
+
+
+def finish(name: str, options: argparse.Namespace, report: dict[str, Any], text: str) -> None:
+    """Prints `text`, or JSON with --json; keeps both in the output folder, with machine, versions and arguments."""
+    from perception.pipeline.record import versions
+
+    facts = {"bench": name, "arguments": dict(vars(options)), "machine": machine(), "versions": versions(), **report}
+    with atomic_file(options.output / f"{name}.json") as aside:
+        aside.write_text(json.dumps(facts, indent=1, default=str), encoding="utf-8")
+    with atomic_file(options.output / f"{name}.txt") as aside:
+        aside.write_text(text + "\n", encoding="utf-8")
+    print(json.dumps(facts, default=str) if options.json else text)
+    print(f"kept in {options.output}: {name}.json, {name}.txt", file=sys.stderr)
+
+
+def save_plot(path: Path, draw: Callable[[Any], None], size: tuple[float, float] = (9, 5)) -> None:
+    """`draw(figure)` to a PNG; without matplotlib one line says so and the figures stay in the JSON."""
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError:
+        print(f"no {path.name}: plots need matplotlib (pip install '.[bench]' in the clone)", file=sys.stderr)
+        return
+    figure = Figure(figsize=size, dpi=120, layout="constrained")
+    draw(figure)
+    with atomic_file(path) as aside:
+        figure.savefig(aside, format="png")

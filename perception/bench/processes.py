@@ -1,0 +1,48 @@
+"""Processes of a benchmark's own: they run this very package, whatever folder the benchmark was started from."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import perception
+
+
+def _options() -> dict[str, Any]:
+    """cwd and env for subprocess: started in a repository's root, Python would find sources without their core."""
+    paths = [str(Path(perception.__file__).resolve().parents[1]), *(path for path in sys.path if path)]
+    return {
+        "cwd": tempfile.gettempdir(),
+        "env": {**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))},
+        "text": True,
+    }
+
+
+def run_python(*arguments: str) -> str:
+    """The standard output of `python ARGUMENTS`; RuntimeError with what it said when it failed."""
+    done = subprocess.run([sys.executable, *arguments], capture_output=True, check=False, **_options())
+    if done.returncode:
+        raise RuntimeError(f"python {' '.join(arguments)[:80]} ended with {done.returncode}: {done.stderr.strip()}")
+    return done.stdout
+
+
+@contextmanager
+def served(*arguments: str) -> Iterator[tuple[str, int]]:
+    """`perception ARGUMENTS` while the context is open: its first line, which begins with "serving", and its id."""
+    command = [sys.executable, "-m", "perception.cli", *arguments]
+    server = subprocess.Popen(command, stderr=subprocess.PIPE, **_options())
+    try:
+        assert server.stderr is not None
+        told = server.stderr.readline()
+        if not told.startswith("serving "):
+            raise RuntimeError(f"perception {arguments[0]} did not start: {told}{server.stderr.read()}")
+        yield told, server.pid
+    finally:
+        server.terminate()
+        server.wait()
