@@ -109,12 +109,15 @@ def view_from_json(entry: dict[str, Any]) -> StoredView:
     K, pose = (np.array(entry[name], np.float64) for name in ("K", "camera_from_world"))
     if K.shape != (3, 3) or pose.shape != (4, 4) or not (np.isfinite(K).all() and np.isfinite(pose).all()):
         raise ValueError(f"{entry['name']}: K or camera_from_world is no finite matrix")
+    width, height = int(entry["width"]), int(entry["height"])
+    if min(width, height) < 1:
+        raise ValueError(f"{entry['name']}: {width}×{height} pixels")
     return StoredView(
         str(entry["name"]),
         Path(entry["photo"]),
         K,
-        int(entry["width"]),
-        int(entry["height"]),
+        width,
+        height,
         pose,
         None if lens is None else Lens(str(lens[0]), tuple(map(float, lens[1])), int(lens[2]), int(lens[3])),
         bool(entry.get("held_out", False)),
