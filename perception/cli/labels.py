@@ -29,30 +29,29 @@ def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         return _set(args)
     if args.clear:
         raise InputError("label: --clear needs the ID whose name is taken away")
-    from perception.io.labels import given_names
+    from perception.io.map import Map
 
-    named = given_names(args.map)
+    named = {entry["id"]: entry["label"] for entry in Map.open(args.map).instances if entry.get("label")}
     return {"labels": named}, "\n".join(f"{i:>5}  {name}" for i, name in named.items()) or "no instance has a name"
 
 
 def _set(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.labels import give_names
+    from perception.io.store import set_labels
 
     if args.text is None and not args.clear:
         raise InputError("label: no NAME given; write one, or --clear to take it away")
-    label = give_names(args.map, {args.id: args.text})[args.id]
+    label = set_labels(args.map, {args.id: args.text})[args.id]
     said = f"instance {args.id} is called “{label}” now" if label else f"instance {args.id} has no name any more"
     return {"id": args.id, "label": label}, said
 
 
 def _transfer(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.instances.label_transfer import transfer_labels, transfer_text
-    from perception.io.labels import give_names
-    from perception.io.store import read_map
+    from perception.io.store import read_map, set_labels
 
     if args.id is not None:
         raise InputError("label: --from carries all names over and takes no ID")
     transfer = transfer_labels(read_map(args.old), read_map(args.map))
     if transfer.labels:
-        give_names(args.map, dict(transfer.labels))
+        set_labels(args.map, dict(transfer.labels))
     return {"labels": transfer.labels, "dropped": [name for _, name in transfer.dropped]}, transfer_text(transfer)

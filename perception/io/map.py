@@ -20,6 +20,10 @@ GAUSSIANS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features",
 """Fields with a row a Gaussian."""
 
 
+PART = "language_"
+"""Before the names of the arrays in `parts` that are as those in `language`."""
+
+
 class PhotosMoved(UserWarning):
     """Photos of a map are missing or are other files than when it was made."""
 
@@ -108,6 +112,11 @@ class Map:
     def poses(self) -> np.ndarray:
         """[V, 4, 4] float64 camera_from_world of the views."""
         return np.array([view.camera_from_world for view in self.views], np.float64).reshape(-1, 4, 4)
+
+    @property
+    def part_language(self) -> dict[str, np.ndarray]:
+        """As `language`, of the parts: a row a part in ascending id; {} without parts or embeddings."""
+        return {n.removeprefix(PART): array for n, array in self.parts.items() if n.startswith(PART)}
 
     @property
     def map_id(self) -> str:

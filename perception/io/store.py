@@ -50,6 +50,9 @@ __all__ = [
 ]
 
 
+LONGEST_LABEL = 200  # characters
+
+
 def write_map(path: Path, gmap: Map, keep_report: bool = False) -> None:
     """Writes the whole map aside and swaps it in: a reader sees the old map or the new one, never half of one.
 
@@ -87,8 +90,10 @@ def _recorded(view: View, path: Path, before: Path | None) -> StoredView:
 
 
 def read_map(path: Path) -> Map:
-    """All of a map in memory, checksums compared. InputError naming the file when it is no map, of another version, or
-    damaged."""
+    """All of a map in memory, checksums compared.
+
+    InputError naming the file when it is no map, of an unknown version, or damaged.
+    """
     return Map.open(path).load()
 
 
@@ -100,21 +105,32 @@ def verify_map(path: Path) -> dict[str, str]:
     return states
 
 
-def set_labels(path: Path, labels: dict[int, str | None]) -> None:
-    """Gives instances of the map on disk the user's names (None takes one away), or does nothing at all.
+def set_labels(path: Path, labels: dict[int, str | None]) -> dict[int, str | None]:
+    """Gives instances of the map on disk, by id, the names of a person; None takes one away. All are written or none.
 
-    InputError for an id the map does not have, and while another writer is at this map.
+    Returns what was written, white space tidied. InputError for an id that the map does not have, a name that is empty
+    or too long, and while another writer is at this map.
     """
+    tidied = {i: None if label is None else tidy_label(label) for i, label in labels.items()}
     with writing(path):
         files = MapFiles(path)
         places = {entry["id"]: n for n, entry in enumerate(files.instances)}
-        for instance_id, label in labels.items():
+        for instance_id, label in tidied.items():
             if instance_id not in places:
                 raise InputError(f"{path}: has no instance {instance_id}; it has {len(places)}")
-            if label is not None and not (isinstance(label, str) and label.strip()):
-                raise InputError(f"{path}: the label of instance {instance_id} is empty; give a name or none")
             files.instances[places[instance_id]]["label"] = label
         _write_instances(path, files)
+    return tidied
+
+
+def tidy_label(label: str) -> str:
+    """One line without outer white space; InputError when nothing is left or more than LONGEST_LABEL."""
+    tidy = " ".join(label.split())
+    if not tidy:
+        raise InputError('label: it is empty; write a name such as "grandma\'s cup", or --clear to take it away')
+    if len(tidy) > LONGEST_LABEL:
+        raise InputError(f"label: {len(tidy)} characters, at most {LONGEST_LABEL} are kept; choose a shorter name")
+    return tidy
 
 
 def _write_instances(path: Path, files: MapFiles) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.instances.describe import describe_instances
 from perception.instances.silhouettes import render_silhouettes
-from perception.io.map import Map
+from perception.io.map import PART, Map
 from perception.io.map_lock import writing
 from perception.io.map_views import StoredView, locate_photo, stored_view
 from perception.io.store import FORMAT_VERSION, read_info, read_map, write_map
@@ -68,13 +68,11 @@ def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:
     zooms = int(gmap.info.get("config", {}).get("language", {}).get("zooms") or reading_of(encoder).zooms)
     ids = [entry["id"] for entry in gmap.instances]
     gmap.language = _described(gmap, encoder, gmap.language, gmap.instance_ids, ids, zooms, progress)
-    prefix = "language_"
-    stored = {name[len(prefix) :]: array for name, array in gmap.parts.items() if name.startswith(prefix)}
-    if stored:
+    if gmap.part_language:
         owners = gmap.parts["ids"]
         known = sorted({int(i) for i in np.unique(owners) if i >= 0})
-        anew = _described(gmap, encoder, stored, owners, known, 1, progress)
-        gmap.parts = {"ids": owners, **{prefix + name: array for name, array in anew.items()}}
+        anew = _described(gmap, encoder, gmap.part_language, owners, known, 1, progress)
+        gmap.parts = {"ids": owners, **{PART + name: array for name, array in anew.items()}}
 
 
 def _described(

@@ -23,10 +23,12 @@ class PartsMap:
         self.entries = sorted(entries, key=lambda part: int(part["id"]))
         self._asked: QueryMap | None = None
         if self.entries and "ids" in opened.parts:
-            prefix = "language_"
-            language = {name[len(prefix) :]: a for name, a in opened.parts.items() if name.startswith(prefix)}
             self._asked = QueryMap.of(
-                opened, instances=self.entries, instance_ids=opened.parts["ids"], language=language, parts={}
+                opened,
+                instances=self.entries,
+                instance_ids=opened.parts["ids"],
+                language=opened.part_language,
+                parts={},
             )
 
     def of(self, instance: int) -> list[Hit]:

@@ -12,8 +12,7 @@ from perception.cli import main
 from perception.errors import InputError
 from perception.geometry import look_at
 from perception.instances.label_transfer import match_instances, transfer_labels
-from perception.io.labels import give_names
-from perception.io.store import Map, read_map, write_map
+from perception.io.store import Map, read_map, set_labels, write_map
 from support.views_at import views_at
 
 PLACES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1.2, 1, 0.2]])
@@ -85,7 +84,7 @@ def test_bad_labels_change_nothing(
 
 def test_no_map_is_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is no map"):
-        give_names(tmp_path, {0: "cup"})
+        set_labels(tmp_path, {0: "cup"})
 
 
 def test_names_follow_the_place_not_the_id(tmp_path: Path) -> None:

@@ -19,9 +19,8 @@ import torch
 from perception.editing import Editor
 from perception.errors import InputError
 from perception.export import ExportOptions
-from perception.io.labels import give_names
 from perception.io.scene_cache import save_scene
-from perception.io.store import read_map, verify_map, write_map
+from perception.io.store import read_map, set_labels, verify_map, write_map
 from perception.masks.label_images import write_labels
 from perception.pipeline.checkpoint import save_checkpoint
 from perception.pipeline.exporting import Outputs, export_map
@@ -42,7 +41,7 @@ def writers(disk: Path) -> dict[str, Callable[[], Any]]:
     outputs = Outputs(split=disk / "split", boxes=disk / "boxes.json", scannet=disk / "scannet")
     return {
         "write_map": lambda: write_map(path, gmap),
-        "labels": lambda: give_names(path, {gmap.instances[0]["id"]: "a name"}),
+        "labels": lambda: set_labels(path, {gmap.instances[0]["id"]: "a name"}),
         "editor": edited.save,
         "export": lambda: export_map(path, disk / "out.ply", None, ExportOptions(), outputs),
         "checkpoint": lambda: save_checkpoint(disk / "checkpoint.pt", state, "mark"),
