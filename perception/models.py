@@ -1,4 +1,4 @@
-"""`perception models`: what a model file is, and the user's store of models."""
+"""`perception models`: recognises ONNX files by their inputs and outputs, and adds them to the user's store."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Files over HTTP that survive broken connections: what has arrived stays in a `.part` file and is gone on with.
+"""Downloads over HTTP that resume after broken connections: what has arrived stays in a `.part` file.
 
-A `Range` request asks for the rest, `If-Range` makes the server send everything when the file has changed since;
-a server that knows no ranges sends everything too, which is then taken from the start.
+A `Range` request asks for the rest; with `If-Range` the server sends the whole file when it has changed since. A server
+without ranges sends the whole file too, which is then written from the start.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ def is_url(source: str) -> bool:
 
 
 def download(url: str, part: Path, progress: Progress | None = None) -> Path:
-    """Fetches `url` into `part`, taking up what lies there; returns `part`, complete.
+    """Fetches `url` into `part`, from the bytes that lie there on; returns `part`, complete.
 
-    part: its sibling `*.part.json` remembers which version of the file it belongs to. progress(bytes, all) is
-    told after every chunk. Raises InputError when the server refuses or the line stays dead; `part` is kept.
+    part: its sibling `*.part.json` holds which version of the file it belongs to. progress(bytes, all) is called after
+    every chunk. InputError when the server refuses, or ATTEMPTS connections in a row bring nothing; `part` stays.
     """
     part.parent.mkdir(parents=True, exist_ok=True)
     fruitless = 0
@@ -68,7 +68,7 @@ def _attempt(url: str, part: Path, progress: Progress | None) -> str | None:
             _memory(part).write_text(json.dumps({"url": url, "mark": _mark(answer)}), encoding="utf-8")
             return _receive(answer, part, start, total, progress)
     except urllib.error.HTTPError as error:
-        if error.code == 416 and have:  # nothing lies behind what we have: complete, or another file by now
+        if error.code == 416 and have:  # no bytes after those we have: complete, or another file by now
             if str(error.headers.get("Content-Range", "")).endswith(f"/{have}"):
                 return None
             part.unlink()

@@ -1,13 +1,13 @@
 """ConSE (Norouzi et al. 2014), the encoder that needs no download beyond pip packages.
 
-A picture is what an ImageNet classifier sees in it, a text is what a sentence encoder makes of it. They meet twice:
+An ImageNet classifier gives p(c|x) of a picture x, a sentence encoder s(t) of a text t. They are compared twice:
 
 in the space of sentences, as in the paper,
     f(x) = Σ_{c in top T} √p(c|x) · (s(c) − s̄)  against  s(t) − s̄,   s(c) = mean embedding of the class's names,
-and in the space of classes, where the classifier is surer of itself,
+and in the space of classes,
     √p(·|x)  against  √q(·|t),   q(c|t) ∝ exp(cos(s(t) − s̄, s(c) − s̄) / τ),
-whose product is Bhattacharyya's coefficient of what is seen and what is meant. The first generalises to words that no
-class is named by, the second tells what is there from what merely resembles it. s̄ is the mean over all classes.
+whose dot product is the Bhattacharyya coefficient of the two. The first generalises to words that name no class,
+the second parts what is there from what resembles it. s̄ is the mean over all classes.
 The paper weighs by p itself; the square root measured better on objects the classifier has no class for.
 """
 

@@ -1,6 +1,4 @@
-"""Parity of the CLIP-family encoder with transformers: same architecture, random weights, exported in the
-test.
-"""
+"""Parity of the CLIP-family encoder with transformers: same architecture, random weights, exported here."""
 
 from __future__ import annotations
 

@@ -157,9 +157,7 @@ def test_bad_input(encoder: Any) -> None:
 
 
 def test_a_true_scene_answers(encoder: Any) -> None:
-    """Six objects of tabletop_a, perfect silhouettes: plain prompts find them, absent things mostly are not
-    there.
-    """
+    """Six objects of tabletop_a, perfect silhouettes: plain prompts find them, absent things mostly find nothing."""
     data = os.environ.get("PERCEPTION_DATA")
     if not data:
         pytest.skip("PERCEPTION_DATA is not set")
