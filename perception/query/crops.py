@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.map import Map
 from perception.io.map_views import locate_photo
 from perception.query.query_map import QueryMap, UnknownInstance
+from perception.types import View
 
 MARGIN = 0.15
 """Share of the box's longer side that is left around it."""
@@ -37,10 +39,7 @@ def best_crop(
     if view is None:
         return None
     try:
-        view = gmap.with_photo(view)
-        if folders is not None:
-            view = replace(view, photo=_within(view.photo, folders, instance_id))
-        photo = load_photo(view, int(gmap.info["config"]["photos"]["max_side"]))
+        photo = load_photo(readable_view(gmap, view, folders), int(gmap.info["config"]["photos"]["max_side"]))
     except UnknownInstance:
         raise
     except (InputError, OSError, ValueError, KeyError):
@@ -66,16 +65,20 @@ def _is_below(real: Path, folders: Sequence[Path]) -> bool:
     return any(real.is_relative_to(folder.resolve()) for folder in folders)
 
 
-def _within(photo: Path, folders: Sequence[Path], instance_id: int) -> Path:
-    """`photo` without symbolic links; UnknownInstance unless it is a file below one of the folders."""
+def readable_view(gmap: Map, view: View, folders: Sequence[Path] | None) -> View:
+    """`view` with the path of its photo, symbolic links followed. InputError when the photo is missing; UnknownInstance
+    when it is no file below one of the folders (None: anywhere)."""
+    located = gmap.with_photo(view)
+    if folders is None:
+        return located
     try:
-        real = photo.resolve()
+        real = located.photo.resolve()
         known = _is_below(real, folders) and real.is_file()
     except (OSError, ValueError, RuntimeError):  # no path at all, or links in a circle
         known = False
     if not known:
-        raise UnknownInstance(f"instance {instance_id}: its photo is not in the map's folder nor in --photos DIR")
-    return real
+        raise UnknownInstance(f"{view.name}: this photo is not in the map's folder nor in --photos DIR")
+    return replace(located, photo=real)
 
 
 def _shrunk(picture: np.ndarray, side: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from urllib.parse import quote
 import numpy as np
 
 from perception.errors import InputError, missing_extra
-from perception.listening import check_address, listen, url_host
+from perception.listening import check_address, is_local, listen, url_host
 from perception.viewer.guard import Guard, guarded_server
 from perception.viewer.panel import Panel
 from perception.viewer.session import Session
@@ -41,7 +41,8 @@ class Viewer:
         token = token or secrets.token_urlsafe(24)
         with contextlib.ExitStack() as undo:
             sock = undo.enter_context(listen(host, port))
-            self.session = Session(path)
+            # Who can open a page on this machine may read its files; others get no file that a received map names.
+            self.session = Session(path, None if is_local(host) else (path,))
             label = f"perception · {path.name}"
             self.server = guarded_server(Guard(token, host), sock, host=host, port=port, label=label, verbose=False)
             undo.pop_all()  # the socket is the server's now
@@ -168,13 +169,15 @@ class Viewer:
         from scipy.spatial.transform import Rotation
 
         from perception.io.photos import load_photo
+        from perception.query.crops import readable_view
 
         handles = []
         centres = [-v.camera_from_world[:3, :3].T @ v.camera_from_world[:3, 3] for v in self.session.views.values()]
         spread = float(np.ptp(np.array(centres), axis=0).max()) if centres else 1.0
         for view, centre in zip(self.session.views.values(), centres, strict=True):
             try:
-                image = load_photo(self.session.editor.original.with_photo(view), FRUSTUM_PHOTO)
+                gmap, folders = self.session.editor.original, self.session.folders
+                image = load_photo(readable_view(gmap, view, folders), FRUSTUM_PHOTO)
             except InputError:  # the photo has moved: the frustum is drawn without it
                 image = None
             wxyz = Rotation.from_matrix(view.camera_from_world[:3, :3].T).as_quat()[[3, 0, 1, 2]]

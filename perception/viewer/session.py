@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,8 @@ import numpy as np
 
 from perception.editing import Editor
 from perception.errors import InputError
-from perception.io.photos import load_photo
 from perception.query import Hit, PartsMap, QueryMap
+from perception.query.crops import best_crop
 from perception.types import View
 from perception.viewer.paint import highlight, paint
 from perception.viewer.picking import pick
@@ -23,8 +24,10 @@ CROP_SIDE = 320
 class Session:
     """Shared by all browsers of one viewer: they see the same map, and edits come one after the other."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, folders: Sequence[Path] | None = None):
+        """folders: where photos may be read, None = anywhere (see `best_crop`)."""
         self.editor = Editor(path)
+        self.folders = folders
         self.mode = "photo"
         self.selected: list[int] = []
         self.part: int | None = None
@@ -142,35 +145,13 @@ class Session:
         return entry.get("label") or f"instance {entry['id']}"
 
     def crop(self, instance: int) -> np.ndarray | None:
-        """The best photo of an instance, cut out with a margin; None when no photo shows it or it is gone."""
-        gmap = self._loaded()
-        place = next(i for i, entry in enumerate(gmap.instances) if entry["id"] == instance)
-        if not gmap.language or gmap.language["view_counts"][place] == 0:
-            return None
-        row = int(gmap.language["view_counts"][:place].sum())
-        view = self.views.get(str(gmap.language["view_names"][row]))
-        if view is None:
-            return None
+        """The best photo of an instance, cut out with a margin; None when no photo of it can be read."""
         try:
-            photo = load_photo(gmap.with_photo(view), int(gmap.info["config"]["photos"]["max_side"]))
-        except InputError:  # photos may have moved since the map was made; the map itself is whole
+            return best_crop(self._loaded(), instance, CROP_SIDE, self.folders)
+        except InputError:
             return None
-        return _cut(photo, gmap.language["view_boxes"][row])
 
 
 def _whole(hit: Hit) -> int:
     """The instance that a hit is, or is a part of."""
     return hit.instance_id if hit.parent is None else hit.parent
-
-
-def _cut(photo: np.ndarray, box: np.ndarray) -> np.ndarray:
-    import cv2
-
-    x0, y0, x1, y1 = (int(v) for v in box)
-    margin = 6 + max(x1 - x0, y1 - y0) // 5
-    photo = photo.copy()
-    cv2.rectangle(photo, (x0, y0), (x1, y1), (255, 214, 10), 2)
-    crop = photo[max(0, y0 - margin) : y1 + margin, max(0, x0 - margin) : x1 + margin]
-    scale = min(1.0, CROP_SIDE / max(crop.shape[:2]))
-    size = (max(1, round(crop.shape[1] * scale)), max(1, round(crop.shape[0] * scale)))
-    return np.asarray(cv2.resize(crop, size, interpolation=cv2.INTER_AREA))

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from perception.io.map_lock import writing
-from perception.io.store import Map, read_map, set_labels, write_map
+from perception.io.store import read_map, set_labels, write_map
 from perception.language.description import InstanceDescription, to_arrays
+from perception.query import QueryMap
 from support.viewer_maps import free_port, small_map
 
 viser = pytest.importorskip("viser")
@@ -26,19 +27,16 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a Chromium (PERC
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
-class Asked:
+class Asked(QueryMap):
     """Stands for the language model: "pear" is instance 1, nothing else is present."""
 
-    def __init__(self, opened: Map, path: Path):
-        self.gmap = opened
-
-    def query(self, text: str, top_k: int) -> list[Any]:
+    def query(self, text: str, top_k: int) -> list[Any]:  # type: ignore[override]
         from perception.query import Hit
         from perception.types import OrientedBox
 
         if text != "pear":
             return []
-        points = self.gmap.means[self.gmap.instance_ids == 1]
+        points = self.means[self.instance_ids == 1]
         return [Hit(1, 0.97, points, points.mean(0), OrientedBox(points.mean(0), np.eye(3), np.ones(3)))]
 
 
