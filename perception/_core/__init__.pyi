@@ -76,7 +76,3 @@ def plane_normals(points: Annotated[NDArray[numpy.float32], dict(shape=(None, 3)
     Normals [Q, 3] of the planes through neighbour lists [Q, k] of points [N, 3]; zero where there is none.
     """
 
-def densest(points: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], precisions: Annotated[NDArray[numpy.float32], dict(shape=(None, 6), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], instances: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu', writable=False)], candidates: Annotated[NDArray[numpy.int32], dict(shape=(None, None), order='C', device='cpu', writable=False)], labels: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu')], threads: int = 1) -> None:
-    """
-    Instance with the largest summed density at each point; see perception.export.likelihood.
-    """
