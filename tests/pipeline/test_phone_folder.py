@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from PIL import Image
 from perception.cli import main
 from perception.demo import make_photos
 from perception.geometry import align_similarity, camera_centres
+from perception.io.photo_folder import view_name
 from perception.io.store import read_map
 from support.videos import turn_video, write_video
 
@@ -53,6 +55,9 @@ def phone_folder(folder: Path, pictures: list[np.ndarray]) -> list[str]:
         else:
             names.append(f"{name}.HEIC")
             image.save(folder / names[-1], quality=90)
+    odd = os.fsdecode(b"IMG_6\xe9#\n.jpg")  # bytes that are no UTF-8, and a line end
+    (folder / names[6]).rename(folder / odd)
+    names[6] = view_name(folder / odd, folder)
     write_video(folder / "IMG_0000.MOV", [pictures[0]] * 5)  # the Live Photo of the first
     Image.fromarray(pictures[3]).save(folder / "IMG_0003_burst.HEIC", quality=60)
     (folder / "IMG_0050.HEIC").write_bytes((folder / names[0]).read_bytes()[:2000])
@@ -78,7 +83,7 @@ def test_a_phones_folder_becomes_a_map(
     assert "damaged" in left_out["IMG_0050.HEIC"] or "not a readable" in left_out["IMG_0050.HEIC"]
     assert len({"IMG_0003.HEIC", "IMG_0003_burst.HEIC"} & left_out.keys()) == 1
     posed = [index for index, name in enumerate(names) if name in found]
-    assert len(posed) >= 0.8 * VIEWS
+    assert len(posed) >= 0.8 * VIEWS and names[6] == "IMG_6%E9#%0A.jpg" in found
     mapped = camera_centres(np.stack([found[names[index]] for index in posed]))
     scale, rotation, shift = align_similarity(centres[posed], mapped)
     errors = np.linalg.norm(centres[posed] - (scale * mapped @ rotation.T + shift), axis=1)
