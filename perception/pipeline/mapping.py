@@ -31,7 +31,7 @@ from perception.pipeline.estimate import tell_estimate
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
 from perception.pipeline.photos import load_all, split_views, with_labels
 from perception.pipeline.record import Stages, finite, peak_memory_mib, versions
-from perception.pipeline.work_folder import clear_work, working
+from perception.pipeline.work_folder import clear_work, frames_folder, working
 from perception.progress import Progress
 from perception.types import Scene, View
 
@@ -159,7 +159,7 @@ def _scene(source: Path, output: Path, work: Path, config: MapConfig, progress: 
             progress=progress,
             seed=config.seed,
             strict=config.photos.strict,
-            frames=output.with_suffix(".frames"),
+            frames=frames_folder(output),
         )
         save_scene(kept, scene := recentred(scene))
     return scene

@@ -23,6 +23,11 @@ def work_folder(output: Path) -> Path:
     return output.with_name(output.name + WORK_SUFFIX)
 
 
+def frames_folder(output: Path) -> Path:
+    """Where the frames of a video go, which are the map's photos: a sibling of the map that stays."""
+    return output.with_suffix(".frames")
+
+
 @contextmanager
 def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
     """The work folder of a run that makes `output`, locked against other writers; it goes when the block ends well.
@@ -30,7 +35,7 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
     It stays after any error, so that `--resume` goes on from there, unless bad input was found before the training
     began. InputError for a source that is missing, an output or an unfinished run that is in the way, a full disk.
     """
-    fresh = not work_folder(output).exists()
+    fresh, had_frames = not work_folder(output).exists(), frames_folder(output).exists()
     work = _prepare(source, output, resume)
     with writing(output):
         try:
@@ -43,6 +48,8 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
         except InputError:
             if fresh and not (work / CHECKPOINT).exists():
                 shutil.rmtree(work, ignore_errors=True)
+                if not had_frames:
+                    shutil.rmtree(frames_folder(output), ignore_errors=True)
             raise
 
 

@@ -14,6 +14,7 @@ from perception.errors import InputError
 from perception.io.inputs import load_scene
 from perception.io.photo_folder import list_photos
 from perception.io.video import frame_size, video_frames
+from perception.pipeline.work_folder import frames_folder, working
 from support.progress import Told
 from support.videos import turn_video, write_video
 
@@ -84,3 +85,15 @@ def test_a_record_that_is_none_is_no_record(tmp_path: Path) -> None:
         (tmp_path / "frames" / "frames.json").write_text(content)
         with pytest.raises(InputError, match="exists already"):
             video_frames(video, tmp_path / "frames", Told())
+
+
+@pytest.mark.parametrize("earlier", [False, True])
+def test_a_refused_run_leaves_only_frames_that_were_there(tmp_path: Path, earlier: bool) -> None:
+    video, output = tmp_path / "v.mp4", tmp_path / "v.gsmap"
+    video.write_bytes(b"x")
+    if earlier:
+        frames_folder(output).mkdir()
+    with pytest.raises(InputError, match="later"), working(video, output, resume=False):
+        frames_folder(output).mkdir(exist_ok=True)
+        raise InputError("found later")
+    assert {path.name for path in tmp_path.iterdir()} == {"v.mp4", *(["v.frames"] if earlier else [])}
