@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlparse
@@ -22,8 +22,8 @@ from perception.io.model_store import (
     stored_models,
     write_record,
 )
+from perception.progress import Progress
 
-Progress = Callable[[str, int, int], Any]
 _PARTS = ".parts"
 _KEPT = (".onnx", ".onnx_data", ".data", ".json", ".txt")  # of a folder: graphs, weights beside them, tokenizers
 _PURPOSES = {"encoder": "sam", "decoder": "sam", "image tower": "clip", "text tower": "clip", "both towers": "clip"}
@@ -169,7 +169,7 @@ def _local(source: str, expected: str | None, parts: Path, progress: Progress | 
     if is_url(source):
         file_name = Path(unquote(urlparse(source).path)).name.lstrip(".") or "model.onnx"
         part = _part(parts, source)
-        download(source, part, None if progress is None else lambda done, of: progress(file_name, done, of))
+        download(source, part, progress, file_name)
         if expected is not None and sha256_of(part) != expected:
             found = sha256_of(part)
             part.unlink()

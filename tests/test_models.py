@@ -19,6 +19,7 @@ from perception.io.model_store import find_model, models_folder
 from perception.masks import make_source
 from perception.models import add_model, check_file
 from support.onnx_files import FLOAT, INT64, SAM_DECODER, write_onnx
+from support.progress import Told
 
 IMAGE = ((1, 3, 1024, 1024), FLOAT)
 
@@ -129,9 +130,9 @@ def test_a_later_run_goes_on(server: Server, tmp_path: Path) -> None:
     from perception.io import download as module
 
     assert "broke" in str(module._attempt(f"{server.url}/big", part, None)) and part.stat().st_size == 50_000
-    told: list[tuple[int, int]] = []
-    download(f"{server.url}/big", part, lambda done, of: told.append((done, of)))
-    assert part.read_bytes() == server.files["/big"] and told[-1] == (100_000, 100_000)
+    told = Told()
+    download(f"{server.url}/big", part, told)
+    assert part.read_bytes() == server.files["/big"] and told.updates[-1][1:] == (100_000, 100_000)
     assert server.asked[-1] == "bytes=50000-"
 
 

@@ -56,7 +56,7 @@ def _add(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         args.source,
         sha256=args.sha256,
         default=args.default,
-        progress=Progress(quiet=args.json).update,
+        progress=Progress(quiet=args.json),
     )
     warnings = check_file(str(model.folder))["warnings"]
     use = {"sam": f"--masks sam:{model.name}", "clip": f"--set language.encoder=clip:{model.name}"}

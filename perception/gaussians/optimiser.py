@@ -97,11 +97,6 @@ class SparseAdam:
         mask = None if visible is None else visible.numpy()
         return _kernels.adam(*arrays, mask, rate, self.steps, *self.betas, self.eps)
 
-    def zero_grad(self) -> None:
-        """Drops all gradients."""
-        for param in self.params.values():
-            param.grad = None
-
     def keep(self, index: Tensor) -> None:
         """Keeps the rows `index` selects, in its order: [N] bool, or int64 row numbers (repeats allowed)."""
         for table in (self.params, self._first, self._second):
@@ -119,12 +114,6 @@ class SparseAdam:
             for table in (self._first, self._second):
                 table[name] = torch.cat([table[name], torch.zeros_like(new)])
         self._check_rows()
-
-    def reset_state(self, name: str, index: Tensor | None = None) -> None:
-        """Zeroes the moments of a tensor (of rows `index`), for example after an opacity reset."""
-        where = slice(None) if index is None else index
-        self._first[name][where] = 0
-        self._second[name][where] = 0
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on: copies of params and moments, rates, step count."""

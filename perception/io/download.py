@@ -12,16 +12,18 @@ import json
 import urllib.error
 import urllib.request
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from perception.errors import InputError
+from perception.progress import Progress
 
 CHUNK = 1 << 20
 TIMEOUT = 30.0  # seconds without a byte
 ATTEMPTS = 4  # connections in a row that bring nothing new
 
-Progress = Callable[[int, int], Any]
+Told = Callable[[int, int], object]
 
 
 def is_url(source: str) -> bool:
@@ -29,17 +31,17 @@ def is_url(source: str) -> bool:
     return source.lower().startswith(("http://", "https://"))
 
 
-def download(url: str, part: Path, progress: Progress | None = None) -> Path:
+def download(url: str, part: Path, progress: Progress | None = None, name: str = "") -> Path:
     """Fetches `url` into `part`, from the bytes that lie there on; returns `part`, complete.
 
-    part: its sibling `*.part.json` holds which version of the file it belongs to. progress(bytes, all) is called after
-    every chunk. InputError when the server refuses, or ATTEMPTS connections in a row bring nothing; `part` stays.
+    part: its sibling `*.part.json` holds which version of the file it belongs to. name: of the stage whose progress is
+    shown, in bytes. InputError when the server refuses, or ATTEMPTS connections in a row bring nothing; `part` stays.
     """
     part.parent.mkdir(parents=True, exist_ok=True)
     fruitless = 0
     while True:
         before = _size(part)
-        problem = _attempt(url, part, progress)
+        problem = _attempt(url, part, None if progress is None else partial(progress.update, name or part.name))
         if problem is None:
             _memory(part).unlink(missing_ok=True)
             return part
@@ -57,7 +59,7 @@ def sha256_of(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _attempt(url: str, part: Path, progress: Progress | None) -> str | None:
+def _attempt(url: str, part: Path, told: Told | None) -> str | None:
     """One connection: None when the file is complete, else what went wrong in words."""
     have = _size(part)
     try:
@@ -66,7 +68,7 @@ def _attempt(url: str, part: Path, progress: Progress | None) -> str | None:
             if start not in (0, have):
                 return f"the server sent bytes from {start} on, asked for {have}"
             _memory(part).write_text(json.dumps({"url": url, "mark": _mark(answer)}), encoding="utf-8")
-            return _receive(answer, part, start, total, progress)
+            return _receive(answer, part, start, total, told)
     except urllib.error.HTTPError as error:
         if error.code == 416 and have:  # no bytes after those we have: complete, or another file by now
             if str(error.headers.get("Content-Range", "")).endswith(f"/{have}"):
@@ -107,7 +109,7 @@ def _extent(answer: Any, have: int) -> tuple[int, int | None]:
     return start, int(total) if total.isdigit() else (None if size is None else start + size)
 
 
-def _receive(answer: Any, part: Path, start: int, total: int | None, progress: Progress | None) -> str | None:
+def _receive(answer: Any, part: Path, start: int, total: int | None, told: Told | None) -> str | None:
     with part.open("r+b" if start else "wb") as file:
         file.seek(start)
         file.truncate()
@@ -115,8 +117,8 @@ def _receive(answer: Any, part: Path, start: int, total: int | None, progress: P
         while chunk := answer.read(CHUNK):
             file.write(chunk)
             done += len(chunk)
-            if progress:
-                progress(done, total or done)
+            if told:
+                told(done, total or done)
     if total is not None and done < total:
         return f"the connection broke at {done} of {total} bytes"
     return None

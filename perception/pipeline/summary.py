@@ -80,7 +80,7 @@ def info_text(path: Path, info: dict[str, Any]) -> str:
         lines.append(f"the map's origin lies at {scene['origin']} of its input; exports are in the input's frame")
     if training.get("profile"):
         lines.append("of training: " + ", ".join(f"{name} {share:.0%}" for name, share in shares(training).items()))
-    if "psnr" in quality:
+    if quality.get("psnr") is not None:
         lines.append(
             f"held-out views: PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.4f} over {len(quality['views'])}"
         )

@@ -140,16 +140,6 @@ def test_resume_goes_on_with_the_same_bits():
     assert all(torch.equal(p, resumed.params[n]) for n, p in whole.params.items())
 
 
-def test_reset_state_forgets_rows():
-    ours = SparseAdam(leaves(10), RATES)
-    ours.step(None, tensors(10, seed=1))
-    ours.reset_state("means", torch.tensor([2, 3]))
-    state = ours.state_dict()
-    assert state["first"]["means"][2:4].abs().max() == 0 and state["first"]["means"][4].abs().min() > 0
-    ours.reset_state("quats")
-    assert ours.state_dict()["second"]["quats"].abs().max() == 0
-
-
 def run_kernel(threads, level, width):
     random = np.random.default_rng(3)
     p, g, m, v = (torch.from_numpy(random.random((5000, width))).float() for _ in range(4))
