@@ -10,10 +10,9 @@ from __future__ import annotations
 import importlib
 import threading
 import types
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+from hashlib import md5
 from typing import Any
 
 from perception.errors import missing_extra
@@ -52,9 +51,10 @@ def sample_type(kind: str, headed: bool = False) -> Any:
     structure.serialize = serialize
     structure.deserialize = classmethod(deserialize)
     structure.deserialize_key = classmethod(deserialize_key)
-    with _HASHING, _as_ros_hashes():
+    with _HASHING:
         structure.__idl__.populate()
         structure.__idl__.fill_type_data()
+        _announce_as_ros(structure.__idl__)
     return structure
 
 
@@ -108,29 +108,49 @@ _NAMES = {"byte": "uint8", "octet": "uint8", "char": "uint8"}
 """ROS announces its byte and char as uint8."""
 
 
-@contextmanager
-def _as_ros_hashes() -> Iterator[None]:
-    """ROS 2 sets no flag on the elements of a sequence or array where CycloneDDS says "discard what does not fit".
+def _announce_as_ros(idl: Any) -> None:
+    """Makes the structure that a type announces the one that ROS 2 announces for it.
 
-    The flags enter the hash of every type that holds one. CycloneDDS has no switch for it, so while types are hashed
-    its name for that header is one that drops the flags; tests hold the hashes against those rclpy announces.
+    ROS 2 sets no flag on the elements of a sequence or array where CycloneDDS says "discard what does not fit". The
+    flags enter the hash of every type that holds one, and the hash of a type those of the types that refer to it. So
+    the flags are cleared and the hashes computed anew until none changes (14 bytes of the MD5 of the serialised type
+    object: XTypes 1.3, 7.3.1.2.1.2). Tests hold the hashes against those that rclpy announces.
+
+    CycloneDDS offers no way to give it a structure: its serialised form is set on the description of our own class.
     """
-    builder: Any = importlib.import_module("cyclonedds.idl._xt_builder")
-    names = builder.xt
+    info, mapping = idl.get_type_info(), idl.get_type_mapping()
+    renamed: dict[bytes, bytes] = {}
+    changed = True
+    while changed:
+        changed = False
+        for pair in (*mapping.identifier_object_pair_minimal, *mapping.identifier_object_pair_complete):
+            _rename(pair.type_object, renamed)
+            digest = md5(_serialized(pair.type_object), usedforsecurity=False).digest()[:14]
+            if (before := bytes(pair.type_identifier.value)) != digest:
+                renamed[before], changed = digest, True
+                _rename(pair.type_identifier, renamed)
+    _rename([info, mapping.identifier_complete_minimal], renamed)
+    idl._xt_bytedata = (_serialized(info), _serialized(mapping))
 
-    class WithoutFlags:
-        def __getattr__(self, name: str) -> Any:
-            return plain_header if name == "PlainCollectionHeader" else getattr(names, name)
 
-    def plain_header(equiv_kind: int, element_flags: Any) -> Any:
-        del element_flags
-        return names.PlainCollectionHeader(equiv_kind=equiv_kind, element_flags=names.MemberFlag())
+def _rename(value: Any, renamed: dict[bytes, bytes]) -> None:
+    """Clears the element flags and replaces the type hashes in a tree of CycloneDDS' type objects."""
+    if isinstance(value, (list, tuple)):
+        for item in value:
+            _rename(item, renamed)
+    elif type(value).__name__ == "TypeIdentifier" and isinstance(value.value, bytes):
+        while (digest := bytes(value.value)) in renamed:
+            value.set(value.discriminator, renamed[digest])
+    elif hasattr(value, "__idl__"):
+        if type(value).__name__ == "PlainCollectionHeader":
+            value.element_flags = type(value.element_flags)()
+        for item in list(vars(value).values()):
+            _rename(item, renamed)
 
-    builder.xt = WithoutFlags()
-    try:
-        yield
-    finally:
-        builder.xt = names
+
+def _serialized(value: Any) -> bytes:
+    """The XCDR2 form without its 4-byte head; little-endian, as are all machines that CycloneDDS has wheels for."""
+    return bytes(value.serialize(use_version_2=True)[4:])
 
 
 def _idl() -> Any:
