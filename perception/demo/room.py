@@ -49,10 +49,12 @@ def build(seed: int, light_samples: int = 20) -> Scene:
     room = Room(half)
     room.bodies += _shell(rng, half)
     walls = (np.array([0, 1, 2, 3]) + rng.integers(4)) % 4
-    if rng.random() < 0.5:
-        walls = walls[::-1]
-    for group, wall in zip((_sitting, _watching, _dining, _working), walls.tolist(), strict=True):
-        group(rng, room, wall)
+    side = 1 if rng.random() < 0.5 else -1  # the television is to the right of the sofa, or to its left
+    sitting, watching, dining, working = walls[::side].tolist()
+    _sitting(rng, room, sitting, side)
+    _watching(rng, room, watching)
+    _dining(rng, room, dining)
+    _working(rng, room, working)
     lighting = Lighting(
         [
             Lamp(np.array([-0.5 * half[0], 0.35 * half[1], 2.45]), 0.30, np.array([1.0, 0.94, 0.85]) * 3.4),
@@ -118,8 +120,8 @@ def _hang(rng: np.random.Generator, room: Room, wall: int, kind: str, along: flo
     room.stand(fur.picture(rng, name, _art(rng, kind), width, frame), wall, along, 0.0, rng.uniform(1.5, 1.62))
 
 
-def _sitting(rng: np.random.Generator, room: Room, wall: int) -> None:
-    """Sofa with cushions, lamp and plant beside it, a low table on a rug before it."""
+def _sitting(rng: np.random.Generator, room: Room, wall: int, side: int) -> None:
+    """Sofa with cushions, lamp and plant beside it, a low table on a rug before it, an armchair on one side (±1)."""
     cloth, other = rng.permutation(["grey", "blue", "green", "beige"])[:2]
     width = rng.uniform(1.75, 2.0)
     room.stand(fur.sofa(rng, f"{cloth} sofa", width, cloth, 2 + int(width > 1.9)), wall, 0, 0.47)
@@ -127,8 +129,10 @@ def _sitting(rng: np.random.Generator, room: Room, wall: int) -> None:
     for color, along in zip(colors, (-0.45, 0.42), strict=True):
         room.stand(fur.cushion(rng, f"{color} cushion", things.COLORS[color]), wall, along, 0.42, 0.48)
     room.stand(things.teddy(rng, "teddy bear").placed(0, np.zeros(3), 1.5), wall, rng.uniform(-0.1, 0.1), 0.50, 0.49)
-    room.stand(fur.floor_lamp(rng, "floor lamp", str(rng.choice(["#c98a4a", "#c9b48a", "#a8453a"]))), wall, 1.35, 0.36)
-    room.stand(fur.plant(rng, "big plant"), wall, -1.42, 0.45, turn=rng.uniform(0, 360))
+    room.stand(
+        fur.floor_lamp(rng, "floor lamp", str(rng.choice(["#c98a4a", "#c9b48a", "#a8453a"]))), wall, 1.35 * side, 0.36
+    )
+    room.stand(fur.plant(rng, "big plant"), wall, -1.42 * side, 0.45, turn=rng.uniform(0, 360))
     _hang(rng, room, wall, "lake", rng.uniform(-0.2, 0.2), rng.uniform(0.9, 1.1))
     out = 1.62
     rug = fur.rug(rng, "oriental rug", 2.2, 1.5, RUGS[int(rng.integers(len(RUGS)))])
@@ -141,7 +145,8 @@ def _sitting(rng: np.random.Generator, room: Room, wall: int) -> None:
     book = things.named_book(rng, str(rng.choice(list(things.BOOKS))))
     room.stand(book.placed(0, np.zeros(3), 1.2), wall, 0.30, out + 0.05, top, rng.uniform(-40, 40))
     chair = fur.sofa(rng, f"{other} armchair", 0.95, other, 1)
-    room.stand(chair, wall, 1.5, 1.5, turn=-75 + rng.uniform(-12, 12))
+    beside = (room.half[wall % 2] - 1.15) * side  # leaves room for what stands at the next wall
+    room.stand(chair, wall, beside, 1.5, turn=-75 * side + rng.uniform(-12, 12))
 
 
 def _watching(rng: np.random.Generator, room: Room, wall: int) -> None:

@@ -99,6 +99,7 @@ def test_prompts_name_what_is_seen(scene: Path) -> None:
     seen = {entry["id"]: entry for entry in about["instances"] if entry["gt_points"]}
     count = np.bincount(read_cloud(scene / "gt_points.ply").labels["instance_id"])
     assert all(count[i] == entry["gt_points"] for i, entry in seen.items())
+    assert np.mean([entry["gt_points"] >= 100 for entry in about["instances"]]) > 0.6  # ScanNet's least, in ten photos
     queries, unseen = read_queries(scene)
     assert len(queries) > 20 and unseen == 0
     for text, ids in queries:
