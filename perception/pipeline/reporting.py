@@ -226,7 +226,7 @@ def _best_crop(opened: QueryMap, index: int, album: _Album, whole: bool) -> np.n
 
 def _rows(opened: QueryMap, album: _Album) -> Iterator[tuple[dict[str, Any], np.ndarray | None, list[str]]]:
     """(entry of instances.json, best crop, likeliest names) of each instance; no names for a map without language."""
-    names = opened.likely_names() if opened.language else [[] for _ in opened.instances]
+    names = opened.likely_names() if opened.problem is None else [[] for _ in opened.instances]
     for i, entry in enumerate(opened.instances):
         yield entry, _best_crop(opened, i, album, whole=False), names[i]
 

@@ -105,7 +105,7 @@ def test_where_folders_cannot_be_exchanged_the_old_map_is_put_back(gmap: Path, r
     before = read_map(gmap)
     assert child(WITHOUT_EXCHANGE, gmap, rename).returncode == -signal.SIGKILL
     assert gmap.exists() == (rename == 1)
-    after = perception.load_map(gmap).gmap
+    after = perception.load_map(gmap)
     assert np.array_equal(after.means, before.means) and after.instances == before.instances
     set_labels(gmap, {0: "goes on"})
     assert [path.name for path in gmap.parent.iterdir()] == ["a.gsmap"]
