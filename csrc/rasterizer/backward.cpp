@@ -267,7 +267,8 @@ template <bool DEPTH, class T, bool FEATURES>
     T *record = w.records.data() + static_cast<std::size_t>(at) * size;
     const bool first = !w.touched[at];
     m.store(record, first);
-    if (FEATURES && first) std::memset(record + kGeometry, 0, (size - kGeometry) * sizeof(T));
+    if (FEATURES && first)
+      for (int c = kGeometry; c < size; c += Vec<T>::kLanes) Vec<T>(T(0)).store(record + c);
     w.touched[at] = 1;
   }
 }
