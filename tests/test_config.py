@@ -93,6 +93,7 @@ NUMBERS = st.one_of(st.integers(-5, 200_000), st.floats(), st.integers())
 VALUES = st.one_of(NUMBERS.map(str), st.text(max_size=8), st.sampled_from(["none", "true", "1e3", "-0", "0x1", "1_0"]))
 
 
+@pytest.mark.slow
 @given(pairs=st.lists(st.tuples(st.sampled_from(sorted(KEYS)) | st.text(max_size=12), VALUES), max_size=4))
 def test_any_pairs_are_settings_in_range_or_one_line(pairs: list[tuple[str, str]]) -> None:
     config: MapConfig | None = None

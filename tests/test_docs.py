@@ -106,6 +106,7 @@ def _commands() -> list[argparse.ArgumentParser]:
     return list(below(build_parser()))
 
 
+@pytest.mark.slow
 def test_the_walkthrough_runs(small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From photos to answers exactly as the README has it, on a small scene with short training."""
     monkeypatch.chdir(tmp_path)

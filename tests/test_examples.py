@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from perception.bench.synthetic_map import write_synthetic_map
 from perception.language.encoders import make_encoder
 from support.paths import REPOSITORY
@@ -20,6 +22,7 @@ def run(name: str, *arguments: object, folder: Path) -> str:
     return ended.stdout
 
 
+@pytest.mark.slow
 def test_asking_for_a_name_finds_its_instance(tmp_path: Path) -> None:
     names = ["banana", "laptop", "teapot"]
     path = tmp_path / "a.gsmap"
@@ -37,6 +40,7 @@ def test_what_is_near_is_told_nearest_first(tmp_path: Path) -> None:
     assert "the corridor is " in out
 
 
+@pytest.mark.slow
 def test_an_image_is_fitted(tmp_path: Path) -> None:
     errors = [float(word) for word in re.findall(r"mean error (\S+)", run("fit_an_image.py", folder=tmp_path))]
     assert len(errors) == 6 and errors[-1] < 0.5 * errors[0]

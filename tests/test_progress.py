@@ -66,6 +66,7 @@ class Terminal:
         os.close(self.master)
 
 
+@pytest.mark.slow
 def test_a_live_line_then_ctrl_c_then_the_printed_command_goes_on(small_scene: Path, tmp_path: Path) -> None:
     words = ["map", str(small_scene / "transforms.json"), "-o", "k.gsmap", "--masks", f"labels:{small_scene}/labels"]
     words += ["--iterations", "600", "--budget", "1500"]

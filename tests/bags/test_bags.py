@@ -132,6 +132,7 @@ BASE_FROM_CAM = pose(0.7, 0.1)
 TIMES = [10**9 * 5 + 200_000_000 * i for i in range(12)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
 def test_images_camera_and_poses_come_through(tmp_path: Path, kind: str) -> None:
     path = tmp_path / ("drive.bag" if kind == "ros1" else "drive")
@@ -164,6 +165,7 @@ def test_images_camera_and_poses_come_through(tmp_path: Path, kind: str) -> None
     assert "perception map" in text
 
 
+@pytest.mark.slow
 def test_poses_are_those_recorded(tmp_path: Path) -> None:
     bag = Recorder(tmp_path / "drive", "mcap")
     bag.info("/camera_info", TIMES[0], (128, 96), K, [-0.02, 0.01, 0.0, 0.0], "equidistant")
@@ -284,6 +286,7 @@ def test_bad_bags_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "is no bag" in told(tmp_path / "empty")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA, reason="PERCEPTION_DATA is not set")
 def test_a_bag_of_the_fox_becomes_a_scene_for_the_mapper(tmp_path: Path) -> None:
     fox = Path(str(DATA)) / "fox_480"

@@ -49,6 +49,7 @@ def test_all_trees_give_the_same_neighbours_and_segments(tmp_path: Path, capsys:
         assert (votes[0] == votes[other]).mean() > 0.999
 
 
+@pytest.mark.slow
 def test_bench_clouds_measures_in_processes_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = ["--points", "2000", "--gaussians", "300", "--turns", "1", "--tasks", "assignment"]
     assert main(["bench", "clouds", *small, "-o", str(tmp_path)]) == 0

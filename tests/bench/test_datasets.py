@@ -20,6 +20,8 @@ from perception.io.cloud import write_cloud
 from perception.io.store import read_info
 from perception.types import PointCloud
 
+pytestmark = pytest.mark.slow
+
 QUICK = [
     *("--set", "train.iterations=300", "--set", "train.budget=5000", "--set", "densify.every=50"),
     *("--set", "instances.min_cluster_size=15", "--set", "instances.min_samples=5"),

@@ -18,6 +18,7 @@ def small(monkeypatch):
     return scene
 
 
+@pytest.mark.slow
 def test_rasterizer_rows_are_consistent(small, tmp_path, capsys):
     rasterizer.main(["-o", str(tmp_path), "--rounds", "1", "--threads", "1", "2"])
     rows = json.loads((tmp_path / "rasterizer.json").read_text())["rows"]

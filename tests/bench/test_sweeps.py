@@ -111,6 +111,7 @@ def test_a_table_shows_what_is_missing() -> None:
     assert text.splitlines()[1].split() == ["g", "n", "20.00", "-"]
 
 
+@pytest.mark.slow
 def test_a_bench_trains_and_scores_a_scene(small_scene: Path, tmp_path: Path) -> None:
     """The first row's figures are those of `perception map` and `export` with the same settings."""
     scene, out = tmp_path / "scene", tmp_path / "out"

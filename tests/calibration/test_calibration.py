@@ -19,6 +19,8 @@ from perception.io.camera_file import read_camera
 from perception.io.lens import camera_from_lens
 from support.board_pictures import KnownCamera, board_views, render_board
 
+pytestmark = pytest.mark.slow
+
 CHARUCO = Board("charuco", (8, 11), 0.02, 0.015)
 CAMERAS = {
     "pinhole": KnownCamera("pinhole", np.array([520, 525, 330.5, 228.2, -0.25, 0.09, 0.001, -0.0007, 0]), (640, 480)),

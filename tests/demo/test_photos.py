@@ -84,6 +84,7 @@ def test_every_thing_is_seen_and_every_query_has_its_answer(made: tuple[Path, De
     assert red[0] > 2 * red[2] and blue[2] > 2 * blue[0]
 
 
+@pytest.mark.slow
 def test_same_seed_same_photos_other_seed_other_photos(made: tuple[Path, DemoTruth], tmp_path: Path) -> None:
     folder, truth = made
     again = make_photos(tmp_path / "again" / "photos", views=5, width=160, height=120, light_samples=2)

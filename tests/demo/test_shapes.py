@@ -55,6 +55,7 @@ def _rays(count: int) -> tuple[np.ndarray, np.ndarray]:
     return start, toward / np.linalg.norm(toward, axis=1, keepdims=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "inside", "tolerance"),
     [(BULB, _inside_bulb, 0.004), (HOOK, _inside_hook, 0.01), (EGG, _inside_egg, 0.004), (CRATE, _inside_crate, 0.004)],

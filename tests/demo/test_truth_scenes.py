@@ -16,6 +16,8 @@ from perception.cli import main
 from perception.demo import make_photos
 from perception.io.cloud import read_cloud
 
+pytestmark = pytest.mark.slow
+
 
 def image(path: Path) -> np.ndarray:
     found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
@@ -122,7 +124,6 @@ def test_the_command_writes_the_scene_once(
     assert main(["demo", "--seed", "-1", "--photos-only", str(tmp_path / "t")]) == 2
 
 
-@pytest.mark.slow
 def test_another_seed_is_another_scene(tmp_path: Path) -> None:
     names = []
     for seed in (1, 2):

@@ -35,6 +35,7 @@ def noisy_map(cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
     return means, ids
 
 
+@pytest.mark.slow
 def test_smoothing_raises_the_figure_of_noisy_labels(cloud):
     means, ids = noisy_map(cloud)
     truth = cloud.labels["instance_id"]
@@ -43,6 +44,7 @@ def test_smoothing_raises_the_figure_of_noisy_labels(cloud):
     assert raw["ap"] < 0.6 and smooth["ap"] > 0.97 and smooth["ap50"] == 1.0
 
 
+@pytest.mark.slow
 def test_smoothing_leaves_true_labels_nearly_whole(cloud):
     truth = cloud.labels["instance_id"]
     smoothed = vote(truth, segment_cloud(cloud))

@@ -48,6 +48,7 @@ def thin(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return source
 
 
+@pytest.mark.slow
 def test_a_seeded_map_is_the_same_for_one_two_and_three_threads(
     thin: Path, small_scene: Path, tmp_path: Path, threads
 ) -> None:
@@ -67,6 +68,7 @@ def test_a_seeded_map_is_the_same_for_one_two_and_three_threads(
     assert 700 < len(one) <= 3000 and any("holes" in told for told in one.info["training"]["decisions"])
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_map(thin: Path, small_scene: Path, tmp_path: Path) -> None:
     """Else the test above would show nothing."""
     maps = []
@@ -76,6 +78,7 @@ def test_another_seed_is_another_map(thin: Path, small_scene: Path, tmp_path: Pa
     assert len(maps[0]) != len(maps[1]) or not np.array_equal(maps[0].means, maps[1].means)
 
 
+@pytest.mark.slow
 def test_so_is_one_of_more_gaussians_than_torch_gives_one_thread(small_scene: Path, tmp_path: Path, threads) -> None:
     """Above 32,768 elements torch shares an operation out, and some of its results depend on where the shares end."""
     cloud = read_cloud(small_scene / "truth" / "gt_points.ply")

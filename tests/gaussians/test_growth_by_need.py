@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from perception.config import load_config
@@ -39,6 +40,7 @@ def trained(views: list[TrainingView], held: list[TrainingView], *more: str) -> 
     return trainer
 
 
+@pytest.mark.slow
 def test_the_full_half_gets_most_of_the_gaussians_and_a_plain_wall_ends_growth() -> None:
     places = [(x, y) for x in (-0.3, -0.1, 0.1, 0.3) for y in (-0.15, 0.15)]
     both = trained([photographed(*place) for place in places], [photographed(0.0, 0.0)])

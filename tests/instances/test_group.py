@@ -105,6 +105,7 @@ def test_masks_in_one_photo_only() -> None:
     assert adjusted_rand_score(scene.truth[known], found.ids[known]) > 0.9
 
 
+@pytest.mark.slow
 def test_300_instances() -> None:
     grid = np.stack(np.meshgrid(np.arange(20), np.arange(15)), axis=-1).reshape(-1, 2) * 0.8
     centres = np.concatenate([grid - grid.mean(axis=0), np.zeros((300, 1))], axis=1)

@@ -124,6 +124,7 @@ def test_merged_split_and_moved_instances_have_no_partner() -> None:
     assert match_instances(cube, ones, cube, mostly, [0]) == {0: 0}  # four fifths of it live on
 
 
+@pytest.mark.slow
 def test_a_map_made_again_keeps_the_names(
     small_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

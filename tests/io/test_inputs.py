@@ -257,6 +257,7 @@ def test_atomic_writes_leave_old_or_new(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["map"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exchange", [True, False])
 def test_a_swapped_folder_is_old_or_new_and_never_gone(tmp_path, monkeypatch, exchange):
     target, done, seen = tmp_path / "map", threading.Event(), set()

@@ -26,6 +26,8 @@ from perception.pipeline.work_folder import work_folder
 from support.paths import SUPPORT
 from support.query_maps import write_map_of
 
+pytestmark = pytest.mark.slow
+
 QUICK = ["train.iterations=3", "language.encoder=none", "instances.min_cluster_size=15", "train.budget=2000"]
 
 

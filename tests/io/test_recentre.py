@@ -18,6 +18,8 @@ from perception.io.store import read_map
 from perception.pipeline.mapping import build_map
 from perception.types import Scene, View
 
+pytestmark = pytest.mark.slow
+
 ORIGIN = np.array([367_000.0, 5_790_000.0, 40.0])  # UTM 33N, metres
 QUICK = ["train.iterations=60", "train.budget=3000", "language.encoder=none", "densify.every=20", "photos.holdout=6"]
 QUICK += ["instances.min_cluster_size=15", "instances.min_samples=5"]

@@ -17,6 +17,8 @@ from perception.io.lens import load_pycolmap
 from perception.io.sfm_checks import Pair
 from support.progress import Told
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT, FOCAL, VIEWS = 320, 240, 300.0, 10
 
 

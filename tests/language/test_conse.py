@@ -126,6 +126,7 @@ def test_texts_and_classes_share_the_space(encoder: Any) -> None:
     assert np.allclose(np.linalg.norm(words, axis=1), 1, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_batching_changes_nothing(encoder: Any) -> None:
     """10,000 texts at once equal texts one by one."""
     many = [f"thing {n % 50}" for n in range(10_000)]
@@ -156,6 +157,7 @@ def test_bad_input(encoder: Any) -> None:
         encoder.encode_images([np.zeros((8, 8), np.uint8)])
 
 
+@pytest.mark.slow
 def test_a_true_scene_answers(encoder: Any) -> None:
     """Six objects of tabletop_a, perfect silhouettes: plain prompts find them, absent things mostly find nothing."""
     data = os.environ.get("PERCEPTION_DATA")

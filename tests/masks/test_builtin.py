@@ -90,6 +90,7 @@ def stereo_views() -> list[StereoView]:
     return [shown for shown in made if shown is not None]
 
 
+@pytest.mark.slow
 def test_stereo_finds_the_depth_that_the_map_has_wrong():
     found = stereo_views()
     measure_depths(found)
@@ -258,6 +259,7 @@ def test_growth_of_a_union_against_its_voxels():
     assert compared > 20
 
 
+@pytest.mark.slow
 def test_box_floor_and_wall_are_one_segment_each_in_all_photos(tmp_path):
     """Through the store, with rough depth, in millimetres: whole parts, and the same ids in every photo."""
     unit = 1000.0
@@ -302,6 +304,7 @@ def test_an_opencv_without_ximgproc_is_told_at_once(monkeypatch):
         make_source("builtin")
 
 
+@pytest.mark.slow
 def test_a_photo_that_sees_another_place_spoils_no_other(tmp_path):
     views = [view for view, *_ in world()]
     away = np.eye(4)

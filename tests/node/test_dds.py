@@ -233,6 +233,7 @@ def test_unusable_network_is_told_in_one_line(tmp_path: Path, map_path: Path) ->
     assert node.returncode == 1 and "network nosuchif0" in told and "Traceback" not in told
 
 
+@pytest.mark.slow
 def test_node_ends_in_order_when_asked(map_path: Path) -> None:
     node = start(map_path, "brief")
     node.send_signal(signal.SIGTERM)
@@ -240,6 +241,7 @@ def test_node_ends_in_order_when_asked(map_path: Path) -> None:
     end(node)
 
 
+@pytest.mark.slow
 def test_clients_recover_from_a_node_killed_under_load(map_path: Path) -> None:
     node = start(map_path, "mortal")
     answered, failures, stop = [0], [], threading.Event()
@@ -275,6 +277,7 @@ def test_clients_recover_from_a_node_killed_under_load(map_path: Path) -> None:
     assert not failures and answered[0] >= 60
 
 
+@pytest.mark.slow
 def test_map_replaced_under_load_answers_come_from_one_or_the_other(tmp_path: Path) -> None:
     path, other = tmp_path / "live.gsmap", tmp_path / "b.gsmap"
     write_small_map(path, LABELS, seed=0)

@@ -29,6 +29,8 @@ from perception.pipeline.reporting import write_map_report
 from perception.pipeline.work_folder import work_folder
 from support.interrupts import interrupt_at
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = [
     "train.iterations=400",
     "train.budget=6000",

@@ -17,6 +17,8 @@ from perception.io.photo_folder import view_name
 from perception.io.store import read_map
 from support.videos import turn_video, write_video
 
+pytestmark = pytest.mark.slow
+
 VIEWS, WIDTH, HEIGHT = 18, 400, 300
 SETTINGS = ["train.iterations=60", "train.budget=3000", "language.encoder=none", "photos.max_side=120"]
 
@@ -65,7 +67,6 @@ def phone_folder(folder: Path, pictures: list[np.ndarray]) -> list[str]:
     return names
 
 
-@pytest.mark.slow
 def test_a_phones_folder_becomes_a_map(
     rendered: tuple[list[np.ndarray], np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -91,7 +92,6 @@ def test_a_phones_folder_becomes_a_map(
     assert np.median(errors) < 0.03 * spread
 
 
-@pytest.mark.slow
 def test_a_video_becomes_a_map(
     rendered: tuple[list[np.ndarray], np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -30,6 +30,8 @@ from perception.pipeline.work_folder import work_folder
 from support.interrupts import interrupt_at
 from support.progress import Told
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = ["train.iterations=60", "train.budget=2000", "densify.every=10", "language.encoder=none"]
 SETTINGS += ["instances.min_cluster_size=15", "instances.min_samples=5", "photos.holdout=6"]
 

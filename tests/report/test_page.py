@@ -125,6 +125,7 @@ def test_nothing_but_a_title_is_a_page(tmp_path: Path) -> None:
     assert not list(tree.iter("h2")) and not list(tree.iter("img")) and tree.find("body/main/header/h1") is not None
 
 
+@pytest.mark.slow
 def test_many_large_pictures_stay_under_the_limit(tmp_path: Path) -> None:
     path = write_report(tmp_path / "r.html", _full(480))
     assert path.stat().st_size < 3_000_000

@@ -114,6 +114,7 @@ def hanging(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestCli
         end.set()
 
 
+@pytest.mark.slow
 def test_photos_that_hang_hold_up_no_question_and_are_told(hanging: TestClient) -> None:
     for side in range(20, 24):  # twice as many as there are workers, of the engine and for photos
         assert hanging.get(f"/instances/0/crop.jpg?side={side}").status_code == 504

@@ -37,6 +37,7 @@ def ask(port: int, name: str, timeout: float = 10.0) -> dict[str, Any]:
         return json.load(answer)
 
 
+@pytest.mark.slow
 def test_clients_recover_from_a_server_killed_and_restarted_under_load(tmp_path: Path) -> None:
     """Eight clients ask without pause and repeat what failed; every answer that comes is the right one."""
     path = write_map_of(tmp_path / "a.gsmap", gaussians=900)
@@ -148,6 +149,7 @@ def test_a_port_in_use_is_told_before_the_map_is_opened(tmp_path: Path) -> None:
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and f"--port {port}: is in use" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, -signal.SIGTERM)])
 def test_the_command_stops_when_told(tmp_path: Path, number: signal.Signals, code: int) -> None:
     """Served by the command itself; the map has no words, so it says so and answers about places."""

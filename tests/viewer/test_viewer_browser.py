@@ -23,7 +23,10 @@ from support.viewer_maps import free_port, small_map
 viser = pytest.importorskip("viser")
 api = pytest.importorskip("playwright.sync_api")
 CHROMIUM = os.environ.get("PERCEPTION_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a Chromium (PERCEPTION_CHROMIUM or on the PATH)")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs a Chromium (PERCEPTION_CHROMIUM or on the PATH)"),
+]
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
