@@ -1,4 +1,4 @@
-"""The command `perception`: arguments in, one library call, words or JSON out. Heavy imports wait for their command."""
+"""The command `perception`: parses arguments, calls the library, prints text or JSON. Heavy imports are deferred."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MODULES = (
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """All subcommands and their options."""
+    """The parser with all subcommands and their options."""
     parser = Parser(prog="perception", description="From photos to a 3D instance map that answers text prompts.")
     parser.add_argument("--version", action="version", version=f"perception {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
@@ -42,7 +42,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _resume(argv: Sequence[str] | None) -> str:
-    """The command that goes on where this one stopped; only `map` needs to be told."""
+    """The command that continues the interrupted one; `map` needs --resume for that."""
     words = [str(word) for word in (sys.argv[1:] if argv is None else argv)]
     more = ["--resume"] if words[:1] == ["map"] and "--resume" not in words else []
     return shlex.join(["perception", *words, *more])

@@ -92,7 +92,7 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _write_own_report(path: Path, progress: Progress) -> None:
-    """report.html inside the map. A failure is a warning: the map is whole, `perception report` makes it again."""
+    """Writes report.html into the map. A failure is only a warning: `perception report` can be run later."""
     from perception.io.store import REPORT
     from perception.pipeline.reporting import write_map_report
     from perception.query import load_map
@@ -105,7 +105,7 @@ def _write_own_report(path: Path, progress: Progress) -> None:
 
 @contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
-    """SIGTERM is Ctrl-C inside the block: what was done is kept, and the exit code is 130."""
+    """Treats SIGTERM like Ctrl-C inside the block: finished work is kept, and the exit code is 130."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,4 +1,4 @@
-"""`perception relink` and `perception upgrade`: what keeps older and moved maps useful."""
+"""`perception relink` and `perception upgrade`: new photo paths for moved maps, the new format for older maps."""
 
 from __future__ import annotations
 

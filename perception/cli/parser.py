@@ -1,4 +1,4 @@
-"""What every subcommand shares: one clear line on bad usage, and `--json`."""
+"""What all subcommands share: errors on one line, and `--json`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from perception.errors import InputError
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse with one clear line and exit code 2 on bad usage; late_epilog makes the epilog when help is printed."""
+    """argparse with a one-line error and exit code 2 on bad usage. late_epilog makes the epilog, when help is shown."""
 
     late_epilog: Callable[[], str] | None = None
 
@@ -27,7 +27,7 @@ Run = Callable[[argparse.Namespace], tuple[dict[str, Any], str]]
 
 
 def command(commands: Any, name: str, run: Run, summary: str) -> Parser:
-    """A new subcommand. `run` takes the parsed arguments and returns (what --json prints, the words for people)."""
+    """Adds a subcommand. `run` takes the parsed arguments and returns (the object for --json, the text otherwise)."""
     parser: Parser = commands.add_parser(name, help=summary, description=summary)
     parser.set_defaults(run=run)
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else there")

@@ -1,4 +1,4 @@
-"""`perception calibrate` and `perception frames`: what a robot's camera brings."""
+"""`perception calibrate` and `perception frames`: camera calibration, and frames from recordings."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def _add_eval(commands: Any) -> None:
 
 
 def _add_rules(p: argparse.ArgumentParser) -> None:
-    """The switches of an AP protocol."""
+    """Adds the options of an AP protocol."""
     p.add_argument("--protocol", default="scannet", choices=("scannet", "mask3d", "segment3d", "scannetpp"))
     p.add_argument("--by-class", action="store_true", help="match within semantic classes and average over them")
     p.add_argument("--classes", type=_numbers, metavar="N,N,...", help="classes that count; others are void")
@@ -59,7 +59,7 @@ def _numbers(text: str) -> tuple[int, ...]:
 
 
 def _rules(args: argparse.Namespace) -> dict[str, Any]:
-    """Switches of the protocol that were given."""
+    """The options of the protocol that were given."""
     given = {"valid_classes": args.classes, "void_ids": args.void, "min_region": args.min_region}
     if args.constant_score:
         given["constant_score"] = True

@@ -1,4 +1,4 @@
-"""Corrections by hand: rename, hide, merge, split, remove, delete floaters; undone, saved, repeated on a newer map."""
+"""Manual corrections of a map: rename, hide, merge, split, remove, delete floaters; with undo, redo and save."""
 
 from perception.editing.changes import isolated
 from perception.editing.editor import Editor

@@ -1,4 +1,4 @@
-"""What edits compute, on arrays and descriptions alone."""
+"""The computations of the edits, on arrays and descriptions."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
 
 FLOATER_SPREAD = 5.0
-"""A Gaussian is a floater when its mean distance to its neighbours lies this many robust deviations (in logarithm)
-above the map's median: what statistical outlier removal (Rusu et al. 2008) cuts, without its Gaussian model."""
+"""A Gaussian is a floater when the logarithm of its mean distance to its neighbours exceeds the map's median by this
+many robust deviations. As in statistical outlier removal (Rusu et al. 2008), but without its normal model."""
 NEIGHBORS = 8
 
 
 def isolated(means: np.ndarray) -> np.ndarray:
-    """[N] bool: points [N, 3] whose mean distance to their NEIGHBORS nearest is far above the common one."""
+    """[N] bool: points [N, 3] whose mean distance to their NEIGHBORS nearest is an outlier (see FLOATER_SPREAD)."""
     from scipy.spatial import cKDTree
 
     distance, _ = cKDTree(means).query(means, k=NEIGHBORS + 1, workers=-1)
     level = np.log(np.maximum(distance[:, 1:].mean(axis=1), 1e-12))
     middle = np.median(level)
-    spread = 1.4826 * np.median(np.abs(level - middle))  # the deviation a normal distribution would have
+    spread = 1.4826 * np.median(np.abs(level - middle))  # the standard deviation, for a normal distribution
     return np.asarray(level > middle + FLOATER_SPREAD * max(spread, 1e-3))
 
 
@@ -36,7 +36,7 @@ def nearest_filled(means: np.ndarray, ids: np.ndarray) -> np.ndarray:
 
 
 def joined(descriptions: list[InstanceDescription]) -> InstanceDescription:
-    """What is known of several instances as one: all views, the mean embedding, the colours of the best seen."""
+    """One description of several instances: all views, their mean embedding, the palette of the one with most views."""
     best = max(descriptions, key=lambda d: len(d.views))
     total = np.sum([d.embedding * len(d.views) for d in descriptions], axis=0)
     norm = float(np.linalg.norm(total))
@@ -50,7 +50,7 @@ def joined(descriptions: list[InstanceDescription]) -> InstanceDescription:
 
 
 def described(parts: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, np.ndarray]:
-    """parts.npz's arrays with the language rows of parts that are alive [P] bool, in ascending id."""
+    """The arrays of parts.npz with language rows only for parts that are alive [P] bool, in ascending id."""
     prefix = "language_"
     language = {name[len(prefix) :]: array for name, array in parts.items() if name.startswith(prefix)}
     if not language or alive.all():
@@ -61,7 +61,7 @@ def described(parts: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, np.n
 
 
 def instances_named(calls: Iterable[tuple[str, tuple[Any, ...], dict[str, Any], Any]]) -> set[int]:
-    """Instance ids that edits (method, arguments, named arguments, result) start from: a number or a list of them."""
+    """Instance ids that edits (method, arguments, named arguments, result) take as input: an id or a list of ids."""
     named: set[int] = set()
     for _, args, kwargs, _ in calls:
         for value in (*args[:1], *(kwargs[name] for name in ("instance", "chosen") if name in kwargs)):

@@ -1,8 +1,8 @@
-"""Corrections by hand: rename, hide, merge, split, remove, delete floaters; each can be undone, all saved at once.
+"""Manual corrections of a map: rename, hide, merge, split, remove, delete floaters; with undo, redo and save.
 
-An `Editor` owns one opened map. Operations change memory only; `save` writes the whole map aside and swaps it in. It is
-safe to call from several threads: every operation is one step under a lock, so a caller that vanishes leaves either all
-of an edit or none of it. When another program changed the map meanwhile, what was not saved is done again on its work.
+An `Editor` holds one opened map. Edits change memory only; `save` writes the whole map to a new place and swaps it in.
+Thread-safe: each edit is one step under a lock, so it is applied completely or not at all. When another program changed
+the map meanwhile, the unsaved edits are applied again to the changed map.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ UNDO_DEPTH = 100
 
 F = TypeVar("F", bound=Callable[..., Any])
 Call = tuple[str, tuple[Any, ...], dict[str, Any], Any]
-"""An edit: method, arguments, named arguments, what it returned."""
+"""An edit: method name, arguments, named arguments, return value."""
 
 
 @dataclass(frozen=True)
 class _State:
-    """One moment of the map; arrays are never changed in place, so states share what they have in common."""
+    """One state of the edit history; arrays are never changed in place, so states share the unchanged ones."""
 
     what: str
     ids: np.ndarray
@@ -55,7 +55,7 @@ def _step(method: F) -> F:
 
 
 def _edit(method: F) -> F:
-    """A step that is remembered, so that it can be done again."""
+    """A step whose call is recorded, so that `reopen` can repeat it."""
 
     @_step
     @wraps(method)
@@ -70,12 +70,12 @@ def _edit(method: F) -> F:
 
 
 class Editor:
-    """A map and its history. Instances are named by their `id`, which never changes; merged ones get a new id."""
+    """A map and its edit history. Instances are named by their `id`, which never changes; merged ones get a new id."""
 
     def __init__(self, path: Path):
         self.path = Path(path)
         self._lock = threading.RLock()
-        read_info(self.path)  # says it best when there is no map
+        read_info(self.path)  # its error is the clearest when there is no map
         self._signature = map_signature(self.path)
         self.original = read_map(self.path)
         gmap = self.original
@@ -93,7 +93,7 @@ class Editor:
 
     @property
     def instances(self) -> tuple[dict[str, Any], ...]:
-        """The entries of instances.json as they now are."""
+        """The entries of instances.json in their current state."""
         return self._now.instances
 
     @property
@@ -103,7 +103,7 @@ class Editor:
 
     @property
     def part_ids(self) -> np.ndarray:
-        """[N] part of every Gaussian of the opened map, −1 = none; parts went with instances that were edited away."""
+        """[N] part of every Gaussian as opened, −1 = none; without the parts of merged, split or removed instances."""
         known = [part["id"] for entry in self.instances for part in entry.get("parts", [])]
         ids = self.original.parts.get("ids")
         return np.full(len(self.ids), -1) if ids is None else np.where(np.isin(ids, known), ids, -1)
@@ -115,12 +115,12 @@ class Editor:
 
     @property
     def dirty(self) -> bool:
-        """Whether there is something to save."""
+        """Whether there are unsaved edits."""
         return self._now is not self._saved
 
     @property
     def history(self) -> list[str]:
-        """What was done, oldest first."""
+        """Descriptions of the edits, oldest first."""
         return [state.what for state in self._past[1:]]
 
     def entry(self, instance: int) -> dict[str, Any]:
@@ -135,7 +135,7 @@ class Editor:
 
     @_step
     def current(self) -> Map:
-        """The map as edited, deleted Gaussians left out."""
+        """The edited map, without deleted Gaussians."""
         now, kept = self._now, self._now.kept
         arrays: dict[str, Any] = {name: getattr(self.original, name)[kept] for name in GAUSSIANS}
         arrays["instance_ids"] = now.ids[kept]
@@ -146,7 +146,7 @@ class Editor:
         )
 
     def _parts_now(self) -> dict[str, np.ndarray]:
-        """parts.npz's arrays: the parts of instances that were merged, split or removed went with them."""
+        """The arrays of parts.npz, without the parts of instances that were merged, split or removed."""
         parts = self.original.parts
         if "ids" not in parts:
             return parts
@@ -170,18 +170,18 @@ class Editor:
 
     @_edit
     def rename(self, instance: int, label: str | None) -> None:
-        """Gives an instance a name of the user's; an empty one takes the name away."""
+        """Sets the user's label of an instance; an empty label or None removes it."""
         label = " ".join(label.split()) if label else None
         self._change(f"named {instance} '{label}'" if label else f"took the name of {instance}", instance, label=label)
 
     @_edit
     def hide(self, instance: int, hidden: bool = True) -> None:
-        """Marks an instance as not to be shown (it stays in the map)."""
+        """Marks an instance as hidden or visible in the viewer; it stays in the map."""
         self._change(f"{'hid' if hidden else 'showed'} {instance}", instance, hidden=hidden)
 
     @_edit
     def merge(self, chosen: list[int]) -> int:
-        """Makes one instance of several, with a new id; it keeps the first name among them. Returns the id."""
+        """Joins instances into one with a new id, which is returned; it keeps the first label among them."""
         chosen = sorted(set(chosen))
         if len(chosen) < 2:
             raise InputError(f"merge: found {len(chosen)} instance, expected at least 2; choose another one to join")
@@ -198,10 +198,10 @@ class Editor:
 
     @_edit
     def split(self, instance: int) -> list[int]:
-        """Cuts an instance into its parts; returns their ids. Raises InputError when it has none.
+        """Splits an instance into new ones; returns their ids. Raises InputError when it cannot be split.
 
-        Along the map's hierarchy where the instance has parts there; else its features are clustered again, alone
-        and finer.
+        The parts in the map's hierarchy are used where the instance has any. Otherwise its Gaussians alone are
+        clustered by their features again, with finer settings.
         """
         place = self._place(instance)
         rows = np.flatnonzero((self.ids == instance) & self.kept)
@@ -220,14 +220,14 @@ class Editor:
 
     @_edit
     def remove(self, instance: int) -> None:
-        """Takes an instance from the list; its Gaussians stay, as no instance."""
+        """Removes an instance from the list; its Gaussians stay and belong to no instance."""
         place = self._place(instance)
         ids = np.where(self.ids == instance, -1, self.ids).astype(np.int32)
         self._replace(f"removed {instance}", [place], ids, [], joined)
 
     @_edit
     def delete_floaters(self) -> int:
-        """Deletes Gaussians that hang alone in space; returns how many. Instances left empty leave the list."""
+        """Deletes isolated Gaussians (see `isolated`); returns how many. Instances left empty are removed."""
         rows = np.flatnonzero(self.kept)
         if len(rows) <= NEIGHBORS:
             return 0
@@ -255,7 +255,7 @@ class Editor:
 
     @_step
     def undo(self) -> str | None:
-        """Takes the last edit back; returns what it was, None when there is none."""
+        """Undoes the last edit; returns its description, None when there is none."""
         if len(self._past) < 2:
             return None
         state = self._past.pop()
@@ -264,7 +264,7 @@ class Editor:
 
     @_step
     def redo(self) -> str | None:
-        """Does again what was undone last; returns what it was, None when there is nothing."""
+        """Repeats the edit that was undone last; returns its description, None when there is none."""
         if not self._future:
             return None
         self._past.append(self._future.pop())
@@ -273,12 +273,12 @@ class Editor:
     @property
     @_step
     def outdated(self) -> bool:
-        """Whether somebody else changed the map since it was opened or saved; InputError when it is gone."""
+        """Whether another program changed the map since it was opened or saved; InputError when it is missing."""
         return map_signature(self.path) != self._signature
 
     @_step
     def save(self) -> None:
-        """Writes the edited map in place of the old one; one that somebody else changed is opened again first."""
+        """Writes the edited map in place of the old one, after `reopen` if another program changed that."""
         with writing(self.path):
             if self.outdated:
                 self.reopen()
@@ -288,9 +288,9 @@ class Editor:
 
     @_step
     def reopen(self, discard: bool = False) -> None:
-        """Opens the map as it now lies there and does again what was not saved (unless `discard`); history restarts.
+        """Opens the map now on disk and applies the unsaved edits to it (unless `discard`); history restarts.
 
-        Raises InputError, with nothing changed, when that has no meaning there: other Gaussians, other instances.
+        Raises InputError, with nothing changed, when the edits do not fit it: other Gaussians, other instances.
         """
         fresh = Editor(self.path)
         if self.dirty and not discard:
@@ -301,7 +301,7 @@ class Editor:
             setattr(self, name, getattr(fresh, name))
 
     def _unsaved(self, fresh: Editor) -> list[Call]:
-        """The edits since the last save, if what they touch is the same in `fresh`."""
+        """The edits since the last save; InputError when the instances that they use differ in `fresh`."""
         place = next((n for n, state in enumerate(self._past) if state is self._saved), None)
         kept, there = self._saved.kept, fresh.original
         if place is None or not np.array_equal(self.original.means[kept], there.means):
@@ -323,7 +323,7 @@ class Editor:
     # ------------------------------------------------------------------ helpers
 
     def _parts_of(self, entry: dict[str, Any], rows: np.ndarray) -> np.ndarray:
-        """[R] number of the part of each of an instance's Gaussians, 0 ... and −1 = none."""
+        """[R] index of the part of each Gaussian of an instance, from 0; −1 = none."""
         from perception.instances.cluster import cluster_gaussians
 
         gmap = self.original
@@ -362,7 +362,7 @@ class Editor:
         news: list[dict[str, Any]],
         describe: Callable[[list[InstanceDescription]], InstanceDescription],
     ) -> None:
-        """Entries at `places` make room for `news`, which stand where the first of them stood."""
+        """Replaces the entries at `places` by `news`, which are inserted at the first of these places."""
         entries, descriptions = list(self.instances), list(self._now.descriptions)
         said = [descriptions[place] for place in places] if descriptions else []
         for place in reversed(places):

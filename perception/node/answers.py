@@ -1,4 +1,4 @@
-"""The engine's replies, the map and the health figures as messages."""
+"""Conversion of the engine's replies, the map and the health figures into ROS messages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _OK, _WARN, _ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
 
 
 def answer_json(reply: Reply, identity: str | None) -> dict[str, Any]:
-    """An entry of the contract's `results`, with what ties it to its prompt and its map."""
+    """An entry of `results` with the prompt's id and the map's frame, unit and id."""
     facts = {"frame": reply.frame, "metric": reply.metric, "map_id": reply.map_id}
     return {"id": identity, **reply.to_json(), **facts}
 
@@ -42,7 +42,7 @@ def _hit_columns(hits: Sequence[Hit]) -> dict[str, np.ndarray]:
 
 
 def hits_detections(reply: Reply, stamp: Stamp) -> dict[str, Any]:
-    """Detection3DArray: id is the instance's, class_id the prompt's text, the score how well it fits."""
+    """Detection3DArray: id is the instance's, class_id the prompt's text, the score that of the hit."""
     head = header(reply.frame, stamp)
     found = [
         detection(hit.obb, reply.request.text, hit.score, str(hit.instance_id), head, hit.covariance)
@@ -52,7 +52,7 @@ def hits_detections(reply: Reply, stamp: Stamp) -> dict[str, Any]:
 
 
 def hits_markers(reply: Reply, identity: str | None, stamp: Stamp) -> dict[str, Any]:
-    """MarkerArray: a box and its words a hit; ns is the asker's id, else the text."""
+    """MarkerArray: a box and a text for each hit; ns is the prompt's id, else its text."""
     boxes = [
         (hit.instance_id, hit.obb, f"{reply.request.text} #{hit.instance_id} {hit.score:.2f}") for hit in reply.hits
     ]
@@ -65,14 +65,14 @@ def text_value(text: str) -> dict[str, Any]:
 
 
 def points_value(reply: Reply) -> dict[str, Any]:
-    """rcl_interfaces/ParameterValue: a row (instance id, x, y, z) a point, flat; float64 holds our float32 exactly."""
+    """rcl_interfaces/ParameterValue: rows (instance id, x, y, z), one a point, flat; float64 holds float32 exactly."""
     columns = _hit_columns(reply.hits)
     rows = np.stack([columns[name].astype(np.float64) for name in ("instance_id", "x", "y", "z")], axis=1)
     return {"type": _DOUBLE_ARRAY, "double_array_value": rows.reshape(-1)}
 
 
 def map_cloud(gmap: QueryMap, most: int, stamp: Stamp) -> dict[str, Any]:
-    """PointCloud2 of the whole map, at most `most` points evenly thinned: x y z, rgb, instance_id (−1 = none)."""
+    """PointCloud2 of the map, every k-th Gaussian, at most `most`: x y z, rgb, instance_id (−1 = none)."""
     rows = slice(None, None, max(1, -(-len(gmap) // most)))
     colors = rgb8_from_sh(gmap.sh[rows, 0])
     columns = {axis: np.asarray(gmap.means[rows, i], np.float32) for i, axis in enumerate("xyz")}

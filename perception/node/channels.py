@@ -1,4 +1,4 @@
-"""The node's face: every topic and service, by its short name. Standard message types only."""
+"""The node's topics and services, by short name. Only standard message types are used."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from perception.io.ros_messages import DETECTIONS, DIAGNOSTICS, MARKERS, POINT_C
 
 @dataclass(frozen=True)
 class Topic:
-    """kind: ROS type. latched: late joiners get the last one. absolute: outside the node's namespace."""
+    """kind: ROS type. latched: late subscribers receive the last message. absolute: outside the node's namespace."""
 
     name: str
     kind: str
@@ -33,22 +33,22 @@ class Service:
 
 
 PROMPT = Topic("prompt", STRING)
-"""In: a prompt as plain text, or as a JSON object with "text" and, if wanted, "id", "top_k", "min_score", …"""
+"""Input: a prompt as plain text, or a JSON object with "text" and optionally "id", "top_k", "min_score", …"""
 ANSWER = Topic("answer", STRING)
-"""Out: JSON; the last message of an answer. Its "stamp" is that of the three below, and no other answer has it."""
+"""Output: JSON, the last message of an answer. Its "stamp", unique to the answer, is also that of the three below."""
 POINTS = Topic("answer/points", POINT_CLOUD)
 BOXES = Topic("answer/detections", DETECTIONS)
 MARKS = Topic("answer/markers", MARKERS)
 MAP_CLOUD = Topic("map/points", POINT_CLOUD, latched=True)
 HEALTH = Topic("diagnostics", DIAGNOSTICS, absolute=True)
-"""Where ROS tools look for health (REP 107)."""
+"""The topic on which ROS tools expect health (REP 107)."""
 
 QUERY = Service("query", "rcl_interfaces/srv/GetParameters")
-"""The one standard service that carries texts in and typed values out: each name is a prompt, each value its answer."""
+"""The standard service type that takes texts and returns typed values: each name is a prompt, each value its answer."""
 RELOAD = Service("reload", "std_srvs/srv/Trigger")
 
 OUTPUTS = (ANSWER, POINTS, BOXES, MARKS, MAP_CLOUD, HEALTH)
 SERVICES = (QUERY, RELOAD)
 
 DEPTH = 64
-"""Messages kept for a reader that is behind; older ones are dropped, never the process's memory filled."""
+"""Largest number of messages queued for a slow reader; older ones are dropped, which bounds the memory."""

@@ -1,4 +1,4 @@
-"""A planner's side of the node, in Python without ROS 2: ask over DDS, by topic or by service."""
+"""A Python client of the node without ROS 2: queries over DDS, by topic or by service."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class TopicAnswer:
-    """What came on the topics: the JSON, and the messages that bear its stamp (dicts of their fields)."""
+    """An answer received on the topics: the JSON, and the messages with the same stamp (dicts of their fields)."""
 
     facts: dict[str, Any]
     points: dict[str, Any] | None = None
@@ -34,9 +34,9 @@ class TopicAnswer:
 
 
 class NodeClient:
-    """Asks a node over DDS. One question at a time; use a client a thread. Raises TimeoutError when no node answers.
+    """Queries a node over DDS. One request at a time; use one client per thread. TimeoutError when no node answers.
 
-    A node may be killed and started again meanwhile: what it did not answer is asked again until `timeout`.
+    An unanswered request is repeated every `retry` seconds until its time-out, so a node may restart meanwhile.
     """
 
     def __init__(self, config: NodeConfig | None = None, retry: float = 2.0) -> None:
@@ -44,7 +44,7 @@ class NodeClient:
         self._participant = Participant(self._config.domain_id, self._config.network)
         space = self._config.namespace
         query = channels.QUERY
-        # The network tells of readers in the order they are made: who answers on the last of them knows them all.
+        # DDS announces readers in the order of creation: a node that has discovered the last one has discovered all.
         self._replies = self._participant.reader(f"rr/{query.path(space)}Reply", f"{query.kind}_Response", headed=True)
         self._answers = {
             topic: self._participant.reader(f"rt/{topic.path(space)}", topic.kind)
@@ -65,10 +65,10 @@ class NodeClient:
         self._participant.close()
 
     def wait_for_node(self, timeout: float = 10.0) -> None:
-        """Returns once a node is there that sees this client too; TimeoutError otherwise.
+        """Returns once the node and this client have discovered each other; TimeoutError otherwise.
 
-        That we see the node does not mean that it sees us, and what it sends before it does is lost: an empty prompt,
-        which it refuses, shows that its answers arrive.
+        Discovery has two directions: messages that the node sends before it has discovered our readers do not arrive.
+        So an empty prompt is sent, which the node rejects; receiving this error shows that its answers arrive.
         """
         end = time.monotonic() + timeout
         readers = [self._replies, *self._answers.values()]
@@ -81,7 +81,7 @@ class NodeClient:
     # ----------------------------------------------------------------- service
 
     def query(self, names: Sequence[str | dict[str, Any]], timeout: float = 10.0) -> list[dict[str, Any] | np.ndarray]:
-        """Answers of the service, one a prompt (text, or options with "text"), all from one map: the JSON, or for
+        """Calls the service; one answer a prompt (text, or options with "text"), all from one map: the JSON, or for
         {"want": "points"} the rows [P, 4] float64 of instance id, x, y, z."""
         prompts = [name if isinstance(name, str) else json.dumps(name) for name in names]
         response = self._call({"names": prompts}, timeout)
@@ -108,7 +108,7 @@ class NodeClient:
     # ------------------------------------------------------------------ topics
 
     def ask(self, prompt: str | dict[str, Any], timeout: float = 10.0, retry: float | None = None) -> TopicAnswer:
-        """An answer over the topics, with its cloud, detections and markers."""
+        """Sends a prompt on the topic; returns its answer with point cloud, detections and markers."""
         asked = {"text": prompt} if isinstance(prompt, str) else dict(prompt)
         identity = asked.setdefault("id", uuid.uuid4().hex)
         data = serialize(channels.PROMPT.kind, {"data": json.dumps(asked)})
@@ -143,7 +143,7 @@ class NodeClient:
         timeout: float,
         retry: float | None = None,
     ) -> Any:
-        """Sends, and again each `retry` seconds (the client's own when None), until `found` finds."""
+        """Calls `send` every `retry` seconds (None: the client's own) until `found` returns a value; returns it."""
         end, again = time.monotonic() + timeout, 0.0
         while True:
             now = time.monotonic()
@@ -159,7 +159,7 @@ class NodeClient:
 
 
 def cloud_rows(message: dict[str, Any]) -> np.ndarray:
-    """The rows [P] of a PointCloud2 as a structured array, one field a field of its."""
+    """The points [P] of a PointCloud2 as a structured array with its fields."""
     kinds = {5: "<i4", 6: "<u4", 7: "<f4"}
     fields = message["fields"]
     layout = np.dtype(

@@ -1,4 +1,4 @@
-"""The node's settings: typed, defaults need no file."""
+"""The node's settings; every one has a default."""
 
 from __future__ import annotations
 

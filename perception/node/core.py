@@ -1,7 +1,7 @@
-"""What the node does, whatever carries its messages: prompts to the engine, replies to topics and services.
+"""The node's logic, independent of the transport: prompts to the engine, replies to topics and services.
 
-An answer on topics is four messages with one stamp that no other answer has; the JSON among them names the prompt's
-id and text. An answer of the service goes to its caller alone. So no answer can be taken for another's.
+An answer on the topics is four messages with the same stamp, unique to the answer; the JSON message contains the
+prompt's id and text. An answer of the service goes to its caller only. So each answer can be matched to its prompt.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _MOST_NAMES = 32
 
 
 class Transport(Protocol):
-    """What the core needs of DDS or rclpy. `publish` is called from any thread and does not raise for a slow or
-    absent reader; `warnings` (what is wrong now) and `figures` (counts) are told in the health message."""
+    """The interface of DDS or rclpy that the core uses. `publish` is called from any thread and does not raise for a
+    slow or absent reader. The health message contains `warnings` (present problems) and `figures` (counts)."""
 
     def publish(self, topic: channels.Topic, message: Message) -> None: ...
 
@@ -36,7 +36,7 @@ class Transport(Protocol):
 
 
 class Core:
-    """One map's engine behind a transport. Thread-safe."""
+    """Connects the engine of one map to a transport. Thread-safe."""
 
     def __init__(self, engine: QueryEngine, transport: Transport, config: NodeConfig) -> None:
         self._engine, self._transport, self._config = engine, transport, config
@@ -46,13 +46,13 @@ class Core:
         engine.on_reload(lambda _: self._submit(self._send_map))
 
     def start(self) -> None:
-        """Sends the cloud of the map."""
+        """Publishes the point cloud of the map."""
         self._submit(self._send_map)
 
     # ------------------------------------------------------------------ topics
 
     def prompt(self, data: str) -> None:
-        """A prompt arrived on the topic. Returns at once; the answer follows from a thread of the engine's."""
+        """Handles a prompt from the topic. Returns at once; a thread of the engine publishes the answer."""
         try:
             questions = read_questions(data)
         except InputError as error:
@@ -88,10 +88,10 @@ class Core:
     # ---------------------------------------------------------------- services
 
     def query(self, names: list[str], done: Callable[[Message], None]) -> None:
-        """The query service: `done` gets the response, now or later from a thread of the engine's.
+        """The query service: calls `done` with the response, at once or later from a thread of the engine.
 
-        names: prompts as on the topic. values: one a name, in order, all from the same map: the JSON of the answer
-        or of the error; for {"want": "points"} the points.
+        names: prompts as on the topic. values: one per name, in order, all from the same map: the JSON of the answer or
+        of the error; for {"want": "points"} the points.
         """
         try:
             future = self._engine.run(lambda gmap: [self._value(gmap, name) for name in names[:_MOST_NAMES]])
@@ -129,7 +129,7 @@ class Core:
         return answers.text_value(json.dumps(told))
 
     def reload(self) -> Message:
-        """The reload service (std_srvs/Trigger): takes the map that lies at the path now; the old one stays if bad."""
+        """The reload service (std_srvs/Trigger): loads the map now at the path; on failure the current one stays."""
         try:
             changed = self._engine.reload()
         except InputError as error:
@@ -137,10 +137,10 @@ class Core:
         identity = self._engine.current.map_id
         return {"success": True, "message": f"map {identity}" + ("" if changed else ", which was serving already")}
 
-    # ------------------------------------------------------------ unasked for
+    # ------------------------------------------------------------ health, map
 
     def send_health(self) -> None:
-        """The health message: the engine's figures, what was refused here, what the transport warns of."""
+        """Publishes the health message: figures of the engine, counts of rejected prompts, transport warnings."""
         refused = {f"refused_{kind}": count for kind, count in self._refused.items()}
         facts = {**self._engine.health(), **refused, **self._transport.figures()}
         told = answers.diagnostics(self._config.namespace, facts, self._transport.warnings(), self._stamps.next())
@@ -150,12 +150,12 @@ class Core:
         if not self._config.map_points:
             return
         with self._sending_map:
-            if gmap is self._engine.current:  # else a newer one is on its way
+            if gmap is self._engine.current:  # else a newer map is published soon
                 cloud = answers.map_cloud(gmap, self._config.map_points, self._stamps.next())
                 self._transport.publish(channels.MAP_CLOUD, cloud)
 
     def _submit(self, work: Callable[[QueryMap], None]) -> None:
-        """Work on the map by the engine's threads; when they are all taken and the queue is full, here and now."""
+        """Runs work on the map in a thread of the engine, or in the calling thread when the request queue is full."""
         try:
             self._engine.run(work)
         except EngineBusy:
@@ -165,7 +165,7 @@ class Core:
 
 
 class _Stamps:
-    """Times of answers, (seconds, nanoseconds) of the system's clock, each later than the one before."""
+    """Unique stamps of answers: (seconds, nanoseconds) of the system clock, strictly increasing."""
 
     def __init__(self) -> None:
         self._last, self._lock = 0, threading.Lock()

@@ -1,4 +1,4 @@
-"""The node on DDS without ROS 2: CycloneDDS under ROS 2's conventions."""
+"""The DDS transport of the node, without ROS 2: CycloneDDS with ROS 2's conventions."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from perception.node.core import Core, Message
 from perception.node.participant import Participant, Reader
 
 _LOOK_SECONDS = 0.1
-"""How often the loop looks at the clock when nothing arrives."""
+"""Longest wait for messages before the clock is checked."""
 _NS = 1_000_000_000
 
 
 class DdsTransport:
-    """Writers and readers of the node. `serve` blocks; everything else is called from any thread."""
+    """The node's DDS writers and readers. `serve` blocks; the other methods may be called from any thread."""
 
     def __init__(self, config: NodeConfig) -> None:
         self._config = config
@@ -30,14 +30,14 @@ class DdsTransport:
         self._answer_name = f"rt/{channels.ANSWER.path(config.namespace)}"
 
     def others(self) -> int:
-        """Nodes of this name that were on the network `discovery_seconds` after this one came."""
+        """The number of other nodes of this name that are discovered within `discovery_seconds`."""
         end = time.monotonic() + self._config.discovery_seconds
         while time.monotonic() < end and not self._participant.writers_elsewhere(self._answer_name):
             time.sleep(0.02)
         return self._participant.writers_elsewhere(self._answer_name)
 
     def open(self) -> None:
-        """Shows the node to the network."""
+        """Creates the node's writers and readers."""
         space = self._config.namespace
         self._writers = {
             topic: self._participant.writer(f"rt/{topic.path(space)}", topic.kind, latched=topic.latched)
@@ -56,13 +56,13 @@ class DdsTransport:
         }
 
     def publish(self, topic: Topic, message: Message) -> None:
-        """Sends a message; not even made into bytes when nobody reads."""
+        """Sends a message; unless latched, it is not serialised when there is no reader."""
         writer = self._writers[topic]
         if topic.latched or writer.readers:
             writer.write(serialize(topic.kind, message))
 
     def warnings(self) -> list[str]:
-        """What is wrong now."""
+        """Present problems, one text each."""
         others = self._participant.writers_elsewhere(self._answer_name)
         return [f"{others} other node(s) answer on {self._config.namespace}"] if others else []
 
@@ -77,7 +77,7 @@ class DdsTransport:
         self._participant.close()
 
     def serve(self, core: Core, stop: threading.Event) -> None:
-        """Hands what arrives to the core, and lets it tell its health, until `stop`."""
+        """Passes received messages to the core and publishes health messages, until `stop` is set."""
         waiting = self._participant.wait_set([self._prompts, *self._requests.values()])
         due = time.monotonic()
         while not stop.is_set():
@@ -99,7 +99,7 @@ class DdsTransport:
         for data, caller in _arrived(self._requests[channels.RELOAD]):
             if self._read(f"{channels.RELOAD.kind}_Request", data) is not None:
                 reply = self._reply_to(channels.RELOAD, caller)
-                # Opening a map takes longer than other askers should wait.
+                # In its own thread: opening a map would delay other requests.
                 threading.Thread(target=_reload, args=(core, reply), daemon=True).start()
 
     def _reply_to(self, service: Service, caller: tuple[int, int]) -> Callable[[Message], None]:

@@ -1,8 +1,8 @@
-"""CycloneDDS types that look to the network like ROS 2's own, and carry bytes that are already CDR.
+"""CycloneDDS types that equal ROS 2's own on the network, with samples that are already CDR bytes.
 
-ROS 2 puts messages on DDS under mangled names (`std_msgs::msg::dds_::String_` on topic `rt/…`); the type's
-structure, announced with it, must hash to what ROS announces, or readers of some vendors refuse the match. A sample
-holds its serialised bytes: rosbags makes them, CycloneDDS' own Python serialiser is two hundred times slower.
+ROS 2 uses mangled names on DDS (`std_msgs::msg::dds_::String_` on topic `rt/…`). The type structure announced in
+discovery must have the same hash as ROS 2's, or readers of some vendors refuse the match. A sample holds its serialised
+bytes: rosbags makes them, because CycloneDDS' own Python serialiser is two hundred times slower.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ def dds_type_name(kind: str) -> str:
 
 @cache
 def sample_type(kind: str, headed: bool = False) -> Any:
-    """The class of samples of a ROS type, `sample_type(kind)(data)` with `data` the CDR bytes, head included.
+    """The class of samples of a ROS type, `sample_type(kind)(data)` with `data` the CDR bytes and their header.
 
-    headed: with the 16 bytes of rmw_cyclonedds before a service's message (client's id uint64, number int64).
+    headed: a service message, with the 16 bytes of rmw_cyclonedds before it (client's id uint64, number int64).
     """
     structure = _structure(kind, headed)
 
@@ -109,14 +109,14 @@ _NAMES = {"byte": "uint8", "octet": "uint8", "char": "uint8"}
 
 
 def _announce_as_ros(idl: Any) -> None:
-    """Makes the structure that a type announces the one that ROS 2 announces for it.
+    """Makes the type structure that discovery announces equal to the one of ROS 2.
 
-    ROS 2 sets no flag on the elements of a sequence or array where CycloneDDS says "discard what does not fit". The
-    flags enter the hash of every type that holds one, and the hash of a type those of the types that refer to it. So
-    the flags are cleared and the hashes computed anew until none changes (14 bytes of the MD5 of the serialised type
-    object: XTypes 1.3, 7.3.1.2.1.2). Tests hold the hashes against those that rclpy announces.
+    CycloneDDS sets the flag "discard what does not fit" on the elements of a sequence or array; ROS 2 sets none. The
+    flags enter the hash of every type with such a member, and that hash those of the types that refer to it. So the
+    flags are cleared and the hashes computed again until none changes. A hash is 14 bytes of the MD5 of the serialised
+    type object (XTypes 1.3, 7.3.1.2.1.2). Tests compare the hashes with those that rclpy announces.
 
-    CycloneDDS offers no way to give it a structure: its serialised form is set on the description of our own class.
+    CycloneDDS has no function to set a structure: the serialised form is set on the description of our own class.
     """
     info, mapping = idl.get_type_info(), idl.get_type_mapping()
     renamed: dict[bytes, bytes] = {}
@@ -149,7 +149,7 @@ def _rename(value: Any, renamed: dict[bytes, bytes]) -> None:
 
 
 def _serialized(value: Any) -> bytes:
-    """The XCDR2 form without its 4-byte head; little-endian, as are all machines that CycloneDDS has wheels for."""
+    """The XCDR2 form without its 4-byte header; little-endian, as are all machines with CycloneDDS wheels."""
     return bytes(value.serialize(use_version_2=True)[4:])
 
 

@@ -1,7 +1,7 @@
-"""A DDS participant under ROS 2's conventions: writers and readers by ROS name and type, raw CDR in and out.
+"""A DDS participant with ROS 2's conventions: writers and readers by ROS name and type, for raw CDR bytes.
 
-The node and its clients in Python use it. Topics are `rt/NAME`; a service is `rq/NAMERequest` and
-`rr/NAMEReply`, whose messages carry rmw_cyclonedds' header: the client's id (uint64) and the request's number (int64).
+Used by the node and its Python client. Topics are `rt/NAME`; a service is `rq/NAMERequest` and `rr/NAMEReply`, whose
+messages carry rmw_cyclonedds' header: the client's id (uint64) and the request's number (int64).
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from perception.node.idl import sample_type
 
 _HEADER = struct.Struct("<Qq")
 _MAX_BYTES = 256 << 20
-"""Of one message, in or out; a larger one is dropped by the network layer, unread."""
+"""Largest message in bytes, in or out; the network layer drops larger ones."""
 _BLOCKED_MS = 100
-"""How long a writer may wait for readers that are behind before it gives the message up."""
+"""Longest time that a write waits for slow readers; the message is dropped after that."""
 
 
 class Participant:
@@ -41,26 +41,26 @@ class Participant:
         self._publications = dds.builtin.BuiltinDataReader(self.participant, dds.builtin.BuiltinTopicDcpsPublication)
 
     def writer(self, name: str, kind: str, *, latched: bool = False, headed: bool = False) -> Writer:
-        """A reliable writer of ROS type `kind` on DDS topic `name`; latched: the last sample waits for late readers."""
+        """A reliable writer of ROS type `kind` on DDS topic `name`; latched: late readers receive the last sample."""
         topic = self._dds.topic.Topic(self.participant, name, sample_type(kind, headed))
         return Writer(
             self._dds, self._dds.pub.DataWriter(self.participant, topic, qos=self._qos(latched)), kind, headed
         )
 
     def reader(self, name: str, kind: str, *, latched: bool = False, headed: bool = False) -> Reader:
-        """A reliable reader; holds at most DEPTH samples, the newest."""
+        """A reliable reader; it keeps the DEPTH newest samples."""
         topic = self._dds.topic.Topic(self.participant, name, sample_type(kind, headed))
         return Reader(self._dds, self._dds.sub.DataReader(self.participant, topic, qos=self._qos(latched)), headed)
 
     def wait_set(self, readers: list[Reader]) -> Any:
-        """Something whose `wait(nanoseconds)` returns when one of the readers has samples."""
+        """A WaitSet, whose `wait(nanoseconds)` returns when one of the readers has samples."""
         waiting = self._dds.core.WaitSet(self.participant)
         for reader in readers:
             waiting.attach(reader.condition)
         return waiting
 
     def writers_elsewhere(self, name: str) -> int:
-        """How many writers of DDS topic `name` other participants have, as discovered so far."""
+        """The number of writers on DDS topic `name` in other participants, as discovered so far."""
         own = self.participant.guid
         alive = self._dds.core.InstanceState.Alive
         condition = self._dds.core.ReadCondition(
@@ -70,8 +70,8 @@ class Participant:
         return sum(1 for one in found if one.topic_name == name and one.participant_key != own)
 
     def close(self) -> None:
-        """Leaves the network: others learn it now and not when the lease ends. Writers and readers end with it."""
-        self.participant.__del__()  # CycloneDDS has no other name for it; harmless when repeated
+        """Leaves the network at once instead of when the DDS lease ends. Closes all writers and readers."""
+        self.participant.__del__()  # CycloneDDS has no other method for it; may be repeated
 
     def _qos(self, latched: bool) -> Any:
         policy, duration = self._dds.qos.Policy, self._dds.util.duration
@@ -88,22 +88,22 @@ _DOMAINS: dict[int, Any] = {}
 
 
 def _open_domain(dds: _Modules, domain: int, network: str | None) -> None:
-    """Settles how this process sits on a domain; the first to come decides for the rest of its life."""
+    """Configures a DDS domain for this process. Only the first call for a domain has an effect."""
     with _OPENING:
         if domain not in _DOMAINS:
-            own = os.environ.get("CYCLONEDDS_URI", "")  # what the user sets there has the last word
+            own = os.environ.get("CYCLONEDDS_URI", "")  # the user's settings there take precedence
             _DOMAINS[domain] = dds.domain.Domain(domain, ",".join(filter(None, [network_settings(network), own])))
 
 
 class Writer:
-    """Sends CDR bytes. `given_up` counts messages that slow readers would not take in time."""
+    """Sends CDR bytes. `given_up`: number of messages dropped because of slow readers."""
 
     def __init__(self, dds: _Modules, writer: Any, kind: str, headed: bool) -> None:
         self._dds, self._writer, self._kind, self._headed = dds, writer, kind, headed
         self.given_up = 0
 
     def write(self, cdr: bytes, header: tuple[int, int] | None = None) -> bool:
-        """False when it was given up. header: client and number of a service's message."""
+        """Sends a message; False when it was dropped. header: client id and number of a service's message."""
         if header is not None:
             cdr = cdr[:4] + _HEADER.pack(*header) + cdr[4:]
         try:
@@ -115,7 +115,7 @@ class Writer:
 
     @property
     def readers(self) -> int:
-        """How many readers are matched."""
+        """The number of matched readers."""
         return len(self._writer.get_matched_subscriptions())
 
 
@@ -128,9 +128,9 @@ class Reader:
         self.condition = dds.core.ReadCondition(reader, states)
 
     def take(self) -> Iterator[tuple[bytes, tuple[int, int] | None]]:
-        """What has arrived: CDR bytes and, for services, client and number. Too short ones come as empty bytes."""
+        """Received messages: CDR bytes and, for services, client and number. Too short ones give empty bytes."""
         for sample in self._reader.take(DEPTH):
-            if not sample.sample_info.valid_data:  # a writer has gone
+            if not sample.sample_info.valid_data:  # a notice that a writer left, without data
                 continue
             data = bytes(sample.data)
             if not self._headed:
@@ -144,13 +144,13 @@ class Reader:
 
     @property
     def writers(self) -> int:
-        """How many writers are matched."""
+        """The number of matched writers."""
         return len(self._reader.get_matched_publications())
 
 
 def network_settings(network: str | None) -> str:
-    """CycloneDDS configuration (XML) for a network: an interface's name, "localhost", or None for what ROS's own
-    variables say, else CycloneDDS' choice."""
+    """CycloneDDS configuration (XML) for a network: an interface's name, "localhost", or None for the network in ROS's
+    environment variables, else CycloneDDS' default."""
     chosen = network or _from_environment()
     interfaces, discovery = "", ""
     if chosen == "localhost":
@@ -170,7 +170,7 @@ _ON_THIS_MACHINE = (
     "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>63</MaxAutoParticipantIndex>"
     '<Peers><Peer address="127.0.0.1"/></Peers></Discovery>'
 )
-"""Without multicast, as ROS 2 does it on one machine: well-known ports, each of them asked."""
+"""Discovery without multicast, as in ROS 2 on one machine: unicast to each of the well-known ports."""
 
 
 def _from_environment() -> str | None:
@@ -180,7 +180,7 @@ def _from_environment() -> str | None:
 
 
 class _Modules:
-    """CycloneDDS' modules, imported when a node or client is made."""
+    """CycloneDDS' modules, imported when a node or client is created."""
 
     def __init__(self) -> None:
         try:

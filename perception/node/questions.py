@@ -1,4 +1,4 @@
-"""Prompts as they arrive (plain text or JSON) and answers as JSON; the engine's own words in between."""
+"""Conversion of prompts (plain text or JSON) into requests, and of errors into JSON."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from perception.query import AnswerTimeout, EngineBusy, EngineClosed, Request
 from perception.query.bodies import QueryBody, parse
 
 MAX_BYTES = 64 * 1024
-"""Of one prompt, JSON included; longer ones are refused unread."""
+"""Largest prompt in bytes, JSON included; larger ones are rejected before parsing."""
 _SHOWN = 80
 
 
 @dataclass(frozen=True)
 class Question:
-    """One prompt. identity: the asker's own word for it, given back with the answer. points: the service is to give
-    the points instead of the JSON."""
+    """One prompt. identity: an id chosen by the client, returned with the answer. points: the service returns points
+    instead of the JSON."""
 
     request: Request
     identity: str | None = None
@@ -27,7 +27,7 @@ class Question:
 
 
 def read_questions(data: str) -> list[Question]:
-    """The questions in a prompt: one for a plain text, one for each text of a JSON object. InputError when bad."""
+    """The questions in a prompt: one for a plain text, one per text of a JSON object. InputError when malformed."""
     size = len(data.encode("utf-8", "surrogatepass"))
     if size > MAX_BYTES:
         raise InputError(f"prompt: has {size} bytes, expected at most {MAX_BYTES}")
@@ -46,7 +46,7 @@ def read_questions(data: str) -> list[Question]:
 
 
 def identity_of(data: str) -> str | None:
-    """The id of a prompt that was refused, when it can be made out, so that its asker still hears of it."""
+    """The id of a rejected prompt, when it can be parsed, so that the client can match the error; else None."""
     if len(data) > MAX_BYTES:
         return None
     try:
@@ -57,7 +57,7 @@ def identity_of(data: str) -> str | None:
 
 
 def error_json(error: BaseException, text: str, identity: str | None) -> dict[str, Any]:
-    """What an asker is told when there is no answer; kind: bad_input, busy, timeout, closed or failed."""
+    """The JSON that is sent instead of an answer; kind: bad_input, busy, timeout, closed or failed."""
     return {
         "id": identity,
         "text": text if len(text) <= _SHOWN else text[:_SHOWN] + "…",
@@ -66,7 +66,7 @@ def error_json(error: BaseException, text: str, identity: str | None) -> dict[st
 
 
 def error_kind(error: BaseException) -> str:
-    """bad_input: ask otherwise; busy, timeout: ask again later; closed: ask another node; failed: a defect of ours."""
+    """bad_input: change the request; busy, timeout: retry later; closed: use another node; failed: a defect here."""
     kinds: tuple[tuple[type[BaseException], str], ...] = (
         (InputError, "bad_input"),
         (EngineBusy, "busy"),

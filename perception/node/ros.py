@@ -1,4 +1,4 @@
-"""The node where ROS 2 is: the same messages through rclpy, whatever middleware it uses."""
+"""The rclpy transport of the node: the same messages through ROS 2, over any of its middlewares."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from perception.node.core import Core, Message
 
 _SEQUENCE = re.compile(r"(?:sequence<)?(\w+/\w+)(?:, \d+)?>?(?:\[\d+\])?")
 _EXTRA_SECONDS = 1.0
-"""Beyond the engine's time-out before a service call is given up; the engine answers in time, if with an error."""
+"""Added to the engine's time-out for a service call; the engine answers or fails before that."""
 
 
 class RosTransport:
@@ -41,7 +41,7 @@ class RosTransport:
         self._absent: list[str] = []
 
     def others(self) -> int:
-        """Nodes of this name that were on the network `discovery_seconds` after this one came."""
+        """The number of other nodes of this name that are discovered within `discovery_seconds`."""
         end = time.monotonic() + self._config.discovery_seconds
         while time.monotonic() < end and not self._answerers():
             time.sleep(0.02)
@@ -52,7 +52,7 @@ class RosTransport:
         return max(0, len(self._node.get_publishers_info_by_topic(self._answer_name)) - own)
 
     def open(self) -> None:
-        """Shows topics to the network. A message type that this ROS 2 lacks (vision_msgs) is left out and told."""
+        """Creates the publishers. A topic whose type is not installed (vision_msgs) is skipped; see `figures`."""
         for topic in channels.OUTPUTS:
             try:
                 kind = _class(topic.kind)
@@ -63,22 +63,22 @@ class RosTransport:
             self._publishers[topic] = self._node.create_publisher(kind, name, _qos(topic.latched))
 
     def publish(self, topic: Topic, message: Message) -> None:
-        """Sends a message; not even built when nobody reads."""
+        """Sends a message; unless latched, it is not built when there is no subscriber."""
         publisher = self._publishers.get(topic)
         if publisher is not None and (topic.latched or publisher.get_subscription_count()):
             publisher.publish(fill(_class(topic.kind)(), message))
 
     def warnings(self) -> list[str]:
-        """What is wrong now."""
+        """Present problems, one text each."""
         others = self._answerers()
         return [f"{others} other node(s) answer on {self._config.namespace}"] if others else []
 
     def figures(self) -> dict[str, Any]:
-        """What this ROS 2 cannot do."""
+        """The topics that are not published, with the reason."""
         return {"left_out": "; ".join(self._absent)} if self._absent else {}
 
     def serve(self, core: Core, stop: threading.Event) -> None:
-        """Hands what arrives to the core, and lets it tell its health, until `stop`."""
+        """Passes received messages to the core and publishes health messages, until `stop` is set."""
         from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
         from rclpy.executors import MultiThreadedExecutor
 
@@ -128,7 +128,7 @@ class RosTransport:
 
 
 def fill(message: Any, values: Message) -> Any:
-    """A ROS message with the fields of a dict set; KeyError for a field it has not."""
+    """Sets the fields of a ROS message from a dict; KeyError for an unknown field."""
     kinds = message.get_fields_and_field_types()
     for name, value in values.items():
         setattr(message, name, _converted(kinds[name], getattr(message, name), value))
@@ -140,7 +140,7 @@ def _converted(kind: str, current: Any, value: Any) -> Any:
         return fill(current, value)
     if kind == "octet":
         return bytes([value])
-    if isinstance(current, array.array):  # a sequence of numbers: its bytes, and no look at each of them
+    if isinstance(current, array.array):  # numbers are copied as bytes, not one by one
         return array.array(current.typecode, np.asarray(value, np.dtype(current.typecode)).tobytes())
     if isinstance(value, list) and value and isinstance(value[0], dict):
         inner = _SEQUENCE.fullmatch(kind)
@@ -153,7 +153,7 @@ def _converted(kind: str, current: Any, value: Any) -> Any:
 
 @cache
 def _class(kind: str) -> Any:
-    """The Python class of `sensor_msgs/msg/PointCloud2` or `std_srvs/srv/Trigger`; ImportError when not there."""
+    """The Python class of `sensor_msgs/msg/PointCloud2` or `std_srvs/srv/Trigger`; ImportError when not installed."""
     package, space, name = kind.split("/")
     return getattr(importlib.import_module(f"{package}.{space}"), name)
 

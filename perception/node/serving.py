@@ -1,4 +1,4 @@
-"""One process that owns a map and serves it until it is told to stop."""
+"""Runs the query node: one process that serves a map until it is stopped."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def serve_node(
     log: Callable[[str], None] = lambda _: None,
     encoders: Callable[[str], Encoder | None] | None = None,
 ) -> dict[str, Any]:
-    """Serves the map at `path` until `stop` is set; returns the engine's figures.
+    """Serves the map at `path` until `stop` is set; returns the engine's health figures.
 
-    InputError when the map or the network cannot be used, or another node of this name is there already.
+    InputError when the map or the network cannot be used, or when another node of this name is running.
     encoders: see QueryEngine.
     """
     kind = transport_kind(config)
@@ -64,7 +64,7 @@ def _engine(path: str | Path, config: NodeConfig, encoders: Callable[[str], Enco
 
 @contextlib.contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that SIGINT and SIGTERM set, for work that ends in order; after Ctrl-C it ends in KeyboardInterrupt."""
+    """An event that SIGINT and SIGTERM set, for an orderly stop; after SIGINT it ends in KeyboardInterrupt."""
     stop, interrupted = threading.Event(), threading.Event()
 
     def end(number: int, _: object) -> None:
@@ -83,7 +83,7 @@ def stop_on_signals() -> Iterator[threading.Event]:
 
 
 def transport_kind(config: NodeConfig) -> str:
-    """dds or rclpy; InputError with the line that installs it when it is not there."""
+    """The transport, dds or rclpy. InputError with the remedy when it is not installed."""
     if config.transport != "dds" and importlib.util.find_spec("rclpy") is not None:
         return "rclpy"
     if config.transport == "rclpy":

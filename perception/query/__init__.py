@@ -1,7 +1,7 @@
-"""Ask a finished map: text in, ranked 3D instances out; filters, frames, neighbourhoods; an engine for servers.
+"""Queries on a finished map: ranked 3D instances for a text prompt, with filters on position, size and label.
 
-gmap = load_map("kitchen.gsmap")             one process, as many threads as you like
-with QueryEngine("kitchen.gsmap") as engine  a server's: queue, time-outs, reload while it answers
+gmap = load_map("kitchen.gsmap")             a map in one process; thread-safe
+with QueryEngine("kitchen.gsmap") as engine  for servers: bounded request queue, time-outs, reload of a changed map
 """
 
 from __future__ import annotations

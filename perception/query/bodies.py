@@ -1,7 +1,7 @@
-"""The JSON that servers are asked with, HTTP and DDS alike: pydantic models, and how each becomes a question.
+"""The JSON request bodies of the HTTP and DDS servers as pydantic models, and their conversion to query types.
 
-Numbers are finite and at most MAX_NUMBER in size, so that squares and products of lengths stay finite. Texts are
-Unicode; a lone surrogate is refused. What is null counts as not given.
+Numbers are finite and at most MAX_NUMBER in absolute value, so that squares and products of lengths stay finite. Texts
+are Unicode without lone surrogates. A field that is null counts as absent.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from perception.query.where import Where
 from perception.types import OrientedBox
 
 MAX_NUMBER = 1e12
-"""Larger than any coordinate in millimetres on the earth."""
+"""Largest absolute value of a number; it exceeds every coordinate on the earth in millimetres."""
 MAX_SCALE = 1e9
-"""Of a frame against the map's, and its inverse the least."""
+"""Largest scale of a frame relative to the map; the smallest is 1 / MAX_SCALE."""
 _MAX_CORNERS = 1000
 
 Number = Annotated[float, Field(ge=-MAX_NUMBER, le=MAX_NUMBER)]
@@ -30,12 +30,12 @@ Length = Annotated[float, Field(ge=0, le=MAX_NUMBER)]
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Rotation = Annotated[list[Point], Field(min_length=3, max_length=3)]
 Matrix = Annotated[list[Annotated[list[Number], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)]
-Text = Annotated[str, Field(max_length=MAX_TEXT)]  # the bound makes pydantic look at the characters: no lone surrogate
+Text = Annotated[str, Field(max_length=MAX_TEXT)]  # with a bound, pydantic also rejects lone surrogates
 Prompt = Annotated[str, Field(min_length=1, max_length=MAX_TEXT)]
 
 
 def _of_lists(value: Any) -> str:
-    """Which of the alternatives below a value is meant to be, so that the error is about that one."""
+    """Tag of the union member that a value belongs to, so that a validation error names that member only."""
     if isinstance(value, list):
         return "nested" if value and isinstance(value[0], list) else "list"
     return "single"
@@ -45,7 +45,7 @@ Place = Annotated[
     Annotated[Point, Tag("list")] | Annotated[Matrix, Tag("nested")],
     Discriminator(lambda value: "nested" if _of_lists(value) == "nested" else "list"),
 ]
-"""A point [3], or a pose [4, 4] whose origin counts."""
+"""A point [3], or a pose [4, 4] of which only the origin is used."""
 Prompts = Annotated[
     Annotated[Prompt, Tag("single")] | Annotated[list[Prompt], Field(min_length=1, max_length=MAX_TEXTS), Tag("list")],
     Discriminator(lambda value: "list" if isinstance(value, list) else "single"),
@@ -122,7 +122,7 @@ class WhereBody(Body):
     labels: Labels | None = None
 
     def where(self) -> Where:
-        """The filter; InputError for what only its parts together show, such as `within` without `near`."""
+        """The filter; InputError when fields do not fit together, such as `within` without `near`."""
         region = None if self.region is None else self.region.region()
         share = 0.5 if self.share is None else self.share
         near = None if self.near is None else np.array(self.near)
@@ -163,7 +163,7 @@ class QueryBody(FilteredBody):
     min_score: Number | None = None
 
     def requests(self) -> list[Request]:
-        """One a prompt."""
+        """One Request for each prompt."""
         texts = self.text if isinstance(self.text, list) else [self.text]
         where, frame, top_k = self.asked_where(), self.asked_frame(), self.top_k or 3
         return [Request(text, top_k, self.min_score, where, frame) for text in texts]
@@ -195,7 +195,7 @@ Model = TypeVar("Model", bound=Body)
 
 
 def parse(model: type[Model], value: Any) -> Model:
-    """`value`, which came as JSON, as a model; InputError with one line when it is none."""
+    """Validates the decoded JSON `value` as `model`; raises InputError with a one-line message when it does not fit."""
     try:
         return model.model_validate(value)
     except ValidationError as error:
@@ -203,7 +203,7 @@ def parse(model: type[Model], value: Any) -> Model:
 
 
 def problem_line(errors: Sequence[Any]) -> str:
-    """One of pydantic's errors as a line: where, what was expected, what was found. A misspelt field comes first."""
+    """One of pydantic's errors as a line: field, expected, found. An unknown field takes precedence."""
     first = next((error for error in errors if error["type"] == "extra_forbidden"), errors[0])
     tags = {"body", "query", "list", "nested", "single", "corners", "box", "prism"}
     place = ".".join(str(part) for part in first["loc"] if part not in tags)

@@ -1,4 +1,4 @@
-"""The photo that shows an instance best, cut out around it."""
+"""Crops of instances from the photos that show them best."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from perception.query.query_map import QueryMap, UnknownInstance
 from perception.types import View
 
 MARGIN = 0.15
-"""Share of the box's longer side that is left around it."""
+"""Margin around the bounding box, as a share of its longer side."""
 
 
 def best_crop(
     gmap: QueryMap, instance_id: int, side: int = 320, folders: Sequence[Path] | None = None
 ) -> np.ndarray | None:
-    """The instance in its best photo, [h, w, 3] uint8 RGB, longer side at most `side` pixels.
+    """The crop of an instance from its best photo, [h, w, 3] uint8 RGB, longer side at most `side` pixels.
 
-    None when no photo shows it, or the photo has moved or cannot be read any more. InputError for an unknown id.
-    folders: where photos may be read, None = anywhere. The map says where its photos lie, and a map from somebody else
-    may say anything: UnknownInstance for a photo elsewhere, symbolic links followed.
+    None when no photo shows the instance or its photo is missing or unreadable. InputError for an unknown id.
+    folders: where photos may be read, None = anywhere. An untrusted map may name any file as its photo, so
+    UnknownInstance is raised for a photo outside these folders. Symbolic links are resolved first.
     """
     from perception.io.photos import load_photo
 
@@ -51,7 +51,7 @@ def best_crop(
 
 
 def folders_needed(gmap: QueryMap, folders: Sequence[Path]) -> list[Path]:
-    """The folders that hold photos of the map and are neither among `folders` nor below one, sorted."""
+    """The folders with photos of the map that are neither among `folders` nor below one of them, sorted."""
     needed = set()
     for view in gmap.views:
         with suppress(OSError, ValueError, RuntimeError):
@@ -66,15 +66,15 @@ def _is_below(real: Path, folders: Sequence[Path]) -> bool:
 
 
 def readable_view(gmap: Map, view: View, folders: Sequence[Path] | None) -> View:
-    """`view` with the path of its photo, symbolic links followed. InputError when the photo is missing; UnknownInstance
-    when it is no file below one of the folders (None: anywhere)."""
+    """`view` with the path of its photo, symbolic links resolved if `folders` are given. Raises InputError when the
+    photo is missing, UnknownInstance when it is not a file below one of `folders` (None: anywhere)."""
     located = gmap.with_photo(view)
     if folders is None:
         return located
     try:
         real = located.photo.resolve()
         known = _is_below(real, folders) and real.is_file()
-    except (OSError, ValueError, RuntimeError):  # no path at all, or links in a circle
+    except (OSError, ValueError, RuntimeError):  # an invalid path, or a cycle of symbolic links
         known = False
     if not known:
         raise UnknownInstance(f"{view.name}: this photo is not in the map's folder nor in --photos DIR")

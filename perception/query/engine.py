@@ -1,6 +1,6 @@
-"""The engine of every server: one map, many askers, a bounded queue, and a new map while it answers.
+"""The query engine of all servers: one map, worker threads, a bounded request queue, reload of a changed map.
 
-Servers (HTTP, DDS, ROS) only convert messages; waiting, refusing, timing out and reloading happen here.
+Servers (HTTP, DDS, ROS) only convert messages. Queueing, rejection, time-outs and reloading are implemented here.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from perception.query.requests import Reply, Request
 
 T = TypeVar("T")
 _SELDOM = 32
-"""A new map that cannot be opened is tried again at most this many looks later."""
+"""Largest interval between attempts to open an unreadable new map, in multiples of `watch`."""
 
 
 class EngineBusy(RuntimeError):
-    """The queue is full: ask again later, or ask another."""
+    """The request queue is full: retry later, or use another server."""
 
 
 class AnswerTimeout(TimeoutError):
-    """No answer within the time given; work that had not begun is dropped."""
+    """No answer within the time-out; a request that had not started is dropped."""
 
 
 class EngineClosed(RuntimeError):
@@ -41,13 +41,13 @@ class EngineClosed(RuntimeError):
 
 
 class QueryEngine:
-    """Owns the map at `path`, answers from `workers` threads, and takes over a new map without dropping a question.
+    """Answers requests on the map at `path` in `workers` threads, and reloads the map when it changes on disk.
 
-    At most `queue_size` questions wait; more are refused with EngineBusy. A question not answered within `timeout`
-    seconds raises AnswerTimeout. Every `watch` seconds (None: never) the directory is looked at; when another map or
-    new labels lie there it is opened beside the old one, made ready, and put in its place in one step: every answer
-    comes from one map or the other. A new map that cannot be read is told in `health`, the old one goes on. The map
-    may be deleted meanwhile; what answers need is in memory. Thread-safe; a context manager.
+    At most `queue_size` requests wait; further ones raise EngineBusy. A request without an answer after `timeout`
+    seconds raises AnswerTimeout. Every `watch` seconds (None: never) the map's directory is checked. A changed map, or
+    changed labels, is loaded beside the current map and then swapped in atomically: each answer comes from one map
+    only. When a new map cannot be read, `health` reports it and the current map stays in use. The directory may be
+    deleted meanwhile: queries use only data in memory. Thread-safe; a context manager.
     """
 
     def __init__(
@@ -84,15 +84,15 @@ class QueryEngine:
 
     @property
     def current(self) -> QueryMap:
-        """The map that answers now. Keep the reference for as long as one answer needs one map."""
+        """The map in use. Keep the reference while several calls must read the same map."""
         return self._map
 
     def ask(self, request: Request | str, timeout: float | None = None) -> Reply:
-        """The answer to a prompt; blocks. InputError, EngineBusy, AnswerTimeout, EngineClosed."""
+        """The reply to a prompt; blocks. Raises InputError, EngineBusy, AnswerTimeout or EngineClosed."""
         return self.wait(self.submit(request, timeout), timeout)
 
     def submit(self, request: Request | str, timeout: float | None = None) -> Future[Reply]:
-        """Queues a prompt and returns at once; EngineBusy when the queue is full. The future raises as `ask` does."""
+        """Queues a prompt and returns its future, which raises as `ask` does. EngineBusy when the queue is full."""
         asked = time.monotonic()
         item = Request(request) if isinstance(request, str) else request
 
@@ -104,7 +104,7 @@ class QueryEngine:
         return self.run(work, timeout)
 
     def run(self, work: Callable[[QueryMap], T], timeout: float | None = None) -> Future[T]:
-        """Queues any question to the map: `work` is called with it by a worker. EngineBusy when the queue is full."""
+        """Queues `work`, which a worker thread calls with the current map. EngineBusy when the queue is full."""
         if self._closed.is_set():
             raise EngineClosed(f"{self.path}: the engine has been closed")
         now = time.monotonic()
@@ -117,7 +117,7 @@ class QueryEngine:
         return job.future
 
     def wait(self, future: Future[T], timeout: float | None = None) -> T:
-        """The future's result, AnswerTimeout after `timeout` seconds (the engine's own when None)."""
+        """The future's result; AnswerTimeout after `timeout` seconds (None: the engine's own)."""
         seconds = self.timeout if timeout is None else timeout
         try:
             return future.result(seconds)
@@ -129,7 +129,7 @@ class QueryEngine:
             raise AnswerTimeout(f"no answer within {seconds:g} s") from None
 
     async def awaited(self, future: Future[T], timeout: float | None = None) -> T:
-        """`wait` for servers that run an event loop."""
+        """`wait` as a coroutine, for servers with an event loop."""
         seconds = self.timeout if timeout is None else timeout
         try:
             return await asyncio.wait_for(asyncio.wrap_future(future), seconds)  # cancels what has not begun
@@ -142,9 +142,9 @@ class QueryEngine:
     # --------------------------------------------------------------- reloading
 
     def reload(self) -> bool:
-        """Opens what lies at the path now and swaps it in; False when it is the map that answers already.
+        """Loads the map now at the path and swaps it in; False when it is the current map already.
 
-        InputError when it cannot be opened; the old map goes on answering.
+        Raises InputError when it cannot be loaded; the current map then stays in use.
         """
         with self._reloading:
             try:
@@ -165,7 +165,7 @@ class QueryEngine:
             return True
 
     def on_reload(self, listener: Callable[[QueryMap], None]) -> None:
-        """Calls `listener(new map)` after each swap, from the thread that reloaded; it must not raise."""
+        """Registers `listener(new map)`, called after each swap by the thread that reloaded; it must not raise."""
         self._listeners.append(listener)
 
     def _open(self) -> QueryMap:
@@ -174,8 +174,8 @@ class QueryEngine:
         return gmap
 
     def _watch(self, every: float) -> None:
-        """Looks, and takes over. A map that cannot be opened may still be on its way (someone copies it file by file),
-        so it is tried again, less and less often."""
+        """Reloads the map when its signature changes. A map that cannot be opened may still be being copied file by
+        file, so it is tried again, at intervals that double up to _SELDOM times `every`."""
         tried: Any = None
         wait, left = every, 0.0
         while not self._closed.wait(every):
@@ -190,15 +190,15 @@ class QueryEngine:
             elif signature != tried or left <= 0:
                 wait = every if signature != tried else min(2 * wait, _SELDOM * every)
                 tried, left = signature, wait
-                with suppress(InputError):  # told in health
+                with suppress(InputError):  # reported by `health`
                     self.reload()
 
     # ------------------------------------------------------------------ health
 
     def health(self) -> dict[str, Any]:
-        """status: ok, closed or degraded, and the problem then: the map on disk is gone or unreadable and the one in
-        memory answers, prompts cannot be answered, or answers are overdue; the map's identity and counts, the queue,
-        totals since the start, and latency of the last thousand answers in ms."""
+        """The state of the engine. status: "ok", "closed", or "degraded" with the reason in `problem`: the map on disk
+        is missing or unreadable, prompts cannot be answered, or answers are overdue. Further: the map's identity and
+        counts, the queue, totals since the start, and the latency of the last thousand answers in ms."""
         gmap = self._map
         problem = self._problem or gmap.problem or self._overdue()
         return {
@@ -221,7 +221,7 @@ class QueryEngine:
         return f"{late} answers take longer than {self.timeout:g} s" if late else None
 
     def close(self) -> None:
-        """Answers what runs, refuses what waits, and ends the threads."""
+        """Finishes running requests, ends waiting ones with EngineClosed, and joins the threads."""
         if self._closed.is_set():
             return
         self._closed.set()
@@ -251,7 +251,7 @@ class QueryEngine:
                 del self._busy_since[own]
 
     def _drop(self, job: Job) -> None:
-        """Tells who asked that the time is over; nothing when they have gone already."""
+        """Ends a job with AnswerTimeout, unless its future was cancelled."""
         if job.future.set_running_or_notify_cancel():
             self._counters.count("timed_out")
             job.future.set_exception(AnswerTimeout("the question waited too long and was dropped"))
@@ -271,7 +271,7 @@ class QueryEngine:
 
 
 class _Shared:
-    """Encoders by name, made once and shared by the old map and the new."""
+    """Encoders by name; each is made once and shared by the current map and a reloaded one."""
 
     def __init__(self, make: Callable[[str], Encoder | None]) -> None:
         self._make, self._made, self._lock = make, {}, threading.Lock()  # type: ignore[var-annotated]

@@ -1,4 +1,4 @@
-"""Frames other than the map's: a planner speaks of its robot's base, or of metres."""
+"""Coordinate frames other than the map's, such as a robot's base frame or a metric frame."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from perception.errors import InputError
 from perception.types import OrientedBox
 
 _TOLERANCE = 1e-4
-"""How far R Rᵀ / s² may be from the identity: float32 poses pass, shears do not."""
+"""Largest deviation of R Rᵀ / s² from the identity: float32 poses pass, shears do not."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame by its name and how to get there: from_map [4, 4], a rigid or similarity transform frame_from_map.
+    """A named frame. from_map [4, 4]: the transform frame_from_map, rigid or a similarity.
 
-    A scale other than 1 is what turns a reconstruction's units into metres.
+    A scale other than 1 converts units, for example those of a reconstruction into metres.
     """
 
     name: str
@@ -58,13 +58,13 @@ def scale_of(a_from_b: np.ndarray) -> float:
 
 
 def move_points(a_from_b: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """points [..., 3] in b → in a, computed in float64, returned in the points' own float type."""
+    """Transforms points [..., 3] from frame b to a in float64; returns their own float dtype, else float64."""
     moved = np.asarray(points, np.float64) @ a_from_b[:3, :3].T + a_from_b[:3, 3]
     return moved.astype(points.dtype if np.issubdtype(np.asarray(points).dtype, np.floating) else np.float64)
 
 
 def move_box(a_from_b: np.ndarray, box: OrientedBox) -> OrientedBox:
-    """An oriented box in b → in a."""
+    """Transforms an oriented box from frame b to frame a."""
     scale = scale_of(a_from_b)
     rotation = np.asarray(box.rotation, np.float64) @ (a_from_b[:3, :3] / scale).T  # rows are axes
     center = a_from_b[:3, :3] @ np.asarray(box.center, np.float64) + a_from_b[:3, 3]

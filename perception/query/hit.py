@@ -1,4 +1,4 @@
-"""What an answer is made of."""
+"""The result types of queries: Hit, Neighbor, Description."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ _NO_SPREAD = np.zeros((3, 3))
 
 @dataclass(frozen=True)
 class Hit:
-    """One instance that answers a question.
+    """One instance in the result of a query.
 
     points: [P, 3] float32, read-only, the means of its Gaussians. centroid: [3] float64, weighted by opacity.
-    obb: the box around the points. covariance: [3, 3] float64 of the points about their mean, divided by P.
-    score: in [0, 1]; of a prompt's answer how well it fits, else the instance's own confidence. views: the photos
-    that show it best, best first. All of it in `frame`, whose unit is the metre when the map says so.
-    distance: from the place asked about to the nearest of the points; None when no place was given.
-    parent: of a part, the id of the instance it belongs to.
+    obb: oriented bounding box of the points. covariance: [3, 3] float64 of the points about their mean, divided by P.
+    score: in [0, 1]; for a text prompt how well the instance matches, else the mapper's confidence. views: the photos
+    that show it best, best first. distance: from the query's position to the nearest point; None without a position.
+    parent: for a part, the id of its instance. All of it is in `frame`, in metres when the map is metric.
     """
 
     instance_id: int
@@ -57,7 +56,7 @@ class Hit:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """A hit of `perception query --json`."""
+        """The hit as JSON, as in `perception query --json`."""
         answer: dict[str, Any] = {
             "instance_id": self.instance_id,
             "score": round(float(self.score), 4),
@@ -75,7 +74,7 @@ class Hit:
 
 @dataclass(frozen=True)
 class Neighbor:
-    """Another instance beside one: the gap is the least distance between their points."""
+    """An instance near another one; gap: the smallest distance between points of the two."""
 
     instance_id: int
     label: str | None
@@ -84,8 +83,8 @@ class Neighbor:
 
 @dataclass(frozen=True)
 class Description:
-    """All a map knows of one instance. confidence: the mapper's own score in [0, 1]; aabb: [2, 3] lowest and
-    highest corner in the frame of `hit`; colors: names of its main colours with their shares, largest first."""
+    """All properties of one instance. confidence: the mapper's score in [0, 1]; aabb: [2, 3] lowest and highest corner
+    in the frame of `hit`; colors: names of its main colours with their shares, largest first."""
 
     hit: Hit
     confidence: float

@@ -1,4 +1,4 @@
-"""Questions about parts of things: "handle of the mug", or the parts of one instance."""
+"""Queries for parts of instances: "handle of the mug", or all parts of one instance."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from perception.query.query_map import QueryMap
 
 _OF = re.compile(r"^(?:the\s+)?(?P<part>.+?)\s+of\s+(?:the\s+|a\s+|an\s+)?(?P<whole>.+)$", re.IGNORECASE)
 _WHOLES = 3
-"""Hits for the whole whose parts are looked at."""
+"""Number of instances, the best hits for the whole, whose parts are searched."""
 
 
 class PartsMap:
-    """The parts of a map's instances (see io.store), asked like instances. Made from an opened map, lazily cheap."""
+    """The parts of the instances of the map `opened` (see io.store), queried in the same way as instances."""
 
     def __init__(self, opened: QueryMap):
         self.opened = opened
@@ -40,11 +40,11 @@ class PartsMap:
         return sorted(hits, key=lambda hit: -len(hit.points))
 
     def query(self, text: str, top_k: int = 3) -> list[Hit]:
-        """The parts that answer `text`, best first, each with the `parent` it belongs to.
+        """The parts that match `text`, best first, each with the `parent` it belongs to.
 
-        "X of the Y" looks for X among the parts of what answers Y, and says what fits best there: that Y is present
-        is the evidence. Any other text is judged against all parts as a prompt is against instances; empty when not
-        present. Raises InputError as QueryMap.query does.
+        "X of the Y": the parts of the best hits for Y are ranked by their match with X. X has no presence threshold,
+        because its whole Y is present. Any other text is ranked against all parts, with the presence threshold of
+        instances: the result is empty when it is not present. Raises InputError as QueryMap.query does.
         """
         if not text.strip():
             raise InputError('query: the text is empty; ask for a part, such as "handle of the mug"')

@@ -1,4 +1,4 @@
-"""A map that answers questions: `perception.load_map`."""
+"""`QueryMap`, a map that answers queries; `perception.load_map` opens one."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class UnknownInstance(InputError):
 
 
 class QueryMap(Map):
-    """A `Map` that answers questions, from any number of threads at once.
+    """A `Map` with queries. Thread-safe.
 
-    What only some questions need is read for the first of them: embeddings and encoder for the first prompt. The folder
-    may be replaced meanwhile: this object goes on answering from the map it opened.
+    Data is loaded on first use: embeddings and encoder at the first prompt. The map's folder may be replaced meanwhile:
+    this object keeps the map that it opened.
 
-    Every method that takes `frame` speaks that frame: points, poses, boxes and lengths given to it are in that frame,
-    and so is all it returns. Without, everything is in the map's own frame (`frame`), in metres when `metric`.
+    A method with `frame` takes and returns points, poses, boxes and lengths in that frame. Without it, they are in the
+    map's own frame (`frame`), in metres when `metric`.
     """
 
     encoders: Encoders | None = None
@@ -50,11 +50,11 @@ class QueryMap(Map):
 
     @property
     def ranker(self) -> Ranker:
-        """What ranks the instances for a prompt; InputError when the map has no embeddings or encoder."""
+        """The ranker of instances for prompts; InputError when the map has no embeddings or encoder."""
         return self._ranking.ranker
 
     def warm(self) -> None:
-        """Does now what the first questions would wait for."""
+        """Prepares what the first queries need: spatial index, shape scores, text encoder."""
         _ = self._spatial
         if self.problem is None and self.instances:
             _ = self.ranker.shapes
@@ -71,11 +71,11 @@ class QueryMap(Map):
         where: Where | None = None,
         frame: Frame | None = None,
     ) -> list[Hit]:
-        """The instances that answer `text`, best first, at most top_k; empty when it is not present.
+        """The instances that match `text`, best first, at most top_k; empty when it is not present.
 
-        With `min_score` the encoder's own judgement of presence is replaced by that bound on the score. `where` leaves
-        only instances that fulfil it; what is present then is judged among those. Raises InputError for an empty or
-        overlong text, and for a map without embeddings or whose encoder is not installed.
+        `min_score` replaces the encoder's presence threshold by this bound on the score. `where` keeps only instances
+        that fulfil it, and presence is then decided among those. Raises InputError for an empty or overlong text, and
+        for a map without embeddings or whose encoder is not installed.
         """
         Request(text, top_k, min_score)
         if not self.instances:
@@ -105,8 +105,8 @@ class QueryMap(Map):
         where: Where | None = None,
         frame: Frame | None = None,
     ) -> list[Hit]:
-        """The top_k instances nearest to a point [3] or a pose [4, 4] by their nearest point, nearest first; each hit
-        says its `distance`. `where` leaves only those that fulfil it."""
+        """The top_k instances nearest to a point [3] or a pose [4, 4] by their nearest point, nearest first, each hit
+        with its `distance`. `where` keeps only instances that fulfil it. Raises InputError for top_k below 1."""
         if top_k < 1:
             raise InputError(f"nearest: top_k is {top_k}, expected at least 1")
         wanted = (where or Where()).in_map(frame)
@@ -133,7 +133,7 @@ class QueryMap(Map):
         return self._in(frame, self.hit(self.position(instance_id)))
 
     def describe(self, instance_id: int, *, frame: Frame | None = None) -> Description:
-        """What the map knows of an instance: its hit, colours, bounds and the three instances nearest to it."""
+        """The properties of an instance: its hit, colours, bounds and the three nearest instances."""
         position = self.position(instance_id)
         hit = self._in(frame, self.hit(position))
         scale = 1.0 if frame is None else float(np.cbrt(np.linalg.det(frame.from_map[:3, :3])))
@@ -155,7 +155,7 @@ class QueryMap(Map):
         return likely_names(self.ranker, count) if self.instances else []
 
     def hit(self, position: int, score: float | None = None) -> Hit:
-        """The instance at place `position` of instances.json; score: its own confidence when None."""
+        """Entry `position` of instances.json as a Hit; score: the mapper's confidence when None."""
         entry = self.instances[position]
         box = entry["obb"]
         points = self.index.of(entry["id"])
@@ -172,15 +172,15 @@ class QueryMap(Map):
         )
 
     def position(self, instance_id: int) -> int:
-        """The place of this id in instances.json; InputError when there is none."""
+        """The index of this id in instances.json; UnknownInstance when there is none."""
         place = self._places.get(instance_id)
         if place is None:
             raise UnknownInstance(f"instance {instance_id}: the map has none such; it has {len(self.instances)}")
         return place
 
     def best_view(self, position: int) -> tuple[str, tuple[int, int, int, int]] | None:
-        """The photo that shows the instance best and its tight box (x0, y0, x1, y1) there, in pixels of the size the
-        map was trained at; None when no photo does."""
+        """The photo that shows the instance best and the tight box (x0, y0, x1, y1) in it, in pixels of the size used
+        for training; None when no photo shows it."""
         names = self._views(position)
         if not names:
             return None
@@ -203,7 +203,7 @@ class QueryMap(Map):
         return [self._in(frame, self._measured(n, where, s)) for n, s in chosen[:top_k]]
 
     def _fulfilling(self, where: Where) -> list[int]:
-        """Places in instances.json of the instances that fulfil `where`, which speaks the map's frame."""
+        """Indices in instances.json of the instances that fulfil `where`, which is in the map's frame."""
         return [n for n in range(len(self.instances)) if self._fulfils(n, where)]
 
     def _fulfils(self, position: int, where: Where) -> bool:
@@ -220,7 +220,7 @@ class QueryMap(Map):
         return where.within is None or self._spatial.distance(entry["id"], np.asarray(where.near)) <= where.within
 
     def _measured(self, position: int, where: Where, score: float | None = None) -> Hit:
-        """A hit that says its distance where `where` names a place."""
+        """A Hit, with its distance if `where.near` is given."""
         hit = self.hit(position, score)
         if where.near is None:
             return hit

@@ -1,4 +1,4 @@
-"""Parts of space: an oriented box, or a prism over a polygon (a room of a floor plan)."""
+"""Regions of space: an oriented box, or a prism over a polygon (for example a room of a floor plan)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from perception.types import OrientedBox
 
 @dataclass(frozen=True)
 class Prism:
-    """The space over a polygon [n, 2] of x and y, n >= 3, between the heights low and high along z.
+    """The volume over a polygon [n, 2] of x and y, n >= 3, between the heights low and high along z.
 
-    The polygon may be concave and is closed by itself. The axes are those of a frame of its own, `from_prism` [4, 4]
-    away from the frame it is used in.
+    The polygon may be concave; its last corner joins the first. Its coordinates are in the prism's own frame, which
+    `from_prism` [4, 4] transforms into the frame where the prism is used.
     """
 
     polygon: np.ndarray
@@ -57,14 +57,14 @@ def inside(region: Region, points: np.ndarray) -> np.ndarray:
 
 
 def move_region(a_from_b: np.ndarray, region: Region) -> Region:
-    """A region in b → in a."""
+    """Transforms a region from frame b to frame a."""
     if isinstance(region, OrientedBox):
         return move_box(a_from_b, region)
     return Prism(region.polygon, region.low, region.high, a_from_b @ region.from_prism)
 
 
 def check_region(region: Any) -> Region:
-    """`region` itself when it is a sound one, else InputError."""
+    """`region`, validated; InputError for any other type or for an invalid box."""
     if isinstance(region, Prism):
         return region
     if isinstance(region, OrientedBox):
@@ -73,7 +73,7 @@ def check_region(region: Any) -> Region:
 
 
 def check_box(box: OrientedBox) -> OrientedBox:
-    """The box with float64 arrays; InputError unless its rotation is one and its extent is not negative."""
+    """The box with float64 arrays; InputError unless its rotation is a rotation matrix and its extent is >= 0."""
     center, extent = _numbers(box.center, "region: center"), _numbers(box.extent, "region: extent")
     rotation = _numbers(box.rotation, "region: rotation")
     if center.shape != (3,) or extent.shape != (3,) or rotation.shape != (3, 3) or (extent < 0).any():

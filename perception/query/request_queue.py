@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from perception.query.query_map import QueryMap
 
 _REMEMBERED = 1000
-"""Latencies kept for `health`."""
+"""Number of latencies kept for `health`."""
 
 
 @dataclass(eq=False)
 class Job:
-    """A question, who waits for its answer, and since and until when (monotonic seconds)."""
+    """A queued request: `work` is called with the map, `future` gets its result. asked, deadline: monotonic seconds."""
 
     work: Callable[[QueryMap], Any]
     future: Future[Any]
@@ -30,8 +30,8 @@ class Job:
 
 
 class RequestQueue:
-    """At most `most` waiting jobs, first in, first out. When it is full, cancelled and expired jobs make room: `drop`
-    is called with each of them."""
+    """A FIFO queue of at most `most` jobs. When it is full, cancelled and expired jobs are removed, and `drop` is
+    called with each of them."""
 
     def __init__(self, most: int, drop: Callable[[Job], None]) -> None:
         self.most, self._drop = most, drop
@@ -59,7 +59,7 @@ class RequestQueue:
         return taken
 
     def get(self) -> Job | None:
-        """The job that waited longest; blocks until there is one. None once the queue is closed."""
+        """The oldest job; blocks until there is one. None once the queue is closed."""
         with self._changed:
             while self._open and not self._jobs:
                 self._changed.wait()
@@ -75,7 +75,7 @@ class RequestQueue:
 
 
 class Counters:
-    """How many requests ended in which way since the start, and the latencies of the last answers."""
+    """Totals of requests by outcome since the start, and the latencies of the last answers."""
 
     _NAMES = ("answered", "bad_input", "failed", "refused", "timed_out", "reloads")
 

@@ -1,4 +1,4 @@
-"""A prompt with its filters, and the answer to it."""
+"""`Request`, a prompt with its filters, and `Reply`, its answer."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from perception.query.hit import Hit
 
 MAX_TEXT = 1000
-"""Characters of a prompt; no encoder reads more, and a server should not be made to."""
+"""Largest number of characters in a prompt. No encoder reads more; the bound limits the work of a server."""
 MAX_TOP = 1000
 MAX_TEXTS = 32
 
 
 @dataclass(frozen=True)
 class Request:
-    """One prompt with its filters; everything in it and in its answer is in `frame`, None = the map's."""
+    """One prompt with its filters; its coordinates and those of the reply are in `frame`, None = the map's."""
 
     text: str
     top_k: int = 3
@@ -45,7 +45,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Reply:
-    """The answer to a request, all of it from the one map named map_id. seconds: from asking to answer."""
+    """The answer to a request, computed on the map map_id alone. seconds: from submission to answer."""
 
     request: Request
     hits: tuple[Hit, ...]
@@ -55,12 +55,12 @@ class Reply:
     seconds: float
 
     def to_json(self) -> dict[str, Any]:
-        """An entry of the contract's `results`."""
+        """An entry of `results` in the JSON output."""
         return {"text": self.request.text, "present": bool(self.hits), "hits": [hit.to_json() for hit in self.hits]}
 
 
 def check_text(text: Any) -> str:
-    """The prompt itself; InputError when it is no text, empty or longer than MAX_TEXT."""
+    """`text`, validated; InputError when it is not a str, is empty, or is longer than MAX_TEXT."""
     if not isinstance(text, str):
         raise InputError(f"query: the text is {type(text).__name__}, expected a text")
     if not text.strip():

@@ -1,4 +1,4 @@
-"""Exact distances to instances' points, and shares of them inside regions; bounding boxes rule most instances out."""
+"""Exact distances to instances' points, and their shares inside regions; bounding boxes prune the search."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NEIGHBORS = 8
 
 
 class SpatialIndex:
-    """The points of all instances; bounds [K, 2, 3] are their lowest and highest corners, in the order of ids."""
+    """Spatial queries on the points of instances. bounds [K, 2, 3]: lowest and highest corner, in the order of ids."""
 
     def __init__(self, index: InstanceIndex) -> None:
         self.index = index
@@ -36,8 +36,8 @@ class SpatialIndex:
     def nearest(self, point: np.ndarray, count: int, ids: Iterable[int]) -> list[tuple[float, int]]:
         """The `count` instances of `ids` with the nearest points: (distance, id), nearest first, ties by id.
 
-        Instances come in the order of the distance to their bounds, which is never more than that to their points,
-        so the search may stop once the bound exceeds the worst that is kept.
+        Instances are visited by increasing distance to their bounding box, a lower bound of the distance to their
+        points. The search stops once this bound exceeds the largest distance that is kept.
         """
         known = [i for i in ids if i in self._place]
         bounds = self.bounds[[self._place[i] for i in known]].reshape(-1, 2, 3)
@@ -51,15 +51,15 @@ class SpatialIndex:
         return kept
 
     def share_inside(self, instance_id: int, region: Region) -> float:
-        """Which share of the instance's points lies in `region`; 0 without points."""
+        """The share of the instance's points that lies in `region`, in [0, 1]; 0 without points."""
         points = self.index.of(instance_id)
         if not len(points) or self._apart(instance_id, region):
             return 0.0
         return float(inside(region, points).mean())
 
     def reaches(self, instance_id: int, point: np.ndarray) -> bool:
-        """Whether `point` [3] lies on the instance by the spacing of its own points there: no farther from its
-        nearest point than that point from its eighth neighbour."""
+        """Whether `point` [3] lies on the instance: its distance to the instance's nearest point p is at most the
+        distance of p to its eighth neighbour."""
         points = self.index.of(instance_id)
         squared = _squared(points, point)
         nearest = int(squared.argmin())
@@ -100,7 +100,7 @@ class SpatialIndex:
         return [entry for entry in kept if np.isfinite(entry[0])]
 
     def _apart(self, instance_id: int, region: Region) -> bool:
-        """True when the bounds alone say that no point is inside."""
+        """True when the bounding boxes alone show that no point is inside."""
         if not isinstance(region, OrientedBox):
             return False
         corners = region.center + (_CORNERS * region.extent) @ region.rotation

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Encoders = Callable[[str], Encoder | None]
 REMEMBERED = 256
-"""Prompts whose ranking is kept: planners ask the same thing again and again."""
+"""Number of prompts whose ranking is cached, because planners repeat the same prompts."""
 
 
 class TextRanking:
@@ -45,9 +45,9 @@ class TextRanking:
         return None
 
     def rank(self, text: str, min_score: float | None) -> Answer:
-        """See `perception.language.ranking`; by labels alone when the map has no embeddings or its encoder is unknown.
+        """The ranking of `perception.language.ranking`. Without embeddings or encoder, the instances with this label.
 
-        InputError when it has none, and no instance is called `text`.
+        Raises InputError when the map has no embeddings or encoder and no instance has the label `text`.
         """
         key = (" ".join(text.split()), min_score)
         with self._lock:
@@ -69,7 +69,7 @@ class TextRanking:
         return answer
 
     def _by_label(self, text: str) -> Answer | None:
-        """The instances that a person gave this name; None when none has it. Needs neither embeddings nor encoder."""
+        """The instances that the user labelled `text`, None without any. Needs no embeddings and no encoder."""
         from perception.language.ranking import Answer
 
         same = [n for n, e in enumerate(self._gmap.instances) if tidy(e.get("label") or "") == tidy(text)]
@@ -77,7 +77,7 @@ class TextRanking:
 
     @property
     def ranker(self) -> Ranker:
-        """Made once; InputError when the map has no words, the same one every time."""
+        """Made once; raises the same InputError every time when the map has no embeddings or encoder."""
         with self._lock:
             if self._made is None:
                 try:
@@ -116,8 +116,8 @@ class TextRanking:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """A prompt is a few tokens: torch's second thread costs more than it brings (10 ms of one processor against 24 of
-    two, and far more when the machine is busy). Servers answer several prompts side by side instead."""
+    """Limits torch to one thread. A prompt has a few tokens, so a second thread costs more than it saves: 10 ms on one
+    core against 24 on two, far more on a busy machine. Servers run several prompts in parallel instead."""
     torch = sys.modules.get("torch")
     before = 1 if torch is None else torch.get_num_threads()
     if torch is None or before == 1:

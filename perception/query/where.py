@@ -1,4 +1,4 @@
-"""Filters on a question: where, how far, how big, called what."""
+"""`Where`, a filter on the position, distance, size and label of instances."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from perception.query.regions import Region, check_region, move_region
 
 @dataclass(frozen=True)
 class Where:
-    """What an instance must fulfil to be an answer; what is None asks nothing.
+    """The conditions that an instance must fulfil to be in the result; None = no condition.
 
-    region: at least `share` of its points lie in this box or prism. near: a point [3] or a pose [4, 4] whose origin
-    counts; hits then carry their distance. within: the instance has a point at most this far from `near`.
-    min_size, max_size: bounds on the longest side of its box. labels: it has one of these labels (upper and lower
-    case alike). Lengths in the unit of the frame of the question.
+    region: at least `share` of its points lie in this box or prism. near: a point [3], or a pose [4, 4] of which only
+    the origin is used; hits then carry their distance. within: largest distance of its nearest point from `near`.
+    min_size, max_size: bounds on the longest side of its box. labels: it has one of these labels (case-insensitive).
+    Lengths are in the unit of the query's frame.
     """
 
     region: Region | None = None
@@ -53,7 +53,7 @@ class Where:
             raise InputError("where: within needs near, the point or pose it is measured from")
 
     def in_map(self, frame: Frame | None) -> Where:
-        """The same filter in the map's frame, given the frame it is spoken in."""
+        """The same filter in the map's frame, given the frame that its values are in."""
         if frame is None:
             return self
         map_from_frame = frame.to_map
@@ -70,7 +70,7 @@ class Where:
 
 
 def place(point_or_pose: Any) -> np.ndarray:
-    """[3] float64: a point as it is, or the origin of a pose [4, 4] (map_from_robot)."""
+    """[3] float64: a point as it is, or the origin of a pose [4, 4] (map_from_robot); InputError for other input."""
     try:
         array = np.asarray(point_or_pose, np.float64)
     except (TypeError, ValueError) as error:
@@ -83,5 +83,5 @@ def place(point_or_pose: Any) -> np.ndarray:
 
 
 def tidy(text: str) -> str:
-    """A label for comparison: white space and case do not count."""
+    """A label normalised for comparison: case-folded, runs of white space replaced by one space."""
     return " ".join(text.casefold().split())

@@ -1,1 +1,1 @@
-"""A map over HTTP: JSON, binary points and a page. Only messages are converted here; perception.query thinks."""
+"""The HTTP server of a map: JSON, binary points, a web page. It only converts messages of perception.query."""

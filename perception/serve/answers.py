@@ -1,4 +1,4 @@
-"""What the server answers, as pydantic models: the OpenAPI document is made from them, tests hold answers to them."""
+"""The server's answers as pydantic models. The OpenAPI document is made from them; tests check answers with them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The routes: a question in, an answer of the engine out."""
+"""The HTTP routes: each passes a request to the engine and converts the result."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ _ABOUT = (
     "`metric`. With `frame`, everything in a request and its answer is in that frame."
 )
 _PAGE = {"/": "html", "/page.js": "javascript", "/page.css": "css"}
-"""The page for people: path → kind of text."""
+"""The files of the web page: path → subtype of the media type text."""
 
 
 def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
-    """The ASGI application that serves `engine`; who starts the engine closes it."""
+    """The ASGI application that serves `engine`, which the caller closes."""
     app = FastAPI(
         title="perception",
         version=__version__,
         description=_ABOUT,
-        docs_url=None,  # these pages load scripts from elsewhere
+        docs_url=None,  # these pages load scripts from other servers
         redoc_url=None,
         redirect_slashes=False,
         responses={"default": {"model": answers.Problem}},
@@ -65,7 +65,7 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
 
 
 class _Routes:
-    """One method a route. Each answer is made by one map, named in `map_id` or in the header X-Map-Id."""
+    """One method per route. Each answer is computed on one map, given in `map_id` or in the header X-Map-Id."""
 
     def __init__(self, engine: QueryEngine, settings: ServeSettings) -> None:
         self.engine = engine
@@ -150,7 +150,7 @@ class _Routes:
     # ------------------------------------------------------------------ shared
 
     async def _answer(self, wanted: str | None, work: Callable[[QueryMap], T]) -> T:
-        """`work` done by the engine, on the map `wanted` if the client named one."""
+        """The result of `work` in the engine; OtherMap when `wanted` is given and is not the map's id."""
 
         def checked(gmap: QueryMap) -> T:
             _check_map(gmap, wanted)

@@ -1,7 +1,7 @@
-"""Time-outs of connections, which uvicorn has none of: until a request's header is there, and for the request in all.
+"""Time-outs of connections, which uvicorn lacks: until a request's header is complete, and for the whole request.
 
-A client that opens connections and sends half a header would hold all that the server allows. So the oldest of those
-that wait for a header is closed when a share of all connections does.
+A client that opens connections and sends incomplete headers could occupy all allowed connections. So when more than
+MAX_WAITING connections wait for a header, the one that has waited longest is closed.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 MAX_CONNECTIONS = 256
 MAX_WAITING = MAX_CONNECTIONS // 2
-"""Connections whose next header is not complete."""
+"""Largest number of connections whose next header is not complete."""
 
 
 class Connections:
     """The connections of a server, by their peer's address. header, total: seconds until the next header is complete,
     and for a whole request.
 
-    `protocol_class` reports that connections open and close, and `watched` that a request has begun and ended: what
-    uvicorn calls the application with has a complete header.
+    `protocol_class` reports when connections open and close, `watched` when a request begins and ends: uvicorn calls
+    the application after the header is complete.
     """
 
     def __init__(self, header: float, total: float) -> None:
@@ -32,7 +32,7 @@ class Connections:
         self._waiting: OrderedDict[Any, None] = OrderedDict()
 
     def protocol_class(self) -> type[asyncio.Protocol]:
-        """What uvicorn's setting `http` takes."""
+        """The protocol class for uvicorn's setting `http`."""
         connections = self
 
         class Timed(H11Protocol):
@@ -52,7 +52,7 @@ class Connections:
         return Timed
 
     def watched(self, app: Any) -> Any:
-        """The ASGI application `app`, reporting each request."""
+        """The ASGI application `app`, wrapped to report each request."""
 
         async def watching(scope: Any, receive: Any, send: Any) -> None:
             peer = tuple(scope.get("client") or ())

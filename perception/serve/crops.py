@@ -1,4 +1,4 @@
-"""Crops of photos, read in threads of their own: a photo on a mount that hangs must hold up no question."""
+"""Crops of photos, read in separate threads: a photo on a mount that hangs must not delay queries."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from typing import Any
 from perception.query.engine import EngineBusy
 
 WORKERS = 2
-"""Photos read at once."""
+"""Number of photos read at the same time."""
 MAX_HUNG = 8
-"""Threads that may wait for photos that do not come; with more, crops are refused until one comes back."""
+"""Largest number of hung threads; with more, crops are refused until one returns."""
 MAX_WAITING = 64
 _MAX_KEPT = 256
 
@@ -23,10 +23,10 @@ Key = tuple[Any, ...]
 
 
 class Crops:
-    """JPEGs by key: kept, being made, or made by `work`. timeout: seconds after which a photo counts as hung.
+    """JPEGs by key: cached, in progress, or to be made by `work`. timeout: seconds after which a photo counts as hung.
 
     A thread that reads cannot be interrupted. One that takes longer than `timeout` is counted as hung, and another
-    takes its place. Thread-safe; the threads end with the work, or with the process.
+    replaces it. Thread-safe; the threads end when no work waits, or with the process.
     """
 
     def __init__(self, timeout: float, clock: Callable[[], float] = time.monotonic) -> None:
@@ -38,9 +38,9 @@ class Crops:
         self._lock = threading.Lock()
 
     def jpeg(self, key: Key, work: Callable[[], Any]) -> Future[bytes | None]:
-        """The future JPEG of the picture that `work` makes, None when that is None; the same for askers of one key.
+        """The future JPEG of the picture that `work` returns, None for None; all requests for one key share it.
 
-        EngineBusy when too many wait, or too many photos hang.
+        EngineBusy when too many requests wait, or too many photos hang.
         """
         with self._lock:
             if key in self._kept:
@@ -54,14 +54,14 @@ class Crops:
                 raise EngineBusy(f"{hung} photos hang and {len(self._waiting)} wait to be read; ask again later")
             self._waiting.append((key, work))
             future = self._asked[key] = Future()
-            future.set_running_or_notify_cancel()  # one asker who gives up must not cancel it for the others
+            future.set_running_or_notify_cancel()  # one client that gives up must not cancel it for the others
             if len(self._since) - hung < WORKERS:
                 thread = threading.Thread(target=self._read, name="crops", daemon=True)
                 thread.start()
             return future
 
     def hung(self) -> int:
-        """Photos that have not come within the time."""
+        """The number of photos that take longer than `timeout` to read."""
         with self._lock:
             return self._hung()
 
@@ -70,7 +70,7 @@ class Crops:
         return sum(now - since > self._timeout for since in self._since.values())
 
     def _read(self) -> None:
-        """Works off what waits, then ends."""
+        """Processes waiting requests until there are none."""
         own = threading.get_ident()
         while True:
             with self._lock:
@@ -81,7 +81,7 @@ class Crops:
                 self._since[own] = self._clock()
             try:
                 data, error = _encode_jpeg(work()), None
-            except Exception as raised:  # told to who asked
+            except Exception as raised:  # passed on by the future
                 data, error = None, raised
             with self._lock:
                 future = self._asked.pop(key)

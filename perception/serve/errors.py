@@ -1,4 +1,4 @@
-"""Every failure is one JSON object with one clear line: {"error": line, "status": code}."""
+"""The server's errors: every failure is one JSON object with a one-line message, {"error": line, "status": code}."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ _log = logging.getLogger("perception.serve")
 
 
 class OtherMap(Exception):
-    """The client asked about a map that has been replaced."""
+    """The client's map_id is not that of the current map."""
 
 
 def problem(status: int, line: str, headers: Mapping[str, str] | None = None) -> JSONResponse:
-    """An error as JSON."""
+    """An error response as JSON."""
     told = " ".join(line.encode("utf-8", "backslashreplace").decode().split())
     return JSONResponse({"error": told, "status": status}, status, headers)
 
 
 async def told(request: Request, error: Exception) -> JSONResponse:
-    """The answer to an exception that a handler raised."""
+    """The response to an exception that a handler raised."""
     if isinstance(error, UnknownInstance):
         return problem(404, str(error))
     if isinstance(error, InputError):

@@ -1,4 +1,4 @@
-"""What stands before every request: who asks, how often, how much, and how long it may take to say it."""
+"""The checks before every request: host, token, rate, content type, body size, and time to send the body."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from perception.serve.errors import problem
 from perception.serve.settings import ServeSettings
 
 OPEN = {"/", "/page.js", "/page.css", "/openapi.json", "/health"}
-"""Paths that tell nothing of the map without a token; /health then says only its status."""
+"""Paths that need no token; without one, /health returns its status only."""
 _MAX_CLIENTS = 4096
 _MAX_DROPPED = 8 << 20
 _HEADERS = [
@@ -32,11 +32,11 @@ Message = dict[str, Any]
 
 
 class Guard:
-    """ASGI middleware. Sets scope["state"]["trusted"]: whether the client showed the token, or none is asked for.
+    """ASGI middleware. Sets scope["state"]["trusted"]: whether the client sent the token, or none is required.
 
-    A web page opened in a browser on this machine could send requests here too. So without a token the Host header
-    must name this machine (against DNS rebinding), and a POST must say it is JSON, which pages of other origins
-    may only send after a preflight that is never granted.
+    A web page opened in a browser on this machine could send requests here too. So without a token the Host header must
+    name this machine (against DNS rebinding), and a POST must have the JSON content type. Pages of other origins may
+    send that only after a preflight request, which is never granted.
     """
 
     def __init__(self, app: Any, settings: ServeSettings, clock: Callable[[], float] = time.monotonic) -> None:
@@ -58,7 +58,7 @@ class Guard:
         await self.app(scope, receive, _with_headers(send))
 
     def _refusal(self, scope: Any, headers: dict[str, str], trusted: bool) -> Any:
-        """The answer that turns the request away, or None."""
+        """The response that rejects the request, or None."""
         settings = self.settings
         if settings.token is None:
             name = headers.get("host", "")
@@ -83,7 +83,7 @@ class Guard:
         return kind.lower() == "bearer" and hmac.compare_digest(given.strip().encode(), self.settings.token.encode())
 
     def _wait(self, client: str) -> float:
-        """Seconds until this client may ask again; 0 takes a drop from its bucket."""
+        """Token bucket by client: seconds until it may send again; 0 takes one from its bucket."""
         rate = self.settings.rate
         if rate == 0:
             return 0.0
@@ -97,10 +97,10 @@ class Guard:
         return short
 
     async def _body(self, receive: Any) -> tuple[Any, Any]:
-        """Reads the body within its limits; (refusal, None) or (None, a receive that gives it again).
+        """Reads the body within its limits; (rejection, receive) or (None, a receive that returns the body again).
 
-        What is too much is read and dropped up to a bound, because a client that is still sending when the connection
-        closes never sees the answer.
+        An oversized body is read and dropped up to _MAX_DROPPED bytes, because a client that is still sending when the
+        connection closes does not receive the response.
         """
         most, kept, size = self.settings.max_body, bytearray(), 0
         deadline = time.monotonic() + self.settings.timeout

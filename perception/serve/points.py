@@ -1,4 +1,4 @@
-"""An instance's points as bytes."""
+"""Encoding of an instance's points as NPZ or PLY bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`perception serve`: the engine, the application and the socket, together until told to stop."""
+"""`perception serve`: runs the engine, the application and the socket until a signal stops them."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def serve(
     say: Callable[[str], None] | None = None,
     encoders: Callable[[str], Encoder | None] | None = None,
 ) -> None:
-    """Serves the map at `path` until SIGINT or SIGTERM, finishing what is being answered.
+    """Serves the map at `path` until SIGINT or SIGTERM; running requests are finished.
 
     InputError when the map cannot be opened, the port is taken, or the packages of the extra `serve` are missing.
-    say: told the address in one line once requests are accepted; by default standard error.
+    say: called with the address in one line once requests are accepted; by default it writes to standard error.
     """
     for package in ("fastapi", "uvicorn"):
         if importlib.util.find_spec(package) is None:
@@ -58,7 +58,7 @@ def serve(
         config = uvicorn.Config(
             connections.watched(build_app(engine, settings)),
             http=connections.protocol_class(),
-            proxy_headers=False,  # they name the client that the rate is counted for, and anybody can write them
+            proxy_headers=False,  # a client could forge them to evade its rate limit
             log_level="warning",
             lifespan="off",
             server_header=False,
@@ -69,7 +69,7 @@ def serve(
 
 
 def _tell_photos(engine: QueryEngine, settings: ServeSettings, say: Callable[[str], None]) -> None:
-    """Runs in a thread of its own: the photos' disk may not answer."""
+    """Reports folders of photos that are not shown. In its own thread, because the photos' disk may hang."""
     for folder in folders_needed(engine.current, (engine.path, *settings.photos))[:3]:
         say(f"note: photos in {folder} are not shown; --photos {shlex.quote(str(folder))} would show them")
 

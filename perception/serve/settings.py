@@ -1,4 +1,4 @@
-"""How a map is served, checked before anything is opened."""
+"""The settings of the HTTP server, checked before anything is opened."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A map in the browser: walk through it, ask, pick, correct, save (`perception view`)."""
+"""A map viewer in the browser, with queries, selection and corrections (`perception view`)."""
 
 from perception.viewer.app import Viewer, start_viewer
 

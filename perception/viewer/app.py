@@ -1,4 +1,4 @@
-"""The viewer's page: viser's splat renderer and controls around a `Session`."""
+"""The viewer's web page: viser's splat renderer and the controls of a `Session`."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from perception.viewer.session import Session
 from perception.viewer.splats import Splats
 
 FRUSTUM_PHOTO = 96
-"""Pixels of the longer side of the photo drawn in a camera's frustum."""
+"""Pixels of the longer side of the photo drawn in a camera frustum."""
 
 FIRST_LOOK = 1.0
-"""Seconds that a browser has for the coarse picture before the whole map follows."""
+"""Seconds between the coarse picture in a new browser and the whole map."""
 WATCH = 1.0
-"""Seconds between looks at whether another program changed the map."""
+"""Seconds between checks whether another program changed the map."""
 
 
 class Viewer:
-    """A running page. `address` is where, `url` the same with the token that opens it; `stop` ends it."""
+    """A running viewer page. `address`: its URL; `url`: the same with the access token; `stop` closes it."""
 
     def __init__(self, path: Path, host: str = "127.0.0.1", port: int = 8090, token: str | None = None):
         check_address(host, port, token)
@@ -41,15 +41,15 @@ class Viewer:
         token = token or secrets.token_urlsafe(24)
         with contextlib.ExitStack() as undo:
             sock = undo.enter_context(listen(host, port))
-            # Who can open a page on this machine may read its files; others get no file that a received map names.
+            # Local users may see any photo. Remote users see only those in the map's folder: a map may name any file.
             self.session = Session(path, None if is_local(host) else (path,))
             label = f"perception · {path.name}"
             self.server = guarded_server(Guard(token, host), sock, host=host, port=port, label=label, verbose=False)
-            undo.pop_all()  # the socket is the server's now
+            undo.pop_all()  # the server owns the socket from here on
         shown = "localhost" if host in ("127.0.0.1", "0.0.0.0", "::") else url_host(host)
         self.address = f"http://{shown}:{sock.getsockname()[1]}"
         self.url = f"{self.address}/?token={quote(token, safe='')}"
-        self._one = threading.RLock()  # what browsers ask for is done one after the other
+        self._one = threading.RLock()  # the actions of all browsers run one at a time
         self._overlays: dict[str, list[Any]] = {"cameras": [], "boxes": [], "names": []}
         self._overlays_on = dict.fromkeys(self._overlays, False)
         self._frame_map()
@@ -67,13 +67,13 @@ class Viewer:
     def stop(self) -> None:
         """Closes the page and its port."""
         self._stopped.set()
-        with contextlib.redirect_stdout(io.StringIO()):  # viser says goodbye there too
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints there
             self.server.stop()
 
     # ------------------------------------------------------------------ drawing
 
     def _frame_map(self) -> None:
-        """Up, the first camera, and the scale: the page keeps half precision, so the map is brought to size 10."""
+        """Sets up direction, first camera and scale. The page uses half precision, so the map is scaled to size 10."""
         gmap = self.session.editor.original
         low, high = np.percentile(gmap.means, [5, 95], axis=0) if len(gmap) else (np.zeros(3), np.ones(3))
         self.scale = 10 / max(float(np.linalg.norm(high - low)), 1e-9)
@@ -89,7 +89,7 @@ class Viewer:
         camera.look_at = tuple((eye + pose[2, :3] * max(float(depth), 1e-6)) * self.scale)
 
     def _welcome(self, client: Any) -> None:
-        """A new browser: the coarse picture, and the whole one when it has had time to draw that."""
+        """Draws the map in a new browser: the coarse picture, and the whole map FIRST_LOOK seconds later."""
         with self._one:
             self._show(client)
         if self._splats.coarse:
@@ -99,12 +99,12 @@ class Viewer:
 
     def _show(self, client: Any) -> None:
         if client.client_id not in self.server.get_clients():
-            return  # it left in the meantime
+            return  # it disconnected in the meantime
         camera = self._camera_of(client) if self.session.mode == "depth" else None
         self._splats.show(client, self.session.colors(camera), self.session.opacities())
 
     def redraw(self) -> None:
-        """Colours and opacities anew in every browser, in one message each; overlays that are on follow."""
+        """Sends colours and opacities to every browser, in one message each, and redraws the visible overlays."""
         with self._one:
             clients = self.server.get_clients().values()
             if self._drawn is not self.session.editor.original:
@@ -209,7 +209,7 @@ class Viewer:
         self.guarded(lambda: self.session.pick(origin, direction, add))
 
     def guarded(self, action: Callable[[], object], client: Any = None, edited: bool = False) -> None:
-        """Runs what a control asks for; what is wrong is told in the page, and everything is drawn anew."""
+        """Runs the action of a control, then redraws everything. An InputError is shown in the page instead."""
         with self._one:
             try:
                 action()
@@ -222,11 +222,11 @@ class Viewer:
             self.redraw()
 
     def _watch(self) -> None:
-        """Follows a map that another program changes: at once, or when what is unsaved here has been dealt with."""
+        """Reopens a map that another program changed, as soon as the unsaved edits here fit it or are gone."""
         while not self._stopped.wait(WATCH):
             try:
                 outdated, problem = self.session.editor.outdated, ""
-            except InputError as error:  # gone; between two renames for an instant only
+            except InputError as error:  # missing; for an instant also between the two renames of a save
                 outdated, problem = False, str(error)
             if outdated:
                 problem = self._follow()
@@ -236,7 +236,7 @@ class Viewer:
             self._problem = problem
 
     def _follow(self) -> str:
-        """Takes over the changed map; returns what is in the way, if something is."""
+        """Reopens the changed map; returns the reason when that fails, else an empty text."""
         with self._one:
             try:
                 if not self.session.editor.outdated:
@@ -253,7 +253,7 @@ class Viewer:
 def start_viewer(path: Path, host: str = "127.0.0.1", port: int = 8090, token: str | None = None) -> Viewer:
     """Opens a map in a page at http://host:port (port 0: any free one).
 
-    token: what opens the page; None makes one up, and is refused where other machines can reach `host`.
-    Raises InputError for no map, a port in use, an address without a token, or viser missing.
+    token: the access token; None generates one, which is refused where other machines can reach `host`.
+    Raises InputError when `path` is no map, the port is in use, the token is missing, or viser is not installed.
     """
     return Viewer(Path(path), host, port, token)

@@ -1,4 +1,4 @@
-"""The selection as a file for the person's own disk."""
+"""Export of the selection as a PLY file for download."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from perception.viewer.paint import base_colors
 
 
 def selection_ply(gmap: Map, chosen: list[int]) -> bytes:
-    """A binary PLY of the chosen instances' Gaussian means: x y z, red green blue, instance_id."""
+    """A binary PLY of the chosen instances' means: x y z, red green blue, instance_id. InputError for no instance."""
     if not chosen:
         raise InputError("nothing is selected; click a thing first")
     rows = np.isin(gmap.instance_ids, chosen)

@@ -1,8 +1,8 @@
-"""Who may use the viewer's page: a check of every HTTP request and websocket handshake, before viser sees it.
+"""Access control of the viewer: checks every HTTP request and websocket handshake before viser handles it.
 
-Any web page that the same browser shows can open a connection to this machine, and viser accepts all of them. Three
-checks keep others out: the Host header names this machine (against DNS rebinding), a websocket's Origin is the page
-that this server sent, and the browser has the token. The token comes in the printed address and is kept as a cookie.
+Any web page in the same browser can open a connection to this machine, and viser accepts all of them. Three checks
+reject other clients: the Host header names this machine (against DNS rebinding), a websocket's Origin is the page that
+this server sent, and the browser sends the token. The token is in the printed address and is kept as a cookie.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _patching = threading.Lock()
 
 
 class Guard:
-    """Answers what must not reach viser. token: what the browser must show; host: where the server listens."""
+    """Rejects requests before viser handles them. token: the access token; host: the address that is listened on."""
 
     def __init__(self, token: str, host: str) -> None:
         self._token, self._host = token.encode(), host
@@ -59,7 +59,7 @@ class Guard:
         if not any(self._right(value) for value in _cookies(request, cookie)):
             return _answer(HTTPStatus.FORBIDDEN, "open the address with the token that perception view printed")
         if query:
-            # viser's page would connect to any server that ?websocket=… names, and run what that one sends.
+            # viser's page connects to any server given by ?websocket=… and executes the messages from there.
             return _answer(HTTPStatus.SEE_OTHER, "", {"Location": "/"})
         return None
 
@@ -68,7 +68,7 @@ class Guard:
 
 
 def _only(request: Any, name: str) -> str | None:
-    """A header that is there once, else None."""
+    """The value of a header that occurs exactly once, else None."""
     values = request.headers.get_all(name)
     return values[0] if len(values) == 1 else None
 
@@ -91,11 +91,11 @@ def _answer(status: HTTPStatus, line: str, headers: dict[str, str] | None = None
 
 
 def guarded_server(guard: Guard, sock: socket.socket, **settings: Any) -> Any:
-    """A viser.ViserServer that listens on `sock` and lets `guard` answer first. settings: of ViserServer.
+    """A viser.ViserServer that listens on `sock` and calls `guard` before it answers. settings: of ViserServer.
 
-    viser 1.1 offers no such hook. It starts its server by `websockets.asyncio.server.serve`, whose documented argument
-    `process_request` is called with each request before a handshake, and `sock` says where to listen: that function is
-    replaced while the server starts. Raises InputError when viser starts its server in another way.
+    viser 1.1 has no such hook. It starts its server by `websockets.asyncio.server.serve`, which has two documented
+    arguments: `process_request` is called with each request before a handshake, and `sock` is the socket to listen on.
+    This function is replaced while viser starts. Raises InputError when viser starts its server in another way.
     """
     import viser
     import websockets.asyncio.server as ws
@@ -108,7 +108,7 @@ def guarded_server(guard: Guard, sock: socket.socket, **settings: Any) -> Any:
         check = _process_request(guard, process_request)
         return original(handler, None, None, sock=sock, process_request=check, **rest)
 
-    with _patching, contextlib.redirect_stdout(io.StringIO()):  # viser greets on stdout, which belongs to --json
+    with _patching, contextlib.redirect_stdout(io.StringIO()):  # viser prints on stdout, which is reserved for --json
         ws.serve = serve  # type: ignore[assignment,misc]
         try:
             server = viser.ViserServer(**settings)

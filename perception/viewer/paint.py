@@ -1,4 +1,4 @@
-"""What colour every Gaussian has in the viewer."""
+"""The colours of the Gaussians in the viewer, by display mode."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HIGHLIGHT = np.array([255, 214, 10], np.uint8)
 
 
 def base_colors(gmap: Map) -> np.ndarray:
-    """[N, 3] uint8: each Gaussian's colour seen from anywhere (its constant harmonic)."""
+    """[N, 3] uint8: the part of each Gaussian's colour that does not depend on the view (harmonic of degree 0)."""
     return rgb8_from_sh(gmap.sh[:, 0])
 
 
@@ -25,9 +25,8 @@ def paint(
 ) -> np.ndarray:
     """[N, 3] uint8 colours in a mode of MODES.
 
-    ids [N]: instance (or part) of each Gaussian, −1 = none (grey where instances are shown). scores: instance →
-    confidence.
-    from_above: camera_from_world [4, 4] that depth is measured from.
+    ids [N]: instance (or part) of each Gaussian, −1 = none (grey in those modes). scores: confidence by instance id.
+    from_above: camera_from_world [4, 4] of the camera that depth is measured from; None = identity.
     """
     if mode in ("instances", "parts"):
         return instance_palette(ids)

@@ -1,4 +1,4 @@
-"""The controls beside the scene: ask, show, select, correct."""
+"""The viewer's control panel: queries, display, selection, corrections."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from perception.viewer.session import Session
 
 
 class Page(Protocol):
-    """What the panel needs of the page it belongs to."""
+    """The interface of the page that the panel uses."""
 
     session: Session
     server: Any
@@ -28,17 +28,17 @@ class Page(Protocol):
 
 
 def escaped(text: str) -> str:
-    """`text` as Markdown that shows exactly these characters: viser renders HTML in it, and names are anybody's.
+    """`text` as Markdown that shows exactly these characters: viser renders HTML in it, and names are untrusted.
 
-    Every ASCII punctuation character becomes a character reference, which Markdown never takes for structure. The
-    characters that make a web or mail address one are set apart by an invisible element, else viser makes it a link.
+    Every ASCII punctuation character becomes a character reference, which Markdown does not parse as syntax. An
+    invisible element precedes the characters of web and mail addresses (. : @), else viser makes links of these.
     """
     shown = (f"&#{ord(c)};" if c in string.punctuation else c for c in " ".join(text.split()))
     return re.sub("(&#(?:46|58|64);)", r"<wbr>\1", "".join(shown))  # . : @
 
 
 class Panel:
-    """Builds viser's controls and keeps their words true."""
+    """Builds viser's controls and updates their texts."""
 
     def __init__(self, viewer: Page):
         self.viewer = viewer
@@ -145,20 +145,20 @@ class Panel:
 
         client.send_file_download("selection.ply", selection_ply(self.session.editor.current(), self.session.selected))
 
-    # ------------------------------------------------------------------- words
+    # ------------------------------------------------------------------- texts
 
     def tell(self, client: Any, text: str) -> None:
-        """A notice in the browser that asked, or in all."""
+        """Shows a notification in one browser, or in all when `client` is None."""
         receivers = [client] if client is not None else list(self.viewer.server.get_clients().values())
         for receiver in receivers:
             receiver.add_notification("perception", text, auto_close_seconds=8, color="orange")
 
     def offer_renewal(self, offered: bool) -> None:
-        """Shows or hides the button that drops the corrections for a map that another program put there."""
+        """Shows or hides the button that drops the corrections and opens the map of another program."""
         self._renew.visible = offered
 
     def refresh(self) -> None:
-        """Every word of the panel from the session's state."""
+        """Updates all texts of the panel from the session's state."""
         session, editor = self.session, self.session.editor
         unit = "m" if editor.original.info.get("metric") else "map units"
         self._facts.content = f"**{int(editor.kept.sum()):,} Gaussians · instances: {len(editor.instances)}**"
@@ -179,7 +179,7 @@ class Panel:
                 + (f"  \n{len(entry['parts'])} parts; Split takes it apart" if entry.get("parts") else "")
             )
             named = (entry["id"], entry.get("label"))
-            if named != self._named:  # else somebody may be typing there
+            if named != self._named:  # else keep what a user is typing there
                 self._named = named
                 self._name.value = entry.get("label") or ""
             self._show_photo(session.crop(entry["id"]))

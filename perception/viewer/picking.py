@@ -1,4 +1,4 @@
-"""Which instance a ray meets first."""
+"""Picking: the instance that a ray through the map shows."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import numpy as np
 from perception.io.store import Map
 
 PIXEL = 0.0015
-"""Radians that a click covers: about a pixel of a laptop's window. Thinner Gaussians count as that wide."""
+"""Angle of a click in radians: about a pixel of a laptop's window. Thinner Gaussians are widened to it."""
 SEEN = 0.15
-"""Least share of the ray's light that must come from one instance for it to be the answer."""
+"""Smallest summed weight on the ray, in [0, 1], at which an instance is picked."""
 
 
 def responses(
     means: np.ndarray, quats: np.ndarray, scales: np.ndarray, origin: np.ndarray, direction: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where along a ray each Gaussian is strongest, and how strong: (t [N], exp(−½ d²) [N]); 0 behind the origin.
+    """The ray parameter t [N] where each Gaussian is largest, and its value exp(−½ d²) [N]; 0 behind the origin.
 
     In the Gaussian's own axes, scaled to a unit ball, the ray o + t d is nearest the centre at t = −o·d / d·d.
     """
@@ -44,7 +44,7 @@ def pick(gmap: Map, ids: np.ndarray, shown: np.ndarray, origin: np.ndarray, dire
     origin, direction = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
     if not np.isfinite([origin, direction]).all() or not direction.any():
         return None
-    # Only Gaussians within four radii of the ray can matter: the cheap test first.
+    # A cheap test first: only Gaussians within four radii of the ray contribute.
     unit = direction / np.linalg.norm(direction)
     away = gmap.means - origin
     along = away @ unit
@@ -67,7 +67,7 @@ def pick(gmap: Map, ids: np.ndarray, shown: np.ndarray, origin: np.ndarray, dire
 
 
 def covariances(gmap: Map) -> np.ndarray:
-    """[N, 3, 3] float32 second moments R S Sᵀ Rᵀ."""
+    """[N, 3, 3] float32 covariance matrices R S Sᵀ Rᵀ of the Gaussians."""
     norms = np.linalg.norm(gmap.quats, axis=1, keepdims=True)
     quats = np.where(norms > 0, gmap.quats / np.where(norms > 0, norms, 1), np.array([1, 0, 0, 0], np.float32))
     w, x, y, z = quats.astype(np.float32).T

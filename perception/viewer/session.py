@@ -1,4 +1,4 @@
-"""What the viewer shows and knows, without any browser: an edited map, a question and its hits, a selection."""
+"""The viewer's state, without any browser: an edited map, a prompt and its hits, a selection."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CROP_SIDE = 320
 
 
 class Session:
-    """Shared by all browsers of one viewer: they see the same map, and edits come one after the other."""
+    """The state shared by all browsers of one viewer: they see the same map, and edits are applied one at a time."""
 
     def __init__(self, path: Path, folders: Sequence[Path] | None = None):
         """folders: where photos may be read, None = anywhere (see `best_crop`)."""
@@ -49,9 +49,9 @@ class Session:
         return self._opened[1]
 
     def ask(self, text: str, top_k: int = 5, parts: bool = False) -> list[Hit]:
-        """Ranked hits, which are then highlighted; empty when the text is not present. Hidden ones are left out.
+        """Ranked hits, which are then highlighted; empty when the text is not present. Hidden instances are left out.
 
-        parts: hits are parts of things, each with its `parent`, as "handle of the mug".
+        parts: search parts of instances, such as "handle of the mug"; each hit then has its `parent`.
         """
         with self._lock:
             hidden = {entry["id"] for entry in self.editor.instances if entry.get("hidden")}
@@ -65,14 +65,14 @@ class Session:
             return self.hits
 
     def show_hit(self, hit: Hit) -> None:
-        """Selects what was found; of a part the thing it belongs to, with the part highlighted."""
+        """Selects the instance of a hit; for a part its parent, with the part highlighted."""
         self.select(_whole(hit))
         self.part = hit.instance_id if hit.parent is not None else None
 
     # --------------------------------------------------------------- selecting
 
     def select(self, instance: int | None, add: bool = False) -> None:
-        """Selects an instance, or takes it in and out of the selection; None selects nothing."""
+        """Selects an instance, or with `add` toggles it in the selection. None clears the selection, unless `add`."""
         with self._lock:
             self.part = None
             if instance is None:
@@ -85,7 +85,7 @@ class Session:
                 self.selected = [*self.selected, instance]
 
     def pick(self, origin: np.ndarray, direction: np.ndarray, add: bool = False) -> int | None:
-        """Selects what a ray in the map frame meets first."""
+        """Selects the instance that a ray in the map frame shows, and returns its id."""
         instance = pick(self.editor.original, self.editor.ids, self.shown(), origin, direction)
         self.select(instance, add)
         return instance
@@ -99,7 +99,7 @@ class Session:
     # ----------------------------------------------------------------- editing
 
     def edited(self) -> None:
-        """To be called after an edit: what no longer exists is no longer selected."""
+        """To be called after an edit: removes what no longer exists from the selection and the hits."""
         with self._lock:
             self._edits += 1
             known = {entry["id"] for entry in self.editor.instances}
@@ -109,7 +109,7 @@ class Session:
             self.hits = [hit for hit in self.hits if hit.instance_id in (known if hit.parent is None else parts)]
 
     def reopen(self, discard: bool = False) -> None:
-        """Takes over the map that another program left there, with what is unsaved here (see Editor.reopen)."""
+        """Opens the map that another program changed and applies the unsaved edits to it (see Editor.reopen)."""
         with self._lock:
             self.editor.reopen(discard)
             self.views = self._views()
@@ -123,7 +123,7 @@ class Session:
         return np.asarray(self.editor.kept & ~np.isin(self.editor.ids, hidden))
 
     def colors(self, camera_from_world: np.ndarray | None = None) -> np.ndarray:
-        """[N, 3] uint8 in the present mode, the selection (or the hits) highlighted."""
+        """[N, 3] uint8 in the current mode, with the selection (or the hits) highlighted."""
         scores = {int(entry["id"]): float(entry["score"]) for entry in self.editor.instances}
         ids, parts = self.editor.ids, self.editor.part_ids
         shown = np.where(parts >= 0, parts, ids) if self.mode == "parts" else ids
@@ -133,19 +133,19 @@ class Session:
         return highlight(colors, ids, self.lit())
 
     def lit(self) -> list[int]:
-        """The instances that stand out: the selected ones, else all that were found; empty when all are alike."""
+        """The highlighted instances: the selected ones, else those of all hits; empty when there are neither."""
         return self.selected or [_whole(hit) for hit in self.hits]
 
     def opacities(self) -> np.ndarray:
-        """[N] float32, 0 for what is not shown."""
+        """[N] float32 opacities; 0 for Gaussians that are not shown."""
         return np.where(self.shown(), self.editor.original.opacities, 0).astype(np.float32)
 
     def name(self, entry: dict[str, Any]) -> str:
-        """How an instance is called: by its label, else by its number."""
+        """The name of an instance in the viewer: its label, else its id."""
         return entry.get("label") or f"instance {entry['id']}"
 
     def crop(self, instance: int) -> np.ndarray | None:
-        """The best photo of an instance, cut out with a margin; None when no photo of it can be read."""
+        """The crop of an instance from its best photo; None when no photo of it can be read."""
         try:
             return best_crop(self._loaded(), instance, CROP_SIDE, self.folders)
         except InputError:
@@ -153,5 +153,5 @@ class Session:
 
 
 def _whole(hit: Hit) -> int:
-    """The instance that a hit is, or is a part of."""
+    """The instance id of a hit; for a part, that of its parent."""
     return hit.instance_id if hit.parent is None else hit.parent

@@ -1,4 +1,4 @@
-"""The map's Gaussians in every browser: a coarse picture at once, then all of them."""
+"""Sends the map's Gaussians to every browser: a coarse picture at once, then all of them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from perception.io.store import Map
 from perception.viewer.picking import covariances
 
 FIRST = 25_000
-"""Gaussians that a browser gets first (0.8 MB): what a slow line or a computer without a GPU shows within seconds."""
+"""Number of Gaussians sent first (0.8 MB): drawn in seconds on a slow connection or a computer without a GPU."""
 
 
 class Splats:
-    """Sends each browser its own copy, since each has its own camera and comes and goes by itself."""
+    """Sends the Gaussians to each browser separately, because each has its own camera and connects on its own."""
 
     def __init__(self, gmap: Map, scale: float):
         self.centers = (gmap.means * np.float32(scale)).astype(np.float32)
@@ -25,7 +25,7 @@ class Splats:
         self._lock = threading.Lock()
 
     def show(self, client: Any, colors: np.ndarray, opacities: np.ndarray) -> None:
-        """Draws in one browser, at first the coarse picture only; colors [N, 3] uint8, opacities [N] in [0, 1]."""
+        """Draws in one browser; the first call sends the coarse picture only. colors [N, 3] uint8, opacities [N]."""
         with self._lock:
             handle = self._handles.get(client.client_id)
             if handle is None:
@@ -38,11 +38,11 @@ class Splats:
 
     @property
     def coarse(self) -> bool:
-        """Whether the first picture lacks Gaussians that the second brings."""
+        """Whether the coarse picture lacks Gaussians, so that a second one must follow."""
         return len(self.first) < len(self.centers)
 
     def forget(self, client: Any) -> None:
-        """To be called when a browser has gone."""
+        """To be called when a browser has disconnected."""
         with self._lock:
             self._handles.pop(client.client_id, None)
 
