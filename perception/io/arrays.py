@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import struct
+import sys
 import tokenize
 import zipfile
 import zlib
@@ -79,10 +80,14 @@ def _read_npy(stream: IO[bytes], size: int) -> np.ndarray:
     version = _version(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = read(stream)
-    if dtype.hasobject or dtype.itemsize == 0:
+    if dtype.hasobject or dtype.itemsize == 0 or dtype.fields is not None:
         raise ValueError(f"an array of {dtype}")
     needed, left = math.prod(shape) * dtype.itemsize, size - stream.tell()
     if min(shape, default=0) < 0 or needed != left:
         raise ValueError(f"an array of shape {shape} needs {needed} bytes, {left} are there")
     data = bytearray(stream.read(needed))  # writable, unlike the bytes
+    if dtype.kind == "U":  # numpy makes text of any code point; Python's own functions then fail on it
+        codes = np.frombuffer(data, np.dtype(np.uint32).newbyteorder(dtype.byteorder))
+        if codes.max(initial=0) > sys.maxunicode:
+            raise ValueError(f"text with the code point {codes.max():#x}, expected at most {sys.maxunicode:#x}")
     return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")

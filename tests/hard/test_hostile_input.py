@@ -17,7 +17,7 @@ import perception
 from perception import _core
 from perception.config import load_config
 from perception.errors import InputError
-from perception.io.arrays import map_npy
+from perception.io.arrays import map_npy, read_npz
 from perception.io.camera_file import read_camera
 from perception.io.cloud import read_cloud
 from perception.io.colmap import read_workspace
@@ -223,6 +223,19 @@ def test_npz_files_that_hold_no_arrays(tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "a.npz"
     file.write_bytes(content)
     refused(read_cloud, file, match="a.npz: (cannot be read|expected an array 'points')")
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_text_of_code_points_that_do_not_exist(order: str, tmp_path: Path) -> None:
+    """Unicode ends at 0x10ffff; numpy takes any 32 bits, and str() of them raises SystemError."""
+    good = np.array(["a.jpg", "\U0010ffff"], np.dtype("U5").newbyteorder(order))
+    file = tmp_path / "names.npz"
+    file.write_bytes(npz(**{"names": npy(good)}))
+    assert read_npz(file, file, "")["names"].tolist() == good.tolist()
+    last = 0x10FFFF.to_bytes(4, "little" if order == "<" else "big")
+    beyond = 0x110000.to_bytes(4, "little" if order == "<" else "big")
+    file.write_bytes(npz(**{"names": npy(good).replace(last, beyond)}))
+    refused(read_npz, file, file, "", match="code point 0x110000")
 
 
 def test_an_npy_header_longer_than_its_file_is_not_asked_for(tmp_path: Path) -> None:
