@@ -1,8 +1,8 @@
-"""Where Gaussians are added and removed: growth by screen-space gradient under a hard budget, pruning of the unneeded.
+"""Adaptive density control: adds Gaussians by screen-space gradient up to a fixed budget, and prunes Gaussians.
 
-The rules are those of Kerbl et al. 2023 §5.2 (clone the small, split the large), with three changes that hold a budget:
-candidates are ranked and only the best fill the schedule's room; a clone's opacities are corrected so that the picture
-does not jump (Rota Bulò et al. 2024, eq. 11); opacities decay a little instead of being reset.
+Small Gaussians are cloned and large ones split (Kerbl et al. 2023, §5.2), with three changes. Candidates are ranked by
+gradient, and only as many as the budget allows are used. The opacities of a clone and its original are corrected to
+preserve the rendered image (Rota Bulò et al. 2024, eq. 11). Opacities decay a little instead of being reset.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ import torch
 from perception.gaussians.model import Gaussians, sigmoid
 
 START, STOP = 0.05, 0.6
-"""Progress between which the number of Gaussians grows."""
+"""Progress at which the number of Gaussians begins and ends to grow."""
 PERCENT_DENSE = 0.01
-"""Share of the scene's extent above which a Gaussian is split, below which it is cloned (Kerbl et al. 2023)."""
+"""A Gaussian is split if its largest scale exceeds this share of the scene extent, else cloned (Kerbl et al. 2023)."""
 PRUNE_OPACITY = 0.005
 OPACITY_DECAY = 1e-2
-"""Share of every opacity that is taken off before each densification."""
+"""Share by which every opacity is reduced before each densification."""
 SPLIT_SHRINK = 1.6
 """Scales of the two halves of a split Gaussian are divided by this (Kerbl et al. 2023)."""
 
@@ -38,7 +38,7 @@ class Statistics:
         return Statistics(*(torch.zeros(count) for _ in range(3)))
 
     def add(self, gradient_px: torch.Tensor, radius_px: torch.Tensor, visible: torch.Tensor, long_side: int) -> None:
-        """One view's figures: gradient_px [N] per pixel, radius_px [N] pixels, visible [N] bool."""
+        """Adds one view: gradient_px [N] per pixel, radius_px [N] pixels, visible [N] bool, long_side in pixels."""
         self.gradient += torch.where(visible, gradient_px * (0.5 * long_side), 0.0)
         self.seen += visible
         self.radius = torch.maximum(self.radius, torch.where(visible, radius_px / long_side, 0.0))
@@ -71,8 +71,8 @@ def densify(
 ) -> Change:
     """Prunes, then clones or splits the best candidates while there are at most `allowed` Gaussians.
 
-    extent: scene size in world units. grad_threshold: mean gradient (see Statistics) from which one grows. The result
-    depends on the arguments alone, not on global random state.
+    extent: scene size in world units. grad_threshold: mean gradient (see Statistics) above which a Gaussian is
+    cloned or split. Opacities of cloned Gaussians change in place. Global random state is not used.
     """
     needed = _needed(gaussians, statistics)
     room = max(0, allowed - int(needed.sum()))
@@ -85,7 +85,7 @@ def densify(
     large = gaussians.log_scales[candidates].max(dim=1).values.exp() > PERCENT_DENSE * extent
     split, clone = candidates[large], candidates[~large]
 
-    # A clone and its original share the light: o' = 1 − sqrt(1 − o) keeps what both show together.
+    # Rota Bulò et al. 2024, eq. 11: clone and original get o' = 1 − sqrt(1 − o); both together have opacity o.
     halved = _halved_logit(gaussians.opacity_logits[clone])
     gaussians.opacity_logits[clone] = halved
     needed[split] = False
@@ -95,7 +95,7 @@ def densify(
 
 
 def decay_opacities(gaussians: Gaussians) -> None:
-    """Multiplies every opacity by 1 − OPACITY_DECAY: what no photo holds up fades and is pruned."""
+    """Multiplies every opacity by 1 − OPACITY_DECAY in place. Gaussians that no photo supports fade and are pruned."""
     opacities = gaussians.opacities * (1 - OPACITY_DECAY)
     gaussians.opacity_logits.copy_(torch.logit(opacities.clamp(1e-6, 1 - 1e-6)))
 
@@ -114,7 +114,7 @@ def _halved_logit(logits: torch.Tensor) -> torch.Tensor:
 
 
 def _halves(gaussians: Gaussians, index: torch.Tensor, generator: torch.Generator) -> list[Gaussians]:
-    """Two children of each Gaussian in `index`, drawn from it and shrunk."""
+    """Two children of each Gaussian in `index`: means sampled from it, scales divided by SPLIT_SHRINK."""
     rotations = rotation_matrices(gaussians.quats[index])
     children = []
     for _ in range(2):

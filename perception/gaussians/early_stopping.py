@@ -1,8 +1,8 @@
-"""Early stopping: growth, harmonics and iterations end when what they gain no longer pays for their time.
+"""Early stopping of growth, of spherical harmonics and of training, by the PSNR gained per training time.
 
-The course of training is cut into trials of 5 %. At the end of each the held-out PSNR is taken (of training views where
-nothing is held out). Time is counted in iterations, so that a run repeats. `train.exchange_db` is the dB that 10 % more
-time must gain.
+Training progress is divided into trials of 5 %. At the end of each trial PSNR is measured on held-out views, or on
+training views if there are none. Time is counted in iterations, so that runs are repeatable. `train.exchange_db` is the
+gain in dB required of 10 % more time.
 """
 
 from __future__ import annotations
@@ -11,21 +11,21 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 TRIAL = 0.05
-"""Length of a trial, as a share of the whole course."""
+"""Length of a trial, as a share of training progress."""
 CEILING = 45.0
-"""dB beyond which nothing is gained: errors of 1.4 grey levels of 255, less than a photo's own noise."""
+"""PSNR in dB above which gains are not counted: an RMS error of 1.4 of 255 grey levels, below a photo's noise."""
 COST_EXPONENT = 0.6
-"""An iteration's time grows like the number of Gaussians to this power (`perception bench scaling`)."""
+"""The time of an iteration grows with the number of Gaussians to this power (`perception bench scaling`)."""
 HARMONICS_GAIN = 0.05
-"""dB of held-out PSNR that the highest degree of harmonics must be worth to stay."""
+"""Least gain in held-out PSNR, in dB, for which the highest degree of harmonics is kept."""
 
 
 @dataclass
 class EarlyStopping:
-    """What was measured and decided so far; its fields are plain values and go into a checkpoint as they are.
+    """Measurements and decisions so far. All fields are plain values and are stored in the checkpoint.
 
-    asked_db: dB that 10 % more time must gain. scores, counts: PSNR in dB and number of Gaussians at the end of each
-    trial. growing: Gaussians may be added. degree_decided: the degree of harmonics is final. finished: only the
+    asked_db: gain in dB required of 10 % more time. scores, counts: PSNR in dB and number of Gaussians at the end of
+    each trial. growing: Gaussians may be added. degree_decided: the degree of harmonics is final. finished: only the
     cool-down is left. due: progress at which the next trial ends.
     """
 
@@ -38,17 +38,17 @@ class EarlyStopping:
     due: float = TRIAL
 
     def gain(self) -> float | None:
-        """dB that the best PSNR gained over the last two trials, up to CEILING; None before there are three."""
+        """Gain of the best PSNR over the last two trials in dB, counted up to CEILING; None before three trials."""
         if len(self.scores) < 3:
             return None
         return min(max(self.scores), CEILING) - min(max(self.scores[:-2]), CEILING)
 
     def growth_pays(self, allowed: int) -> str | None:
-        """None while growth pays; else why it ends. allowed: Gaussians at the end of the next trial, at most.
+        """None while growth is worthwhile, else the reason it ends. allowed: most Gaussians after the next trial.
 
-        All that two trials gained, by growth and by training alone, bounds what growth gained in them; when even that
-        is less than the next trial's growth costs, growth does not pay. The next trial is taken to add as many as the
-        last: where little wants to grow, far fewer than are allowed.
+        The PSNR gain of the last two trials includes that of training alone, so it is an upper bound for that of
+        growth. Growth ends when the bound is below the gain required for the next trial's extra time. The next trial
+        is assumed to add as many Gaussians as the last one, which can be far fewer than allowed.
         """
         gain = self.gain()
         if gain is None:
@@ -65,7 +65,7 @@ class EarlyStopping:
         return f"growth: ended at {gaussians} Gaussians, a trial gains {gain / 2:.3f} dB and {asked:.3f} are asked"
 
     def plateau(self, progress: float) -> str | None:
-        """Why training may cool down now; None while it still pays."""
+        """Reason to begin the cool-down now; None while more training is worthwhile."""
         gain = self.gain()
         if gain is None:
             return None
@@ -75,11 +75,11 @@ class EarlyStopping:
         return f"stop: 10 % more time gains {gain / tenths:.3f} dB, {self.asked_db:g} are asked"
 
     def next_degree(self, degree: int, highest: int, score: Callable[[int], float]) -> tuple[int, str | None]:
-        """The degree of harmonics to go on with after a trial, and what was decided, if anything.
+        """The degree of spherical harmonics after a trial, and the decision as text, or None.
 
-        A trial adds a degree up to `highest`. One trial after the last, `score` gives the held-out PSNR with the
-        colours cut to a degree, and the highest degree goes while it is worth less than HARMONICS_GAIN. What a degree
-        gains in its own first trial says little: harmonics learn slowly, and the others make room.
+        Each trial adds one degree up to `highest`. One trial after the last, `score` gives the held-out PSNR with the
+        colours truncated to a degree. The highest degree is removed while it gains less than HARMONICS_GAIN. The gain
+        in a degree's first trial is not used: harmonics converge slowly, and the lower degrees still adapt to them.
         """
         if degree < highest:
             return degree + 1, None

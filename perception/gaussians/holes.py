@@ -1,7 +1,7 @@
-"""Gaussians for the places that have none: growth by gradient copies what is there and never reaches an empty wall.
+"""Adds Gaussians in image regions that the map leaves empty. Densification only copies existing Gaussians.
 
-A view's picture is cut into blocks. A block that the map leaves empty gets one Gaussian as large as the block, of the
-photo's colour, at the depth of the covered blocks around it; the photos then pull it where it belongs.
+Each view is divided into blocks of BLOCK × BLOCK pixels. An empty block gets one Gaussian of the block's size and the
+photo's mean colour there, at a depth taken from the nearest covered blocks. Training then moves it to the surface.
 """
 
 from __future__ import annotations
@@ -17,21 +17,20 @@ from perception.gaussians.render import render
 from perception.gaussians.views import TrainingView
 
 BLOCK = 8
-"""Pixels a side of a block."""
+"""Side of a block in pixels."""
 EMPTY = 0.5
 """A block is empty when its mean opacity is below this."""
 NEIGHBOURS = 12
 FAR = 0.75
-"""Of the depths of the nearest covered blocks this quantile is taken: what has no points is background more often."""
+"""Quantile of the depths of the nearest covered blocks that is used: regions without points are mostly background."""
 OPACITY = 0.5
 
 
 @torch.no_grad()
 def fill_holes(gaussians: Gaussians, views: list[TrainingView], room: int, seed: int) -> tuple[Gaussians, float]:
-    """At most `room` new Gaussians for what `views`, taken in turn, show and the map does not; and the share of the
-    pictures' blocks that was empty.
+    """At most `room` new Gaussians for the empty blocks of `views`, and the share of all blocks that was empty.
 
-    A view is rendered with the Gaussians found for those before it, so that they share what they share.
+    Each view is rendered with the Gaussians added for the views before it, so a hole seen in several is filled once.
     """
     generator = torch.Generator().manual_seed(seed)
     born, empty, blocks = gaussians.rows(torch.zeros(0, dtype=torch.long)), 0, 0
@@ -47,7 +46,7 @@ def fill_holes(gaussians: Gaussians, views: list[TrainingView], room: int, seed:
 
 
 def _blocks(gaussians: Gaussians, view: TrainingView) -> tuple[np.ndarray, np.ndarray]:
-    """Mean opacity, and opacity-weighted depth (0 where nothing is), of each block [h, w]."""
+    """Mean opacity of each block [h, w], and its opacity-weighted mean depth [h, w], 0 where the opacity is 0."""
     height, width = view.photo.shape[:2]
     out = render(gaussians, view.camera_from_world, view.K, width, height, eps2d=view.eps2d)
     images = torch.stack([out.alphas[0], out.depths[0]])[None]
@@ -58,7 +57,7 @@ def _blocks(gaussians: Gaussians, view: TrainingView) -> tuple[np.ndarray, np.nd
 def _placed(
     view: TrainingView, holes: np.ndarray, depths: np.ndarray, like: Gaussians, generator: torch.Generator
 ) -> Gaussians:
-    """One Gaussian for each of the blocks in `holes` [h, w] bool, shaped like the rows of `like`."""
+    """One Gaussian for each True block of holes [h, w]; depths [h, w] of the blocks; tensors shaped as in `like`."""
     from scipy.spatial import cKDTree
 
     covered, empty = np.argwhere(~holes), np.argwhere(holes)
@@ -74,7 +73,7 @@ def _placed(
     K = view.K.numpy()
     rays = np.stack([(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones(len(empty))], axis=1)
     pose = view.camera_from_world.double().numpy()
-    # Sums written out: a matrix product may round otherwise on another number of threads.
+    # Explicit sums: the rounding of a matrix product can depend on the number of threads.
     means = ((rays * depth[:, None] - pose[:3, 3])[:, :, None] * pose[:3, :3]).sum(axis=1)
     colors = torch.nn.functional.avg_pool2d(view.photo.float().permute(2, 0, 1)[None], BLOCK, ceil_mode=True)[0]
     sh = torch.zeros(len(empty), *like.sh.shape[1:])

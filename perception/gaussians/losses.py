@@ -2,9 +2,9 @@
 
     L = L_RGB + λ_inst2D (w_p L_pos + w_n L_neg) + λ_var L_var
 
-All take CPU tensors, float32 or float64, are differentiable once, and sum values in float64. The kernels use
-all processors unless `_core.training.set_threads` says otherwise; the bits do not depend on how many. Keep
-torch itself at one thread beside them: the idle workers of its OpenMP pool spin for milliseconds.
+All losses take CPU tensors of float32 or float64, sum in float64 and are differentiable once. The kernels use
+all processors unless `_core.training.set_threads` limits them. The result does not depend on the number of
+threads, bit for bit. Set torch to one thread: idle workers of its OpenMP pool busy-wait for milliseconds.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ VarianceForm = Literal["paper", "channels", "plain"]
 
 
 def _ready(name: str, tensor: Tensor) -> Tensor:
-    """`tensor` as the kernels read it: CPU, float32 or float64, C order, outside the graph."""
+    """`tensor` detached and in C order, as the kernels need it; InputError unless float32 or float64 on the CPU."""
     if tensor.device.type != "cpu" or tensor.dtype not in (torch.float32, torch.float64):
         found = f"{tensor.dtype} on {tensor.device}"
         raise InputError(f"{name}: found {found}, expected float32 or float64 on the CPU")
@@ -78,14 +78,14 @@ class _Photometric(Function):
 def photometric(
     render: Tensor, target: Tensor | np.ndarray, beta: float = 0.2, weight: Tensor | None = None
 ) -> PhotometricLoss:
-    """L_RGB = (1 − β) L1 + β (1 − SSIM): the value with its parts.
+    """L_RGB = (1 − β) L1 + β (1 − SSIM) (eq. 4), with its parts.
 
     render: [H, W, C] in [0, 1]. target: same shape, of render's dtype in [0, 1], or uint8 (read as x / 255).
-    weight: [H, W] ≥ 0; the loss is the weighted mean over pixels of |x − y| and 1 − SSIM (a masked pixel
-    still lies in its neighbours' windows). All weights 0: loss 0, gradient 0.
+    weight: [H, W] ≥ 0; the loss is the weighted mean over pixels of |x − y| and 1 − SSIM (pixels of weight
+    0 still enter their neighbours' windows). All weights 0: loss 0, gradient 0.
 
     SSIM (Wang et al. 2004): 11 × 11 Gaussian window, σ = 1.5, C1 = .01², C2 = .03², biased moments, zero
-    padding to the input's size, mean over pixels and channels, as 3DGS has it. With β = 0 SSIM is skipped.
+    padding to the input's size, mean over pixels and channels, as in 3DGS. With β = 0 SSIM is skipped.
     """
     image = target if isinstance(target, Tensor) else torch.from_numpy(np.ascontiguousarray(target))
     if render.ndim != 3 or render.shape != image.shape:
@@ -119,9 +119,9 @@ def photometric_loss(
 
 @dataclass(frozen=True)
 class LabelAssignment:
-    """The labels of one photo, ready for the kernels; keep it between iterations if all pixels count.
+    """The labels of one photo as the kernels take them; reusable in all iterations if no pixels are sampled out.
 
-    ids: [M] int32 ascending, 0 left out. counts: [M] int64 pixels. first: [M] int64 a pixel of each label.
+    ids: [M] int32 ascending, 0 left out. counts: [M] int64 pixels. first: [M] int64 index of one pixel of each label.
     slots: [P] int32, each pixel's index into ids or −1. shape: (H, W).
     """
 
@@ -133,10 +133,10 @@ class LabelAssignment:
 
 
 def assign_labels(labels: Tensor | np.ndarray, fraction: float = 1.0, seed: int = 0) -> LabelAssignment:
-    """Reads label image `labels` [H, W] of any integer type (0 = unlabelled, ids need not be dense).
+    """Indexes label image `labels` [H, W] of any integer type (0 = unlabelled, ids need not be dense).
 
-    fraction: each pixel is kept with this probability, decided by a hash of (seed, pixel); M_i then means the
-    kept pixels, and a label without any drops out.
+    fraction: each pixel is kept with this probability, decided by a hash of (seed, pixel); M_i is then the set
+    of kept pixels, and a label without any is left out. InputError for other types, ids or fractions.
     """
     image = np.asarray(labels)
     if image.dtype.kind not in "iu":
@@ -213,8 +213,8 @@ def separation_loss(
 ) -> Tensor:
     """L_neg: mean over pairs of ReLU(γ − ‖z_i − z_j‖²), or of ReLU(γ − ‖z_i − z_j‖) with squared=False.
 
-    prototypes: [M, D]; the pairs are i < j. With others [K, D] (say, prototypes remembered from other views)
-    they are all M·K pairs between the two, differentiable in both. No pair: 0. The gradient of ‖z‖ at 0 is 0.
+    prototypes: [M, D]; the pairs are i < j. With others [K, D] (such as prototypes of other views) the pairs
+    are all M·K between the two, differentiable in both. Without pairs the loss is 0. The gradient of ‖z‖ at 0 is 0.
     """
     if prototypes.ndim != 2 or (others is not None and others.shape[1:] != prototypes.shape[1:]):
         raise InputError(f"separation loss: found {list(prototypes.shape)}, expected [M, D]")
@@ -254,7 +254,7 @@ def instance_loss(
         L_pos = 1/N Σ_i 1/|M_i| Σ_{p ∈ M_i} ‖F(p) − z_i‖²
         L_neg = 2/(N (N − 1)) Σ_{i<j} ReLU(γ − ‖z_i − z_j‖²)
 
-    features: [H, W, D] F. labels: [H, W] integers, 0 = unlabelled, or what `assign_labels` made of them.
+    features: [H, W, D] F. labels: [H, W] integers, 0 = unlabelled, or the result of `assign_labels`.
     The authors' released code differs: per_pixel=True averages L_pos over all labelled pixels instead of per
     mask, squared=False takes the distance unsquared in L_neg. fraction, seed: see `assign_labels`.
     """

@@ -1,4 +1,4 @@
-"""The trainable Gaussians: tensors named for what they store, properties for what they mean."""
+"""The parameters of 3D Gaussians as stored for training, with properties for their activated values."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from perception.colors import rgb_from_sh, sh_from_rgb
 
 
 def sigmoid(logits: torch.Tensor) -> torch.Tensor:
-    """1 / (1 + exp(−x)), the same bits for any number of threads.
+    """Sigmoid 1 / (1 + exp(−x)) of each element; the result does not depend on the number of threads, bit for bit.
 
-    torch.sigmoid's are not beyond 32,768 elements: the last few of each thread's share are computed on another path.
-    exp(80) is the last power of e whose gradient float32 holds; opacities of 1e-35 have none to lose.
+    torch.sigmoid depends on it above 32,768 elements: the last elements of each thread's part take another code path.
+    Logits are clamped to ±80, where float32 still holds exp(x). Opacities near 1e-35 need no gradient.
     """
     return 1 / (1 + torch.exp(-logits.clamp(-80, 80)))
 
@@ -68,9 +68,9 @@ class Gaussians:
 def from_points(
     points: np.ndarray, colors: np.ndarray, *, feature_dim: int, seed: int, opacity: float = 0.1
 ) -> Gaussians:
-    """One isotropic Gaussian a point, as wide as the mean distance to its 3 neighbours (Kerbl et al. 2023, §5.1).
+    """One isotropic Gaussian per point, its scale the RMS distance to the 3 nearest points (Kerbl et al. 2023, §5.1).
 
-    points [P, 3] float; colors [P, 3] uint8. Coincident points get a scale from the cloud's median spacing.
+    points [P, 3] float; colors [P, 3] uint8. Coincident points get the median scale; all are clipped relative to it.
     """
     from scipy.spatial import cKDTree
 

@@ -1,4 +1,4 @@
-"""Adam over the visible Gaussians only."""
+"""Sparse Adam: a step updates only the rows (Gaussians) that a mask selects."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ class SparseAdam:
     rates: name -> learning rate, or a tensor of one rate per column, shaped like a row ([...]), so that for
     example the DC and the higher spherical harmonics share a tensor and still learn at different speeds.
 
-    What "sparse" means, exactly:
-    - A selected row is updated as dense Adam would, also when its gradient is 0: its moments decay and it
-      moves on by what momentum it has.
-    - A row not selected is untouched: its moments do not decay, it does not move.
-    - The bias correction uses the global step count, common to all rows, as in 3DGS. So a row of zero state
-      that enters late takes up to (1 − β1)/√(1 − β2) ≈ 3.2 times the rate at its first step.
-    - A selected row whose gradient holds a NaN or an infinity is left untouched in that tensor, and counted.
+    Semantics of the mask:
+    - A selected row is updated as dense Adam would, also when its gradient is 0: its moments decay,
+      and its momentum still moves it.
+    - A row not selected is unchanged: its moments do not decay, and it does not move.
+    - The bias correction uses the global step count, common to all rows, as in 3DGS. So a row with zero moments
+      that is added late takes up to (1 − β1)/√(1 − β2) ≈ 3.2 times the rate at its first step.
+    - A selected row whose gradient holds a NaN or an infinity is unchanged in that tensor, and counted as skipped.
 
-    With every row selected and every gradient finite this is torch.optim.Adam(eps=1e-15), to rounding.
+    With every row selected and every gradient finite this equals torch.optim.Adam(eps=1e-15) up to rounding.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class SparseAdam:
     def step(self, visible: Tensor | None = None, grads: Mapping[str, Tensor] | None = None) -> StepReport:
         """One step. visible: [N] bool or uint8, None for all. grads: name -> [N, ...], by default each .grad.
 
-        Tensors without a gradient are left alone; the global step count rises by one for all.
+        Tensors without a gradient are not updated; the global step count increases by one for all.
         """
         if visible is not None:
             if visible.shape != (len(self),):
@@ -104,7 +104,7 @@ class SparseAdam:
                 table[name] = _leaf_like(tensor, tensor.detach()[index].contiguous())
 
     def append(self, rows: Mapping[str, Tensor]) -> None:
-        """Appends rows (name -> [M, ...], the same M for all) with zero state."""
+        """Appends rows (name -> [M, ...], the same M for all) with zero moments."""
         if set(rows) != set(self.params):
             raise InputError(f"SparseAdam: append got {sorted(rows)}, expected {sorted(self.params)}")
         for name, new in rows.items():
@@ -116,13 +116,13 @@ class SparseAdam:
         self._check_rows()
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on: copies of params and moments, rates, step count."""
+        """Everything needed to continue: copies of params and moments, rates, step count."""
         tables = {"params": self.params, "first": self._first, "second": self._second}
         copies: dict[str, Any] = {k: {n: t.detach().clone() for n, t in d.items()} for k, d in tables.items()}
         return copies | {"rates": dict(self.rates), "betas": self.betas, "eps": self.eps, "steps": self.steps}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Takes over a `state_dict`; the number of rows may differ from the present one."""
+        """Restores a `state_dict`; the number of rows may differ, different names raise InputError."""
         if set(state["params"]) != set(self.params):
             raise InputError(f"SparseAdam: state has {sorted(state['params'])}, expected {sorted(self.params)}")
         for table, key in ((self.params, "params"), (self._first, "first"), (self._second, "second")):

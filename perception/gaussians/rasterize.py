@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 @dataclass
 class RasterizationStats:
-    """Per-Gaussian figures for densification, in pixels, and what the call cost.
+    """Per-Gaussian values for densification, in pixels, and the cost of the call.
 
     radii: [C, N] three standard deviations along the long axis of the 2D Gaussian, 0 where it is not in view.
     mean2d_grad: [C, N] norm of the loss's gradient with respect to the 2D mean; None until backward has run.
-    evaluated_pairs, contributing_pairs: (Gaussian, pixel) pairs over all cameras: those a register was spent on
-    (some more on wider registers), and those that added colour, the unit in which speed is reported.
+    evaluated_pairs, contributing_pairs: (Gaussian, pixel) pairs over all cameras: those evaluated in SIMD
+    registers (more on wider registers), and those that contributed colour. Speed is reported in the latter.
     seconds: wall clock by stage: project, sort, bin, blend, and from the backward pass blend_backward, reduce.
     """
 
@@ -53,10 +53,10 @@ class Rasterization:
 
 @dataclass(frozen=True)
 class Settings:
-    """How to rasterize. simd: "auto", "avx512", "avx2" or "baseline"; threads: 0 for torch's number.
+    """Rasterization settings. simd: "auto", "avx512", "avx2" or "baseline"; threads: 0 for torch's number.
 
-    max_records: gradient records (one a Gaussian and 64 × 64-pixel tile, 4 (16 + D) bytes in float32) held at once by
-    the backward pass, which takes the picture in parts beyond that; 0: four a visible Gaussian, at least 2**20.
+    max_records: most gradient records (one per Gaussian and 64 × 64-pixel tile, 4 (16 + D) bytes in float32) held at
+    once. The backward pass processes larger images in parts. 0: four per visible Gaussian, at least 2**20.
     """
 
     width: int
@@ -280,8 +280,8 @@ def rasterize(
     viewmats [C,4,4] camera_from_world, Ks [C,3,3] pixels (pixel centres at +0.5, no skew), features [N,D],
     background [3] or [C,3]. float32 or float64, on the CPU. Gradients flow to all of them except Ks.
 
-    eps2d: px² added to the diagonal of every 2D covariance, the square of the blur that a pixel is (gsplat's name).
-    variance=False and depth=False leave out `feature_variance` and `depths` (None then) and save their time.
+    eps2d: px² added to the diagonal of every 2D covariance, the variance of the pixel's blur (named as in gsplat).
+    variance=False and depth=False save time: `feature_variance` and `depths` are not computed (None).
     threads: 0 takes torch.get_num_threads(). The result is the same, bit for bit, for any number of threads.
     Finite inputs up to 1e15 in magnitude give finite images and gradients; InputError names an input that is not
     finite.
@@ -308,7 +308,7 @@ def rasterize(
 def _check(
     tensors: dict[str, Tensor | None], width: int, height: int, sh_degree: int | None, near_plane: float, eps2d: float
 ) -> None:
-    """Names the first argument at fault."""
+    """Raises InputError for the first invalid argument."""
     import torch
 
     means = tensors["means"]

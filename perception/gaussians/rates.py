@@ -1,4 +1,4 @@
-"""Learning rates over the course of training (Kerbl et al. 2023, for a tenth of their iterations)."""
+"""Learning rates as functions of training progress (Kerbl et al. 2023, adapted to a tenth of their iterations)."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import numpy as np
 import torch
 
 MEANS, MEANS_LAST = 1.6e-4, 5e-5
-"""Of the means at the start and the end, times the scene's extent. Kerbl et al. let it fall to a hundredth; a tenth of
-their iterations leaves no time for small steps."""
+"""Rates of the means at the start and at the end, times the scene extent. Kerbl et al. decay to a hundredth; a tenth of
+their iterations is too few for such small steps."""
 QUATS = 1e-3
 SCALES = 1e-2
-"""Of log-scales: twice theirs, as that of the colours; that of the higher harmonics is eight times theirs."""
+"""Rate of the log-scales: twice that of Kerbl et al. COLORS is also twice theirs, HARMONICS eight times theirs."""
 OPACITIES = 0.05
 COLORS, HARMONICS = 5e-3, 1e-3
 FEATURES = 1e-2
 COOLDOWN = 0.1
-"""Last share of the course, over which all rates fall to a twentieth."""
+"""Final share of training progress, over which all rates decrease to a twentieth."""
 
 
 def learning_rates(progress: float, extent: float, coefficients: int) -> dict[str, float | torch.Tensor]:
-    """Rates of all tensors of `Gaussians` at `progress` in [0, 1]; of sh one a coefficient, [coefficients, 3].
+    """Learning rates of the tensors of `Gaussians` at `progress` in [0, 1]; of sh one per entry, [coefficients, 3].
 
-    extent: size of the scene in world units.
+    extent: scene size in world units. coefficients: number of spherical-harmonic coefficients of a Gaussian.
     """
     cool = cooling(progress)
     sh = torch.full((coefficients, 3), cool * HARMONICS)
@@ -37,7 +37,7 @@ def learning_rates(progress: float, extent: float, coefficients: int) -> dict[st
 
 
 def cooling(progress: float, share: float = COOLDOWN) -> float:
-    """Factor of all rates at `progress`: 1, and over the last `share` of the course down to .05 (half a cosine)."""
+    """Factor of all rates at `progress`: 1, then half a cosine from 1 to 0.05 over the last `share` of training."""
     if share <= 0 or progress <= 1 - share:
         return 1.0
     return 0.05 + 0.95 * 0.5 * (1 + float(np.cos(np.pi * (progress - 1 + share) / share)))

@@ -1,4 +1,4 @@
-"""What a training run records of itself: its curve, its decisions, and where its seconds went."""
+"""Record of a training run: quality curve, decisions of the schedule, seconds by part."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 @dataclass
 class TrainRecord:
-    """JSON-able. profile: wall-clock seconds by part. pairs: contributing (Gaussian, pixel) pairs of all renders."""
+    """JSON-able. profile: wall-clock seconds by part. pairs: contributing (Gaussian, pixel) pairs over all renders."""
 
     curve: list[dict[str, float]] = field(default_factory=list)
     decisions: list[str] = field(default_factory=list)
@@ -22,7 +22,7 @@ class TrainRecord:
 
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
-        """Adds the seconds of its block to `part` of the profile. A block inside another belongs to both."""
+        """Adds the wall-clock seconds of its block to `part` of the profile. A nested block counts in both parts."""
         start = time.perf_counter()
         try:
             yield

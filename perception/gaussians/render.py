@@ -1,4 +1,4 @@
-"""A model of Gaussians seen by one camera: `rasterize` with the model's own tensors."""
+"""Renders a `Gaussians` model from one camera with `rasterize`."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def render(
     harmonics: bool = False,
     **options: Any,
 ) -> Rasterization:
-    """One view (C = 1) from camera_from_world [4, 4] through K [3, 3], float32; `options` as of `rasterize`.
+    """Renders one view (C = 1): camera_from_world [4, 4], K [3, 3] in pixels, float32; `options`: see `rasterize`.
 
-    harmonics: colours as seen from this camera; without, the constant ones, which are enough where only visibility,
-    depth or features are asked for.
+    harmonics: True computes view-dependent colours from all spherical harmonics. False uses the constant term, which is
+    enough for visibility, depth and features.
     """
     return rasterize(
         gaussians.means,

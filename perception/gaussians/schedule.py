@@ -1,10 +1,10 @@
-"""What happens between the steps of training, by progress: which view comes next, growth, harmonics, early stopping.
+"""Training schedule as a function of progress: next view, densification, spherical harmonics, early stopping.
 
 progress   0 ─ .05 ─ .15 ──── .3 ──── .6 ────────── .9 ── 1
 photos     half size │ full size
 features             │       rendered every 2nd step (`losses.start`, `losses.every`)
 growth         densified every 100 steps, holes filled
-harmonics                             one degree more a trial, then the needless ones go
+harmonics                             one more degree per trial, then unneeded degrees are removed
 rates                                               cool down
 """
 
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
     from perception.gaussians.train import Trainer
 
 COARSE_UNTIL = 0.15
-"""Progress until which photos of half the resolution are trained on: cheaper, and large structures come first."""
+"""Progress until which photos of half the resolution are used: steps are cheaper, and large structures are fitted."""
 FILL_EVERY = 5
-"""In every so many-th densification, places that the photos show and the map leaves empty get Gaussians."""
+"""Every FILL_EVERY-th densification also adds Gaussians in image regions that the map leaves empty."""
 FEATURES_NEED = 0.35
-"""Share of the course for which features are trained before training may stop early."""
+"""Share of training progress for which features are trained before early stopping is allowed."""
 SCORED, NOTED = 8, 6
-"""Held-out views, at most, that decide at the end of a trial, and that a point of the curve is made from."""
+"""Maximum number of held-out views scored at the end of a trial, and for one point of the quality curve."""
 
 
 class Schedule:
-    """Acts on a trainer between its steps; what it has measured and decided is in `stopping`."""
+    """Modifies a `Trainer` between its steps; measurements and decisions are kept in `stopping`."""
 
     def __init__(self, trainer: Trainer):
         self.trainer, self.config = trainer, trainer.config
@@ -45,7 +45,7 @@ class Schedule:
         self._order: np.ndarray = np.zeros(0, dtype=np.int64)
 
     def next_view(self, progress: float) -> tuple[TrainingView, bool]:
-        """The view of the coming step, and whether its features are rendered. Every epoch has its own random order."""
+        """The view of the next step, and whether its features are rendered. Each epoch has a new random order."""
         trainer, losses = self.trainer, self.config.losses
         with_features = trainer.has_labels and progress >= losses.start and trainer.iteration % losses.every == 0
         coarse = progress < COARSE_UNTIL or (with_features and losses.half_resolution)
@@ -55,11 +55,11 @@ class Schedule:
         return (trainer.coarse if coarse else trainer.views)[self._order[place]], with_features
 
     def grows_at(self, progress: float) -> bool:
-        """Whether densification still asks for the statistics of a step."""
+        """Whether the gradient statistics of a step are still collected for densification."""
         return self.stopping.growing and progress < STOP
 
     def after_step(self, progress: float, may_stop: bool) -> None:
-        """All that is due after the step that began at `progress`. may_stop: this leg of the training may end early."""
+        """Runs what is due after the step that began at `progress`. may_stop: early stopping is allowed in this run."""
         trainer, every = self.trainer, self.config.densify.every
         due = trainer.iteration % every == 0
         if due:
@@ -70,7 +70,7 @@ class Schedule:
             self._stop_early()
 
     def finish(self) -> None:
-        """Once, when the whole course is over."""
+        """Prunes and records the final quality; called once, when training is complete."""
         self._prune()
         self._note(self.trainer.progress)
 
@@ -78,8 +78,8 @@ class Schedule:
 
     def _densify_and_judge(self, progress: float) -> None:
         trial_ends = self.trainer.progress >= self.stopping.due and not self.stopping.finished
-        # Scored before densification, which sets the picture back for a while: after it, most trials of a short run
-        # gained nothing, and growth ended .6 dB too early (tabletop_a).
+        # PSNR is measured before densification, which lowers it for a while. Measured after it, most trials of a short
+        # run showed no gain, and growth ended 0.6 dB too early (tabletop_a).
         reached = self.score(SCORED)["psnr"] if trial_ends else None
         if START <= progress < STOP:
             self._densify(progress)
@@ -90,7 +90,7 @@ class Schedule:
         return target_count(progress, self.trainer.initial_count, self.config.train.budget)
 
     def _densify(self, progress: float) -> None:
-        """Growth while it pays; holes are filled all the same."""
+        """Clones, splits and prunes while growth is on. Holes are filled also after growth has ended."""
         trainer, config = self.trainer, self.config
         with trainer.record.timed("densification"):
             seed = int(np.random.default_rng([config.seed, trainer.iteration, 2]).integers(2**31))
@@ -119,7 +119,7 @@ class Schedule:
                 self._tell(f"holes: {empty:.2%} of the pictures were empty, {len(born)} Gaussians placed there")
 
     def _prune(self) -> None:
-        """Drops at the end what is not finite, and what adds to no photo: no training view's picture changes by it."""
+        """Removes Gaussians with non-finite values, then those that contribute to no pixel of any training view."""
         trainer = self.trainer
         columns = [tensor.reshape(len(tensor), -1) for tensor in vars(trainer.gaussians).values()]
         self._keep(torch.isfinite(torch.cat(columns, dim=1)).all(dim=1), "whose values are not finite")
@@ -130,7 +130,7 @@ class Schedule:
         self._keep(seen, "that no photo sees")
 
     def _keep(self, wanted: torch.Tensor, which: str) -> None:
-        """Keeps the Gaussians `wanted` [N] bool; `which` describes the others."""
+        """Keeps the Gaussians where wanted [N] bool is True; `which` describes the others in the record."""
         if not bool(wanted.all()):
             self._tell(f"pruned: {int((~wanted).sum())} Gaussians {which}")
             self.trainer.keep(torch.nonzero(wanted).flatten())
@@ -139,7 +139,7 @@ class Schedule:
     # ----------------------------------------------------------- early stopping
 
     def _end_trial(self, reached: float) -> None:
-        """What the trial gained, now at `reached` dB, decides about growth while there is any, then about harmonics."""
+        """Ends a trial at `reached` dB: decides whether growth continues or, after it, on the degree of harmonics."""
         trainer, stopping = self.trainer, self.stopping
         progress, count = trainer.progress, len(trainer.gaussians)
         stopping.due = progress + TRIAL
@@ -161,7 +161,7 @@ class Schedule:
                 trainer.set_degree(degree)
 
     def _stop_early(self) -> None:
-        """Jumps to the cool-down when the target is reached or more time does not pay."""
+        """Skips to the cool-down when the target PSNR is reached or more training gains too little."""
         trainer, stopping, progress = self.trainer, self.stopping, self.trainer.progress
         if stopping.finished or not self._may_stop(progress):
             return
@@ -177,7 +177,7 @@ class Schedule:
             self._tell(f"{reason}; {left:.0%} of the course left out")
 
     def _may_stop(self, progress: float) -> bool:
-        """Not when the end is near anyway, nor before the features have had their time."""
+        """Whether early stopping is allowed: features were trained for FEATURES_NEED, and the cool-down is not near."""
         needed = self.config.losses.start + FEATURES_NEED if self.trainer.has_labels else 0.0
         return needed <= progress < 1.0 - COOLDOWN - TRIAL
 
@@ -190,7 +190,7 @@ class Schedule:
     def score(self, limit: int, with_ssim: bool = False, degree: int = 3) -> dict[str, float]:
         """Mean PSNR (and SSIM as trained) over at most `limit` held-out views, training views if there are none.
 
-        degree: of the harmonics that are shown.
+        degree: highest degree of the spherical harmonics that are rendered.
         """
         trainer = self.trainer
         shown = replace(trainer.gaussians, sh=trainer.gaussians.sh[:, : (degree + 1) ** 2].contiguous())
@@ -206,7 +206,7 @@ class Schedule:
         return dict(zip(("psnr", "ssim"), np.mean(figures, axis=0).tolist(), strict=False))
 
     def _note(self, progress: float) -> None:
-        """A point of the curve that reports draw."""
+        """Appends one point to the quality curve of the record."""
         trainer, figures = self.trainer, self.score(NOTED, with_ssim=True)
         trainer.record.curve.append(
             {

@@ -1,10 +1,10 @@
-"""Optimises Gaussians against photos and masks (OpenSplat3D §3): a step renders a view, takes the loss, and descends.
+"""Optimises Gaussians against photos and masks (OpenSplat3D §3), with one rendered view per gradient step.
 
     L = L_RGB + λ_inst2d L_inst2d + λ_var L_var                                                                (eq. 14)
 
-Every schedule is driven by progress in [0, 1], the larger of iterations done and time spent, so a time limit shortens
-the whole course instead of cutting its end. Randomness is a function of (seed, iteration): a run resumed from a
-checkpoint takes the very steps the interrupted one would have taken.
+All schedules are functions of progress in [0, 1], the larger of the shares of iterations done and of time spent. A time
+limit thus shortens every phase instead of cutting off the end. Random numbers depend on (seed, iteration) only, so a
+run resumed from a checkpoint takes the same steps as one without interruption.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ INSTANCE_WEIGHT = 0.1
 
 
 class Observer(Protocol):
-    """Follows a training run: progress bars, checkpoints."""
+    """Interface for following a training run, for progress bars and checkpoints."""
 
     def after_step(self, trainer: Trainer, loss: float) -> None:
-        """Called after every iteration and what the schedule did after it."""
+        """Called after every iteration, when the schedule has been applied."""
 
     def after_leg(self, trainer: Trainer) -> None:
-        """Called when `Trainer.run` ends, also by an exception."""
+        """Called when `Trainer.run` returns or raises."""
 
 
 class Trainer:
-    """Holds all state of one optimisation; `state` and `load` round-trip it through a checkpoint."""
+    """All state of one optimisation; `state` exports it for a checkpoint, and `load` restores it."""
 
     def __init__(
         self, gaussians: Gaussians, views: list[TrainingView], config: MapConfig, held_out: list[TrainingView]
@@ -56,23 +56,23 @@ class Trainer:
         self.extent = scene_extent(views)
         self.record = TrainRecord()
         self.iteration = 0
-        self.complete = False  # nothing is left to do unless more time is given
-        self.skipped = 0.0  # share of the course left out by early stopping
+        self.complete = False  # finished, unless a longer training is requested
+        self.skipped = 0.0  # share of training progress skipped by early stopping
         self.initial_count = len(gaussians)
         self.gaussians = gaussians
         self.statistics = Statistics.zeros(len(gaussians))
         self.optimiser = SparseAdam(vars(gaussians), self._rates(0.0))
         self.schedule = Schedule(self)
         self.show(views)
-        self._since: float | None = None  # when the leg that runs began
+        self._since: float | None = None  # time.monotonic() at the start of `run`, None outside
 
     def show(self, views: list[TrainingView]) -> None:
-        """Trains on `views` from here on: the same photos, whose masks may have come since."""
+        """Sets the training views: the same photos as before, possibly with labels added."""
         self.views, self.coarse = views, [view.halved() for view in views]
         self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
 
     def run(self, observer: Observer | None = None, until: float = 1.0) -> TrainRecord:
-        """Trains until progress `until`. A leg that something waits for (until < 1) is not stopped early."""
+        """Trains until progress `until`. Early stopping is allowed only with until = 1."""
         self._since = time.monotonic()
         try:
             while (progress := self.progress) < until:
@@ -94,7 +94,7 @@ class Trainer:
     # -------------------------------------------------------------------- step
 
     def step(self, progress: float) -> float:
-        """One iteration: renders a view, takes its loss, descends. Returns the loss."""
+        """One iteration: renders a view, computes the loss and its gradient, takes an Adam step. Returns the loss."""
         view, with_features = self.schedule.next_view(progress)
         params = {name: tensor.detach().requires_grad_() for name, tensor in vars(self.gaussians).items()}
         with self.record.timed("rasterizer forward"):
@@ -121,7 +121,7 @@ class Trainer:
         return float(loss.detach())
 
     def _render(self, params: dict[str, torch.Tensor], view: TrainingView, with_features: bool) -> Rasterization:
-        """The view before a random background, so that nothing is learnt by leaving it empty."""
+        """Renders the view on a random background colour, so that an empty region cannot fit the photo."""
         height, width = view.photo.shape[:2]
         colors = np.random.default_rng([self.config.seed, self.iteration, 1]).random(3, dtype=np.float32)
         return rasterize(
@@ -164,7 +164,7 @@ class Trainer:
 
     @property
     def elapsed(self) -> float:
-        """Seconds of training: those before a resume counted in, those between two legs (masks are made then) not."""
+        """Seconds of training, including those before a resume, without the time between two calls of `run`."""
         return self.record.seconds + (0.0 if self._since is None else time.monotonic() - self._since)
 
     @property
@@ -175,30 +175,30 @@ class Trainer:
 
     @property
     def expected_iterations(self) -> int:
-        """How many iterations the run will have had, as far as can be told now."""
+        """Estimate of the total number of iterations of the run."""
         share = self.iteration / self.config.train.iterations + self.skipped
-        if self.progress > share:  # the clock rules
+        if self.progress > share:  # the time limit determines progress
             return max(self.iteration, round(self.iteration / max(self.progress, 1e-6)))
         return round(self.iteration + (1 - self.progress) * self.config.train.iterations)
 
     def skip(self, share: float) -> None:
-        """Leaves out `share` of the course."""
+        """Skips `share` of training progress."""
         self.skipped += share
 
     # ------------------------------------------------------------------- model
 
     def keep(self, rows: torch.Tensor) -> None:
-        """Keeps the Gaussians that `rows` [M] int64 selects, with their moments."""
+        """Keeps the Gaussians that `rows` [M] int64 selects, with their Adam moments."""
         self.optimiser.keep(rows)
         self._sync()
 
     def append(self, born: Gaussians) -> None:
-        """Adds Gaussians without moments."""
+        """Adds Gaussians with zero Adam moments."""
         self.optimiser.append(vars(born))
         self._sync()
 
     def set_degree(self, degree: int) -> None:
-        """Cuts the harmonics to `degree` or adds coefficients of 0."""
+        """Truncates the spherical harmonics to `degree`, or adds zero coefficients up to it."""
         state, count = self.optimiser.state_dict(), (degree + 1) ** 2
         for table in ("params", "first", "second"):
             sh = state[table]["sh"]
@@ -208,7 +208,7 @@ class Trainer:
 
     @torch.no_grad()
     def depth(self, name: str) -> np.ndarray:
-        """[H, W] float32 depth along the optical axis of training view `name` as the map now has it, 0 = nothing."""
+        """Rendered depth [H, W] float32 along the optical axis of training view `name`, 0 = no surface."""
         view = next(view for view in self.views if view.name == name)
         return depth_image(self.gaussians, view.camera_from_world, view.K, *view.photo.shape[1::-1]).numpy()
 
@@ -219,13 +219,13 @@ class Trainer:
         self._sync()
 
     def _sync(self) -> None:
-        """The optimiser owns the tensors; the model is a view of them."""
+        """Makes `gaussians` share the optimiser's tensors, which are replaced when rows are added or removed."""
         self.gaussians = Gaussians(**{name: tensor.detach() for name, tensor in self.optimiser.params.items()})
 
     # -------------------------------------------------------------- checkpoint
 
     def state(self) -> dict[str, Any]:
-        """Everything a resumed run needs."""
+        """All values needed to resume, for a checkpoint."""
         return {
             "iteration": self.iteration,
             "initial_count": self.initial_count,
@@ -238,7 +238,7 @@ class Trainer:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Takes up a run from `state()`."""
+        """Restores the result of `state`."""
         self._restart_optimiser(state["optimiser"])
         self.statistics = Statistics(**state["statistics"])
         self.record = TrainRecord(**state["record"])

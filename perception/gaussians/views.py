@@ -1,4 +1,4 @@
-"""A photo as the trainer and the scorers see it, and a map seen from there."""
+"""Training photos as tensors, and renders of the Gaussians from their cameras."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from perception.gaussians.rasterize import Rasterization
 from perception.gaussians.render import render
 
 BEST_PSNR = 100.0
-"""dB of two equal pictures, as in `evaluate.images`: a finite number, for means and for JSON."""
+"""PSNR in dB of two equal images, as in `evaluate.images`: finite, so that means and JSON stay valid."""
 
 
 @dataclass(frozen=True)
 class TrainingView:
-    """One photo ready for training. photo [H, W, 3] uint8; labels [H, W] int32 (0 = unlabelled) or None;
+    """One photo as used in training. photo [H, W, 3] uint8; labels [H, W] int32 (0 = unlabelled) or None;
     K [3, 3] and camera_from_world [4, 4] float32; eps2d: see `rasterize`."""
 
     name: str
@@ -30,8 +30,8 @@ class TrainingView:
     def halved(self) -> TrainingView:
         """The same view at half the resolution: photo averaged 2 × 2, labels taken at every other pixel.
 
-        The average adds (2² − 1) / 12 px² to the blur of the full picture. With the usual eps2d in these larger pixels
-        Gaussians come out too thin for the full picture (−0.33 dB on tabletop_a at half length, as measured).
+        Averaging adds a blur of (2² − 1) / 12 px² at full resolution, so eps2d is changed. With an unchanged eps2d
+        Gaussians become too thin for full resolution (−0.33 dB on tabletop_a at half length).
         """
         height, width = self.photo.shape[0] // 2, self.photo.shape[1] // 2
         blocks = self.photo[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3)
@@ -43,7 +43,7 @@ class TrainingView:
 
 
 def scene_extent(views: list[TrainingView]) -> float:
-    """1.1 × the largest distance of a camera from the cameras' mean (Kerbl et al. 2023), never 0."""
+    """1.1 × the largest distance of a camera from the mean camera centre (Kerbl et al. 2023), at least 1e-3."""
     poses = torch.stack([view.camera_from_world for view in views])
     centres = -torch.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     return max(1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max()), 1e-3)
@@ -51,13 +51,13 @@ def scene_extent(views: list[TrainingView]) -> float:
 
 @torch.no_grad()
 def render_view(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
-    """The photo as the map sees it, [H, W, 3] float32 in [0, 1], black where nothing is."""
+    """The Gaussians rendered from the view, [H, W, 3] float32 in [0, 1], on a black background."""
     return _render(gaussians, view).colors[0].clamp(0, 1)
 
 
 @torch.no_grad()
 def visible_in(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
-    """[N] bool: adds to some pixel of the view."""
+    """[N] bool: whether each Gaussian contributes to some pixel of the view."""
     return _render(gaussians, view).visible[0]
 
 
@@ -80,6 +80,6 @@ def depth_image(
 
 def psnr(image: torch.Tensor, photo: torch.Tensor) -> float:
     """Peak signal-to-noise ratio in dB of image [H, W, 3] in [0, 1] against photo uint8."""
-    # In numpy: torch adds up in as many parts as it has threads, and decisions about growth hang on these bits.
+    # In numpy: the order of torch's sum depends on the number of threads, and growth decisions depend on the result.
     error = float(np.square(image.detach().numpy() - photo.numpy() / np.float64(255)).mean())
     return BEST_PSNR if error == 0 else min(BEST_PSNR, -10 * float(np.log10(error)))
