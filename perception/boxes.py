@@ -9,17 +9,17 @@ import numpy as np
 from perception.types import OrientedBox
 
 SAMPLE = 4096
-"""Points that choose a trimmed box's axes."""
+"""Maximum number of points from which the axes of a trimmed box are chosen."""
 
 
 def oriented_box(points: np.ndarray, trim: float = 0.0) -> OrientedBox:
     """The smallest box of finite points [P, 3] float, P >= 1, among those with an edge along x, y or z, or along
     their principal axes.
 
-    About each of the three axes the box turns along the sides of the planar hull, where the least area lies.
-    Longest side first, right-handed, the sign of each axis fixed by its largest component being positive: the same
-    points in any order have the same box. Coplanar points give a zero extent. trim: share of points left out at
-    either end of each axis, against strays; the choice is then made on an even sample.
+    For each of these axes, rotations about it that align with a side of the planar convex hull are tried; the least
+    area is at one of them. Axes: longest side first, right-handed, largest component positive, so the result does not
+    depend on the order of points. Coplanar points give a zero extent. trim: share of points left out at either end of
+    each axis, against outliers; the axes are then chosen on an even sample.
     """
     points = np.asarray(points, np.float64)
     outline = _hull(points) if trim == 0 else points[:: len(points) // SAMPLE + 1]
@@ -29,7 +29,7 @@ def oriented_box(points: np.ndarray, trim: float = 0.0) -> OrientedBox:
     extent = high - low
     # A floor of a thousandth of the longest side, so that flat instances compare by their area.
     volume = np.maximum(extent, np.maximum(extent.max(axis=1, keepdims=True) * 1e-3, 1e-12)).prod(axis=1)
-    best = int(np.argmax(volume <= 1.001 * volume.min()))  # of equals the first: the world's axes if they do
+    best = int(np.argmax(volume <= 1.001 * volume.min()))  # the first of equals: the world axes if they qualify
     rotation = _in_order(axes[best], extent[best])
     low, high = _sides(rotation[None], points if trim else outline, trim)
     return OrientedBox(rotation.T @ ((low[0] + high[0]) / 2), rotation, high[0] - low[0])
@@ -86,7 +86,7 @@ def _hull(points: np.ndarray) -> np.ndarray:
 
 
 def _candidates(points: np.ndarray) -> list[np.ndarray]:
-    """Rotations [3, 3] (rows are axes) worth trying; the world's axes come first."""
+    """Candidate rotations [3, 3] (rows are axes); the world axes come first."""
     found = [np.eye(3)]
     if len(points) < 4:
         return [*found, _along(points)]

@@ -1,4 +1,4 @@
-"""The colour of an instance by its id, and the colour of a Gaussian by its spherical harmonics."""
+"""Colours of instances from their ids, and colours of Gaussians from spherical harmonics."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     Array = TypeVar("Array", np.ndarray, torch.Tensor)
 
 GREY = np.array([128, 128, 128], np.uint8)
-"""The colour of "no instance"."""
+"""Colour of points and pixels without an instance."""
 SH_C0 = 0.28209479177387814
 """Zeroth real spherical harmonic, 1 / (2 √π)."""
 _GOLDEN = 0.6180339887498949
@@ -22,8 +22,8 @@ _GOLDEN = 0.6180339887498949
 def instance_palette(ids: int | np.ndarray | Sequence[int]) -> np.ndarray:
     """Colours [N, 3] uint8 of instance ids [N] (or of 0..n−1): the same id always has the same colour, −1 is grey.
 
-    Hues step by the golden ratio, so that consecutive ids lie far apart on the colour wheel; saturation and value
-    change every 8 ids.
+    The hue advances by the golden ratio per id, so that consecutive ids have very different hues; saturation and
+    value change every 8 ids.
     """
     wanted = np.arange(ids) if isinstance(ids, int | np.integer) else np.asarray(ids, np.int64).ravel()
     k = np.maximum(wanted, 0)

@@ -1,6 +1,6 @@
-"""The mapper's settings: typed and checked; defaults need no file, a TOML file or KEY=VALUE pairs override single ones.
+"""Settings of mapping, typed and validated; a TOML file or KEY=VALUE pairs override individual defaults.
 
-What the user has no reason to change is a named constant beside its use.
+Values that users have no reason to change are named constants in the module that uses them.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from pydantic.fields import FieldInfo
 from perception.errors import InputError
 
 LARGEST_SEED = 2**31 - 1
-"""COLMAP's generator takes 32-bit signed seeds."""
+"""COLMAP's random generator takes 32-bit signed seeds."""
 
 
 class Settings(BaseModel):
-    """Base of all settings: immutable; unknown names, NaN and infinities are refused."""
+    """Base of all settings: immutable; unknown names, NaN and infinities are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @field_validator("*", mode="before")
     @classmethod
     def _plain(cls, value: Any, info: ValidationInfo) -> Any:
-        """The texts that mean None; and no truth value passes as a number."""
+        """Converts the texts that mean None, and rejects booleans for numbers."""
         kinds = _kinds(cls.model_fields[str(info.field_name)])
         if NoneType in kinds and isinstance(value, str) and value in ("none", "null", ""):
             return None
@@ -127,13 +127,13 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 METHOD = ("densify.", "losses.", "instances.min_", "train.sh_degree", "language.views", "language.zooms")
-"""Beginnings of the settings that vary the method, for experiments; the others are for users."""
+"""Prefixes of the settings that change the method, for experiments; the others are for users."""
 
 AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
 def load_config(file: Path | None = None, pairs: list[str] | None = None, preset: str = "default") -> MapConfig:
-    """Defaults, then the preset, then the TOML file, then KEY=VALUE pairs. Raises InputError for the first mistake."""
+    """Defaults, overridden by the preset, the TOML file and KEY=VALUE pairs. Raises InputError for the first error."""
     if preset not in PRESETS:
         raise InputError(f"--preset: found '{preset}', expected one of: {', '.join(PRESETS)}")
     given = {key: (value, "--preset") for key, value in PRESETS[preset].items()}
@@ -146,8 +146,7 @@ def load_config(file: Path | None = None, pairs: list[str] | None = None, preset
 def settings_from(model: type[AnySettings], given: Mapping[str, tuple[Any, str]]) -> AnySettings:
     """The model with the given settings: dotted key -> (value, where it was read, for the error message).
 
-    Raises InputError with the key, the value and the range for the first that is unknown, of another type or outside
-    its range.
+    Raises InputError with key, value and range for the first setting that is unknown, of another type or out of range.
     """
     known = dict(fields(model))
     nested: dict[str, Any] = {}
@@ -176,7 +175,7 @@ def fields(model: type[Settings]) -> Iterator[tuple[str, FieldInfo]]:
 
 
 def expected(field: FieldInfo) -> str:
-    """The type and range of a setting in words; a field's `title` says it where its constraints cannot."""
+    """Type and range of a setting as text; a field's `title` gives it if the constraints do not."""
     kinds = _kinds(field)
     if field.title:
         words = field.title
@@ -191,7 +190,7 @@ def expected(field: FieldInfo) -> str:
 
 
 def settings_text(model: type[Settings] = MapConfig, method: tuple[str, ...] = METHOD) -> str:
-    """All settings with default, range and effect, those for users first, for `--help`."""
+    """All settings with default, range and effect, user settings first, for `--help`."""
     lines: dict[bool, list[str]] = {False: [], True: []}
     for key, field in fields(model):
         default = field.default
@@ -202,7 +201,7 @@ def settings_text(model: type[Settings] = MapConfig, method: tuple[str, ...] = M
 
 
 def read_pairs(pairs: list[str]) -> dict[str, Any]:
-    """KEY=VALUE texts by key; the last of equal keys counts."""
+    """KEY=VALUE texts by key; the last of equal keys is used."""
     values: dict[str, Any] = {}
     for pair in pairs:
         key, separator, value = pair.partition("=")
@@ -244,7 +243,7 @@ def flat(table: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def read_toml(file: Path) -> dict[str, Any]:
-    """The tables of a TOML file; InputError where it cannot be read or is not valid."""
+    """The tables of a TOML file; InputError if it cannot be read or is not valid TOML."""
     try:
         import tomllib
     except ModuleNotFoundError:  # Python 3.10

@@ -1,4 +1,4 @@
-"""The one exception that means "the user's input is at fault"; the command line turns it into exit code 2."""
+"""The exception for invalid user input; the command line reports it and exits with code 2."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import unicodedata
 
 
 class InputError(ValueError):
-    """Bad input from the user, told in one line: what was read, what was found, what was expected, what to do.
+    """Invalid user input, with a one-line message: what was read, found and expected, and what to do.
 
-    What file names and contents bring along that is no visible text (line ends, control codes) is shown escaped.
+    Characters that are not visible text (line ends, control codes), for example from file names, are escaped.
     """
 
     def __init__(self, message: object = ""):
@@ -20,5 +20,5 @@ def _visible(character: str) -> bool:
 
 
 def missing_extra(package: str, extra: str) -> InputError:
-    """An error for an optional dependency that is absent, with the exact line that installs it."""
+    """The error for a missing optional dependency, with the exact install command."""
     return InputError(f"the package '{package}' is not installed; run in its clone: pip install \".[{extra}]\"")

@@ -29,7 +29,7 @@ def inverse_se3(a_from_b: np.ndarray) -> np.ndarray:
 
 
 def camera_centres(camera_from_world: np.ndarray) -> np.ndarray:
-    """Where cameras stand, [N, 3] in the world, of poses [N, 4, 4]."""
+    """Camera centres [N, 3] in the world frame, of poses camera_from_world [N, 4, 4]."""
     return np.asarray(-np.einsum("nji,nj->ni", camera_from_world[:, :3, :3], camera_from_world[:, :3, 3]))
 
 
@@ -40,7 +40,7 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """camera_from_world [4, 4], OpenCV axes, of a camera at `eye` looking at `target`; `up` not along the view."""
+    """camera_from_world [4, 4], OpenCV axes, of a camera at `eye` looking at `target`; `up` not parallel to it."""
     forward = np.asarray(target, dtype=np.float64) - eye
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, up)

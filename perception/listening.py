@@ -1,4 +1,4 @@
-"""Where a server listens and who may reach it: the rules that `perception serve` and `perception view` share."""
+"""Network address and access rules of the servers of `perception serve` and `perception view`."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ def check_address(host: str, port: int, token: str | None) -> None:
 
 
 def names_this_machine(header: str, host: str) -> bool:
-    """Whether a request's Host header is a loopback name or the name `host` that the server was told to listen on.
+    """Whether a request's Host header is a loopback name or `host`, the address that the server listens on.
 
-    DNS rebinding: a page of another site can make its own name resolve to 127.0.0.1, and the browser then lets it read
-    answers from here. Its requests still carry that name.
+    This prevents DNS rebinding: a web page of another site can make its name resolve to 127.0.0.1, so that the browser
+    lets it read responses of this server. Its requests still have that name in the Host header.
     """
     name = header[: header.index("]") + 1] if header.startswith("[") and "]" in header else header.partition(":")[0]
     return name.lower() in _LOCAL_NAMES | {url_host(host).lower()}
@@ -49,7 +49,7 @@ def url_host(host: str) -> str:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A bound, listening TCP socket; InputError naming the argument when the address or port cannot be had."""
+    """A bound, listening TCP socket; InputError naming the argument when the address or port is not available."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -72,7 +72,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def read_token(path: Path) -> str:
-    """The token in a file, white space around it dropped; InputError when it is unreadable, short or not ASCII."""
+    """The token in a file, without outer white space; InputError when it is unreadable, too short or not ASCII."""
     try:
         token = path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:

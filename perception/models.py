@@ -30,10 +30,10 @@ _PURPOSES = {"encoder": "sam", "decoder": "sam", "image tower": "clip", "text to
 
 
 def check_file(file: str) -> dict[str, Any]:
-    """What an ONNX file, a folder of them or a stored model is: a dict a file under "files", and warnings.
+    """Describes an ONNX file, a folder of them or a stored model: one dict per file under "files", and warnings.
 
-    Each: file, family, role, inputs and outputs with shapes, providers (those really in use). Raises InputError
-    when a file is no ONNX model, and for a SAM encoder and decoder that do not fit.
+    Each: file, family, role, inputs and outputs with shapes, providers (those in use). Raises InputError when a
+    file is not an ONNX model, and for a SAM encoder and decoder that do not fit together.
     """
     stored = find_model(file)
     path = stored.folder if stored and not Path(file).exists() else Path(file).expanduser()
@@ -71,7 +71,7 @@ def describe_graph(path: Path) -> dict[str, Any]:
 
 
 def recognise(graph: Any) -> tuple[str | None, str | None]:
-    """(family, role) of an opened graph; (None, None) for one that this program has no use for."""
+    """(family, role) of an opened graph; (None, None) for an unsupported model."""
     from perception.language.preprocess import family_of
     from perception.masks.sam_models import decoder_family, encoder_family
 
@@ -92,7 +92,7 @@ def _argument(value: Any) -> dict[str, Any]:
 
 
 def judge(found: Sequence[dict[str, Any]]) -> tuple[str | None, str | None, str]:
-    """(family, purpose, what is missing in words) of the files of one model."""
+    """(family, purpose, text on missing files) of the files of one model."""
     known = [entry for entry in found if entry["role"]]
     if not known:
         return None, None, "the family is unknown: neither a SAM nor a CLIP export was recognised"
@@ -105,7 +105,7 @@ def judge(found: Sequence[dict[str, Any]]) -> tuple[str | None, str | None, str]
 
 
 def list_models() -> list[dict[str, Any]]:
-    """The store: name, family, purpose, bytes and folder of each model."""
+    """Name, family, purpose, bytes and folder of each stored model."""
     return [
         {
             "name": model.name,
@@ -127,10 +127,10 @@ def add_model(
     default: bool = False,
     progress: Progress | None = None,
 ) -> StoredModel:
-    """Puts files (or all files of a folder, or web addresses) into the store under `name`, whole or not at all.
+    """Adds files (or all files of a folder, or URLs) to the store under `name`, all or none.
 
-    sha256: expected digests, as many as sources or none. A web address that is in the store under that name already is
-    not fetched again. default: `--masks auto` takes this model from now on.
+    sha256: expected digests, as many as sources or none. A URL that is already stored under that name is not downloaded
+    again. default: `--masks auto` uses this model from now on.
     """
     check_name(name)
     expected = _expected(sources, sha256)
@@ -157,7 +157,7 @@ def _expected(sources: Sequence[str], sha256: Sequence[str]) -> dict[str, str]:
 
 
 def _same(model: StoredModel, sources: Sequence[str], expected: dict[str, str]) -> bool:
-    """Whether the stored model is these very web addresses, with these digests."""
+    """Whether the stored model was made from the same URLs, with the same digests."""
     if not all(is_url(source) for source in sources) or [f["source"] for f in model.files] != list(sources):
         return False
     whole = all((model.folder / f["name"]).is_file() for f in model.files)
@@ -165,7 +165,7 @@ def _same(model: StoredModel, sources: Sequence[str], expected: dict[str, str]) 
 
 
 def _local(source: str, expected: str | None, parts: Path, progress: Progress | None) -> list[tuple[str, Path, str]]:
-    """(file name, where it lies now, source): a download, a file with its side files, or a folder's files."""
+    """(file name, current path, source) of a download, a file with its side files, or the files of a folder."""
     if is_url(source):
         file_name = Path(unquote(urlparse(source).path)).name.lstrip(".") or "model.onnx"
         part = _part(parts, source)

@@ -1,5 +1,4 @@
-"""Small pictures people look at: instance colours, depth, errors, outlines, montages. Images are [H, W, 3]
-uint8 RGB."""
+"""Visualisation images: instance colours, depth, errors, outlines, montages. Images are [H, W, 3] uint8 RGB."""
 
 from __future__ import annotations
 
@@ -12,7 +11,7 @@ from perception.colors import instance_palette
 
 
 def colorize_instances(ids: np.ndarray) -> np.ndarray:
-    """Instance ids [H, W] (-1 = none) -> picture."""
+    """Instance ids [H, W] (-1 = none) as an image in instance colours."""
     present, inverse = np.unique(ids, return_inverse=True)
     return instance_palette(present)[inverse.reshape(ids.shape)]
 
@@ -22,7 +21,7 @@ def _colormap(level: np.ndarray, name: int) -> np.ndarray:
 
 
 def error_map(a: np.ndarray, b: np.ndarray, full: float = 0.25) -> np.ndarray:
-    """Where two pictures (uint8, or float in [0, 1]) differ: black = equal, bright = `full` or more (of 1)."""
+    """Difference of two images (uint8, or float in [0, 1]): black = equal, brightest = `full` or more (of 1)."""
     if a.shape != b.shape:
         raise ValueError(f"error_map: pictures of shapes {a.shape} and {b.shape}; they must agree")
     difference = np.abs(_unit(a) - _unit(b)).mean(-1)
@@ -34,7 +33,7 @@ def _unit(picture: np.ndarray) -> np.ndarray:
 
 
 def overlay(photo: np.ndarray, ids: np.ndarray, alpha: float = 0.55) -> np.ndarray:
-    """Instance colours laid over a photo with a thin border between instances; -1 leaves the photo as it is."""
+    """A photo overlaid with instance colours and thin borders between instances; at -1 the photo is unchanged."""
     tinted = (1 - alpha) * photo + alpha * colorize_instances(ids)
     out = np.where((ids >= 0)[..., None], tinted, photo)
     out[_borders(ids)] = 255
@@ -60,7 +59,7 @@ def outline(
 def features_to_rgb(features: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
     """Features [..., D] -> colours [..., 3] uint8: their first three principal components, stretched to 1-99 %.
 
-    mask [...]: which entries decide the axes and the stretch (default all); the sign of an axis is made definite.
+    mask [...]: the entries from which axes and stretch are computed (default all); axis signs are made unique.
     """
     flat = features.reshape(-1, features.shape[-1]).astype(np.float64)
     basis = flat if mask is None or not mask.any() else flat[mask.ravel()]
@@ -78,7 +77,7 @@ def features_to_rgb(features: np.ndarray, mask: np.ndarray | None = None) -> np.
 def montage(
     images: Sequence[np.ndarray], columns: int, titles: Sequence[str] | None = None, gap: int = 6
 ) -> np.ndarray:
-    """Pictures in a grid on white, each scaled to the size of the first, a small title above each."""
+    """Images in a grid on white, each scaled to the size of the first, with a title above each."""
     if not images:
         raise ValueError("montage: no images")
     height, width = images[0].shape[:2]
@@ -96,7 +95,7 @@ def montage(
 
 
 def _title(strip: np.ndarray, text: str) -> None:
-    """Writes text into a strip of a picture, in place."""
+    """Draws text into a strip of an image, in place."""
     from PIL import Image, ImageDraw, ImageFont
 
     image = Image.fromarray(strip)

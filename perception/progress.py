@@ -1,4 +1,4 @@
-"""What a person sees of long work: a bar on a terminal, plain log lines elsewhere; all of it on stderr."""
+"""Progress display of long computations: a bar on a terminal, plain log lines elsewhere, always on stderr."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import time
 from typing import Any
 
 LINE = "{desc}{percentage:3.0f}%{postfix}  {bar}"
-"""tqdm's line; the bar takes what room is left. Its own rate and rest are wrong for a run that was resumed."""
+"""Format of tqdm's line. tqdm's own rate and remaining time are omitted, as they are wrong for a resumed run."""
 
 
 class Progress:
-    """Reports stages. `quiet` silences everything (library use)."""
+    """Displays the progress of stages. quiet: no output, for use as a library."""
 
     def __init__(self, quiet: bool = False, stream: Any = None):
         self.stream = stream or sys.stderr
@@ -24,10 +24,10 @@ class Progress:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()  # so that what is said next, as after Ctrl-C, begins on a line of its own
+        self.close()  # so that the next output, for example after Ctrl-C, starts on a new line
 
     def log(self, text: str) -> None:
-        """One line, shown at once."""
+        """Prints one line at once."""
         if self.quiet:
             return
         if self._bar is not None:
@@ -35,7 +35,7 @@ class Progress:
         print(text, file=self.stream, flush=True)
 
     def update(self, stage: str, done: int, total: int, *words: str) -> None:
-        """Where a stage stands; elsewhere than on a terminal a line every ten seconds and at the end."""
+        """Shows the state of a stage; without a terminal, prints a line every ten seconds and at the end."""
         if self.quiet:
             return
         if self.terminal:

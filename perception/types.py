@@ -1,4 +1,4 @@
-"""Plain data shared by all layers. Transforms are named a_from_b; pixel centres lie at +0.5; quaternions are wxyz."""
+"""Data types shared by all layers. Transforms are named a_from_b; pixel centres lie at +0.5; quaternions are wxyz."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class View:
     """One posed photo, seen through an ideal pinhole camera (K, width, height) obtained by undistorting `lens`.
 
     name: file name of the photo relative to its folder, unique in the scene ("a/0001.jpg").
-    photo: where the photo lies. lens: None when the photo is already a pinhole image of size width × height.
+    photo: path of the photo. lens: None when the photo is already a pinhole image of size width × height.
     K: [3, 3] float64, pixels. camera_from_world: [4, 4] float64, OpenCV axes (x right, y down, z forward).
-    held_out: whether a finished map was not trained on this view, but scored on it.
+    held_out: whether the view was used for evaluation of a finished map and not for training.
     """
 
     name: str
@@ -44,11 +44,11 @@ class View:
 
 @dataclass
 class Scene:
-    """What the mapper starts from: posed views (sorted by name) and a sparse cloud.
+    """Input of mapping: posed views (sorted by name) and a sparse cloud.
 
     points: [P, 3] float64 in the world frame; point_colors: [P, 3] uint8; both may be empty.
-    metric: True when the unit is known to be the metre. report: JSON-able facts about how the scene came about
-    (registered, left out and why, reprojection error, warnings, seconds by stage).
+    metric: True when the unit is known to be the metre. report: JSON-able facts about the reconstruction
+    (registered photos, left-out photos and reasons, reprojection error, warnings, seconds by stage).
     """
 
     views: list[View]

@@ -1,4 +1,4 @@
-"""From the instances of a Gaussian map to the points of clouds and meshes, and into other programs' files."""
+"""Transfers instance labels of a map to point clouds and meshes, and writes them in formats of other programs."""
 
 from perception.export.formats import write_export
 from perception.export.transfer import ExportOptions, check_overlap, export_labels

@@ -1,4 +1,4 @@
-"""Which Gaussian a point belongs to: the paper's nearest mean, streamed over clouds of any size."""
+"""Assigns points to the Gaussian with the nearest mean (OpenSplat3D), in chunks for clouds of any size."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def nearest_gaussian(
     """Index [P] int64 of the nearest of means [N, 3] for each of points [P, 3].
 
     −1 for points that are not finite or farther than max_distance from every mean. Equal distances go to the smaller
-    index. Means that are not finite take no part.
+    index. Means that are not finite are ignored.
     """
     points = _checked(points, "points")
     means = _checked(means, "means")
@@ -34,10 +34,10 @@ def nearest_gaussian(
 
 
 def auto_distance(means: np.ndarray) -> float | None:
-    """A reach that fits the map: twice the 99th percentile of the distance between neighbouring means [N, 3].
+    """Distance limit from the map itself: twice the 99th percentile of the spacing of neighbouring means [N, 3].
 
-    Even where the map is sparsest a point on its surface lies within half that spacing, so four times as much is
-    taken; what lies farther was not mapped. None (no limit) for fewer than two distinct means.
+    Even in sparse regions a point on the mapped surface is within half that spacing of a mean; the limit is four times
+    this. Points beyond it were not mapped. None (no limit) for fewer than two distinct means.
     """
     means = _checked(means, "means")
     means = means[np.isfinite(means).all(axis=1)]

@@ -1,4 +1,4 @@
-"""Files of labelled clouds: the cloud with its sidecar, one cloud an instance, boxes, ScanNet's submission layout."""
+"""Writes labelled clouds: cloud and sidecar, one cloud per instance, boxes, ScanNet submission format."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def sidecar_of(labels: np.ndarray, instances: Instances) -> dict[str, Any]:
 
 
 def write_split(folder: str | Path, cloud: PointCloud, labels: np.ndarray, suffix: str = ".ply") -> list[Path]:
-    """One file for each instance, "<id><suffix>", points in the cloud's order; the folder appears whole or not at all.
+    """One file for each instance, "<id><suffix>", points in the cloud's order; the folder is written atomically.
 
     InputError when `folder` holds anything but an older split, which is replaced.
     """

@@ -1,4 +1,4 @@
-"""Graphs over the points of a cloud or mesh, and ScanNet's edge weights."""
+"""Neighbourhood graphs of clouds and meshes, normals, and edge weights as in ScanNet's segmentator."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from perception.export.neighbors import Neighbors, cores
 def mesh_edges(faces: np.ndarray, num_points: int) -> np.ndarray:
     """Edges [E, 2] int32 of triangles [F, 3], three per face as ScanNet's segmentator lists them: 12, 13, 32.
 
-    Faces that name a corner twice contribute their proper edges only.
+    Of faces that contain a vertex twice, edges from a vertex to itself are left out.
     """
     if faces.size and (faces.min() < 0 or faces.max() >= num_points):
         raise InputError(f"a face names vertex {faces.max()}, but there are {num_points} vertices")
@@ -23,7 +23,7 @@ def mesh_edges(faces: np.ndarray, num_points: int) -> np.ndarray:
 def neighbor_lists(points: np.ndarray, k: int) -> np.ndarray:
     """The k nearest points [P, k] int32 of each point, itself among them, nearest first; −1 where there are fewer.
 
-    A point that is not finite has no neighbours and is nobody's neighbour.
+    Points that are not finite have no neighbours and are not neighbours of others.
     """
     finite = np.flatnonzero(np.isfinite(points).all(axis=1)).astype(np.int32)
     if len(finite) == 0:
@@ -45,7 +45,7 @@ def list_edges(lists: np.ndarray) -> np.ndarray:
 
 
 def mesh_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Vertex normals [P, 3] float32, faces weighted by area; zero where a vertex has no proper face."""
+    """Vertex normals [P, 3] float32, faces weighted by area; zero where a vertex has no face of non-zero area."""
     corners = points[faces].astype(np.float64)
     with np.errstate(invalid="ignore"):
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -59,12 +59,12 @@ def mesh_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def list_normals(points: np.ndarray, lists: np.ndarray) -> np.ndarray:
     """Normals [P, 3] float32 of the planes through the neighbour lists [P, k] of points [P, 3].
 
-    The normal is the direction of least variance of a point and its neighbours, of arbitrary sign: weights must not
-    tell the two directions apart. Zero where the neighbours span no plane.
+    The normal is the direction of least variance of a point and its neighbours, of arbitrary sign, so weights must
+    not depend on the sign. Zero where the neighbours span no plane.
     """
     normals = np.empty((len(points), 3), np.float32)
     first = np.flatnonzero(np.isfinite(points).all(axis=1))[:1]
-    local = (points - points[first].sum(axis=0)).astype(np.float32)  # about some point: large coordinates stay exact
+    local = (points - points[first].sum(axis=0)).astype(np.float32)  # relative to some point, to keep float32 precision
     _core.plane_normals(local, np.ascontiguousarray(lists), normals, cores())
     return normals
 
@@ -92,8 +92,8 @@ def scannet_weights(points: np.ndarray, normals: np.ndarray, edges: np.ndarray, 
 def step_weights(points: np.ndarray, normals: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """How far each edge (a, b) leaves the planes of its ends, [E] float32: the squared sine of the larger angle.
 
-    0 on a plane, small on a curved surface, near 1 between parallel surfaces that overlap: a book on a book, a poster
-    on its wall. A missing (zero) normal has no say.
+    0 on a plane, small on a curved surface, near 1 between close parallel surfaces, such as a poster and its wall.
+    Missing (zero) normals are ignored.
     """
     a, b = edges[:, 0], edges[:, 1]
     chord = (points[b] - points[a]).astype(np.float32)

@@ -1,6 +1,6 @@
-"""A map with the photos it was made from as a recording: an MCAP file of ROS 2 messages for Foxglove, RViz, `ros2 bag`.
+"""Writes a map and its photos as an MCAP recording of ROS 2 messages, for Foxglove, RViz and `ros2 bag`.
 
-Written through the optional package `rosbags`.
+Requires the optional package `rosbags`.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA = "sensor_msgs/msg/CameraInfo"
 TRANSFORM = "tf2_msgs/msg/TFMessage"
 PHOTO_SIDE = 640
-"""Pixels of the longer side of the photos inside."""
+"""Long side of the recorded photos in pixels."""
 START, STEP = 1_000_000_000, 500_000_000
-"""Time of the map and from photo to photo, in nanoseconds. 0 would mean "no time" to ROS."""
+"""Time of the map, and time between photos, in nanoseconds. ROS interprets time 0 as "no time"."""
 CAMERA_FRAME = "camera"
 
 Timed = tuple[str, str, int, dict[str, Any]]
@@ -59,8 +59,8 @@ def write_recording(
     labels [P] int32, −1 = none. instances: entries of instances.json; hidden ones are left out. At the start:
     /map/points (PointCloud2: x y z and, when known, rgb), /map/instances (PointCloud2: the labelled points in their
     instance's colour, with instance_id), /map/boxes (MarkerArray), /map/detections (Detection3DArray). Then photo by
-    photo: /tf (map → camera), /camera/camera_info, /camera/image/compressed. A photo that is gone is left out, its
-    camera is not.
+    photo: /tf (map → camera), /camera/camera_info, /camera/image/compressed. A missing photo is left out, its
+    camera is still written.
     """
     messages = _map_messages(cloud, labels, [entry for entry in instances if not entry.get("hidden")], frame)
     for i, view in enumerate(views):
@@ -110,7 +110,7 @@ def _photo_messages(view: View, time: int, frame: str) -> list[Timed]:
         },
     }
     messages: list[Timed] = [("/tf", TRANSFORM, time, {"transforms": [transform]})]
-    with contextlib.suppress(InputError):  # a photo that is gone
+    with contextlib.suppress(InputError):  # a missing photo
         photo = load_photo(view, PHOTO_SIDE)
         height, width = photo.shape[:2]
         K = scaled_K(view, width, height)
@@ -135,7 +135,7 @@ def _stamp(time: int) -> Stamp:
 
 
 def _write_bag(path: Path, messages: Iterable[Timed]) -> None:
-    """An MCAP file of messages; written aside, then put in place."""
+    """Writes an MCAP file of messages atomically."""
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Nearest neighbours in 3D on the compiled k-d tree: exact in float32 about a common centre."""
+"""Nearest neighbours in 3D with the compiled k-d tree, exact in float32 relative to a common centre."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from perception.errors import InputError
 
 
 def cores() -> int:
-    """Cores this process may use."""
+    """Number of CPU cores available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Neighbors:
-    """A search tree over points [N, 3] (any float dtype, finite).
+    """A k-d tree over points [N, 3] (any float dtype, finite).
 
-    Where the cloud lies far from the origin, coordinates are taken about its centre in float64 before they
-    become float32, so that clouds in map coordinates lose nothing.
+    For a cloud far from the origin, its centre is subtracted in float64 before conversion to float32, so that
+    georeferenced coordinates keep their precision.
     """
 
     def __init__(self, points: np.ndarray, threads: int | None = None) -> None:
@@ -29,7 +29,7 @@ class Neighbors:
         low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
         if not np.isfinite(low + high).all():
             raise InputError("points hold NaN or infinite coordinates; leave those out before the search")
-        # Coordinates small against the extent stay as they are: the difference of two near floats is exact.
+        # Coordinates small relative to the extent are not moved: the difference of two close floats is exact.
         small = np.maximum(np.abs(low), np.abs(high)).max() <= 4 * (high - low).max()
         self.center = np.zeros(3) if small else (low + high) / 2
         self.low, self.high = low, high
@@ -37,7 +37,7 @@ class Neighbors:
         self._tree = _core.KdTree(self.local(points), self.threads)
 
     def local(self, points: np.ndarray) -> np.ndarray:
-        """points [Q, 3] about the tree's centre, as the tree sees them: float32, contiguous."""
+        """points [Q, 3] relative to the tree's centre: float32, contiguous."""
         shifted = np.asarray(points) - self.center if self.center.any() else points
         return np.ascontiguousarray(shifted, dtype=np.float32)
 

@@ -1,4 +1,4 @@
-"""Superpoint smoothing: segment the cloud by shape (Felzenszwalb-Huttenlocher), then each segment takes one label."""
+"""Superpoint smoothing: segments a cloud by shape (Felzenszwalb-Huttenlocher); each segment gets one label."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from perception.types import PointCloud
 
 K_THRESHOLD, MIN_SIZE = 0.01, 20  # ScanNet's kThresh and segMinVerts
 NEIGHBORS = 8  # of each point in the graph of a cloud without faces
-COLOR_WEIGHT = 0.2  # of clouds without faces: without it a sheet of paper joins its table, whose normals are the same
-_COLOR_EDGE = 0.3  # RGB distance from which colours part: less is texture and shade, which would part everything
-_COLOR_NEIGHBORS = 9  # points, itself included, whose median colour is a point's: fine prints are no borders
-_STEP_WEIGHT = 0.1  # of leaving the tangent plane: parallel surfaces have the same normals
-NORMAL_NEIGHBORS = 12  # of each point, for the plane that gives its normal
-_BYTES_PER_POINT = 250  # at the height of a kNN segmentation, measured with a margin
+COLOR_WEIGHT = 0.2  # for clouds without faces: separates flat objects, such as paper on a table, with equal normals
+_COLOR_EDGE = 0.3  # RGB distance above which colour separates points; texture and shading are below it
+_COLOR_NEIGHBORS = 9  # points, itself included, over which colours are median filtered to remove fine texture
+_STEP_WEIGHT = 0.1  # of `step_weights`, which separates close parallel surfaces with equal normals
+NORMAL_NEIGHBORS = 12  # of each point, for the plane fit of its normal
+_BYTES_PER_POINT = 250  # peak memory of a kNN segmentation, measured, with a margin
 
 
 def felzenszwalb(
@@ -36,7 +36,7 @@ def felzenszwalb(
 ) -> np.ndarray:
     """Segment [num_nodes] int32 of each node of a graph, numbered in order of appearance (IJCV 2004).
 
-    edges [E, 2] int32, weights [E]; equal weights are taken in the order of their nodes, not of their position.
+    edges [E, 2] int32, weights [E]; equal weights are ordered by node numbers, not by position in `edges`.
     """
     labels = np.empty(num_nodes, np.int32)
     edges = np.ascontiguousarray(edges, np.int32)
@@ -61,7 +61,7 @@ def segment_cloud(cloud: PointCloud, color_weight: float | None = None) -> np.nd
     if cloud.normals is not None:
         normals = np.nan_to_num(cloud.normals)
     weights = scannet_weights(points, normals, edges, oriented=meshed or cloud.normals is not None)
-    if not meshed and cloud.normals is not None:  # a mesh has no edge across a gap; estimated normals feel it
+    if not meshed and cloud.normals is not None:  # meshes have no edges across gaps; estimated normals show steps
         weights += _STEP_WEIGHT * step_weights(points, normals, edges)
     if color_weight is None:
         color_weight = 0.0 if meshed else COLOR_WEIGHT
@@ -90,7 +90,7 @@ def _color_difference(colors: np.ndarray, edges: np.ndarray) -> np.ndarray:
 def vote(labels: np.ndarray, segments: np.ndarray) -> np.ndarray:
     """Each segment's most frequent label, for all its points [P] int32; ties go to the smallest label.
 
-    labels [P] int32 (−1 = none), segments [P] int32 >= 0. "None" has a vote like any other label.
+    labels [P] int32 (−1 = none), segments [P] int32 >= 0. −1 counts like any other label.
     """
     if len(labels) != len(segments):
         raise InputError(f"{len(segments)} segment ids for {len(labels)} points; they must be the same points in order")

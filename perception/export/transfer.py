@@ -1,4 +1,4 @@
-"""Instances of a Gaussian map onto the points of a cloud: the nearest Gaussian's, then the superpoint vote."""
+"""Transfers instance ids of a map to the points of a cloud: nearest Gaussian, then superpoint vote."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from perception.types import PointCloud
 class ExportOptions:
     """How labels are transferred; the defaults are the paper's.
 
-    drop_noise: Gaussians without an instance take no part, so every point gets a label (the paper's released code).
-    max_distance: in map units; None = no limit; "auto" = measured from the map's own spacing (`auto_distance`).
-    smooth: superpoint vote, on or off. segments: a ScanNet *.segs.json used instead of an own segmentation.
+    drop_noise: Gaussians without an instance are ignored, so every point gets a label (as in the released code).
+    max_distance: in map units; None = no limit; "auto" = computed from the map's spacing (`auto_distance`).
+    smooth: superpoint vote, on or off. segments: a ScanNet *.segs.json to use instead of computing a segmentation.
     """
 
     drop_noise: bool = True
@@ -47,7 +47,7 @@ def export_labels(
     segments = segment_cloud(cloud) if given is None else read_segments(given, len(labels))
     smoothed = vote(labels, segments)
     if limit is not None:
-        smoothed[labels < 0] = -1  # a vote does not reach where the map has nothing
+        smoothed[labels < 0] = -1  # points beyond the map stay unlabelled
     return np.where(np.isfinite(cloud.points).all(axis=1), smoothed, -1).astype(np.int32)
 
 
@@ -65,7 +65,7 @@ def resolved(options: ExportOptions, means: np.ndarray, instance_ids: np.ndarray
 def check_overlap(means: np.ndarray, points: np.ndarray) -> float:
     """Share of the finite points inside the map's bounds (1st to 99th percentile of its means).
 
-    InputError when the cloud lies wholly outside them: another frame or another unit.
+    InputError when the two bounding boxes do not overlap: the cloud has another frame or unit.
     """
     finite = points[np.isfinite(points).all(axis=1)]
     if len(finite) == 0:

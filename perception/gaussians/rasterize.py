@@ -283,8 +283,7 @@ def rasterize(
     eps2d: px² added to the diagonal of every 2D covariance, the variance of the pixel's blur (named as in gsplat).
     variance=False and depth=False save time: `feature_variance` and `depths` are not computed (None).
     threads: 0 takes torch.get_num_threads(). The result is the same, bit for bit, for any number of threads.
-    Finite inputs up to 1e15 in magnitude give finite images and gradients; InputError names an input that is not
-    finite.
+    Finite inputs up to 1e15 in magnitude give finite images and gradients. InputError names a non-finite input.
     """
     global _function
     if _function is None:

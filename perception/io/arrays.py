@@ -1,4 +1,4 @@
-"""NumPy's .npy and .npz from others: no more is allocated than the file holds, and damage is told in one line."""
+"""Reads untrusted .npy and .npz files: allocates no more than the file holds, reports damage as one-line errors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from perception.errors import InputError
 from perception.io.documents import brief
 
 MOST_ARCHIVE = 4 << 30
-"""Bytes an .npz may unpack to; a damaged or hostile one must not fill the memory."""
+"""Maximum uncompressed size of an .npz in bytes, against damaged or hostile files that would fill the memory."""
 DAMAGE = (
     ValueError,
     KeyError,
@@ -34,7 +34,7 @@ DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""What numpy and zipfile raise on bytes that are no array or archive."""
+"""Exceptions that numpy and zipfile raise on bytes that are not an array or archive."""
 
 
 def read_npz(source: Path | bytes, file: Path, advice: str) -> dict[str, np.ndarray]:
@@ -57,8 +57,8 @@ def read_npz(source: Path | bytes, file: Path, advice: str) -> dict[str, np.ndar
 
 
 def map_npy(file: Path) -> np.ndarray:
-    """The array of an .npy, mapped into memory for reading. Raises what DAMAGE lists, ValueError for a header that is
-    longer than the file: numpy would ask for up to 4 GiB to read it."""
+    """The array of an .npy, memory-mapped read-only. Raises the exceptions in DAMAGE; ValueError for a header length
+    beyond the file, for which numpy would allocate up to 4 GiB."""
     with file.open("rb") as stream:
         version = _version(stream)
         length = struct.unpack("<H", stream.read(2)) if version == (1, 0) else struct.unpack("<I", stream.read(4))
@@ -76,7 +76,7 @@ def _version(stream: IO[bytes]) -> tuple[int, int]:
 
 
 def _read_npy(stream: IO[bytes], size: int) -> np.ndarray:
-    """One array of `size` bytes with its header; the header is believed only when it fits that size."""
+    """One array with its header from `size` bytes; a header that does not agree with this size is an error."""
     version = _version(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = read(stream)

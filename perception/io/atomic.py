@@ -1,8 +1,8 @@
-"""Files and folders that appear under their name complete, or not at all.
+"""Atomic writing of files and folders: they appear under their final name complete, or not at all.
 
-A writer fills a temporary sibling `.NAME.new-PID-RANDOM`, on which it holds a lock, and renames it. Only writers remove
-what writers left behind, and only what nobody holds a lock on: a process number says nothing about a process in another
-container or on another host. Where there are no locks, leftovers stay.
+A writer fills a temporary sibling `.NAME.new-PID-RANDOM`, holds a lock on it, and renames it at the end. Writers delete
+temporary siblings of terminated writers, recognised by the released lock; process ids are not compared, as they are not
+valid across containers and hosts. On file systems without locks these siblings are kept.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from perception.errors import InputError
 from perception.io.file_locks import lock, names
 
 _FULL = {errno.ENOSPC, errno.EDQUOT}
-_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # Linux' fcntl.h and fs.h
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # from Linux fcntl.h and fs.h
 _REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 
@@ -30,7 +30,7 @@ _REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
 def atomic_file(path: Path) -> Iterator[Path]:
     """Yield a temporary sibling to write; on success it is synced and renamed to `path`, else removed.
 
-    What killed writers of `path` left beside it goes too.
+    Temporary siblings left by killed writers of `path` are deleted. InputError for a full disk or missing rights.
     """
     path = Path(path)
     temporary = _sibling(path, "new")
@@ -44,15 +44,15 @@ def atomic_file(path: Path) -> Iterator[Path]:
             temporary.replace(path)
             _sync(path.parent)
     finally:
-        with contextlib.suppress(OSError):  # where nothing may be written there is nothing to remove
+        with contextlib.suppress(OSError):  # in a read-only folder no temporary was created
             temporary.unlink()
 
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[BinaryIO]:
-    """A binary file to write into; it takes the place of `path` only when the block ends without an error.
+    """Yields a binary file to write; it replaces `path` only when the block ends without an error.
 
-    Its folder must exist; whatever the system refuses is an InputError.
+    The folder of `path` must exist. Every OSError is raised as InputError.
     """
     path = Path(path)
     try:
@@ -67,12 +67,12 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def atomic_directory(path: Path) -> Iterator[Path]:
-    """Yield an empty temporary sibling folder to fill; on success it takes the place of `path`, else it is removed.
+    """Yield an empty temporary sibling folder to fill; on success it replaces `path`, else it is removed.
 
-    On Linux the two folders are exchanged in one step, so there is no instant without a `path`. Where the system
-    cannot, the old folder is moved aside first: between the two renames (microseconds) `path` does not exist, and a
-    process killed right there leaves the old folder beside it: `standing(path)` for readers, and the next
-    `atomic_directory(path)` or `recover(path)` puts it back. It is never half of one.
+    On Linux renameat2 exchanges the two folders in one step, so `path` exists at all times. On other systems the old
+    folder is renamed first, and `path` does not exist between the two renames (microseconds). If the process is killed
+    there, `standing(path)` gives readers the old folder; the next `atomic_directory(path)` or `recover(path)` restores
+    it. `path` is never partly written.
     """
     path = Path(path)
     temporary, old = _sibling(path, "new"), _sibling(path, "old")
@@ -92,7 +92,7 @@ def atomic_directory(path: Path) -> Iterator[Path]:
 
 
 def recover(path: Path) -> None:
-    """For writers: puts `path` back when a writer died between its two renames, and deletes leftovers nobody holds."""
+    """For writers: restores `path` if a writer was killed between its renames; deletes unlocked temporary siblings."""
     path = Path(path)
     for kind, item in _leftovers(path):
         with contextlib.suppress(OSError):
@@ -111,7 +111,7 @@ def recover(path: Path) -> None:
 
 
 def standing(path: Path) -> Path:
-    """For readers: `path`, or the folder that lay there when a writer stands or died between its two renames."""
+    """For readers: `path`, or the previous folder if a writer is, or was killed, between its two renames."""
     if path.exists():
         return path
     return next((item for kind, item in reversed(_leftovers(path)) if kind == "old"), path)
@@ -119,7 +119,7 @@ def standing(path: Path) -> Path:
 
 @contextlib.contextmanager
 def _locked(path: Path, make: Callable[[], None]) -> Iterator[None]:
-    """Makes a temporary file or folder and holds a lock on it, where there are locks."""
+    """Calls `make` to create `path` and holds a lock on it, if the file system supports locks."""
     while True:
         make()
         descriptor = os.open(path, os.O_RDONLY)
@@ -129,18 +129,18 @@ def _locked(path: Path, make: Callable[[], None]) -> Iterator[None]:
             if names(path, descriptor):
                 yield
                 return
-        finally:  # else another writer took it for a leftover between our two calls: once more
+        finally:  # if another writer deleted it before it was locked: retry
             os.close(descriptor)
 
 
 def _leftovers(path: Path) -> list[tuple[str, Path]]:
-    """(new or old, where) of all temporary siblings of `path`, oldest first."""
+    """("new" or "old", location) of all temporary siblings of `path`, oldest first."""
     found = []
     with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(path.parent) as entries:
         for entry in entries:
             kind = _kind(entry.name, path)
             if kind is not None:
-                with contextlib.suppress(FileNotFoundError):  # a living writer has just renamed it
+                with contextlib.suppress(FileNotFoundError):  # an active writer has just renamed it
                     found.append((entry.stat(follow_symlinks=False).st_mtime_ns, kind, Path(entry.path)))
     return [(kind, item) for _, kind, item in sorted(found)]
 
@@ -151,19 +151,19 @@ def _swap(new: Path, path: Path, old: Path) -> None:
     elif _exchange(new, path):
         old = new  # where the old folder lies now
     else:
-        with _locked(path, lambda: None):  # between the renames too: nobody is to put the old folder back
+        with _locked(path, lambda: None):  # so that `recover` does not restore it between the renames
             path.rename(old)
             try:
                 new.rename(path)
             except OSError:
                 old.rename(path)
                 raise
-    _sync(path.parent)  # before the old folder goes: a power cut must not leave neither
+    _sync(path.parent)  # before deleting the old folder, so that one of the two survives a power cut
     shutil.rmtree(old, ignore_errors=True)
 
 
 def _exchange(a: Path, b: Path) -> bool:
-    """Swap two names in one step by Linux' renameat2; False where the system or its file system has no such call."""
+    """Exchanges two names in one step with Linux renameat2; False where this is not supported."""
     try:
         call = ctypes.CDLL(None, use_errno=True).renameat2
     except (OSError, AttributeError):
@@ -179,7 +179,7 @@ def _sibling(path: Path, kind: str) -> Path:
 
 
 def _kind(name: str, path: Path) -> str | None:
-    """Whether a file name is one that `_sibling` makes for `path`: "new", "old" or None."""
+    """The kind, "new" or "old", of a name that `_sibling` makes for `path`; None for other names."""
     start = f".{path.name}."
     parts = name[len(start) :].split("-") if name.startswith(start) else []
     return parts[0] if len(parts) == 3 and parts[0] in ("new", "old") and parts[1].isdigit() else None
@@ -198,7 +198,7 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def _told_of(path: Path, temporary: Path) -> Iterator[None]:
-    """What is said of a file inside the temporary folder names the folder that was asked for."""
+    """Replaces the temporary folder by `path` in InputError messages."""
     try:
         yield
     except InputError as error:
@@ -212,7 +212,7 @@ def _disk_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        short = error.errno is None and str(error).endswith(" written")  # all that numpy tells of a full disk
+        short = error.errno is None and str(error).endswith(" written")  # numpy's only sign of a full disk
         if error.errno in _FULL or short:
             raise InputError(f"{path}: the disk is full, nothing was written; free some space") from error
         if error.errno in _REFUSED:

@@ -1,4 +1,4 @@
-"""Calibrated cameras in ROS camera_info YAML (the format of camera_calibration and of `calib/`)."""
+"""Camera calibrations in ROS camera_info YAML, the format of the ROS package camera_calibration."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)
 
 
 def read_camera(path: Path) -> Lens:
-    """The lens in a camera_info file. Pixels; distortion models plumb_bob, rational_polynomial, equidistant.
+    """The lens in a camera_info file, in pixels; distortion models plumb_bob, rational_polynomial, equidistant.
 
-    ROS and OpenCV put the centre of the first pixel at (0, 0), COLMAP and this project at (0.5, 0.5): half a pixel
-    is added to the principal point.
+    The centre of the first pixel is (0, 0) in ROS and OpenCV and (0.5, 0.5) in COLMAP and this project, so 0.5 is added
+    to the principal point.
     """
     path = Path(path)
     data = _load(path)
@@ -45,11 +45,11 @@ def read_camera(path: Path) -> Lens:
 
 
 def write_camera(path: Path, name: str, model: str, size: tuple[int, int], values: np.ndarray) -> None:
-    """A ROS camera_info YAML of a camera of (width, height) pixels.
+    """Writes a ROS camera_info YAML; size: (width, height) in pixels.
 
     model "pinhole": values fx fy cx cy k1 k2 p1 p2 k3 (plumb_bob); "fisheye": fx fy cx cy k1 k2 k3 k4 (equidistant);
-    the principal point in OpenCV's and ROS' convention, the centre of the first pixel being (0, 0). The rectified
-    camera is the camera itself.
+    the principal point in the convention of OpenCV and ROS, with the centre of the first pixel at (0, 0). The rectified
+    camera is written equal to the camera.
     """
     fx, fy, cx, cy = (float(v) for v in values[:4])
     kind = "equidistant" if model == "fisheye" else "plumb_bob"
@@ -57,7 +57,7 @@ def write_camera(path: Path, name: str, model: str, size: tuple[int, int], value
 
 
 def write_camera_info(path: Path, message: Any, rectified: bool = False) -> None:
-    """A ROS CameraInfo message (ROS 1 or 2) as a camera file; rectified images are seen by its projection matrix."""
+    """Writes a ROS CameraInfo message (ROS 1 or 2) as a camera file; rectified: from its projection matrix P."""
 
     def field(name: str) -> list[float]:
         values = getattr(message, name.lower(), None)

@@ -1,4 +1,4 @@
-"""Messages as bytes: ROS 2's CDR through the optional package `rosbags`."""
+"""Serialises ROS 2 messages to and from CDR with the optional package `rosbags`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from perception.errors import missing_extra
 
-# What rosbags does not carry itself: vision_msgs 4 (ROS 2 Humble and later) and the two services the node offers.
+# Types missing in rosbags: vision_msgs 4 (ROS 2 Humble and later) and the two services the node offers.
 _MORE = {
     "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
     "vision_msgs/msg/ObjectHypothesisWithPose": (
@@ -31,7 +31,7 @@ _MORE = {
 
 @cache
 def typestore() -> Any:
-    """rosbags' types of ROS 2 Jazzy with those above added."""
+    """The ROS 2 Jazzy types of rosbags with those above added."""
     try:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
@@ -45,17 +45,17 @@ def typestore() -> Any:
 
 
 def serialize(kind: str, message: dict[str, Any]) -> bytes:
-    """CDR, little endian with its four-byte head, of a message given as a dict of its fields."""
+    """A message, given as a dict of its fields, as little-endian CDR with the four-byte header."""
     return bytes(typestore().serialize_cdr(build(kind, message), kind))
 
 
 def deserialize(kind: str, data: bytes) -> dict[str, Any]:
-    """The fields of a message. Raises ValueError when `data` is no such message, whole and nothing but it."""
+    """The fields of a message. Raises ValueError unless `data` is exactly one such message."""
     if len(data) < 4 or data[0] != 0 or data[1] > 1:
         raise ValueError(f"{kind}: no CDR head")
     try:
         message = typestore().deserialize_cdr(data, kind)
-    except Exception as error:  # its generated code raises whatever the bytes happen to break
+    except Exception as error:  # the generated code raises various exceptions on malformed bytes
         raise ValueError(f"{kind}: {error}") from error
     return plain(message)
 
@@ -75,7 +75,7 @@ def _plain(value: Any) -> Any:
 
 
 def build(kind: str, message: dict[str, Any]) -> Any:
-    """The rosbags message of a dict; fields left out have ROS's default, unknown ones are a KeyError."""
+    """The rosbags message of a dict. Omitted fields get the ROS default; unknown fields raise KeyError."""
     store = typestore()
     fields = store.fielddefs[kind][1]
     unknown = message.keys() - {name for name, _ in fields}
@@ -102,7 +102,7 @@ def _value(definition: tuple[Any, Any], value: Any) -> Any:
 
 
 _DEFAULTS = {"geometry_msgs/msg/Quaternion": {"w": 1.0}}
-"""The only default that is not zero in the types used here; rosbags does not carry it."""
+"""Non-zero default values in the types used here, which rosbags does not provide."""
 _DTYPES = {"byte": "uint8", "octet": "uint8", "char": "uint8"}
 
 

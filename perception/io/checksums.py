@@ -1,4 +1,4 @@
-"""Is a map's directory what was written? Sizes at every opening, SHA-256 when all of a file is read or on demand."""
+"""Integrity of a map folder: file sizes are checked at every opening, SHA-256 on demand and at full reads."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from perception.errors import InputError
 REPORT = "report.html"
 FACTS = "map.json"
 EDITABLE = "instances.json"
-"""People write labels into this file by hand, so a change there is told, not refused."""
+"""Users may edit labels in this file by hand, so a changed checksum is reported and not an error."""
 
 
 def file_facts(folder: Path) -> dict[str, dict[str, Any]]:
-    """{name: {"bytes", "sha256"}} of every file in `folder` but map.json, which cannot hold its own, and the report."""
+    """{name: {"bytes", "sha256"}} of every file in `folder` except the report and map.json, which holds this table."""
     return {file.name: facts_of(file) for file in _files(folder)}
 
 
@@ -26,7 +26,7 @@ def facts_of(file: Path) -> dict[str, Any]:
 
 
 def _files(folder: Path) -> list[Path]:
-    """The map's own files but map.json and the report; what a killed writer left aside is hidden."""
+    """The map's files except map.json and the report; hidden files, such as temporary ones, are skipped."""
     files = (file for file in folder.iterdir() if file.is_file() and file.name not in (FACTS, REPORT))
     return sorted(file for file in files if not file.name.startswith("."))
 
@@ -75,8 +75,8 @@ def check_file(folder: Path, info: dict[str, Any], name: str) -> None:
 def verify(folder: Path, info: dict[str, Any]) -> dict[str, str]:
     """Checks every byte: {file: "ok", "edited" or "no checksum"}; InputError naming the first damaged file.
 
-    "edited": instances.json differs from what was written, which labels set by hand do. Maps made before checksums
-    were recorded have none.
+    "edited": instances.json differs from what was written, as after setting labels by hand. "no checksum": the map was
+    made before checksums were recorded.
     """
     check_sizes(folder, info)
     known = listed(folder, info)
@@ -95,7 +95,7 @@ def verify(folder: Path, info: dict[str, Any]) -> dict[str, str]:
 
 
 def listed(folder: Path, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The files map.json lists; {} for a map made before they were. InputError when the list makes no sense."""
+    """The file table of map.json; {} for older maps without one. InputError when the table is malformed."""
     files = info.get("files", {})
     good = isinstance(files, dict) and all(
         isinstance(facts, dict)

@@ -1,4 +1,4 @@
-"""Point clouds and meshes from and to files, the format told by the file's extension. Order and count are kept."""
+"""Reads and writes point clouds and meshes; the extension selects the format. Order and number of points are kept."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def read_cloud(path: str | Path) -> PointCloud:
 
 
 def write_cloud(path: str | Path, cloud: PointCloud) -> None:
-    """Write .ply (binary), .pcd (binary), .npz or .xyz: points and what the format has of the rest."""
+    """Write .ply (binary), .pcd (binary), .npz or .xyz: points and those attributes that the format supports."""
     path = Path(path)
     writer = _WRITERS.get(path.suffix.lower())
     if writer is None:
@@ -58,7 +58,7 @@ def write_cloud(path: str | Path, cloud: PointCloud) -> None:
 
 
 def to_int32(values: np.ndarray, where: str) -> np.ndarray:
-    """Label column as int32; values that do not fit (or are no whole numbers) are an InputError naming `where`."""
+    """Label column as int32. InputError naming `where` for values that are not integers or out of range."""
     if values.dtype == np.int32:
         return values
     limits = np.iinfo(np.int32)
@@ -178,7 +178,7 @@ _READERS: dict[str, Callable[[Path], PointCloud]] = {
     ".las": read_las,
     ".laz": read_las,
 }
-# Memory to read a file, by its size: compressed and text formats grow.
+# Memory to read a file as a multiple of its size, for compressed and text formats.
 _BYTES_PER_BYTE = {".laz": 40, ".obj": 12, ".xyz": 4, ".txt": 4, ".pts": 4}
 _WRITERS: dict[str, Callable[[Path, PointCloud], None]] = {
     ".ply": _write_ply_cloud,

@@ -1,4 +1,4 @@
-"""Refusing what would not fit, before the machine starts to swap or kill."""
+"""Checks available memory before large allocations, to avoid swapping and the out-of-memory killer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from perception.errors import InputError
 
 
 def available_memory() -> int:
-    """Bytes that can be allocated without swapping, as the kernel estimates; elsewhere all there is."""
+    """Bytes that can be allocated without swapping (Linux kernel's estimate); on other systems the total memory."""
     try:
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
@@ -20,7 +20,7 @@ def available_memory() -> int:
 
 
 def require_memory(needed: float, what: str, advice: str) -> None:
-    """InputError naming `what` and `advice` when `needed` bytes exceed nine tenths of what is free."""
+    """InputError naming `what` and `advice` when `needed` bytes exceed 90 % of the available memory."""
     free = available_memory()
     if needed > 0.9 * free:
         raise InputError(f"{what}: needs about {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; {advice}")

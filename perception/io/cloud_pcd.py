@@ -1,7 +1,7 @@
 """PCD, the Point Cloud Library's format (version 0.7): ASCII, binary and binary_compressed (LZF) in, binary out.
 
-Our own reader, because pypcd4 1.5 reads a file that is cut short at the end of a row as a smaller cloud, allocates what
-a damaged header asks for, and needs a compiled LZF beside it.
+pypcd4 1.5 is not used: it reads a file truncated at the end of a row as a smaller cloud, allocates the size given in a
+damaged header without a check, and needs a compiled LZF package.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def _from_compressed(data: bytes, dtype: np.dtype, points: int, path: Path) -> n
 
 
 def lzf_decompress(data: bytes, size: int) -> bytes | None:
-    """LZF (Marc Lehmann): literal runs and back references of at most 8 KiB; None if it is damaged."""
+    """LZF (Marc Lehmann): literal runs and back references of at most 8 KiB; None if `data` is damaged."""
     out = bytearray()
     at, end = 0, len(data)
     try:
@@ -163,7 +163,7 @@ def _to_cloud(rows: np.ndarray, path: Path) -> PointCloud:
 
 
 def write_pcd(path: Path, cloud: PointCloud) -> None:
-    """Binary PCD 0.7: x y z (float 4 or 8), rgb packed in a float as PCL has it, normals, int32 labels."""
+    """Binary PCD 0.7: x y z (float 4 or 8), rgb packed in a float as in PCL, normals, int32 labels."""
     size = 8 if cloud.points.dtype == np.float64 else 4
     columns = {axis: cloud.points[:, i].astype(f"<f{size}") for i, axis in enumerate("xyz")}
     if cloud.colors is not None:

@@ -1,4 +1,4 @@
-"""Clouds in plain text: XYZ tables and Wavefront OBJ."""
+"""Point clouds in text formats: XYZ tables and Wavefront OBJ."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def read_xyz(path: Path) -> PointCloud:
         raise InputError(f"{path}: rows have {rows.shape[1]} columns; expected x y z at least")
     cloud = PointCloud(np.ascontiguousarray(rows[:, :3]))
     rest = rows[:, 3:]
-    if rest.shape[1] in (4, 7):  # an intensity stands before the colour
+    if rest.shape[1] in (4, 7):  # an intensity column precedes the colour
         rest = rest[:, 1:]
     while rest.shape[1] >= 3:
         triple, rest = rest[:, :3], rest[:, 3:]
@@ -42,7 +42,7 @@ def _table(path: Path) -> np.ndarray:
         data = b"\n".join(kept)
     lines = data.lstrip().split(b"\n", 2)
     if len(lines) > 1 and len(lines[0].split()) == 1 < len(lines[1].split()):
-        data = data.lstrip().split(b"\n", 1)[1]  # a .pts file begins with its count
+        data = data.lstrip().split(b"\n", 1)[1]  # a .pts file begins with the number of points
     width = len(data.lstrip().split(b"\n", 1)[0].split())
     if width == 0:
         return np.empty((0, 3))
@@ -67,7 +67,7 @@ def _looks_like_color(triple: np.ndarray) -> bool:
 
 
 def write_xyz(path: Path, cloud: PointCloud) -> None:
-    """x y z, then r g b and nx ny nz where known; labels have no place in this format."""
+    """Writes x y z, then r g b and nx ny nz where known; labels are not written."""
     with replacing(path) as file:
         columns = [cloud.points.astype(np.float64)]
         formats = ["%.9g" if cloud.points.dtype == np.float32 else "%.17g"] * 3

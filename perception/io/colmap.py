@@ -27,7 +27,7 @@ def read_workspace(folder: Path, workdir: Path, seed: int, progress: Progress, s
     """The largest sparse model of a workspace as a Scene, in COLMAP's world.
 
     Photos that are missing or damaged are left out and reported; strict: damaged ones raise InputError. Image names
-    that leave the photo folder are refused.
+    that point outside the photo folder raise InputError.
     """
     found = {path: _read_model(path) for path in _models(folder)}
     path, model = max(found.items(), key=lambda item: item[1].num_reg_images())
@@ -78,7 +78,7 @@ def views_of_model(
 
 
 def _reprojection_error(model: Any) -> float | None:
-    """Mean error in pixels recomputed from tracks (files may lack it); None without observations."""
+    """Mean reprojection error in pixels, recomputed from the tracks as files may lack it; None without observations."""
     if not any(point.track.length() for point in model.points3D.values()):
         return None
     model.update_point_3d_errors()
@@ -119,7 +119,7 @@ def _read_model(path: Path) -> Any:
 
 
 def _refuse_nan_text(path: Path) -> None:
-    """NaN poses in a text model, told by name (reading them may end in COLMAP's own fatal checks)."""
+    """InputError naming the file for NaN poses in a text model, on which COLMAP may abort the process."""
     file = path / "images.txt"
     lines = [line for line in file.read_text(errors="replace").splitlines() if line and not line.startswith("#")]
     for line in lines:

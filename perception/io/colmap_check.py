@@ -1,7 +1,7 @@
 """Checks of a binary COLMAP model before pycolmap reads it.
 
-pycolmap trusts every count and looks for the end of every name, so a damaged file makes it run without end or ask for
-all memory. Here the files are read once, only ids are kept, and damage is reported by file and record.
+pycolmap does not check counts and string ends, so a damaged file can make it loop forever or allocate all memory. Here
+each file is read once, only ids are kept, and damage is reported by file and record.
 Layout: COLMAP's documentation, "Output Format"; little endian. Rigs and frames came with COLMAP 3.12.
 """
 
@@ -20,7 +20,7 @@ _LONGEST_NAME = 4096
 
 
 def check_binary_model(folder: Path) -> None:
-    """InputError naming the file and record that cannot be right."""
+    """InputError naming the first file and record that is not valid."""
     cameras = _walk(folder / "cameras.bin", _camera)
     images = _walk(folder / "images.bin", _image)
     _walk(folder / "points3D.bin", _point)
@@ -33,7 +33,7 @@ def check_binary_model(folder: Path) -> None:
 
 
 class _Reader:
-    """A file's bytes and how far they are read; ValueError past their end."""
+    """Sequential reader of a file's bytes; ValueError when reading past the end."""
 
     def __init__(self, data: bytes):
         self.data, self.at = data, 0
@@ -64,7 +64,7 @@ _DOUBLE = struct.Struct("<d")
 
 
 def _walk(file: Path, record: Callable[[_Reader], tuple[int, int]]) -> list[tuple[int, int]]:
-    """(id, other id) of every record; [] where there is no such file. Records with the same id are refused."""
+    """(id, other id) of every record; [] if the file does not exist. InputError for records with the same id."""
     if not file.is_file():
         return []
     reader, found = _Reader(file.read_bytes()), []

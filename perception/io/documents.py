@@ -1,4 +1,4 @@
-"""JSON and YAML files that others wrote: parsed, or refused in one line whatever they hold."""
+"""Parses untrusted JSON and YAML files; all parse errors become InputError with a one-line message."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 from perception.errors import InputError
 
 _YAML_ERRORS = (ValueError, LookupError, AttributeError, TypeError, OverflowError, RecursionError)
-"""What PyYAML raises besides its own errors, on dates that do not exist, numbers without digits and the like."""
+"""Exceptions that PyYAML raises besides its own, for example on invalid dates or numbers without digits."""
 
 
 def read_json(file: Path) -> Any:
-    """The value in a JSON file; InputError when there is none."""
+    """The value in a JSON file; InputError when it is not valid JSON."""
     try:
         return json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -23,9 +23,9 @@ def read_json(file: Path) -> Any:
 
 
 def read_yaml(file: Path, expected: str) -> Any:
-    """The value in a YAML file; InputError naming `expected` when there is none.
+    """The value in a YAML file; InputError naming `expected` when it is not valid YAML.
 
-    Aliases (*name) are refused: a few lines of them stand for more values than any memory holds.
+    Aliases (*name) are refused: nested aliases can expand to more values than fit into memory.
     """
     import yaml
 

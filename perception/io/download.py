@@ -1,7 +1,7 @@
-"""Downloads over HTTP that resume after broken connections: what has arrived stays in a `.part` file.
+"""HTTP downloads that resume after broken connections; received bytes are kept in a `.part` file.
 
-A `Range` request asks for the rest; with `If-Range` the server sends the whole file when it has changed since. A server
-without ranges sends the whole file too, which is then written from the start.
+A `Range` request fetches the remaining bytes; with `If-Range` the server sends the whole file if it has changed.
+Servers without range support also send the whole file, which then replaces the partial one.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from perception.errors import InputError
 from perception.progress import Progress
 
 CHUNK = 1 << 20
-TIMEOUT = 30.0  # seconds without a byte
-ATTEMPTS = 4  # connections in a row that bring nothing new
+TIMEOUT = 30.0  # seconds without received data
+ATTEMPTS = 4  # consecutive connections without new data
 
 Told = Callable[[int, int], object]
 
 
 def is_url(source: str) -> bool:
-    """Whether it is to be fetched rather than copied."""
+    """Whether `source` is a URL to download rather than a local file."""
     return source.lower().startswith(("http://", "https://"))
 
 
 def download(url: str, part: Path, progress: Progress | None = None, name: str = "") -> Path:
-    """Fetches `url` into `part`, from the bytes that lie there on; returns `part`, complete.
+    """Downloads `url` to `part`, after the bytes already there; returns `part` when complete.
 
-    part: its sibling `*.part.json` holds which version of the file it belongs to. name: of the stage whose progress is
-    shown, in bytes. InputError when the server refuses, or ATTEMPTS connections in a row bring nothing; `part` stays.
+    part: the sibling `*.part.json` records the version of the file. name: stage name of the progress display, in bytes.
+    InputError when the server refuses, or after ATTEMPTS connections without new data; `part` is then kept.
     """
     part.parent.mkdir(parents=True, exist_ok=True)
     fruitless = 0
@@ -60,7 +60,7 @@ def sha256_of(path: Path) -> str:
 
 
 def _attempt(url: str, part: Path, told: Told | None) -> str | None:
-    """One connection: None when the file is complete, else what went wrong in words."""
+    """One connection: None when the file is complete, else a description of the error."""
     have = _size(part)
     try:
         with urllib.request.urlopen(_request(url, part, have), timeout=TIMEOUT) as answer:
@@ -70,7 +70,7 @@ def _attempt(url: str, part: Path, told: Told | None) -> str | None:
             _memory(part).write_text(json.dumps({"url": url, "mark": _mark(answer)}), encoding="utf-8")
             return _receive(answer, part, start, total, told)
     except urllib.error.HTTPError as error:
-        if error.code == 416 and have:  # no bytes after those we have: complete, or another file by now
+        if error.code == 416 and have:  # range not satisfiable: file complete, or changed
             if str(error.headers.get("Content-Range", "")).endswith(f"/{have}"):
                 return None
             part.unlink()
@@ -98,7 +98,7 @@ def _request(url: str, part: Path, have: int) -> urllib.request.Request:
 
 
 def _extent(answer: Any, have: int) -> tuple[int, int | None]:
-    """First byte that comes, and the size of the whole file where it is told."""
+    """Offset of the first byte in the response, and the size of the whole file if given."""
     length = answer.headers.get("Content-Length")
     size = int(length) if length is not None and length.isdigit() else None
     if answer.status != 206:
@@ -125,7 +125,7 @@ def _receive(answer: Any, part: Path, start: int, total: int | None, told: Told 
 
 
 def _mark(answer: Any) -> str | None:
-    """What tells one version of a file from the next: a strong ETag, else the date."""
+    """Version identifier of a file: its strong ETag, else its modification date."""
     tag = answer.headers.get("ETag")
     if tag and not tag.startswith("W/"):
         return str(tag)

@@ -21,24 +21,24 @@ from perception.progress import Progress
 from perception.types import Lens
 
 MAX_IMAGE_SIDE = 1600
-"""Larger photos are shrunk for feature extraction only; keypoints come back in full-resolution pixels."""
+"""Larger photos are downscaled for feature extraction only; keypoints are in full-resolution pixels."""
 MAX_FEATURES, MIN_FEATURES = 2048, 450
-"""Photos with fewer than MIN_FEATURES are extracted again one octave below (doubled size), at four times the cost."""
+"""Photos with fewer than MIN_FEATURES are extracted again at double size (first octave −1), at four times the cost."""
 PEAK_THRESHOLD = 0.004
 MIN_INLIERS = 20
-"""Verified matches that a pair of photos must have."""
+"""Least number of verified matches of a pair of photos."""
 EXHAUSTIVE_BELOW = 20
 NEIGHBORS = 4
-"""Neighbours by name that are always matched: photos are usually taken in order."""
+"""Each photo is always matched with this many neighbours by name, as photos are usually taken in order."""
 COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS = 256, 4, 0.7, 6
-"""A strict ratio also keeps out pairs that only share repeated textures, which fold models; every photo keeps its
-PARTNERS best pairs so that the set stays connected."""
+"""Preemptive matching. The strict ratio rejects pairs that share repeated textures only; these give wrong models.
+Every photo keeps its PARTNERS best pairs, so that the match graph stays connected."""
 
 
 class FeatureStore:
-    """A folder with `database.db` and `photos/`, where the photos lie under numbered names (see staging).
+    """A folder with the COLMAP `database.db` and `photos/`, which holds the photos under numbered names (see staging).
 
-    names[i] is the i-th photo's name there and in the database.
+    names[i] is the name of the i-th photo in both.
     """
 
     def __init__(self, folder: Path, names: list[str], facts: dict[str, Any]) -> None:
@@ -52,7 +52,7 @@ class FeatureStore:
 def build_features(
     photos: list[Path], lenses: list[Lens | None], workdir: Path, seed: int, progress: Progress
 ) -> FeatureStore:
-    """Extract and match; skipped when `workdir` holds the result for the same photos, lenses, seed and options.
+    """Extracts and matches features, unless `workdir` holds the result of the same photos, lenses, seed and options.
 
     lenses: known intrinsics per photo, or None to let structure from motion find them. Photos share one camera when
     size, EXIF camera and known lens agree.
@@ -94,7 +94,7 @@ def _extract(
     groups: dict[Any, list[int]] = {}
     for index, photo in enumerate(photos):
         groups.setdefault(lenses[index] or _camera_key(photo), []).append(index)
-    pycolmap.Database.open(database).close()  # creates it
+    pycolmap.Database.open(database).close()  # creates the file
     done = 0
     for members in groups.values():
         lens = lenses[members[0]]
@@ -109,7 +109,7 @@ def _extract(
             reader.camera_model = lens.model
             reader.camera_params = ", ".join(map(repr, lens.params))
         chosen = [names[i] for i in members]
-        # Else extraction numbers photos as its threads finish, and later random choices depend on these numbers.
+        # Fixes the image ids, which otherwise depend on thread timing; later random choices depend on the ids.
         pycolmap.import_images(database, root, pycolmap.CameraMode.SINGLE, chosen, reader)
         pycolmap.extract_features(database, root, chosen, pycolmap.CameraMode.SINGLE, reader, options)
         poor = _drop_poor(database, chosen)
@@ -123,7 +123,7 @@ def _extract(
 def _drop_poor(database: Path, names: list[str]) -> list[str]:
     """Deletes the features of photos that have fewer than MIN_FEATURES and returns those photos.
 
-    pycolmap extracts again what has no features, and has no call that deletes those of one image.
+    pycolmap then extracts these again. It has no function that deletes the features of one image.
     """
     db = load_pycolmap().Database.open(database)
     ids = {name: db.read_image_with_name(name).image_id for name in names}
@@ -137,7 +137,7 @@ def _drop_poor(database: Path, names: list[str]) -> list[str]:
 
 
 def _camera_key(photo: Path) -> tuple[Any, ...]:
-    """Photos with the same key share one camera: size, EXIF maker, model, focal length, zoom."""
+    """Key of photos that share one camera: size, and EXIF maker, model, focal length and zoom."""
     with open_photo(photo) as image:
         exif = exif_of(image, photo)
         details = exif.get_ifd(0x8769)
@@ -166,7 +166,7 @@ def _select_pairs(database: Path, names: list[str]) -> list[tuple[int, int]]:
     """All pairs of a small set; else neighbours by name and pairs whose largest features match.
 
     Preemptive matching (Wu, "Towards Linear-time Incremental Structure from Motion", 3DV 2013, section 3): the
-    largest-scale features are few and predict whether a pair overlaps. It also closes loops without a vocabulary.
+    few largest-scale features predict whether a pair overlaps. This also finds loop closures without a vocabulary.
     """
     count = len(names)
     every = list(combinations(range(count), 2))

@@ -1,6 +1,6 @@
-"""Advisory locks (flock) on open files and folders; they end with the process that holds them, however it ends.
+"""Advisory locks (flock) on open files and folders; the system releases them when the process ends in any way.
 
-The package `filelock` would leave its lock files behind, locks no folders, and does not say who holds a lock.
+The package `filelock` is not used: it leaves lock files behind, cannot lock folders and does not name the holder.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 
 try:
     import fcntl
-except ImportError:  # Windows has no locks of this kind
+except ImportError:  # Windows has no flock
     fcntl = None  # type: ignore[assignment]
 
 SUPPORTED = fcntl is not None
@@ -20,7 +20,7 @@ SUPPORTED = fcntl is not None
 def lock(descriptor: int) -> bool:
     """Takes the exclusive lock on an open file or folder; False when another descriptor holds it.
 
-    OSError where the file system has no such locks, or the system has none.
+    OSError where the file system or the operating system does not support flock.
     """
     if fcntl is None:
         raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))
@@ -34,7 +34,7 @@ def lock(descriptor: int) -> bool:
 
 
 def names(path: Path, descriptor: int) -> bool:
-    """Whether `path` is still the file or folder that was opened."""
+    """Whether `path` still names the file or folder that was opened as `descriptor`."""
     try:
         there, here = path.stat(), os.fstat(descriptor)
     except FileNotFoundError:

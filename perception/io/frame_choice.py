@@ -1,4 +1,4 @@
-"""The frames of a bag or video to keep: the sharpest of every stretch over which the view moves by `spacing`."""
+"""Keyframe selection for a bag or video: the sharpest frame of each segment in which the view moves by `spacing`."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-THUMBNAIL = 320  # pixels, long side: motion and sharpness are measured at one size
+THUMBNAIL = 320  # long side in pixels at which motion and sharpness are measured
 _MIN_TRACKS = 20
 
 
 @dataclass
 class Chooser:
-    """Frames are shown in order; `chosen` are the numbers to keep.
+    """Selects keyframes: pass all frames in order to `show`, then call `chosen`.
 
-    spacing: motion between kept frames, as share of the picture's width (median motion of tracked corners, summed over
-    frames). sharp_share: a stretch whose sharpest frame has less than this share of the median sharpness is left out.
+    spacing: motion between kept frames as a share of the image width (median motion of tracked corners, summed over
+    frames). sharp_share: a segment is left out if its sharpest frame is below this share of the median sharpness.
     """
 
     spacing: float = 0.08
@@ -26,7 +26,7 @@ class Chooser:
     _last: np.ndarray | None = None
 
     def show(self, picture: np.ndarray) -> None:
-        """The next frame [H, W, 3] uint8 BGR."""
+        """Adds the next frame [H, W, 3] uint8 BGR."""
         scale = THUMBNAIL / max(picture.shape[:2])
         small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else picture
         grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY))
@@ -38,7 +38,7 @@ class Chooser:
         """Numbers of the frames to keep, at most `most`, in order."""
         if not self.motion:
             return []
-        way = np.cumsum(np.minimum(self.motion, self.spacing))  # a jump is one step, not many
+        way = np.cumsum(np.minimum(self.motion, self.spacing))  # a jump counts as one step
         spacing = max(self.spacing, float(way[-1]) / max(most - 1, 1))
         stretch = np.floor(way / spacing + 1e-9).astype(int)
         sharpness = np.array(self.sharpness)
@@ -53,7 +53,7 @@ class Chooser:
 
 
 def motion_between(before: np.ndarray, after: np.ndarray) -> float:
-    """Median motion of tracked corners as share of the width; 1 where the tracks are lost."""
+    """Median motion of tracked corners as a share of the image width; 1 if tracking fails."""
     corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 6)
     if corners is None or len(corners) < _MIN_TRACKS or before.shape != after.shape:
         same = before.shape == after.shape and abs(float(before.mean()) - float(after.mean())) < 8

@@ -1,4 +1,4 @@
-"""Incremental structure from motion (pycolmap) on the strongest pairs first, so that equal textures fold no model."""
+"""Incremental structure from motion (pycolmap), with checks and retries against errors from repeated textures."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from perception.progress import Progress
 
 MIN_MODEL_SIZE = 3
 REPEATABLE_PHOTOS = 150
-"""Up to this many photos are mapped by one thread, which gives the same bits each time."""
+"""Up to this many photos are mapped by one thread, which makes the result repeatable bit for bit."""
 Found = tuple[list[Any], set[str]]
 """Models, largest first, and the names of the photos left out because most of their matches contradict the largest."""
 LEVELS = (MIN_INLIERS, 2 * MIN_INLIERS, 4 * MIN_INLIERS, 8 * MIN_INLIERS)
-"""Least verified matches of a pair; raised in turn until the model contradicts no stronger pair than it rests on."""
+"""Least verified matches of a pair, tried in turn until the model contradicts no pair stronger than those it uses."""
 
 
 def map_photos(store: FeatureStore, fixed: bool, seed: int, count: int, progress: Progress) -> Found:
-    """All models, largest first (pycolmap's numbering is no ranking), and names of photos left out as contradicted.
+    """All models, largest first (pycolmap does not sort them), and names of photos left out as contradicted.
 
-    fixed: the intrinsics in the database are kept as they are.
+    fixed: the intrinsics in the database are not refined.
     """
     folder = store.folder / "mapping"
     shutil.rmtree(folder, ignore_errors=True)
@@ -36,7 +36,7 @@ def map_photos(store: FeatureStore, fixed: bool, seed: int, count: int, progress
 
 
 class _Mapping:
-    """Models of one set of verified pairs, and the choice among them."""
+    """Computes models from subsets of the verified pairs and selects the best."""
 
     def __init__(
         self, store: FeatureStore, folder: Path, fixed: bool, seed: int, count: int, progress: Progress
@@ -46,7 +46,7 @@ class _Mapping:
         self.told, self.runs = 0.0, 0
 
     def run(self) -> Found:
-        """The first model that contradicts at most MAX_CONTRADICTED pairs, else that with most agreeing matches."""
+        """The first model that contradicts at most MAX_CONTRADICTED of the pairs, else the one with most agreeing."""
         tried: list[tuple[int, Found]] = []
         for found in self._candidates():
             pairs = verified_pairs(found[0][0], self.database)
@@ -58,7 +58,7 @@ class _Mapping:
         return max(tried, key=lambda item: item[0])[1]
 
     def _candidates(self) -> Iterator[Found]:
-        """A model of the pairs of each level, then one of all pairs but those that the former contradicts."""
+        """For each level: a model from its pairs, then one from all pairs except those that the first contradicts."""
         for level in LEVELS:
             models = self._map(self.database, level)
             if not models:
@@ -82,7 +82,7 @@ class _Mapping:
         return copy
 
     def _without_outvoted(self, models: list[Any]) -> Found:
-        """Photos that most of their matches contradict are taken out, tried once more, and left out if need be."""
+        """Removes photos most of whose matches contradict the model, tries them again, leaves out those that fail."""
         best = models[0]
         pairs = verified_pairs(best, self.database)
         wrong = outvoted_photos(pairs)
@@ -111,7 +111,7 @@ class _Mapping:
         options.min_model_size = MIN_MODEL_SIZE
         options.multiple_models = source is None
         options.structure_less_registration_fallback = False
-        # Global adjustment at every 40 % of growth, not 10 %: most of the time of mapping goes there.
+        # Global bundle adjustment at every 40 % of growth, not 10 %, as it takes most of the mapping time.
         options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
         options.ba_global_max_refinements = 3
         options.ba_refine_focal_length = options.ba_refine_extra_params = not self.fixed

@@ -1,4 +1,4 @@
-"""Reading any input as a Scene: a transforms.json, a COLMAP workspace, a folder of photos or a video."""
+"""Reads any input as a Scene: a transforms.json, a COLMAP workspace, a folder of photos or a video."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def load_scene(
 ) -> Scene:
     """Posed views of `source`, sorted by name, with a sparse cloud.
 
-    A folder that is a COLMAP workspace is read as one even if it holds more; then a folder with a transforms.json; any
-    other folder is photos, posed by structure from motion. `workdir` keeps features and models so that a second call
-    is quick. camera_file: ROS camera_info with the intrinsics of all photos, for photos and videos only. strict: a
-    damaged photo is an InputError, else it is left out. frames: folder for the frames of a video (None:
-    workdir/frames); it must last as long as the map.
+    A folder is read as a COLMAP workspace if it is one, else by its transforms.json if it has one, else as photos, with
+    poses from structure from motion. `workdir` caches features and models for later calls. camera_file:
+    ROS camera_info with the intrinsics of all photos, for photos and videos only. strict: a damaged photo is an
+    InputError, else it is left out. frames: folder for the frames of a video (None: workdir/frames), which the map
+    needs later.
     """
     from perception.io.colmap import is_workspace, read_workspace
     from perception.io.photo_folder import VIDEO_SUFFIXES
@@ -67,7 +67,7 @@ def load_scene(
 
 @dataclass(frozen=True)
 class PhotoSizes:
-    """(width, height) of every photo of an input; posed: it brings cameras; what: their number in words."""
+    """(width, height) of every photo of an input; posed: the input has camera poses; what: their number as text."""
 
     sizes: list[tuple[int, int]]
     posed: bool
@@ -75,9 +75,9 @@ class PhotoSizes:
 
 
 def photo_sizes(source: Path) -> PhotoSizes:
-    """The sizes of the photos of `source` from their headers; those that cannot be read are not counted.
+    """The sizes of the photos of `source` from their headers; photos that cannot be read are skipped.
 
-    A video counts as the most frames that are taken of it. No photos for what is no input.
+    A video counts as the maximum number of frames. InputError where `source` cannot be read.
     """
     from perception.io.colmap import is_workspace
     from perception.io.photo_folder import VIDEO_SUFFIXES, list_photos

@@ -1,4 +1,4 @@
-"""The points of each instance side by side, so that a hit costs a slice and not a walk over the whole map."""
+"""Points grouped by instance, so that the points of one instance are a slice and need no pass over the whole map."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class InstanceIndex:
     points: np.ndarray
 
     def of(self, instance_id: int) -> np.ndarray:
-        """The instance's points [P, 3]; none for an id that no Gaussian has."""
+        """The instance's points [P, 3]; P = 0 for an id without Gaussians."""
         place = int(np.searchsorted(self.ids, instance_id))
         if place == len(self.ids) or self.ids[place] != instance_id:
             return self.points[:0]
@@ -32,7 +32,7 @@ class InstanceIndex:
 
 
 def build_index(means: np.ndarray, instance_ids: np.ndarray) -> InstanceIndex:
-    """From means [N, 3] and the instance of each [N], −1 = none."""
+    """The index of means [N, 3] with instance_ids [N], −1 = none."""
     held = np.asarray(instance_ids)
     rows = np.argsort(held, kind="stable")
     rows = rows[np.searchsorted(held[rows], 0) :]
@@ -42,7 +42,7 @@ def build_index(means: np.ndarray, instance_ids: np.ndarray) -> InstanceIndex:
 
 
 def from_arrays(arrays: dict[str, np.ndarray], name: str) -> InstanceIndex:
-    """InputError naming the file `name` when the arrays do not fit together."""
+    """The inverse of `to_arrays`; InputError naming the file `name` when the arrays are inconsistent."""
     try:
         ids, starts, points = arrays["ids"], arrays["starts"], arrays["points"]
         fits = ids.ndim == starts.ndim == 1 and len(starts) == len(ids) + 1 and points.shape[1:] == (3,)

@@ -1,4 +1,4 @@
-"""Lenses: from a COLMAP camera to the ideal pinhole a view is seen through, and the warp between the two."""
+"""Camera models: conversion from and to pycolmap, the pinhole camera of the undistorted image, and the warp to it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 
 
 def load_pycolmap() -> Any:
-    """Import pycolmap, quietly. Every import of pycolmap goes through here.
+    """Imports pycolmap without log output. All code gets pycolmap from here.
 
-    PIL's compiled module must be loaded first: pycolmap 4.2's wheel exports its own zlib, and PIL loaded after it
-    crashes when it writes a PNG. Its log is silent unless GLOG_minloglevel is set. Its glog takes SIGTERM over to print
-    a native stack trace; the handler that Python knows is put back.
+    PIL's compiled module is loaded first: the wheel of pycolmap 4.2 exports its own zlib, and PIL loaded after it
+    crashes when it writes a PNG. The log is silenced unless GLOG_minloglevel is set. glog replaces the SIGTERM handler
+    to print a native stack trace; Python's handler is restored.
     """
     from PIL import _imaging  # type: ignore[attr-defined]  # noqa: F401
 
@@ -65,7 +65,7 @@ def camera_from_lens(lens: Lens, camera_id: int = 1) -> Any:
 
 
 def rescale_lens(lens: Lens, width: int, height: int) -> Lens:
-    """The same lens for its photos resized to width × height, scaled by the true ratio of each axis."""
+    """The lens for photos resized to width × height; parameters are scaled by the exact ratio of each axis."""
     camera = camera_from_lens(lens)
     camera.rescale(width, height)
     return lens_from_camera(camera)
@@ -75,8 +75,8 @@ def rescale_lens(lens: Lens, width: int, height: int) -> Lens:
 def pinhole_from_lens(lens: Lens) -> tuple[tuple[float, float, float, float], int, int]:
     """(fx, fy, cx, cy), width, height of the pinhole image that `lens` undistorts to.
 
-    COLMAP's default: focal lengths kept, size chosen so that no pixel is blank (0.2 to 2 times the photo). A lens
-    without distortion is returned as it is.
+    As COLMAP's default: focal lengths are kept, the size is chosen so that no pixel is blank (0.2 to 2 times that of
+    the photo). Values of a lens without distortion are returned unchanged. InputError where undistortion fails.
     """
     camera = camera_from_lens(lens)
     if is_pinhole(lens):
@@ -97,7 +97,7 @@ def pinhole_from_lens(lens: Lens) -> tuple[tuple[float, float, float, float], in
 
 
 def _check_pinhole(lens: Lens, values: tuple[float, float, float, float], width: int, height: int) -> None:
-    """Beyond these bounds no optics is meant, and float32 cannot tell the pixels' rays apart."""
+    """InputError for values outside the range of real cameras, where float32 cannot resolve the rays of pixels."""
     *focal, cx, cy = values
     if not (min(focal) >= MIN_FOCAL and max(focal) <= MOST_PIXELS and max(abs(cx), abs(cy)) <= MOST_PIXELS):
         raise InputError(
@@ -122,7 +122,7 @@ def is_pinhole(lens: Lens) -> bool:
 def warp_grid(
     lens: Lens, pinhole: tuple[float, float, float, float], width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Photo coordinates x, y [height, width] float32 (pixel centres at +0.5) that each pinhole pixel centre sees."""
+    """Photo coordinates x, y [height, width] float32 (pixel centres at +0.5) that each pinhole pixel centre maps to."""
     fx, fy, cx, cy = pinhole
     camera = camera_from_lens(lens)
     x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)

@@ -1,4 +1,4 @@
-"""A map of Gaussians and instances: the one type that makers, queries, editors, exporters and viewers share."""
+"""A map of Gaussians and instances: the common type of mapping, queries, editing, export and viewing."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from perception.types import View
 
 M = TypeVar("M", bound="Map")
 GAUSSIANS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features", "instance_ids", "membership")
-"""Fields with a row a Gaussian."""
+"""Fields with one row per Gaussian."""
 
 
 PART = "language_"
-"""Before the names of the arrays in `parts` that are as those in `language`."""
+"""Prefix of the arrays in `parts` that correspond to those in `language`."""
 
 
 class PhotosMoved(UserWarning):
-    """Photos of a map are missing or are other files than when it was made."""
+    """Warning: photos of a map are missing, or their files have changed since the map was made."""
 
 
 @dataclass(eq=False, repr=False)
@@ -35,10 +35,10 @@ class Map:
     Arrays are float32: means [N, 3], quats [N, 4] wxyz, log_scales [N, 3], opacity_logits [N], sh [N, K, 3], as the PLY
     stores them; features [N, D], membership [N], and instance_ids [N] int32, −1 = none. instances: the list of
     instances.json. info: map.json without the views. views: the photos it was made from, sorted by name, `StoredView`
-    in a map read from disk. language, parts: named arrays (see io.store), maybe none. index: the points of each
-    instance. Reading a field may raise InputError naming the file when it is damaged; another map may take the folder's
-    place meanwhile. Training has its own `gaussians.model.Gaussians`: the same numbers as torch parameters, which grow,
-    split and carry gradients; layers without torch read maps too.
+    in a map read from disk. language, parts: named arrays (see io.store), possibly empty. index: the points of each
+    instance. Reading a field raises InputError naming the file when it is damaged. The folder may be replaced by
+    another map meanwhile. This type needs no torch; training uses `gaussians.model.Gaussians`, which holds the same
+    values as torch tensors.
     """
 
     means: np.ndarray
@@ -61,14 +61,14 @@ class Map:
 
     @classmethod
     def open(cls: type[M], path: Path) -> M:
-        """The map on disk at `path`; InputError when it is none, damaged, or of an unknown version."""
+        """The map on disk at `path`; InputError when it is missing, damaged, or of an unknown version."""
         gmap = cls.__new__(cls)
         gmap.path, gmap._files = Path(path), MapFiles(path)
         return gmap
 
     @classmethod
     def of(cls: type[M], gmap: Map, **changes: Any) -> M:
-        """`gmap` as this class with other values for some fields; arrays are shared, and none is read for it."""
+        """`gmap` as an instance of this class, with `changes` to its fields; arrays are shared, not read."""
         made = cls.__new__(cls)
         made.path, made._files = gmap.path, gmap._files
         made.__dict__.update({name: value for name, value in vars(gmap).items() if name in _FIELDS} | changes)
@@ -79,7 +79,7 @@ class Map:
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Reads a field at its first use; threads that ask at once agree on one value."""
+            """Reads a field at its first use; concurrent threads get the same value."""
             if name == "index" and self._files is None:
                 value = build_index(self.means, self.instance_ids)
             elif name in _FIELDS and self._files is not None:
@@ -89,7 +89,7 @@ class Map:
             return self.__dict__.setdefault(name, value)
 
     def load(self: M) -> M:
-        """Reads all fields now and lets go of the files."""
+        """Reads all fields now and closes the files."""
         for name in _FIELDS:
             getattr(self, name)
         self._files = None
@@ -115,12 +115,12 @@ class Map:
 
     @property
     def part_language(self) -> dict[str, np.ndarray]:
-        """As `language`, of the parts: a row a part in ascending id; {} without parts or embeddings."""
+        """As `language`, for the parts: one row per part in ascending id; {} without parts or embeddings."""
         return {n.removeprefix(PART): array for n, array in self.parts.items() if n.startswith(PART)}
 
     @property
     def map_id(self) -> str:
-        """Short name of this very map with these very labels; another one has another."""
+        """Short identifier of the map and its labels; it changes when either changes."""
         return "unsaved" if self._files is None else self._files.map_id
 
     @property
@@ -134,9 +134,9 @@ class Map:
         return bool(self.info.get("metric", False))
 
     def with_photo(self, view: View) -> View:
-        """`view` with the place where its photo lies now; InputError when it is missing or another file.
+        """`view` with the current path of its photo; InputError when the photo is missing or has changed.
 
-        The first such case of a map is also told as a PhotosMoved warning.
+        The first such error of a map also issues a PhotosMoved warning.
         """
         try:
             return replace(view, photo=locate_photo(view, self.path))
@@ -147,7 +147,7 @@ class Map:
             raise
 
     def located_views(self) -> list[View]:
-        """`with_photo` of all views; the photo is the empty path, which no reader can open, where it is missing."""
+        """`with_photo` of all views; views whose photo is missing get an empty path."""
         found = []
         for view in self.views:
             try:

@@ -1,4 +1,4 @@
-"""The files of a map folder, opened without reading them: facts now, arrays mapped, the rest when it is asked for."""
+"""The files of a map folder: map.json is read at opening, arrays are memory-mapped, other data are read on demand."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from perception.io.ply import map_ply
 
 FORMAT_VERSION = 2
 READABLE = (1, 2)
-"""Version 1 kept the views twice, in map.json and as arrays in cameras.npz; 2 keeps them in map.json."""
+"""Readable format versions. 1 stores the views in map.json and as arrays in cameras.npz, 2 in map.json only."""
 _ARRAYS = {"features": 2, "instance_ids": 1, "membership": 1}
 ARCHIVES = ("cameras", "language", "index", "parts")
 _TRIES = 5
@@ -32,12 +32,11 @@ Signature = tuple[tuple[int, int, int], ...]
 
 
 class MapFiles:
-    """What lies in a map folder, consistent even if another map takes its place right now or later.
+    """The contents of a map folder, consistent also when the folder is replaced by another map at any time.
 
-    Files are opened (mapped) here and stay open, so a map that is replaced or deleted can still be read through this
-    object. Gaussians and features stay mapped, so whoever truncates those files in place (no writer of ours does) ends
-    readers. facts: map.json. info: the same without the views. instances: the list of instances.json. map_id: changes
-    with every byte of the two.
+    Files are opened (memory-mapped) by the constructor and stay open, so a replaced or deleted map can still be read
+    through this object. Truncating a mapped file in place, which no writer of this package does, crashes the reader.
+    facts: map.json. info: facts without the views. instances: the list of instances.json. map_id: hash of both files.
     """
 
     def __init__(self, path: Path):
@@ -50,7 +49,7 @@ class MapFiles:
                 self._open()
             except InputError:
                 if left and self._identity != _folder_identity(self.path):
-                    continue  # replaced while we opened it
+                    continue  # the folder was replaced during opening
                 raise
             if self._identity == _folder_identity(self.path):
                 return
@@ -92,7 +91,7 @@ class MapFiles:
         return array
 
     def read(self, name: str) -> Any:
-        """The field `name` of a `Map`, in memory. What is read whole is compared with its checksum first.
+        """The field `name` of a `Map`, in memory. Checksums are verified before whole files are read.
 
         Arrays are copies, float32 or int32 and writable. InputError naming the file when it is damaged.
         """
@@ -116,7 +115,7 @@ class MapFiles:
     def _check_contents(self) -> None:
         """Compares the SHA-256 of every file with the one recorded, once; InputError names the first that differs.
 
-        Nothing is compared once another map has taken the folder's place.
+        Skipped when the folder has been replaced by another map.
         """
         with self._lock:
             if self._checked or _folder_identity(self.path) != self._identity:
@@ -127,7 +126,7 @@ class MapFiles:
             self._checked = True
 
     def _index(self) -> InstanceIndex:
-        """The points of each instance; made from the Gaussians for maps that were written before it was stored."""
+        """The points of each instance; computed from the Gaussians for older maps without a stored index."""
         arrays, ids = self._unpack("index"), self._arrays["instance_ids"]
         if not arrays:
             return build_index(_OF_PLY["means"](self._rows), ids)
@@ -137,7 +136,7 @@ class MapFiles:
         return index
 
     def _unpack(self, name: str) -> dict[str, np.ndarray]:
-        """The arrays of an .npz; its CRC-32s tell damage."""
+        """The arrays of an .npz, {} if it does not exist; InputError when a CRC-32 differs."""
         raw, file = self._archives[name], self.path / f"{name}.npz"
         return {} if raw is None else read_npz(raw, file, "the map is damaged, build it again")
 
@@ -163,16 +162,16 @@ _OF_PLY: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "opacity_logits": lambda rows: np.ascontiguousarray(rows["opacity"], np.float32),
     "sh": _harmonics,
 }
-"""Fields of a map that gaussians.ply holds, from its rows."""
+"""Functions that compute fields of a map from the rows of gaussians.ply."""
 
 
 def read_info(path: Path) -> dict[str, Any]:
-    """map.json alone; raises InputError when `path` is no map or of a version this program does not read."""
+    """The content of map.json; InputError when `path` is not a map or has an unsupported format version."""
     return _read_facts(standing(Path(path)))[0]
 
 
 def map_signature(path: Path) -> Signature:
-    """Changes whenever another map or other labels lie at `path`: who, when and how big. InputError when none does."""
+    """Inodes, times and sizes that change when the map or its labels at `path` change. InputError when none exists."""
     folder = standing(path)
     try:
         stats = [file.stat() for file in (folder, folder / FACTS, folder / EDITABLE)]
@@ -230,7 +229,7 @@ def _read_instances(file: Path) -> tuple[list[dict[str, Any]], bytes]:
 
 
 def _check_instance(entry: dict[str, Any]) -> None:
-    """What every reader relies on: a whole id, finite numbers where numbers belong, a label that is a text or null."""
+    """ValueError unless the id is an integer, numbers are finite and shaped as expected, the label a text or null."""
     if isinstance(entry["id"], bool) or not isinstance(entry["id"], int):
         raise ValueError(f"id {entry['id']!r} is no whole number")
     box = entry["obb"]

@@ -1,4 +1,4 @@
-"""One writer at a time on a map: mapping, label editing and copying onto it must not lose each other's work."""
+"""Write lock of a map, so that concurrent mapping, label editing and copying do not overwrite each other."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _guard = threading.Lock()
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Holds the right to write the map at `path`; InputError at once when another process or thread holds it.
+    """Holds the write lock of the map at `path`; InputError at once when another process or thread holds it.
 
-    The lock is an advisory flock on the sibling `.NAME.lock`, so it ends with its process, however that ends; the file
-    says who holds it and goes when the lock does. A thread may take a lock again that it holds. Readers need none.
-    What writers that were killed left beside the map is put back or deleted first.
+    The lock is an advisory flock on the sibling `.NAME.lock`, which the system releases when the process ends in any
+    way. The file holds the process id and is deleted on release. The lock is re-entrant per thread. Readers need none.
+    Leftovers of killed writers are first restored or deleted (see `atomic.recover`).
     """
     path = Path(path).resolve()
     me = threading.get_ident()
@@ -49,12 +49,12 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def lock_file(path: Path) -> Path:
-    """Where the lock on the map at `path` lies while someone writes it."""
+    """Path of the lock file of the map at `path`, which exists while the map is written."""
     return path.with_name(f".{path.name}.lock")
 
 
 def _take(path: Path) -> int | None:
-    if not SUPPORTED:  # renames still keep readers safe
+    if not SUPPORTED:  # readers are still safe through atomic renames
         return None
     file = lock_file(path)
     try:
@@ -68,8 +68,8 @@ def _take(path: Path) -> int | None:
                 raise InputError(f"{path}: {who} is writing this map; wait for it to finish, or write to another place")
             if names(file, descriptor):
                 break
-            os.close(descriptor)  # its last holder removed the file between our open and our lock: once more
-        with contextlib.suppress(OSError):  # on a full disk the lock holds too, it only does not say whose it is
+            os.close(descriptor)  # the last holder deleted the file between open and lock: retry
+        with contextlib.suppress(OSError):  # on a full disk the lock is still valid, without the process id
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         return descriptor
@@ -83,5 +83,5 @@ def _drop(path: Path, descriptor: int | None) -> None:
     if descriptor is None:
         return
     with contextlib.suppress(OSError):
-        lock_file(path).unlink()  # while we hold it: no one else can have locked this very file
+        lock_file(path).unlink()  # before the release, so that no other process has locked this file
     os.close(descriptor)

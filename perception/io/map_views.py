@@ -1,8 +1,8 @@
-"""The views of a map as map.json records them: one JSON object a view, and where its photo is found again.
+"""The views of a map as stored in map.json, one JSON object per view, and how their photos are located.
 
 name, K, width, height, camera_from_world, lens, held_out: as in `types.View`. photo: absolute path of the photo.
-photo_beside: its path relative to the map's folder. photo_bytes: its size; a file of another size under the same name
-is not the photo. The last two may be null; format version 1 has none of the last three.
+photo_beside: its path relative to the map's folder. photo_bytes: its size in bytes; a
+file of another size is not accepted. The last two may be null; format version 1 has none of the last three.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from perception.types import Lens, View
 
 @dataclass(frozen=True)
 class StoredView(View):
-    """A view with what a map records of its photo; the fields are explained at the top of this file."""
+    """A view with the photo record of a map; the fields are described in the module docstring."""
 
     photo_beside: str | None = None
     photo_bytes: int | None = None
 
 
 def stored_view(view: View, folder: Path, held_out: bool = False) -> StoredView:
-    """`view` as the map at `folder` records it: its photo absolute, relative and with its size (None when gone)."""
+    """`view` with the record of its photo for the map at `folder`: both paths, and the size (None if missing)."""
     photo = Path(os.path.abspath(view.photo))  # noqa: PTH100  (links are kept: they are how the user names his photos)
     try:
         size = photo.stat().st_size if photo.is_file() else None
@@ -40,7 +40,7 @@ def stored_view(view: View, folder: Path, held_out: bool = False) -> StoredView:
 
 
 def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
-    """The record of a map read at `before` for a map at `after`: the relative path follows."""
+    """The record of a map at `before`, for a map at `after`: the relative photo path is adapted."""
     if view.photo_beside is None or absolute(before) == absolute(after):
         return view
     from dataclasses import replace
@@ -49,9 +49,9 @@ def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
 
 
 def locate_photo(view: View, folder: Path | None) -> Path:
-    """Where the photo of `view` lies: beside the map, else where it lay when the map was made.
+    """The path of the photo of `view`: relative to the map, else its absolute path when the map was made.
 
-    folder: the map's, None when it is not on disk. InputError when no file is there, or only one of another size.
+    folder: of the map, None when it is not on disk. InputError when there is no file, or only one of another size.
     """
     places = [Path(view.photo)]
     size = None
@@ -87,7 +87,7 @@ def _relative(photo: Path, folder: Path) -> str | None:
 
 
 def view_json(view: View) -> dict[str, Any]:
-    """A view as JSON; what a map records besides is there when `view` has it."""
+    """A view as JSON, with the photo record if `view` is a `StoredView`."""
     lens = view.lens
     entry = {
         "name": view.name,
@@ -104,7 +104,7 @@ def view_json(view: View) -> dict[str, Any]:
 
 
 def view_from_json(entry: dict[str, Any]) -> StoredView:
-    """The inverse of `view_json`. ValueError, TypeError or KeyError for an entry that is none."""
+    """The inverse of `view_json`. ValueError, TypeError or KeyError for an invalid entry."""
     lens, beside, size = entry.get("lens"), entry.get("photo_beside"), entry.get("photo_bytes")
     K, pose = (np.array(entry[name], np.float64) for name in ("K", "camera_from_world"))
     if K.shape != (3, 3) or pose.shape != (4, 4) or not (np.isfinite(K).all() and np.isfinite(pose).all()):
@@ -129,8 +129,8 @@ def view_from_json(entry: dict[str, Any]) -> StoredView:
 def views_of_facts(info: dict[str, Any], file: Path, cameras: dict[str, np.ndarray]) -> list[StoredView]:
     """The views that map.json records, `info` being its content and `file` its name for messages.
 
-    cameras: the arrays of cameras.npz, where format version 1 keeps which views were held out, and all of the views in
-    the oldest maps. InputError when the record makes no sense.
+    cameras: the arrays of cameras.npz. Format version 1 stores there which views were held out; the oldest maps store
+    all views there. InputError when the record is malformed.
     """
     try:
         entries = info.get("views") or _entries_of_arrays(cameras)

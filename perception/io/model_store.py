@@ -1,5 +1,5 @@
-"""Where this user's models are kept: one folder a model below the cache, `models/NAME/`, with
-`perception.json` beside the files that says where each came from.
+"""The user's model store: one folder per model in the cache, `models/NAME/`, with the model files and
+`perception.json`, which records the source of each file.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _DEFAULTS = "defaults.json"
 
 @dataclass(frozen=True)
 class StoredModel:
-    """A model of the store. files: name, source, bytes and sha256 of each; purpose: "sam", "clip" or None."""
+    """A stored model. files: name, source, bytes and sha256 of each; purpose: "sam", "clip" or None."""
 
     name: str
     folder: Path
@@ -31,7 +31,7 @@ class StoredModel:
 
 
 def cache_folder() -> Path:
-    """This user's derived files and models: $XDG_CACHE_HOME/perception or ~/.cache/perception."""
+    """Folder for cached files and models: $XDG_CACHE_HOME/perception or ~/.cache/perception."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "perception"
 
 
@@ -41,14 +41,14 @@ def models_folder() -> Path:
 
 
 def check_name(name: str) -> str:
-    """`name` itself when it can name a folder and cannot be taken for a path."""
+    """Returns `name`; InputError unless it is a valid folder name that is not a path."""
     if not _NAME.fullmatch(name):
         raise InputError(f"model name '{name}': expected letters, digits, '.', '_' or '-', as in mobile-sam")
     return name
 
 
 def stored_models() -> list[StoredModel]:
-    """All models of the store, by name."""
+    """All stored models, sorted by name."""
     if not models_folder().is_dir():
         return []
     found = (find_model(folder.name) for folder in sorted(models_folder().iterdir()))
@@ -56,7 +56,7 @@ def stored_models() -> list[StoredModel]:
 
 
 def find_model(name: str) -> StoredModel | None:
-    """The stored model of that name; None where there is none. A damaged record is an InputError."""
+    """The stored model `name`, or None. InputError for a damaged record."""
     if not _NAME.fullmatch(name):
         return None
     folder = models_folder() / name
@@ -70,7 +70,7 @@ def find_model(name: str) -> StoredModel | None:
 
 
 def resolve(spec: str) -> str:
-    """`spec` itself, or the folder of the stored model that it names; what exists on disk wins."""
+    """`spec` itself if it is an existing path, else the folder of the stored model of that name, else `spec`."""
     if Path(spec).expanduser().exists():
         return spec
     model = find_model(spec)
@@ -78,13 +78,13 @@ def resolve(spec: str) -> str:
 
 
 def known_names() -> str:
-    """Names for messages: what the store holds."""
+    """Names of the stored models, for messages."""
     names = ", ".join(model.name for model in stored_models())
     return f"the store holds {names}" if names else "the store is empty (see perception models add)"
 
 
 def write_record(folder: Path, family: str | None, purpose: str | None, files: list[dict[str, Any]]) -> None:
-    """The model's record inside its folder."""
+    """Writes the model's record into its folder."""
     text = json.dumps({"family": family, "purpose": purpose, "files": files}, indent=1)
     (folder / RECORD).write_text(text + "\n", encoding="utf-8")
 
@@ -101,7 +101,7 @@ def default_model(purpose: str) -> str | None:
 
 
 def set_default(model: StoredModel) -> None:
-    """Makes a model the one that is taken where only its purpose is named (`--masks auto`)."""
+    """Makes a model the default for its purpose, as used by `--masks auto`."""
     if model.purpose is None:
         raise InputError(f"{model.name}: its family is unknown, so nothing can be done with it by default")
     with atomic_file(models_folder() / _DEFAULTS) as file:

@@ -1,4 +1,4 @@
-"""ONNX models opened in onnxruntime: sessions, the types and shapes of their inputs, fingerprints of their files."""
+"""ONNX models in onnxruntime: sessions, types and shapes of inputs and outputs, file fingerprints."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _DTYPES: dict[str, type] = {
     "tensor(int32)": np.int32,
     "tensor(uint8)": np.uint8,
 }
-_SIDE_FILES = ("_data", ".data")  # weights that an exporter keeps beside the graph
+_SIDE_FILES = ("_data", ".data")  # suffixes of external weight files beside the graph
 _EDGE = 1 << 20
 
 
 def open_session(path: Path) -> Any:
-    """An InferenceSession on the first of `wanted_providers` that loads; InputError for what is no ONNX model."""
+    """An InferenceSession on the first of `wanted_providers` that loads; InputError for an invalid ONNX model."""
     try:
         import onnxruntime
     except ImportError as error:
@@ -35,7 +35,7 @@ def open_session(path: Path) -> Any:
     options.log_severity_level = 3
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a provider that does not load is told by `provider_warning`
+            warnings.simplefilter("ignore")  # `provider_warning` reports a provider that does not load
             return onnxruntime.InferenceSession(str(path), options, providers=wanted_providers())
     except Exception as error:  # onnxruntime's exceptions share no public base class
         first = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
@@ -43,7 +43,7 @@ def open_session(path: Path) -> Any:
 
 
 def wanted_providers() -> list[str]:
-    """CUDA where this onnxruntime was built with it, then the CPU."""
+    """Execution providers in order: CUDA if this onnxruntime was built with it, then the CPU."""
     import onnxruntime
 
     available = onnxruntime.get_available_providers()
@@ -51,7 +51,7 @@ def wanted_providers() -> list[str]:
 
 
 def provider_warning(path: Path, session: Any) -> str | None:
-    """One line where the best provider did not load: onnxruntime takes the next one without a word."""
+    """A one-line warning if the best provider did not load, else None: onnxruntime falls back silently."""
     wanted, used = wanted_providers()[0], session.get_providers()[0]
     return None if wanted == used else f"{path.name}: {wanted} did not load, running on {used}"
 
@@ -76,7 +76,7 @@ def signature(session: Any) -> str:
 def fingerprint(path: Path) -> str:
     """12 hex digits of the size, the first and the last MiB of a model and of its side files.
 
-    Enough to tell weights apart without reading gigabytes.
+    This distinguishes weights without reading the whole files, which can be gigabytes.
     """
     digest = hashlib.sha256()
     for part in (path, *(path.with_name(path.name + suffix) for suffix in _SIDE_FILES)):

@@ -1,4 +1,4 @@
-"""A folder of photos as people have them: which files are photos, and which of them serve structure from motion."""
+"""Folders of photos: finds the photos, and selects those that are useful for structure from motion."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from perception.progress import Progress
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
 FRAMES_RECORD = "frames.json"
-"""In a folder of frames that were taken from a video."""
+"""Name of the record file in a folder of frames taken from a video."""
 SAME_MOTION, SAME_GREY = 0.006, 6.0
-"""Neighbouring photos are doubles when their corners move by less than this share of the width and their 320 pixel
-thumbnails differ by less than this mean of grey levels. Neighbours in scenes taken by walking: 0.011 and 11 or more."""
+"""Neighbouring photos are duplicates when their corners move by less than this share of the width and their 320 pixel
+thumbnails differ by less than this mean grey level. Measured between neighbours on a walk: at least 0.011 and 11."""
 PANORAMA_ASPECT, PANORAMA_EXCESS = 2.2, 1.5
-"""Long over short side of a panorama: at least the first, and the second times the folder's median."""
+"""Least aspect ratio (long / short side) of a panorama: absolute, and as a multiple of the folder's median."""
 BLURRED = 0.1
-"""Share of the median sharpness (variance of the thumbnail's Laplacian) below which a photo is called blurred."""
+"""Share of the median sharpness (variance of the thumbnail's Laplacian) below which a photo is reported as blurred."""
 _SHOWN = 5
 
 
 @dataclass
 class PhotoSet:
-    """photos: sorted by relative path; names[i] is that path, escaped. left_out: name and why. notes: one line each."""
+    """photos: sorted by relative path; names[i] is that path, escaped. left_out: name, reason. notes: one line each."""
 
     photos: list[Path] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
@@ -41,7 +41,7 @@ class PhotoSet:
 
 @dataclass
 class _Look:
-    """What is known of one photo: a grey thumbnail [h, w] uint8 of at most 320 pixels, or the error of reading it."""
+    """Data of one photo: a grey thumbnail [h, w] uint8 of at most 320 pixels, or the error of reading it."""
 
     path: Path
     name: str
@@ -56,8 +56,8 @@ class _Look:
 def list_photos(folder: Path) -> list[Path]:
     """All photos under `folder`, sorted by their path relative to it.
 
-    Skipped: hidden files and folders, maps and what unfinished runs left (*.gsmap*), frames taken from a video.
-    Linked folders are followed, each real folder once.
+    Skipped: hidden files and folders, maps and work folders (*.gsmap*), frames taken from a video. Linked folders are
+    followed; each real folder is listed once.
     """
     return _files(folder, SUFFIXES)
 
@@ -67,7 +67,7 @@ def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of photos")
     found, seen, waiting = [], set(), [folder]
-    while waiting:  # links come last, so that a folder is listed under its own path
+    while waiting:  # links last, so that a folder is listed under its own path
         waiting.sort(key=lambda path: (path.is_symlink(), path))
         here = waiting.pop(0)
         identity = (here.stat().st_dev, here.stat().st_ino)
@@ -76,7 +76,7 @@ def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
         seen.add(identity)
         try:
             inside = list(here.iterdir())
-        except OSError:  # a folder that this user may not read
+        except OSError:  # a folder without read permission
             continue
         for path in inside:
             if path.name.startswith("."):
@@ -102,18 +102,18 @@ def view_name(photo: Path, folder: Path) -> str:
 
 
 def choose_photos(folder: Path, strict: bool, progress: Progress) -> PhotoSet:
-    """The photos under `folder` that serve structure from motion; every photo is read once, by several threads.
+    """The photos under `folder` to use for structure from motion; each photo is read once, in several threads.
 
-    Left out with the reason: damaged photos, panoramas (no pinhole sees them), and doubles: all but the sharpest of
-    neighbours by name that show nearly the same picture (bursts, a JPEG beside its HEIC), and equal pictures anywhere.
-    Blurred photos stay and are told. strict: the first photo that cannot be read is raised as InputError.
+    Left out with the reason: damaged photos, panoramas (not pinhole images) and duplicates. Of neighbours by name with
+    nearly the same picture (bursts, JPEG and HEIC of one photo) the sharpest is kept, of equal pictures the first.
+    Blurred photos are kept and reported. strict: the first photo that cannot be read is raised as InputError.
     """
     paths = list_photos(folder)
     looks: list[_Look] = []
     taken: set[str] = set()
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
         for done, look in enumerate(pool.map(lambda path: _look(path, folder, strict), paths), start=1):
-            while look.name in taken:  # an escaped name that another photo has
+            while look.name in taken:  # an escaped name that is already in use
                 look.name += "_"
             taken.add(look.name)
             looks.append(look)
@@ -161,7 +161,7 @@ def _leave_out_panoramas(looks: list[_Look]) -> None:
 
 
 def _leave_out_doubles(looks: list[_Look]) -> None:
-    """Runs of neighbours that equal their first photo keep their sharpest; then equal pictures keep their first."""
+    """Marks all but the sharpest of similar neighbours, then all but the first of equal pictures, as left out."""
     runs: list[list[_Look]] = []
     for look in looks:
         if runs and _same_picture(runs[-1][0], look):

@@ -1,4 +1,4 @@
-"""Photos: decoding them upright as 8-bit RGB, undistorting and shrinking them to a view's pinhole."""
+"""Photos: decodes them upright as 8-bit RGB, undistorts and downscales them to a view's pinhole camera."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from perception.types import View
 HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
 SUFFIXES = HEIF_SUFFIXES | {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 LARGE_PIXELS = 200_000_000
-"""Photos of more pixels are read at 1/2, 1/4 or 1/8 of their size, and have that size for every caller."""
+"""Photos of more pixels are read at 1/2, 1/4 or 1/8 of their size; `photo_size` returns the reduced size."""
 MOST_DECODED = 400_000_000
-"""Most pixels that are decoded at once; JPEG is decoded at the smaller size directly, other formats in full."""
+"""Maximum number of pixels to decode; JPEG is decoded at the reduced size, other formats at full size."""
 DECODE_ERRORS = (
     OSError,
     SyntaxError,
@@ -33,20 +33,20 @@ DECODE_ERRORS = (
     ArithmeticError,
     RuntimeError,
     EOFError,
-    MemoryError,  # Pillow asks for as many bytes as a chunk says it has
+    MemoryError,  # Pillow allocates the size given in a chunk header
     struct.error,
     zlib.error,
     Image.DecompressionBombError,
 )
-"""What Pillow raises on bytes that are no picture, or only the beginning of one."""
+"""Exceptions that Pillow raises on bytes that are not an image, or on a truncated image."""
 
 
 def photo_size(path: Path) -> tuple[int, int]:
     """(width, height) of what read_photo returns, from the header: EXIF rotation applied, large photos reduced."""
     with open_photo(path) as image:
-        tags = getattr(image, "tag_v2", {})  # Pillow has turned the size of a TIFF already, or not, by its version
+        tags = getattr(image, "tag_v2", {})  # depending on its version, Pillow has rotated the size of a TIFF
         size = reduced_size(int(tags.get(0x0100, image.width)), int(tags.get(0x0101, image.height)), _reduction(image))
-        turned = exif_of(image, path).get(0x0112) in (5, 6, 7, 8)  # other values mean nothing
+        turned = exif_of(image, path).get(0x0112) in (5, 6, 7, 8)  # other values do not swap the sides
         return size[::-1] if turned else size
 
 
@@ -62,7 +62,7 @@ def reduced_size(width: int, height: int, factor: int) -> tuple[int, int]:
 
 
 def _reduction(image: Image.Image) -> int:
-    """1, or the power of two that brings a photo of more than LARGE_PIXELS down to them."""
+    """The power of two by which a photo is reduced to at most LARGE_PIXELS; 1 for smaller photos."""
     factor = 1
     while image.width * image.height > LARGE_PIXELS * factor**2:
         factor *= 2
@@ -70,7 +70,7 @@ def _reduction(image: Image.Image) -> int:
 
 
 def exif_of(image: Image.Image, path: Path) -> Image.Exif:
-    """The EXIF data of an open photo, empty if it has none. Raises InputError where they are damaged."""
+    """The EXIF data of an open photo, empty if it has none. Raises InputError if they are damaged."""
     try:
         return image.getexif()
     except DECODE_ERRORS as error:
@@ -78,10 +78,10 @@ def exif_of(image: Image.Image, path: Path) -> Image.Exif:
 
 
 def upright(image: Image.Image, path: Path) -> Image.Image:
-    """An open photo turned as its EXIF data say. Raises InputError where they are damaged."""
+    """An open photo rotated according to its EXIF data. Raises InputError if they are damaged."""
     try:
         return ImageOps.exif_transpose(image)
-    except DECODE_ERRORS as error:  # it reads the data, and writes them anew without the rotation
+    except DECODE_ERRORS as error:  # it decodes the EXIF data and rewrites them without the rotation
         raise _bad_exif(path) from error
 
 
@@ -101,7 +101,7 @@ def photo_damage(path: Path) -> InputError | None:
 
 
 def why_left_out(path: Path, strict: bool) -> str | None:
-    """None for a good photo, else what is wrong with it; strict raises that as InputError."""
+    """None for a readable photo, else the error as text; strict: raised as InputError."""
     damage = photo_damage(path)
     if damage is not None and strict:
         raise damage
@@ -109,7 +109,7 @@ def why_left_out(path: Path, strict: bool) -> str | None:
 
 
 def read_photo(path: Path) -> np.ndarray:
-    """The photo as uint8 [h, w, 3] RGB, rotated as EXIF says; (w, h) = photo_size(path).
+    """The photo as uint8 [h, w, 3] RGB, rotated as in EXIF; (w, h) = photo_size(path).
 
     Grey is repeated to three channels, 16 bits become 8 (v / 257 rounded), palettes are expanded; transparent pixels
     are composited on black. Floating-point images are refused. HEIC needs pillow-heif (extra "heic").
@@ -147,8 +147,8 @@ def scaled_K(view: View, width: int, height: int) -> np.ndarray:
 def load_photo(view: View, max_side: int | None = None) -> np.ndarray:
     """The view's picture as uint8 [h, w, 3] RGB through its ideal pinhole, (w, h) = scaled_size(view, max_side).
 
-    The photo is shrunk by area averaging, then undistorted bilinearly. Nothing is cached but the warp of the last
-    lenses. A photo whose stored orientation alone agrees with the camera is taken as stored (COLMAP ignores EXIF).
+    The photo is downscaled by area averaging, then undistorted with bilinear interpolation. Only the last warps are
+    cached. A photo is used without EXIF rotation if only then its size fits the camera (COLMAP ignores EXIF).
     """
     width, height = scaled_size(view, max_side)
     photo = _oriented(view)
@@ -167,7 +167,7 @@ def load_photo(view: View, max_side: int | None = None) -> np.ndarray:
 def warp_labels(view: View, labels: np.ndarray, width: int, height: int) -> np.ndarray:
     """Labels [H, W] in the photo's geometry to int32 [height, width] in the view's pinhole, nearest sampling.
 
-    Pixels that see nothing of the photo get 0. The label image must have the photo's size (after EXIF rotation).
+    Pixels outside the photo get 0. The label image must have the photo's size (after EXIF rotation).
     """
     expected = (view.height, view.width) if view.lens is None else (view.lens.height, view.lens.width)
     if labels.ndim != 2 or labels.shape != expected:
@@ -215,7 +215,7 @@ _OPENING = threading.Lock()
 
 
 def open_photo(path: Path) -> Image.Image:
-    """The photo opened by Pillow, not decoded. Raises InputError where there is none, or nothing that Pillow reads."""
+    """The photo opened by Pillow, not decoded. Raises InputError if it is missing or not readable by Pillow."""
     if path.suffix.lower() in HEIF_SUFFIXES:
         register_heif()
     try:
@@ -232,7 +232,7 @@ def open_photo(path: Path) -> Image.Image:
 
 
 def register_heif() -> None:
-    """Lets Pillow read HEIC. Raises InputError with the line that installs pillow-heif where it is missing."""
+    """Enables HEIC in Pillow. Raises InputError with the install command if pillow-heif is missing."""
     try:
         import pillow_heif
     except ImportError as error:
@@ -241,7 +241,7 @@ def register_heif() -> None:
 
 
 def decode(image: Image.Image, path: Path) -> None:
-    """Reads the pixels of an open photo. Raises InputError where the file is damaged or more than MOST_DECODED."""
+    """Decodes an open photo. Raises InputError if the file is damaged or has more than MOST_DECODED pixels."""
     if image.width * image.height > MOST_DECODED:
         raise InputError(
             f"{path}: {image.width}×{image.height} pixels, at most {MOST_DECODED} can be decoded; make it smaller"
@@ -254,7 +254,7 @@ def decode(image: Image.Image, path: Path) -> None:
 
 def to_rgb(image: Image.Image, path: Path) -> np.ndarray:
     """A decoded photo as uint8 [h, w, 3]; see read_photo."""
-    if image.mode.startswith("I"):  # 16-bit grey, as "I;16" or widened to "I"
+    if image.mode.startswith("I"):  # 16-bit grey, as "I;16" or as 32-bit "I"
         grey = np.clip(np.asarray(image).astype(np.float64), 0, 65535)
         eight = (grey / 257 + 0.5).astype(np.uint8)
         return np.ascontiguousarray(np.repeat(eight[..., None], 3, axis=2))

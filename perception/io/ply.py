@@ -1,6 +1,6 @@
-"""The PLY container: elements of named properties, ASCII and both byte orders, fixed or ragged lists.
+"""Reader and writer of PLY: elements of named properties, ASCII and both byte orders, uniform and ragged lists.
 
-Format: Greg Turk's "The PLY Polygon File Format" (1994). Binary tables are mapped straight onto structured arrays.
+Format: Greg Turk's "The PLY Polygon File Format" (1994). Binary tables are read as structured arrays.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def read_ply(path: str | Path) -> dict[str, Element]:
 def map_ply(path: str | Path, element: str) -> np.ndarray:
     """The first element of a binary little-endian PLY as a structured array [rows], mapped into memory, read-only.
 
-    For tables too big to read whole. InputError when the file has another first element, lists in it, or is cut short.
+    For large tables. InputError when the first element has another name or lists, or when the file is truncated.
     """
     path = Path(path)
     with path.open("rb") as file:
@@ -104,7 +104,7 @@ def write_ply(path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]]
 
 
 def ply_bytes(elements: Mapping[str, Mapping[str, np.ndarray]]) -> bytes:
-    """What `write_ply` would write, binary, for those who send it elsewhere."""
+    """The bytes of the file that `write_ply` writes, for example to send them over a network."""
     return _header(elements) + b"".join(_packed(p).tobytes() for p in elements.values())
 
 
@@ -175,7 +175,7 @@ def _read_binary(file: BinaryIO, table: _Table, order: str, path: Path) -> Eleme
 
 
 def _first_lengths(file: BinaryIO, table: _Table, order: str) -> dict[str, int]:
-    """The list lengths of an element's first row, the guess for all of them."""
+    """The list lengths of an element's first row, assumed for all rows until checked."""
     lengths: dict[str, int] = {}
     for p in table.properties:
         if p.count_kind is None:

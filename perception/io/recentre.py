@@ -1,4 +1,4 @@
-"""Georeferenced scenes: maps are kept near their own origin, for float32 knows a place 1e6 m away to 1/16 m only."""
+"""Moves georeferenced scenes near the origin, as float32 resolves coordinates of 1e6 m to 1/16 m only."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from perception.geometry import camera_centres
 from perception.types import Scene, View
 
 FAR = 100.0
-"""Distance from the origin, in extents of the camera path, beyond which a scene is moved. There float32's rounding,
-2⁻²⁴ of the distance, reaches 6e-6 of the extent: a hundredth of a pixel."""
+"""Distance from the origin, in extents of the camera path, beyond which a scene is moved. There the rounding
+error of float32, 2⁻²⁴ of the distance, is 6e-6 of the extent: a hundredth of a pixel."""
 
 
 def recentred(scene: Scene) -> Scene:
-    """The scene about its own middle when it lies far from the origin; report["origin"] [3] is what was taken off."""
+    """The scene, moved to its centre if it is far from the origin; report["origin"] [3] is the subtracted offset."""
     centres = camera_centres(np.stack([view.camera_from_world for view in scene.views]))
     middle = np.median(centres, axis=0)
     extent = float(np.linalg.norm(centres - middle, axis=1).max())
     if extent == 0 or np.linalg.norm(middle) <= FAR * extent:
         return scene
-    origin = np.round(middle, -int(np.floor(np.log10(extent))))  # a place a person can remember
+    origin = np.round(middle, -int(np.floor(np.log10(extent))))  # a round number, easy to remember
     return replace(
         scene,
         views=[moved(view, origin) for view in scene.views],
@@ -34,14 +34,14 @@ def recentred(scene: Scene) -> Scene:
 
 
 def moved(view: View, origin: np.ndarray) -> View:
-    """The view in coordinates from which `origin` [3] was taken."""
+    """The view in coordinates with `origin` [3] subtracted."""
     pose = np.array(view.camera_from_world, np.float64)
     pose[:3, 3] += pose[:3, :3] @ origin
     return replace(view, camera_from_world=pose)
 
 
 def map_origin(path: Path, info: dict[str, Any]) -> np.ndarray:
-    """[3] float64: add it to a place in the map to get the place in the input's coordinates; `info` is map.json."""
+    """Offset [3] float64 from map coordinates to those of the input (input = map + offset); info: map.json."""
     try:
         origin = np.asarray(info.get("scene", {}).get("origin", (0, 0, 0)), np.float64)
         if origin.shape != (3,) or not np.isfinite(origin).all():

@@ -1,4 +1,4 @@
-"""Tells a map where its photos lie now."""
+"""Updates the photo paths of a map after its photos were moved."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from perception.io.store import write_facts
 
 
 def relink(path: Path, folder: Path) -> dict[str, Any]:
-    """Records for every view of the map at `path` that photo below `folder` which has its name and its size.
+    """Records for every view of the map at `path` the photo below `folder` with the same name and size.
 
-    A view is looked for under its name ("a/0001.jpg"), else by its file name alone where that is unique below `folder`.
-    Views without such a photo keep what was recorded. Returns {"linked": count, "missing": names, "differ": names of
-    photos of another size}. InputError when no photo is found, and while another writer is at this map.
+    A photo is searched by the view name ("a/0001.jpg"), else by the file name alone if that is unique below `folder`.
+    Views without such a photo keep their record. Returns {"linked": count, "missing": names, "differ": names of
+    photos of another size}. InputError when no photo is found, or while the map is locked by another writer.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; give the one that holds the photos of {path}")

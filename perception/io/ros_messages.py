@@ -1,6 +1,6 @@
-"""What we know in the words of ROS 2: standard messages as plain dicts, whatever carries them afterwards.
+"""Results as standard ROS 2 messages in the form of plain dicts, independent of the transport.
 
-A message is a dict of its fields; fields that are left out have ROS's default. Arrays are numpy, times are
+A message is a dict of its fields; omitted fields have the ROS default. Arrays are numpy, times are
 (seconds, nanoseconds). Layouts: the interface definitions of ROS 2 (common_interfaces, vision_msgs 4).
 """
 
@@ -37,7 +37,7 @@ def packed_rgb(colors: np.ndarray) -> np.ndarray:
 
 
 def point_cloud2(columns: Mapping[str, np.ndarray], frame: str, stamp: Stamp) -> dict[str, Any]:
-    """sensor_msgs/PointCloud2 of one row and one float32, int32 or uint32 field a column [P]; order is kept."""
+    """sensor_msgs/PointCloud2 of one row, with a field for each float32, int32 or uint32 column [P]; order is kept."""
     kinds = {name: values.dtype.newbyteorder("<").str for name, values in columns.items()}
     count = len(next(iter(columns.values())))
     rows = np.empty(count, list(kinds.items()))
@@ -61,7 +61,7 @@ def point_cloud2(columns: Mapping[str, np.ndarray], frame: str, stamp: Stamp) ->
 
 
 def pose(box: OrientedBox) -> dict[str, Any]:
-    """geometry_msgs/Pose of a box: it takes box axes (the rows of `rotation`) to the frame; xyzw."""
+    """geometry_msgs/Pose of a box, frame_from_box (box axes are the rows of `rotation`); quaternion xyzw."""
     w, x, y, z = (float(v) for v in _quaternion(box.rotation.T))
     return {"position": _xyz(box.center), "orientation": {"x": x, "y": y, "z": z, "w": w}}
 
@@ -69,7 +69,7 @@ def pose(box: OrientedBox) -> dict[str, Any]:
 def detection(
     box: OrientedBox, class_id: str, score: float, identity: str, head: dict[str, Any], spread: np.ndarray | None = None
 ) -> dict[str, Any]:
-    """vision_msgs/Detection3D. spread [3, 3]: covariance of the points, told as that of the position."""
+    """vision_msgs/Detection3D. spread [3, 3]: covariance of the points, used as that of the position."""
     covariance = np.zeros((6, 6))
     if spread is not None:
         covariance[:3, :3] = spread
@@ -87,8 +87,8 @@ def box_markers(
     boxes: Iterable[tuple[int, OrientedBox, str]], namespace: str, head: dict[str, Any], least: float = 1e-3
 ) -> dict[str, Any]:
     """visualization_msgs/MarkerArray: one marker that deletes the markers before it, then for each of `boxes`
-    (instance id, box, text) a transparent box in the instance's colour and its text. Viewers refuse a side of no
-    length, so sides are at least `least`."""
+    (instance id, box, text) a transparent box in the instance's colour and its text. Viewers reject sides
+    of length 0, so sides are at least `least`."""
     markers: list[dict[str, Any]] = [{"header": head, "action": _DELETE_ALL}]
     for i, (instance, box, words) in enumerate(boxes):
         at, common = pose(box), {"header": head, "ns": namespace}

@@ -1,4 +1,4 @@
-"""Names of photos and views that come from files which others wrote, checked before any path is made of them."""
+"""Checks names of photos and views from untrusted files before paths are made from them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 
 from perception.errors import InputError
 
-_SEPARATOR = re.compile(r"[/\\]")  # a map made on one system is read on another
+_SEPARATOR = re.compile(r"[/\\]")  # maps are exchanged between operating systems
 _DRIVE = re.compile(r"[A-Za-z]:")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
@@ -15,7 +15,7 @@ def safe_name(name: object, source: object) -> str:
     """`name` itself when it is a relative path that stays below the folder it is joined to ("a/0001.jpg").
 
     source: the file or folder that gave the name, for the message. Both "/" and "\\" count as separators.
-    InputError for what is no string, an empty name, an absolute path, a drive letter, a part "..", and for control
+    InputError if it is not a string, for an empty name, an absolute path, a drive letter, a part "..", and for control
     characters (NUL, newline) and lone surrogates, which line-based files and terminals cannot hold.
     """
     wrong = _what_is_wrong(name)

@@ -1,4 +1,4 @@
-"""A scene kept on disk, so that a resumed run starts from exactly the poses and points the interrupted one had."""
+"""Saves a scene to disk, so that a resumed run starts from the same poses and points as the interrupted one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from perception.types import Scene, View
 
 
 def save_scene(folder: Path, scene: Scene) -> None:
-    """Writes `scene` to `folder`, whole or not at all; photos stay where they are."""
+    """Writes `scene` to `folder` atomically; photos are not copied."""
     views = [view_json(view) for view in scene.views]
     facts = {"views": views, "metric": scene.metric, "frame": scene.frame, "report": scene.report}
     with atomic_directory(folder) as aside:
@@ -24,7 +24,7 @@ def save_scene(folder: Path, scene: Scene) -> None:
 
 
 def load_saved_scene(folder: Path) -> Scene | None:
-    """The scene kept in `folder`; None when there is none. InputError when it is damaged."""
+    """The scene saved in `folder`; None when there is none. InputError when it is damaged."""
     if not (folder / "scene.json").is_file():
         return None
     try:

@@ -1,7 +1,7 @@
 """Structure from motion from a folder of photos: features, matches, incremental model (pycolmap), checks, report.
 
 The seed fixes every random choice: up to incremental_sfm.REPEATABLE_PHOTOS photos the same machine gives the same
-poses bit for bit. Larger sets are mapped by several threads; their poses differ between runs, as do unit and origin.
+poses bit for bit. Larger sets are mapped by several threads; poses, unit and origin then differ between runs.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ def reconstruct(
 ) -> Scene:
     """Poses and a sparse cloud of the photos in `folder`, from the largest model; unit and orientation are arbitrary.
 
-    lens: known intrinsics shared by all photos, kept fixed; None finds focal length and radial distortion. Finished
-    work in `workdir` is used again for unchanged photos, lens and seed. Which photos are left out: choose_photos.
-    strict: damaged photos are refused.
+    lens: known intrinsics shared by all photos, kept fixed; None estimates focal length and radial distortion.
+    Results in `workdir` are reused for unchanged photos, lens and seed. `choose_photos` decides which photos are left
+    out. strict: damaged photos raise InputError.
     """
     chosen = choose_photos(folder, strict, progress)
     photos = chosen.photos

@@ -1,7 +1,7 @@
 """Checks of a structure-from-motion model against the verified photo pairs it was made from.
 
-Equal textures can fold a scene onto itself although nearly every photo registers. Each verified pair has matches that
-satisfy one epipolar geometry; the model either has that geometry or contradicts it.
+Repeated textures can merge different places of a scene although nearly every photo registers. The matches of each
+verified pair satisfy one epipolar geometry, which the model either agrees with or contradicts.
 """
 
 from __future__ import annotations
@@ -64,10 +64,10 @@ def model_warnings(models: list[Any], database: Path, photos: int) -> list[str]:
 
 
 def stronger_contradictions(pairs: list[Pair]) -> list[Pair]:
-    """The contradicted pairs whose photos no chain of agreeing pairs joins that are all at least as strong.
+    """The contradicted pairs whose photos are not connected by agreeing pairs that are all at least as strong.
 
-    Equal textures make verified pairs too, so a contradicted pair alone is no error. A model that rests on a weak pair
-    and contradicts a stronger one is.
+    Repeated textures also give verified pairs, so a contradicted pair alone is not an error. It is one if the model
+    depends on weaker pairs instead.
     """
     parent: dict[int, int] = {}
 
@@ -134,7 +134,7 @@ def _sampson(a: np.ndarray, b: np.ndarray, a_from_w: np.ndarray, b_from_w: np.nd
 
 
 def _unmatched_neighbors(model: Any, matched: set[tuple[int, int]]) -> tuple[int, int]:
-    """(pairs without matches, all pairs) among cameras close together for their depth and within 15° of view."""
+    """(pairs without matches, all pairs) among cameras that are close relative to depth and differ by less than 15°."""
     ids = sorted(model.reg_image_ids())
     centers = np.stack([model.images[i].projection_center() for i in ids])
     forward = np.stack([model.images[i].viewing_direction() for i in ids])

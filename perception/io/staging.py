@@ -1,7 +1,7 @@
-"""Photos laid out for pycolmap under numbered names, upright and in a format that it reads.
+"""Prepares photos for pycolmap: numbered names, upright, in a format that it reads.
 
-pycolmap ignores EXIF rotation and reads few formats; its lists of names hold no blanks, line ends, leading "#" or bytes
-that are no UTF-8. Every photo therefore gets a number, whatever its name is.
+pycolmap ignores EXIF rotation and reads few formats. Its name lists cannot contain blanks, line ends, a leading "#" or
+bytes that are not UTF-8, so every photo gets a number as its name.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from perception.io.photos import LARGE_PIXELS, exif_of, open_photo, read_photo
 from perception.progress import Progress
 
 _PLAIN = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}
-"""Formats that pycolmap reads as they are (MPO: a JPEG that other pictures follow)."""
+"""Formats that pycolmap reads as they are (MPO: a JPEG followed by further images)."""
 _EXIF_FOLDER, _MAKE_AND_MODEL = 0x8769, (0x010F, 0x0110)
 _FOCAL_LENGTH = (0x920A, 0xA405, 0xA20E, 0xA20F, 0xA210)
 """EXIF tags: focal length in mm, the same for 35 mm film, resolution of the focal plane in x and y and its unit."""
 
 
 def stage_photos(folder: Path, photos: list[Path], progress: Progress) -> list[str]:
-    """Names of the photos in the new `folder`, in their order; names sort as the photos do.
+    """Fills the new `folder`; returns the names there, in the order of `photos`, which is also their sorted order.
 
     Upright JPEG and PNG are linked. Others are written as PNG, which keeps the pixels of every 8-bit format (16 bits
     become 8), with the EXIF data that tell the focal length, by several threads.
@@ -54,7 +54,7 @@ def _plain_suffix(photo: Path) -> str | None:
 def _link(photo: Path, target: Path) -> None:
     try:
         target.symlink_to(photo)
-    except OSError:  # a file system without links
+    except OSError:  # a file system without symbolic links
         shutil.copyfile(photo, target)
 
 

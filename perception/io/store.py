@@ -6,10 +6,10 @@ gaussians.ply   the standard 3DGS properties, readable by other viewers
 instances.json  per instance: id, label, score, num_gaussians, centroid, obb, aabb, views, and maybe parts: a list of
                 entries with the same keys and `parent`, the id of the whole. Ids of parts follow those of the wholes.
 features.npy    [N, D] float32      instance_ids.npy  [N] int32 (−1 = none)   membership.npy [N] float32
-language.npz    what the encoder knows of each instance, with its identity (absent without an encoder)
+language.npz    embeddings of each instance, with the identity of the encoder (absent without an encoder)
 parts.npz       ids [N] int32: the part each Gaussian belongs to (−1 = none; absent without parts). With an encoder also
-                language_*: as language.npz, one row a part in ascending id
-index.npz       the points of each instance side by side (see instance_index), for questions
+                language_*: as language.npz, one row per part in ascending id
+index.npz       points grouped by instance (see instance_index), for queries
 map.json also lists size and SHA-256 of the other files (`files`) and its own (`sha256`); see checksums.
 """
 
@@ -54,11 +54,11 @@ LONGEST_LABEL = 200  # characters
 
 
 def write_map(path: Path, gmap: Map, keep_report: bool = False) -> None:
-    """Writes the whole map aside and swaps it in: a reader sees the old map or the new one, never half of one.
+    """Writes the map to a temporary folder and exchanges it with `path`: readers see the old or the new map.
 
-    keep_report: the report of the map that is replaced stays, for corrections by hand.
+    keep_report: keep the report of the replaced map, for manual corrections.
 
-    InputError when another writer is at this map, or the place cannot be written to.
+    InputError when another writer holds the map, or `path` cannot be written.
     """
     info = {**gmap.info, "format_version": FORMAT_VERSION, "num_gaussians": len(gmap)}
     info["num_instances"] = len(gmap.instances)
@@ -82,7 +82,7 @@ def write_map(path: Path, gmap: Map, keep_report: bool = False) -> None:
 
 
 def _recorded(view: View, path: Path, before: Path | None) -> StoredView:
-    """The view as the map at `path` is to record it; `before`: where it was read."""
+    """The record of a view for the map at `path`; before: path of the map it was read from, or None."""
     safe_name(view.name, path)
     if not isinstance(view, StoredView):
         return stored_view(view, path)
@@ -90,9 +90,9 @@ def _recorded(view: View, path: Path, before: Path | None) -> StoredView:
 
 
 def read_map(path: Path) -> Map:
-    """All of a map in memory, checksums compared.
+    """Reads a whole map into memory and verifies its checksums.
 
-    InputError naming the file when it is no map, of an unknown version, or damaged.
+    InputError naming the file when it is not a map, of an unknown version, or damaged.
     """
     return Map.open(path).load()
 
@@ -106,10 +106,10 @@ def verify_map(path: Path) -> dict[str, str]:
 
 
 def set_labels(path: Path, labels: dict[int, str | None]) -> dict[int, str | None]:
-    """Gives instances of the map on disk, by id, the names of a person; None takes one away. All are written or none.
+    """Sets labels of instances, by id, in the map at `path`; None removes a label. All are written or none.
 
-    Returns what was written, white space tidied. InputError for an id that the map does not have, a name that is empty
-    or too long, and while another writer is at this map.
+    Returns the written labels, with white space normalised. InputError for an unknown id, a label that is empty or too
+    long, and while another writer holds the map.
     """
     tidied = {i: None if label is None else tidy_label(label) for i, label in labels.items()}
     with writing(path):
@@ -124,7 +124,7 @@ def set_labels(path: Path, labels: dict[int, str | None]) -> dict[int, str | Non
 
 
 def tidy_label(label: str) -> str:
-    """One line without outer white space; InputError when nothing is left or more than LONGEST_LABEL."""
+    """`label` on one line without outer white space; InputError when it is empty or longer than LONGEST_LABEL."""
     tidy = " ".join(label.split())
     if not tidy:
         raise InputError('label: it is empty; write a name such as "grandma\'s cup", or --clear to take it away')
@@ -134,8 +134,8 @@ def tidy_label(label: str) -> str:
 
 
 def _write_instances(path: Path, files: MapFiles) -> None:
-    """instances.json, and its checksum in map.json; those of other files stay, so that damage is not blessed."""
-    with contextlib.ExitStack() as both:  # ends in reverse: both are written whole before the first takes its place
+    """Writes instances.json, and its checksum in map.json; other checksums are kept, so damage stays detectable."""
+    with contextlib.ExitStack() as both:  # both are written completely before the first rename
         facts = both.enter_context(atomic_file(path / FACTS)) if "files" in files.facts else None
         aside = both.enter_context(atomic_file(path / EDITABLE))
         _dump(aside, {"instances": files.instances})
@@ -144,7 +144,7 @@ def _write_instances(path: Path, files: MapFiles) -> None:
 
 
 def write_facts(file: Path, facts: dict[str, Any]) -> None:
-    """Writes map.json with its own checksum; the caller holds the right to write."""
+    """Writes map.json with its own checksum; the caller holds the write lock."""
     with atomic_file(file) as aside:
         _dump(aside, seal(facts) if "files" in facts else facts)
 

@@ -1,4 +1,4 @@
-"""transforms.json as nerfstudio and instant-ngp write it: camera-to-world matrices with OpenGL camera axes."""
+"""Reads transforms.json of nerfstudio and instant-ngp: camera-to-world matrices with OpenGL camera axes."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ _PERSPECTIVE = (
 def read_transforms(file: Path, workdir: Path, seed: int, progress: Progress, strict: bool = False) -> Scene:
     """The frames of a transforms.json whose photos exist, as a Scene in the file's own world.
 
-    Intrinsics per frame win over global ones; without fl_x, camera_angle_x gives the focal length; without w, h the
-    photo does. Points come from `ply_file_path`, else they are triangulated with the given poses. The unit is never
-    trusted to be the metre. Views are named by their path below the folder that holds all photos. Photos that are
-    missing or damaged are left out and reported; strict: damaged ones raise InputError.
+    Intrinsics of a frame override global ones. Without fl_x the focal length is computed from camera_angle_x; without w
+    and h the size is that of the photo. Points are read from `ply_file_path`, else triangulated with the given poses.
+    The unit is not assumed to be the metre. View names are paths below the common folder of all photos. Missing and
+    damaged photos are left out and reported; strict: damaged ones raise InputError.
     """
     data = _load(file)
     frames = data["frames"]
@@ -128,7 +128,7 @@ def _find(folder: Path, listed: str) -> Path | None:
 def _is_file(path: Path) -> bool:
     try:
         return path.is_file()
-    except OSError:  # such as a name too long for the file system
+    except OSError:  # for example a name too long for the file system
         return False
 
 
@@ -153,7 +153,7 @@ def _pose(file: Path, frame: dict[str, Any]) -> np.ndarray:
 
 
 def _lens(file: Path, values: dict[str, Any], photo: Path | None) -> Lens:
-    """COLMAP lens of one frame; `values` are the frame's over the file's."""
+    """Lens of one frame; values: the global keys of the file, overridden by those of the frame."""
     what = f"{file}: {values['file_path']}"
     width, height = (_number(values, key, what) for key in ("w", "h"))
     if width is None or height is None:
@@ -200,7 +200,7 @@ def _number(values: dict[str, Any], key: str, what: str) -> float | None:
     if value is None:
         return None
     if not isinstance(value, bool) and isinstance(value, (int, float)):
-        with contextlib.suppress(OverflowError):  # a whole number beyond float64
+        with contextlib.suppress(OverflowError):  # an integer out of range of float64
             if math.isfinite(number := float(value)):
                 return number
     raise InputError(f"{what}: {key} must be a finite number, found {brief(value)}")

@@ -1,4 +1,4 @@
-"""A sparse cloud for posed photos that come without one: features matched, points triangulated with fixed poses."""
+"""Triangulates a sparse cloud for photos with known poses: features are matched, poses are kept fixed."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def posed_scene(
     progress: Progress,
     least: int,
 ) -> Scene:
-    """The Scene of views whose poses are given. cloud: points [P, 3] and colors [P, 3] that the input brings.
+    """The Scene of views with known poses. cloud: points [P, 3] and colors [P, 3] from the input.
 
-    With fewer than `least` points, triangulated ones take their place. facts: of the report, "warnings" among them.
+    With fewer than `least` points, triangulated points are used instead. facts: report entries, with "warnings".
     """
     cameras = sorted({lens_text(view_lens(view)) for view in views})
     report = {**facts, "registered": len(views), "cameras": cameras, "seconds": {}}
@@ -55,7 +55,7 @@ def triangulated_cloud(
 ) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """points [P, 3] float64 in the world of the views, colors [P, 3] uint8, facts for the report.
 
-    Under MIN_POINTS points, random ones in the views' frusta take their place, and a warning says so.
+    With fewer than MIN_POINTS points, random points in the view frusta are returned, with a warning.
     """
     started = time.perf_counter()
     store = build_features([v.photo for v in views], [view_lens(v) for v in views], workdir, seed, progress)
@@ -80,7 +80,7 @@ def triangulated_cloud(
 
 
 def random_cloud(views: list[View], seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Random grey points in the frusta of the views, at depths around the size of the camera path."""
+    """Random grey points in the frusta of the views, at 0.5 to 2.5 times the spread of the cameras."""
     rng = np.random.default_rng(seed)
     worlds = np.stack([inverse_se3(v.camera_from_world) for v in views])
     spread = np.linalg.norm(worlds[:, :3, 3] - worlds[:, :3, 3].mean(0), axis=1).mean() or 1.0
@@ -110,7 +110,7 @@ def _triangulate(views: list[View], store: Any, seed: int) -> tuple[np.ndarray, 
     db.close()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
-    options.num_threads = 1  # several threads add up in another order each time
+    options.num_threads = 1  # the order of sums in several threads is not repeatable
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     with TemporaryDirectory(dir=store.folder) as out:
         model = pycolmap.triangulate_points(model, store.database, store.image_root, out, True, options)

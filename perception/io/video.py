@@ -1,4 +1,4 @@
-"""A video as input: its sharp, well-spaced frames, written as photos."""
+"""Video input: selects sharp frames at regular camera motion and writes them as photos."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from perception.progress import Progress
 
 MOST_FRAMES = 200
 LOOKS_PER_SECOND = 15.0
-"""Frames a second among which the sharpest are chosen; at 30 a second neighbours hardly differ."""
+"""Frames per second that are examined; at 30 per second neighbouring frames hardly differ."""
 JPEG_QUALITY = 95
 
 
 def video_frames(video: Path, folder: Path, progress: Progress) -> dict[str, object]:
     """Writes the chosen frames of `video` to the new `folder` as JPEG, upright, named by frame number.
 
-    Frames are chosen as `perception frames` does, at most MOST_FRAMES. Rotation told by the file is applied. A folder
-    that holds the frames of this very file is used again. Returns its record: video, bytes, mtime_ns, frames, chosen.
-    InputError for what is no video and for a folder that holds something else.
+    Frames are chosen as `perception frames` does, at most MOST_FRAMES. The rotation stored in the file is applied. A
+    folder that holds the frames of the same file is reused. Returns its record: video, bytes, mtime_ns, frames, chosen.
+    InputError for an unreadable video, or if `folder` holds anything else.
     """
     stat = video.stat()
     record: dict[str, object] = {"video": video.name, "bytes": stat.st_size, "mtime_ns": stat.st_mtime_ns}
@@ -61,7 +61,7 @@ def _known(folder: Path) -> dict[str, object]:
 
 
 def _frames(video: Path, wanted: set[int] | None) -> Iterator[tuple[int, float, np.ndarray]]:
-    """(number, share of the video, BGR [h, w, 3] uint8) of the `wanted` frames; None: LOOKS_PER_SECOND of all."""
+    """(number, share of the video, BGR [h, w, 3] uint8) of the `wanted` frames; None: LOOKS_PER_SECOND frames."""
     capture = cv2.VideoCapture(str(video))
     try:
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)

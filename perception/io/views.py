@@ -1,4 +1,4 @@
-"""From a posed lens and its photo to a View, checked; shared by all readers."""
+"""Makes a checked View from a photo, its lens and its pose; used by all readers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from perception.io.photos import photo_size, reduced_size, stored_size
 from perception.types import Lens, View
 
 FARTHEST = 1e12
-"""Longest translation, in the scene's unit; float64 tells no millimetres there."""
+"""Maximum translation in scene units; float64 resolves about 1e-4 units there."""
 
 
 def make_view(name: str, photo: Path, lens: Lens, camera_from_world: np.ndarray, source: Path) -> View:
@@ -25,7 +25,7 @@ def make_view(name: str, photo: Path, lens: Lens, camera_from_world: np.ndarray,
 
 
 def rigid_pose(matrix: np.ndarray, what: str) -> np.ndarray:
-    """[4, 4] with an exact rotation; small numerical slack is repaired, anything else is an InputError."""
+    """`matrix` [4, 4] with an exact rotation; small numerical errors are corrected, larger ones raise InputError."""
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"{what} is not a finite 4×4 matrix (NaN or missing values); repair or remove that frame")
     if np.abs(matrix[:3, 3]).max() > FARTHEST:
@@ -39,9 +39,9 @@ def rigid_pose(matrix: np.ndarray, what: str) -> np.ndarray:
 
 
 def fit_lens(lens: Lens, photo: Path, source: Path) -> tuple[Lens, str | None]:
-    """The lens at the photo's true size, and a note when it had to be scaled; other aspects are an InputError.
+    """The lens scaled to the photo's size, and a note if it was scaled; InputError if the aspect ratio differs.
 
-    A photo so large that it is read at 1/2, 1/4 or 1/8 has the lens of its whole size scaled likewise.
+    For a large photo that is read at 1/2, 1/4 or 1/8, the lens of the full size is scaled in the same way.
     """
     size, whole = photo_size(photo), (lens.width, lens.height)
     if whole in (size, stored_size(photo)) and max(whole) <= max(size):

@@ -1,4 +1,4 @@
-"""What a run keeps of its training, and what each stage depends on, so that `--resume` repeats only what has changed.
+"""Checkpoints of a run, and the dependencies of each stage, by which `--resume` repeats only what has changed.
 
     stage      depends on                                                 kept in the work folder as
     poses      input, photos.camera and strict, seed                           poses-MARK/
@@ -7,9 +7,9 @@
     group      optimise, instances.*                                      nothing: it takes seconds
     describe   group, language.*                                          nothing
 
-When to stop (train.time_limit, train.stop_psnr) is left out: giving more time to a stopped run is the point. Other
-settings of the optimisation than those of the checkpoint are refused, so that no hours of work are thrown away by a
-flag that was forgotten; other masks begin again where masks enter.
+train.time_limit and train.stop_psnr are not part of the dependencies, so that a stopped run can be continued with more
+time. If other optimisation settings have changed, the checkpoint is an error and not discarded, as it may be hours of
+work. With changed masks, training restarts at the point where masks are first used.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from perception.progress import Progress
 CHECKPOINT = "checkpoint.pt"
 BEFORE_MASKS = "before_masks.pt"
 CHECKPOINT_SECONDS = 20.0
-"""Between two checkpoints; so much work is lost at most."""
+"""Interval between two checkpoints; an interruption loses at most this much work."""
 DRAWN_SECONDS = 0.5
 LATER = ("masks", "instances", "language")
-"""Settings that the optimisation as such does not depend on."""
+"""Groups of settings that the optimisation does not depend on, apart from the mask images."""
 
 
 def fingerprint(source: Path, config: MapConfig) -> str:
-    """Of a whole map: two runs with the same one make the same map."""
+    """Hash of the input path and all settings that change the map, without time_limit and stop_psnr."""
     settings = config.to_json()
     for name in ("time_limit", "stop_psnr"):
         del settings["train"][name]
@@ -47,12 +47,12 @@ def fingerprint(source: Path, config: MapConfig) -> str:
 
 
 def poses_mark(source: Path, config: MapConfig) -> str:
-    """Of the poses and the sparse cloud."""
+    """Hash of the input path and the settings that change the poses and the sparse cloud."""
     return _digest(str(source.resolve()), config.photos.camera, config.photos.strict, config.seed)
 
 
 def training_mark(source: Path, config: MapConfig) -> str:
-    """Of the optimisation, masks aside."""
+    """Hash of the input path and the settings of the optimisation, without the groups in LATER."""
     usual = MapConfig()
     return fingerprint(source, config.model_copy(update={name: getattr(usual, name) for name in LATER}))
 
@@ -62,10 +62,10 @@ def _digest(*parts: Any) -> str:
 
 
 class TrainingObserver:
-    """Follows one training: draws its progress, and keeps its checkpoints in folder `work`.
+    """Observer of one training run: displays progress, and writes checkpoints to folder `work`.
 
     mark: see `training_mark`. masks: identity of the masks' source. masks_enter: progress up to which the state does
-    not depend on masks; the state at that point is kept on its own.
+    not depend on masks; the state at that point has its own checkpoint.
     """
 
     def __init__(self, work: Path, mark: str, masks: str, masks_enter: float, progress: Progress):
@@ -76,7 +76,7 @@ class TrainingObserver:
         self.first: tuple[float, int] | None = None
 
     def take_up(self, trainer: Trainer) -> None:
-        """Goes on from the latest checkpoint that fits, if there is one. InputError when it is of other settings."""
+        """Loads the latest valid checkpoint into `trainer`, if any. InputError when it was made with other settings."""
         for name in (CHECKPOINT, BEFORE_MASKS):
             state = load_checkpoint(self.work / name, self.mark)
             if state is None:
@@ -128,17 +128,17 @@ class TrainingObserver:
 
 
 def save_checkpoint(path: Path, state: dict[str, Any], mark: str) -> None:
-    """Writes `state` under the settings' fingerprint `mark`, whole or not at all."""
+    """Writes `state` with the fingerprint `mark` of its settings, atomically."""
     import torch
 
-    buffer = io.BytesIO()  # torch's own file writer ends the process where the disk is full
+    buffer = io.BytesIO()  # torch's file writer aborts the process if the disk is full
     torch.save({"mark": mark, "state": state}, buffer)
     with atomic_file(path) as aside:
         aside.write_bytes(buffer.getbuffer())
 
 
 def load_checkpoint(path: Path, mark: str) -> dict[str, Any] | None:
-    """The state kept at `path`; None when there is none. InputError when it is damaged or belongs to other settings."""
+    """The state saved at `path`; None when there is none. InputError when it is damaged or of other settings."""
     import torch
 
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""`perception demo`: makes photos of a scene, maps them as photos, and scores the map against the truth it knows."""
+"""`perception demo`: renders photos of a synthetic scene, maps them, and evaluates the map with exact ground truth."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from perception.query import QueryMap, load_map
 from perception.types import PointCloud
 
 SETTINGS = ["train.iterations=2000", "train.budget=40000"]
-"""The demo's own settings: a small scene within four minutes on two cores."""
+"""Settings of the demo, for a small scene in about four minutes on two cores."""
 
 
 def write_scene(folder: Path, scene: str, seed: int) -> tuple[dict[str, Any], str]:
-    """Photos of a made scene in `folder`/images, poses and truth beside them: figures, and a text."""
+    """Writes photos of a synthetic scene to `folder`/images, with poses and truth; returns figures and a text."""
     _require_empty(folder)
     truth = make_photos(folder / "images", scene=scene, seed=seed, truth_folder=folder)
     facts = {"scene": str(folder), "photos": len(truth.names), "instances": len(truth.instances)}
@@ -43,7 +43,7 @@ def _require_empty(folder: Path) -> None:
 def run_demo(
     output: Path, progress: Progress | None = None, scene: str = "tabletop", seed: int = 0
 ) -> tuple[dict[str, Any], str]:
-    """Photos → SfM → masks → map → export → queries, all in `output`; returns figures and a text for people."""
+    """Photos → SfM → masks → map → export → queries, all in `output`; returns figures and a text."""
     progress = progress or Progress()
     started = time.monotonic()
     _require_empty(output)
@@ -87,9 +87,9 @@ def run_demo(
 
 
 def truth_in_map_frame(truth: DemoTruth, gmap: Map) -> tuple[PointCloud, float]:
-    """The truth's surface points moved into the map's frame by aligning the cameras, and map units per metre.
+    """The true surface points in the map's frame, and the number of map units per metre.
 
-    SfM fixes neither scale nor frame; the cameras' centres, known on both sides, do.
+    SfM determines neither scale nor frame, so the true camera centres are aligned with the estimated ones.
     """
     by_name = dict(zip(truth.names, truth.cameras, strict=True))
     mapped = camera_centres(gmap.poses)
@@ -101,7 +101,7 @@ def truth_in_map_frame(truth: DemoTruth, gmap: Map) -> tuple[PointCloud, float]:
 
 
 def _ask(gmap: QueryMap, text: str, ids: list[int], truth: DemoTruth, labels: np.ndarray) -> dict[str, Any]:
-    """A prompt, its answer, and whether the answer is right: the true object under most of the first hit's points."""
+    """A prompt, its answer, and whether it is correct: the true object of most points of the first hit is compared."""
     hits = gmap.query(text, top_k=1)
     found = None
     if hits:
@@ -120,7 +120,7 @@ def _ask(gmap: QueryMap, text: str, ids: list[int], truth: DemoTruth, labels: np
 
 
 def demo_text(facts: dict[str, Any]) -> str:
-    """What the demo found against what is true."""
+    """The results of the demo and the ground truth as text."""
     ap, quality, seconds = facts["ap"], facts["quality"], facts["seconds"]
     lines = [
         "",

@@ -1,10 +1,10 @@
-"""Memory and time that a map will take, estimated from its photos and settings before the work begins.
+"""Estimates memory and time of a mapping run from its photos and settings, before it starts.
 
-The figures were read on two cores of a server (AMD EPYC, AVX2): fox_480 (50 photos of 270×480, given cameras, built-in
+The constants were measured on two cores of an AMD EPYC (AVX2): fox_480 (50 photos of 270×480, given cameras, built-in
 masks) took 268 s and 1.2 GiB, room_a (86 of 640×480, given cameras, given masks) 222 s and 1.4 GiB, tabletop_a (62 of
 640×480) 1.4 GiB; a step of training takes 1.9 times as long at four times the pixels, and 46, 51, 53 and 73 ms at 25,
 50, 100 and 200 thousand Gaussians. Structure from motion took 96 s for fox_480 and 64 s
-for tabletop_a beside other work. Memory is told to about a fifth, time to about a factor of two.
+for tabletop_a on a loaded machine. Estimates are accurate to about 20 % for memory and to a factor of 2 for time.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ STEP_BYTES_PER_PIXEL, DECODE_BYTES_PER_PIXEL, READERS = 200, 12, 4
 POSED_SECONDS, PHOTO_SECONDS, MASK_SECONDS_PER_PIXEL = 30.0, 0.1, 3e-6
 STEP_SECONDS, STEP_SECONDS_PER_PIXEL, USUAL_BUDGET = 0.04, 1.3e-7, 100_000
 SFM_SECONDS_PER_PIXEL, SFM_MOST_PIXELS, SFM_SECONDS_PER_PAIR, SFM_SECONDS_PER_PHOTO = 4e-7, 1600 * 1200, 0.055, 0.65
-"""Features of a photo by its pixels, of which at most so many are looked at; a matched pair; a photo's other shares."""
+"""Feature extraction per pixel, up to a maximum of pixels per photo; matching per pair; other time per photo."""
 SFM_PARTNERS = 12
-"""Pairs that are matched per photo of a large set: 19 in fox_480, 8 in tabletop_a."""
+"""Matched pairs per photo of a large set; measured: 19 in fox_480, 8 in tabletop_a."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def _minutes(minutes: float) -> str:
 
 
 def estimate(photos: PhotoSizes, config: MapConfig) -> Estimate:
-    """The estimate for photos of these sizes; structure from motion is part of it where the input brings no poses."""
+    """The estimate for photos of these sizes, including structure from motion if the input has no poses."""
     count = len(photos.sizes)
     scales = [min(1.0, config.photos.max_side / max(size)) for size in photos.sizes]
     pixels = [w * h * scale**2 for (w, h), scale in zip(photos.sizes, scales, strict=True)]
@@ -81,7 +81,7 @@ def _sfm_seconds(sizes: list[tuple[int, int]]) -> float:
 
 
 def tell_estimate(source: Path, config: MapConfig, tell: Callable[[str], None]) -> None:
-    """Tells the estimate for the input `source` in one line, or refuses a run that cannot fit into memory."""
+    """Passes the estimate for the input `source` to `tell` as one line; InputError if memory is not sufficient."""
     photos = photo_sizes(source)
     if photos.sizes:
         check_memory(photos, config)
@@ -89,9 +89,9 @@ def tell_estimate(source: Path, config: MapConfig, tell: Callable[[str], None]) 
 
 
 def check_memory(photos: PhotoSizes, config: MapConfig, limit: int | None = None) -> None:
-    """InputError with settings that would fit when the run needs more than `limit` bytes.
+    """InputError that suggests smaller settings if the run needs more than `limit` bytes.
 
-    limit None: the memory that this process may use; where that is unknown nothing is checked.
+    limit None: the memory available to this process; nothing is checked if that is unknown.
     """
     limit = memory_limit() if limit is None else limit
     needed = estimate(photos, config)
@@ -104,7 +104,7 @@ def check_memory(photos: PhotoSizes, config: MapConfig, limit: int | None = None
 
 
 def _advice(photos: PhotoSizes, config: MapConfig, limit: int) -> str:
-    """The largest settings that fit: the budget is lowered no further than the photos are."""
+    """The largest settings that fit; the budget is not reduced by a larger factor than the photos."""
     for share in (0.75, 0.5, 0.35, 0.25, 0.15, 0.1):
         side, budget = max(64, int(config.photos.max_side * share)), max(1000, int(config.train.budget * share))
         for changes in ({"max_side": side}, {"budget": budget}, {"max_side": side, "budget": budget}):
@@ -120,7 +120,7 @@ def _advice(photos: PhotoSizes, config: MapConfig, limit: int) -> str:
 
 
 def memory_limit() -> int | None:
-    """Bytes of memory that this process may use: the machine's, or less where its control group says so."""
+    """Bytes of memory available to this process: that of the machine, or the limit of its control group."""
     try:
         limit = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (ValueError, OSError, AttributeError):

@@ -1,4 +1,4 @@
-"""`perception export`: a map's instances onto a cloud, or onto the map's own surface points."""
+"""`perception export`: transfers the instances of a map to a cloud, or to the map's own surface points."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from perception.types import PointCloud
 
 SUFFIXES = (".ply", ".pcd", ".npz", ".mcap")
 SURFACE_OPACITY = 0.5
-"""Gaussians at least this opaque stand for the map's own surface."""
+"""Gaussians of at least this opacity are the surface points of a map."""
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """What is written beside the labelled cloud: paths, None = not.
+    """Paths of the outputs beside the labelled cloud; None = not written.
 
-    color: of the cloud's points, "original" or "instance". split: folder for one cloud an instance; boxes: JSON;
+    color: of the cloud's points, "original" or "instance". split: folder for one cloud per instance; boxes: JSON;
     scannet: folder of a submission (scene = the output's stem).
     """
 
@@ -40,7 +40,7 @@ class Outputs:
 def export_map(
     map_path: Path, output: Path, points: Path | None, options: ExportOptions, outputs: Outputs
 ) -> tuple[dict[str, Any], str]:
-    """Labels a cloud and writes it with what `outputs` asks for: (JSON-able facts, table).
+    """Labels a cloud, writes it and the `outputs`, and returns (JSON-able facts, table).
 
     Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids. Coordinates are those of
     the input that the map was made from. .ply, .pcd, .npz: the cloud and its sidecar JSON. .mcap: a recording in the
@@ -54,7 +54,7 @@ def export_map(
     origin = map_origin(map_path, gmap.info)
     means = gmap.means + origin if origin.any() else gmap.means
     began = time.perf_counter()
-    if points is None:  # every point is a Gaussian: nearest is itself
+    if points is None:  # every point is its own nearest Gaussian
         cloud, options = surface_points(gmap, means), ExportOptions(drop_noise=False, smooth=False)
     else:
         cloud, options = read_cloud(points), resolved(options, means, gmap.instance_ids)
@@ -76,7 +76,7 @@ def export_map(
 
 
 def surface_points(gmap: Map, means: np.ndarray | None = None) -> PointCloud:
-    """The means of opaque Gaussians with their colours; `means` [N, 3] instead of the map's own."""
+    """The means of opaque Gaussians with their colours; means [N, 3] replaces those of the map."""
     rows = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY)
     return PointCloud((gmap.means if means is None else means)[rows], rgb8_from_sh(gmap.sh[rows, 0]))
 
@@ -84,7 +84,7 @@ def surface_points(gmap: Map, means: np.ndarray | None = None) -> PointCloud:
 def _write(
     output: Path, gmap: Map, cloud: PointCloud, labels: np.ndarray, origin: np.ndarray, outputs: Outputs
 ) -> dict[str, Any]:
-    """Writes everything, the output last: where it lies, all lies. Returns the sidecar."""
+    """Writes all files, `output` last, so that its existence means success. Returns the sidecar."""
     instances, frame = {entry["id"]: entry for entry in gmap.instances}, str(gmap.info.get("frame", "map"))
     if outputs.split is not None:
         write_split(outputs.split, cloud, labels)

@@ -21,7 +21,7 @@ from perception.language.description import to_arrays
 from perception.progress import Progress
 
 BOX_TRIM = 0.01
-"""Share of an instance's Gaussians left out of its oriented box at either end of each axis: strays stretch boxes."""
+"""Share of an instance's Gaussians left out of its oriented box at either end of each axis, as outliers."""
 
 
 @dataclass
@@ -40,7 +40,7 @@ class FoundInstances:
 def group_gaussians(
     gaussians: Gaussians, views: list[TrainingView], config: MapConfig, progress: Progress
 ) -> Grouping | None:
-    """The votes of all masks, and the instances they and the features make (§3.2.1); None where no photo has masks."""
+    """Groups Gaussians into instances by features and votes of all masks (§3.2.1); None if no photo has masks."""
     if not any(view.labels is not None and bool((view.labels > 0).any()) for view in views):
         return None
     progress.log(f"grouping {len(gaussians)} Gaussians")
@@ -65,7 +65,7 @@ def describe(
     encoder: Encoder | None,
     progress: Progress,
 ) -> FoundInstances:
-    """Where each instance is, how sure, and, with an encoder, what it looks like (§3.2.2)."""
+    """Geometry, score and views of each instance and, with an encoder, its language embeddings (§3.2.2)."""
     count = len(gaussians)
     if grouped is None:
         report = {"warnings": ["no photo has masks"]}
@@ -142,7 +142,7 @@ def _embed(
 ) -> dict[str, np.ndarray]:
     """Language arrays of all instances (eq. 11) from their `best` views (eq. 10), `zooms` crops of each.
 
-    zooms 0: as many as suit the encoder.
+    zooms 0: the default number of the encoder.
     """
     pixels = np.stack([view.pixels for view in seen], axis=1)
     total = np.maximum(np.bincount(ids[ids >= 0], minlength=len(pixels)), 1)

@@ -1,4 +1,4 @@
-"""From an input to a map on disk, top to bottom as in OpenSplat3D: poses, masks, optimise, group, describe.
+"""Builds a map from an input in the stages of OpenSplat3D: poses, masks, optimise, group, describe.
 
 Section (§) and equation numbers are the paper's (Piekenbrinck et al. 2025).
 """
@@ -36,7 +36,7 @@ from perception.progress import Progress
 from perception.types import Scene, View
 
 GEOMETRY_START = 0.3
-"""Progress at which masks that begin from the map's own depth (the built-in ones) are made."""
+"""Training progress at which masks that use the depth of the map (the built-in ones) are made."""
 
 
 def build_map(
@@ -50,10 +50,10 @@ def build_map(
 ) -> Map:
     """Builds a map from photos, a video, a COLMAP workspace or a transforms.json, and writes it to `output`.
 
-    Raises InputError for bad input. What was done is kept beside `output` until the map is written; with `resume` a
-    run goes on from there and repeats only what has changed (see `pipeline.checkpoint`). Names given to the instances
-    of the map `labels_from` are carried over to those that fill the same place. A run refused before it trained leaves
-    nothing behind. To resume a run that is finished is to be given its map.
+    Raises InputError for bad input. Intermediate results are kept beside `output` until the map is written; with
+    `resume` a run continues from them and repeats only what has changed (see `pipeline.checkpoint`). labels_from: a map
+    whose labels are transferred to instances at the same place. A run that fails before training leaves no files.
+    Resuming a finished run returns its map.
     """
     progress, stages, started = progress or Progress(quiet=True), Stages(), time.monotonic()
     if config.device == "cuda":
@@ -65,7 +65,7 @@ def build_map(
     labelled = None if labels_from is None else read_map(labels_from)
 
     with working(source, output, resume) as work:
-        # What may be missing or wrong is opened first, not after hours of work.
+        # Files and models are opened first, so that errors appear before hours of work.
         mask_source = make_source(config.masks)
         encoder = _encoder(config.language.encoder, progress)
 
@@ -85,7 +85,7 @@ def build_map(
         observer = TrainingObserver(work, mark, mask_source.identity, masks_enter, progress)
         observer.take_up(trainer)
 
-        # Instance masks M_v,i of every photo (§3.2). Some begin from the map's own depth, which is trained first.
+        # Instance masks M_v,i of every photo (§3.2). Some need the depth of the map, which is then trained first.
         if from_geometry and trainer.progress < GEOMETRY_START:
             with stages("train"):
                 trainer.run(observer, until=GEOMETRY_START)
@@ -135,7 +135,7 @@ def build_map(
 
 
 def _encoder(spec: str, progress: Progress) -> Encoder | None:
-    """What turns pictures into vectors of words; None where none is wanted, or "auto" finds none."""
+    """The image-text encoder; None if disabled, or if "auto" finds none."""
     from perception.language.encoders import make_encoder
 
     try:
@@ -166,7 +166,7 @@ def _scene(source: Path, output: Path, work: Path, config: MapConfig, progress: 
 
 
 def initial_gaussians(scene: Scene, config: MapConfig) -> Gaussians:
-    """One Gaussian a point of the sparse cloud, a random part of them where there are more than the budget."""
+    """One Gaussian per point of the sparse cloud; a random subset if there are more points than the budget."""
     points, colors = scene.points, scene.point_colors
     if len(points) > config.train.budget:
         keep = np.random.default_rng(config.seed).choice(len(points), config.train.budget, replace=False)
@@ -198,7 +198,7 @@ def _masks(
 
 
 def score_views(gaussians: Gaussians, views: list[TrainingView]) -> dict[str, Any]:
-    """PSNR and SSIM of each view (none: empty), and their means."""
+    """PSNR and SSIM of each view, and their means; empty without views."""
     from perception.evaluate.images import ssim
 
     per_view = {}
@@ -220,7 +220,7 @@ def _assemble(
     record: dict[str, Any],
     output: Path,
 ) -> Map:
-    """The map as it is written; no number in it is infinite or NaN, which JSON cannot hold."""
+    """The map to write; in JSON values, None replaces NaN and infinity."""
     held = {view.name for view in held_out}
     arrays = {name: tensor.detach().numpy() for name, tensor in vars(gaussians).items()}
     arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)

@@ -1,4 +1,4 @@
-"""Posed photos and their label images as the trainer wants them: decoded once, at training size."""
+"""Training views from posed photos and label images, decoded once at training size."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from perception.types import View
 
 
 def split_views(views: list[View], holdout: int, listed: str | None = None) -> tuple[list[View], list[View]]:
-    """(training, held out): sorted by name, index % holdout == 0 is held out; holdout 0 or 1 view trains on all.
+    """(training, held out), sorted by name: index % holdout == 0 is held out; none with holdout 0 or a single view.
 
-    listed: a text file that names the held-out photos instead, one a line.
+    listed: a text file that names the held-out photos instead, one per line.
     """
     if listed is not None:
         names = _names(Path(listed))
@@ -62,7 +62,7 @@ def with_labels(decoded: TrainingView, view: View, folder: Path) -> TrainingView
 
 
 def load_all(views: list[View], max_side: int, progress: Progress) -> list[TrainingView]:
-    """All of `views`, decoded; memory is 3 bytes a pixel."""
+    """Decodes all `views`; takes 3 bytes of memory per pixel."""
     loaded = []
     for done, view in enumerate(views, start=1):
         loaded.append(training_view(view, max_side))

@@ -1,4 +1,4 @@
-"""Facts about a run: seconds by stage, peak memory, versions."""
+"""Run record: seconds by stage, peak memory, versions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 
 
 class Stages:
-    """Seconds by stage; a stage entered twice adds up."""
+    """Wall-clock seconds by stage, summed if a stage is entered again."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -36,7 +36,7 @@ def peak_memory_mib() -> float:
 
 
 class PeakMemory:
-    """Peak resident memory since it was made, where the system can tell (Linux); else since the process began."""
+    """Peak resident memory since construction (Linux), or since the start of the process (other systems)."""
 
     def __init__(self) -> None:
         self._since = True
@@ -54,7 +54,7 @@ class PeakMemory:
 
 
 def versions() -> dict[str, str]:
-    """This program, Python, and the libraries whose version may change a map."""
+    """Versions of this program, Python, and the libraries that can affect a map."""
     from perception import __version__
 
     found = {"perception": __version__, "python": platform.python_version(), "machine": platform.machine()}

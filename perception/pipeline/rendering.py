@@ -1,4 +1,4 @@
-"""`perception render`: pictures of a map from given cameras."""
+"""`perception render`: images of a map rendered from given cameras."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ KINDS = ("rgb", "depth", "instances", "features")
 
 
 def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[str]) -> tuple[dict[str, Any], str]:
-    """Writes one picture per camera and kind: `NAME.png` for a single kind, `KIND/NAME.png` for several.
+    """Writes one image per camera and kind: `NAME.png` for a single kind, `KIND/NAME.png` for several.
 
     rgb: 8-bit PNG. depth: 16-bit PNG, thousandths of the map's unit along the optical axis, 0 = nothing. instances:
     16-bit PNG of id + 1, 0 = none. features: 8-bit PNG of the three main components.
     cameras: a transforms.json in the coordinates of the map's input; None takes the map's held-out views (all views if
-    none were held out). A camera with lens distortion is rendered as that lens sees, so that the picture lies over the
-    photo it was given for. InputError for a name that leaves `output`.
+    none were held out). A camera with lens distortion is rendered with that distortion, so that the image aligns with
+    its photo. InputError for a name that points outside `output`.
     """
     for kind in what:
         if kind not in KINDS:
@@ -38,7 +38,7 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     gmap = read_map(map_path)
     origin = map_origin(map_path, gmap.info)
     views = map_views(gmap) if cameras is None else [moved(view, origin) for view in _cameras(cameras)]
-    names = [safe_name(view.name, cameras or map_path) for view in views]  # whoever wrote them: nothing leaves `output`
+    names = [safe_name(view.name, cameras or map_path) for view in views]  # no path outside `output`
     gaussians = as_gaussians(gmap)
     for kind in what:
         folder = output if len(what) == 1 else output / kind
@@ -84,7 +84,7 @@ def _cameras(path: Path) -> list[View]:
 
 
 def _through_lens(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarray:
-    """The picture as the view's own lens takes it: a wider pinhole picture, warped."""
+    """The image with the view's lens distortion, warped from a wider pinhole image."""
     if view.lens is None:
         return _picture(kind, gaussians, gmap, view)
     import cv2
@@ -101,7 +101,7 @@ def _through_lens(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.
     wide = View(view.name, view.photo, K, int(size[0]), int(size[1]), view.camera_from_world)
     picture = _picture(kind, gaussians, gmap, wide)
     where = (rays * [fx, fy] + K[:2, 2] - 0.5).astype(np.float32).reshape(height, width, 2)
-    nearest = picture.dtype != np.uint8  # ids and depths are not to be mixed
+    nearest = picture.dtype != np.uint8  # ids and depths must not be interpolated
     how = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC
     return np.asarray(cv2.remap(picture, where[..., 0], where[..., 1], how))
 

@@ -1,4 +1,4 @@
-"""A map as pictures and as a one-page report."""
+"""Report of a map: images, a contact sheet and a one-page HTML report."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SHOWN = ("worst", "middle", "best")
 def write_map_report(
     opened: QueryMap, path: Path, queries: list[str], expected: dict[str, list[int]] | None = None
 ) -> Path:
-    """The one-page report of a map, with the answers to `queries`; photos that are gone are left out."""
+    """The one-page report of a map, with the answers to `queries`; missing photos are left out."""
     info, album = opened.info, _Album(opened)
     curve = info["training"]["curve"]
     data = ReportData(
@@ -64,11 +64,11 @@ def write_map_report(
 
 
 def rerun_command(info: dict[str, Any], path: Path) -> str:
-    """The command that makes the map again: its input, and every setting that is not the default."""
+    """The command that builds the map again: its input, and all settings that differ from the defaults."""
     usual = _flat(MapConfig().to_json())
     words = ["perception", "map", str(info["source"]), "-o", str(path), "--seed", str(info["seed"])]
     for key, value in _flat(info["config"]).items():
-        if key == "seed" or key not in usual or usual[key] == value:  # an older map has settings that are no more
+        if key == "seed" or key not in usual or usual[key] == value:  # older maps have settings that no longer exist
             continue
         text = "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
         words += ["--masks", text] if key == "masks" else ["--set", f"{key}={text}"]
@@ -76,7 +76,7 @@ def rerun_command(info: dict[str, Any], path: Path) -> str:
 
 
 def _warnings(info: dict[str, Any], gaussians: Gaussians, views: list[View]) -> list[str]:
-    """What went wrong or is thin, the worst first."""
+    """Warnings on the quality of the map, most severe first."""
     scored = info["quality"].get("views", {})
     mean = info["quality"].get("psnr")
     bad = [f"{name} ({figures['psnr']:.1f} dB)" for name, figures in scored.items() if mean - figures["psnr"] > 6]
@@ -90,7 +90,7 @@ def _warnings(info: dict[str, Any], gaussians: Gaussians, views: list[View]) -> 
 
 
 def _left_out(scene: dict[str, Any], most: int = 12) -> list[str]:
-    """One line a reason: the photos that are not in the map."""
+    """The photos that are not in the map, one line per reason."""
     reasons: dict[str, list[str]] = {}
     for entry in scene.get("left_out", []):
         reasons.setdefault(entry["why"], []).append(entry["name"])
@@ -103,7 +103,7 @@ def _left_out(scene: dict[str, Any], most: int = 12) -> list[str]:
 
 
 class _Album:
-    """Photos, renders and silhouettes of the map's views at training size, made when first asked for.
+    """Photos, renders and silhouettes of the map's views at training size, computed on first use.
 
     `render`, `ids` and `features` are for views whose `photo` can be read.
     """
@@ -131,24 +131,24 @@ class _Album:
         return torch.from_numpy(pose), torch.from_numpy(K), width, height
 
     def render(self, name: str) -> np.ndarray:
-        """[h, w, 3] uint8: the map from the photo's place."""
+        """[h, w, 3] uint8: the map rendered from the camera of the photo."""
         pose, K, _, _ = self._camera(name)
         view = TrainingView(name, torch.from_numpy(self.photo(name)), None, K, pose)
         return (render_view(self.gaussians, view) * 255 + 0.5).to(torch.uint8).numpy()
 
     def _ids(self, name: str) -> np.ndarray:
-        """[h, w] instance ids from the photo's place, −1 = none."""
+        """[h, w] instance ids rendered from the camera of the photo, −1 = none."""
         return render_silhouettes(self.gaussians, self.gmap.instance_ids, *self._camera(name)).ids
 
     def features(self, name: str) -> np.ndarray:
-        """[h, w, 3] uint8: rendered features, coloured by their three main components."""
+        """[h, w, 3] uint8: rendered features, first three principal components as RGB."""
         out = render(self.gaussians, *self._camera(name), features=self.gaussians.features)
         assert out.features is not None  # features were given
         return features_to_rgb(out.features[0].numpy())
 
 
 def map_picture(opened: QueryMap, text: str) -> np.ndarray:
-    """Four pictures in a row from the photo that answers `text` best: photo, render, instances, answer."""
+    """Four images in a row for the photo that best shows the answer to `text`: photo, render, instances, answer."""
     album = _Album(opened)
     hits = opened.query(text, top_k=1)
     names = list(album.views)
@@ -191,7 +191,7 @@ def _view_rows(gmap: Map, album: _Album) -> list[ViewRow]:
 
 
 def _overview(gmap: Map, album: _Album) -> dict[str, np.ndarray]:
-    """Instances and features over a photo in the middle of the walk."""
+    """Instances and features of the middle photo of the sequence."""
     names = list(album.views)
     name = names[len(names) // 2]
     photo = album.photo(name)
@@ -225,14 +225,14 @@ def _best_crop(opened: QueryMap, index: int, album: _Album, whole: bool) -> np.n
 
 
 def _rows(opened: QueryMap, album: _Album) -> Iterator[tuple[dict[str, Any], np.ndarray | None, list[str]]]:
-    """(entry of instances.json, best crop, likeliest names) of each instance; no names for a map without language."""
+    """(entry of instances.json, best crop, most likely names) of each instance; no names without language data."""
     names = opened.likely_names() if opened.problem is None else [[] for _ in opened.instances]
     for i, entry in enumerate(opened.instances):
         yield entry, _best_crop(opened, i, album, whole=False), names[i]
 
 
 def write_sheet(opened: QueryMap, path: Path) -> None:
-    """The contact sheet as a picture file, by suffix."""
+    """Writes the contact sheet as an image file; the suffix selects the format."""
     from PIL import Image
 
     from perception.io.atomic import atomic_file
@@ -244,7 +244,7 @@ def write_sheet(opened: QueryMap, path: Path) -> None:
 
 
 def contact_sheet(opened: QueryMap, columns: int = 6, side: int = 240) -> np.ndarray:
-    """Every instance's best crop with its id and label or likeliest names, [H, W, 3] uint8; unseen ones left out."""
+    """Every instance's best crop with id and label or most likely names, [H, W, 3] uint8; unseen ones left out."""
     import cv2
 
     from perception.instances.crops import letterbox

@@ -1,4 +1,4 @@
-"""`perception eval masks`: a finished map's instances, rendered and scored against true masks."""
+"""`perception eval masks`: evaluates the rendered instance masks of a map against ground truth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from perception.pipeline.rendering import as_gaussians, map_views
 def score_masks(map_path: Path, truth_dir: Path, all_views: bool = False) -> tuple[dict[str, Any], str]:
     """mIoU of the map's rendered masks in its held-out views; in all its views with all_views or if none was held out.
 
-    truth_dir: one PNG a view, see `evaluate_rendered`. Returns (JSON-able result, table).
+    truth_dir: one PNG per view, see `evaluate_rendered`. Returns (JSON-able result, table).
     """
     gmap = read_map(map_path)
     views = map_views(gmap, held_out=not all_views)

@@ -1,4 +1,4 @@
-"""Results in words: what `map`, `info` and `query` print, and the points a query writes."""
+"""Output of `perception map`, `info` and `query`: JSON, text, and the points of query hits."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from perception.query import Hit
 
 
 def map_facts(path: Path, info: dict[str, Any], gaussians: int, instances: int) -> dict[str, Any]:
-    """The JSON answer of `perception map`."""
+    """The JSON output of `perception map`; info: content of map.json."""
     scene = info["scene"]
     return {
         "map": str(path),
@@ -30,7 +30,7 @@ def map_facts(path: Path, info: dict[str, Any], gaussians: int, instances: int) 
 
 
 def speed(training: dict[str, Any]) -> dict[str, float]:
-    """Iterations, and contributing (Gaussian, pixel) pairs, a second of training."""
+    """Iterations and contributing (Gaussian, pixel) pairs per second of training; training: entry of map.json."""
     seconds = max(training.get("seconds", 0.0), 1e-9)
     return {
         "iterations_per_second": round(training.get("iterations", 0) / seconds, 2),
@@ -39,7 +39,7 @@ def speed(training: dict[str, Any]) -> dict[str, float]:
 
 
 def shares(training: dict[str, Any]) -> dict[str, float]:
-    """Shares of the training time by part, largest first; "other" is what no part accounts for."""
+    """Share of the training time of each part, largest first; "other" is the unattributed rest."""
     total = max(training.get("seconds", 0.0), 1e-9)
     parts = dict(training.get("profile", {}))
     parts["other"] = max(0.0, total - sum(parts.values()))
@@ -47,7 +47,7 @@ def shares(training: dict[str, Any]) -> dict[str, float]:
 
 
 def profile_text(info: dict[str, Any]) -> str:
-    """Where the time went, a line a part: of the run, then of its training."""
+    """Seconds and share of each stage of the run, then of each part of training, one per line."""
     training, seconds = info["training"], info["seconds"]
     total = max(seconds["total"], 1e-9)
     lines = [f"{name:24}{value:9.1f} s {value / total:7.1%}" for name, value in seconds.items() if name != "total"]
@@ -65,7 +65,7 @@ def profile_text(info: dict[str, Any]) -> str:
 
 
 def info_text(path: Path, info: dict[str, Any]) -> str:
-    """map.json for a person."""
+    """Summary of map.json as text, for `perception info`."""
     quality, training, scene = info.get("quality", {}), info.get("training", {}), info.get("scene", {})
     seconds = info.get("seconds", {})
     lines = [
@@ -96,7 +96,7 @@ def _rates(training: dict[str, Any]) -> str:
 
 
 def query_text(answers: list[tuple[str, list[Hit]]], metric: bool) -> str:
-    """Ranked hits, or "not present", a line each."""
+    """Ranked hits of each prompt, one per line, or "not present"."""
     unit = " m" if metric else ""
     lines = []
     for text, hits in answers:
@@ -115,7 +115,7 @@ def query_text(answers: list[tuple[str, list[Hit]]], metric: bool) -> str:
 
 
 def write_hits(path: Path, gmap: Map, hits: list[Hit]) -> None:
-    """The hits' points as one cloud with `instance_id` and the map's colours."""
+    """Writes the points of all hits as one cloud, with `instance_id` and the colours of the map."""
     from perception.colors import rgb8_from_sh
     from perception.io.cloud import write_cloud
     from perception.types import PointCloud

@@ -1,4 +1,4 @@
-"""A map's instances seen from above, like a floor plan."""
+"""Top view of the instances of a map, like a floor plan."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from perception.geometry import camera_centres
 from perception.io.store import Map
 
 SOLID = 0.3
-"""Opacity from which a Gaussian is drawn."""
+"""Least opacity of Gaussians that are drawn."""
 FAR = 60.0
-"""Height of the eye over the map in units of its width: near enough to parallel rays."""
+"""Height of the camera above the map in units of the map's width; nearly an orthographic projection."""
 INK = (70, 70, 70)
 
 
@@ -22,7 +22,7 @@ INK = (70, 70, 70)
 def instances_top_view(gmap: Map, side: int = 480) -> np.ndarray:
     """[side, side, 3] uint8: the instances in their colours, cameras as dots, a scale bar.
 
-    "Down" is the mean of the cameras' downward axes. What lies above every camera, as ceilings do, is left out.
+    "Down" is the mean of the cameras' downward axes. Gaussians above all cameras, such as ceilings, are left out.
     """
     poses = gmap.poses
     axes = _axes(poses)
@@ -57,10 +57,10 @@ def instances_top_view(gmap: Map, side: int = 480) -> np.ndarray:
 
 
 def _axes(poses: np.ndarray) -> np.ndarray:
-    """[3, 3] rows: right, towards the reader, down; right and the mean of the cameras' right agree."""
+    """Rows [3, 3]: image right, towards the reader, down in the scene; right is that of a camera, made horizontal."""
     down = poses[:, 1, :3].mean(axis=0)
     down /= max(float(np.linalg.norm(down)), 1e-9)
-    right = poses[len(poses) // 2, 0, :3]  # one camera's: the mean of a walk around vanishes
+    right = poses[len(poses) // 2, 0, :3]  # of one camera: the mean over a closed path can be 0
     right = right - (right @ down) * down
     if np.linalg.norm(right) < 1e-3:
         right = np.cross(down, [1.0, 0.2, 0.1])

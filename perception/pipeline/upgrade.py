@@ -1,4 +1,4 @@
-"""`perception upgrade`: an older map in the newest format, its instances embedded by the encoder in use now."""
+"""`perception upgrade`: converts a map to the newest format and embeds its instances with the current encoder."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def upgrade_map(
     encoders: Callable[[str], Encoder | None] = make_encoder,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Writes the map at `path` in the newest format, to `output` or in its own place; Gaussians, instances, names stay.
+    """Writes the map at `path` in the newest format, to `output` or in place; Gaussians, instances, labels are kept.
 
-    When its embeddings are another encoder's than the one its settings name now, every instance is embedded anew, from
-    the photos that the map lists for it and its silhouettes there; InputError naming the first of them that is missing.
+    If the embeddings are from another encoder than the one its settings now select, all instances are embedded again,
+    from their recorded photos and rendered silhouettes; InputError names the first missing photo.
     Returns {"map", "format_version": [before, after], "encoder": [before, after]}.
     """
     target, progress = output or path, progress or Progress(quiet=True)
@@ -47,7 +47,7 @@ def upgrade_map(
         encoder = _encoder(gmap, encoders) if gmap.language else None
         if encoder is not None and encoder.identity != old:
             _embed_again(gmap, encoder, progress)
-        gmap.views = [  # version 1 recorded neither sizes nor paths relative to the map
+        gmap.views = [  # version 1 has neither photo sizes nor relative paths
             view
             if isinstance(view, StoredView) and view.photo_bytes is not None
             else stored_view(view, target, view.held_out)
@@ -64,7 +64,7 @@ def _encoder(gmap: Map, encoders: Callable[[str], Encoder | None]) -> Encoder | 
 
 
 def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:
-    """Replaces `language` and, where there are some, the `language_` arrays of the parts."""
+    """Replaces `language` and, if present, the `language_` arrays of the parts."""
     zooms = int(gmap.info.get("config", {}).get("language", {}).get("zooms") or reading_of(encoder).zooms)
     ids = [entry["id"] for entry in gmap.instances]
     gmap.language = _described(gmap, encoder, gmap.language, gmap.instance_ids, ids, zooms, progress)
@@ -86,7 +86,7 @@ def _described(
 ) -> dict[str, np.ndarray]:
     """Language arrays of the instances `ids`, each from the views that `stored` lists for it.
 
-    owners: [N] the instance of each Gaussian, −1 = none.
+    owners: [N] instance id of each Gaussian, −1 = none.
     """
     descriptions, _ = from_arrays(stored)
     number = {view.name: n for n, view in enumerate(gmap.views)}
@@ -96,7 +96,7 @@ def _described(
             f"{gmap.path}: lists the photo {unknown[0]!a}, which is none of its views; build the map again"
         )
     wanted = sorted({number[name] for d in descriptions for name in d.views})
-    # All photos are looked for before the work.
+    # All photos are located before any is embedded.
     located = {n: replace(gmap.views[n], photo=locate_photo(gmap.views[n], gmap.path)) for n in wanted}
     gaussians, side = as_gaussians(gmap), int(gmap.info["config"]["photos"]["max_side"])
     rank = {instance: n for n, instance in enumerate(ids)}

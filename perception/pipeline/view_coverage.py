@@ -1,4 +1,4 @@
-"""Which parts of a map too few photos saw: a surface needs three views before its place can be trusted."""
+"""Finds parts of a map that too few photos show; the position of a surface is reliable from three views on."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from perception.gaussians.render import render
 from perception.types import View
 
 ENOUGH = 3
-"""Views from which a surface must be seen: two place it, the third confirms."""
+"""Least number of views of a reliable surface: two determine its position, the third confirms it."""
 SOLID = 0.5
-"""Opacity from which a Gaussian counts as surface."""
+"""Least opacity of Gaussians that count as surface."""
 SIDE = 240
-"""Pixels of the longer side at which visibility is looked at."""
+"""Long side in pixels of the images in which visibility is tested."""
 TOLD = 0.02
-"""Share of the surface below which weak places are not worth a warning."""
+"""Least share of weakly covered surface for a warning."""
 
 
 @torch.no_grad()
 def views_of_each(gaussians: Gaussians, views: list[View]) -> np.ndarray:
-    """[N] int: in how many views each Gaussian contributes to some pixel."""
+    """[N] int: number of views in which each Gaussian contributes to some pixel."""
     counts = torch.zeros(len(gaussians), dtype=torch.int64)
     for view in views:
         scale = min(1.0, SIDE / max(view.width, view.height))
@@ -58,7 +58,7 @@ def weak_coverage(gaussians: Gaussians, views: list[View]) -> str | None:
 
 
 def _off_axis(view: View, point: np.ndarray) -> float:
-    """Angle in radians between a view's axis and a point; π where the point lies at its centre."""
+    """Angle in radians between a view's axis and a point; π if the point is the camera centre."""
     local = view.camera_from_world[:3, :3] @ point + view.camera_from_world[:3, 3]
     distance = float(np.linalg.norm(local))
     return float(np.arccos(np.clip(local[2] / distance, -1, 1))) if distance > 0 else float(np.pi)

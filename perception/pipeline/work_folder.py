@@ -1,4 +1,4 @@
-"""Where an unfinished run keeps what it has done, and what becomes of it when the run ends."""
+"""Work folder of an unfinished run: creation, locking, and removal at the end."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from perception.pipeline.checkpoint import CHECKPOINT
 
 WORK_SUFFIX = ".work"
 LEAST_DISK = 256 << 20
-"""Bytes a small run writes to its work folder: features, masks, checkpoint, map."""
+"""Least free disk space in bytes, as a small run needs it for features, masks, checkpoint and map."""
 
 
 def work_folder(output: Path) -> Path:
-    """A sibling of the map."""
+    """Path of the work folder, a sibling of the map."""
     return output.with_name(output.name + WORK_SUFFIX)
 
 
 def frames_folder(output: Path) -> Path:
-    """Where the frames of a video go, which are the map's photos: a sibling of the map that stays."""
+    """Folder for the frames of a video, a sibling of the map; it is kept, as the frames are the map's photos."""
     return output.with_suffix(".frames")
 
 
 @contextmanager
 def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
-    """The work folder of a run that makes `output`, locked against other writers; it goes when the block ends well.
+    """Yields the work folder of a run that makes `output`, locked; it is deleted when the block ends without an error.
 
-    It stays after any error, so that `--resume` goes on from there, unless bad input was found before the training
-    began. InputError for a source that is missing, an output or an unfinished run that is in the way, a full disk.
+    After an error it is kept for `--resume`, except for an InputError before training. InputError for a missing source,
+    an output or unfinished run that already exists, and a full disk.
     """
     fresh, had_frames = not work_folder(output).exists(), frames_folder(output).exists()
     work = _prepare(source, output, resume)
@@ -54,7 +54,7 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
 
 
 def clear_work(output: Path) -> None:
-    """Removes what a run left that was killed after its map took its place: its lock and its work folder."""
+    """Removes the lock and the work folder of a run that was killed after it had written its map."""
     with writing(output):
         shutil.rmtree(work_folder(output), ignore_errors=True)
 
@@ -71,7 +71,7 @@ def _prepare(source: Path, output: Path, resume: bool) -> Path:
         work.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{work}: cannot be made ({error.strerror}); choose a writable -o") from error
-    # Libraries below abort the process when the disk fills up under them, so it is looked at first.
+    # Checked first, because libraries abort the process when the disk becomes full.
     free = shutil.disk_usage(work).free
     if free < LEAST_DISK:
         if not any(work.iterdir()):
