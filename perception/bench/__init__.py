@@ -12,4 +12,4 @@ BENCHES = (
     "lerf-ovs",
     "scannetpp",
 )
-"""Names on the command line; a dash in a name is an underscore in its module's."""
+"""Benchmark names on the command line. A dash in a name is an underscore in the module name."""

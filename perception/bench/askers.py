@@ -1,8 +1,7 @@
-"""Ways to ask a served map, for the load test of `bench query`: each is a server and clients that ask it.
+"""Clients of a served map for the load test of `bench query`: by direct calls to the engine, and over HTTP.
 
-A contender is a context manager over the path of a map; it yields `Served`: a function that makes one client, and the
-process that answers. A client takes a prompt and returns (instance id, number of points) of the best hit, None when not
-present.
+A `Contender` takes the path of a map and returns a context manager. It yields `Served`: a factory of clients and the id
+of the serving process. A client takes a prompt and returns (instance id, number of points) of the best hit, or None.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ Ask = Callable[[str], Best]
 
 @dataclass(frozen=True)
 class Served:
-    """client: makes one asker. process: the id of the process that answers, whose memory is looked at."""
+    """client: creates one client. process: id of the serving process, whose memory is measured."""
 
     client: Callable[[], Ask]
     process: int
@@ -35,7 +34,7 @@ Contender = Callable[[Path], AbstractContextManager[Served]]
 
 @contextmanager
 def engine_askers(path: Path) -> Iterator[Served]:
-    """Threads of one process ask the engine itself."""
+    """Clients that call one `QueryEngine` in this process. They may run in several threads."""
     from perception.query.engine import QueryEngine
     from perception.query.requests import Request
 
@@ -50,7 +49,7 @@ def engine_askers(path: Path) -> Iterator[Served]:
 
 @contextmanager
 def http_askers(path: Path) -> Iterator[Served]:
-    """`perception serve` in a process of its own on the loopback; each client keeps one connection."""
+    """Clients of `perception serve`, a separate process on the loopback interface; one connection per client."""
     options = ["--port", "0", "--rate", "0", "--watch", "0", "--timeout", "60"]
     with served("serve", str(path.resolve()), *options) as (told, process):
         port = int(told.rsplit(":", 1)[1].split()[0])

@@ -25,11 +25,11 @@ from perception.bench.processes import run_python
 
 TREES = ("perception", "scipy", "open3d")
 LISTS = 12
-"""Neighbours that smoothing asks for."""
+"""Neighbours per point used for smoothing."""
 
 
 def surfaces(count: int, seed: int, noise: float = 0.0) -> np.ndarray:
-    """Points [count, 3] float32 on the walls, floor and 40 balls of a made-up room of 8 × 6 × 3 m."""
+    """Points [count, 3] float32, metres, on the walls, floor and 40 spheres of a synthetic room of 8 × 6 × 3 m."""
     rng = np.random.default_rng(seed)
     room = np.array([8.0, 6.0, 3.0])
     points = rng.random((count, 3)) * room
@@ -50,7 +50,7 @@ def surfaces(count: int, seed: int, noise: float = 0.0) -> np.ndarray:
 
 
 def nearest(tree: str, points: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Index [P] of the nearest mean, by one of TREES, on all cores."""
+    """Index [P] of the nearest mean, computed with one of TREES on all cores."""
     if tree == "perception":
         from perception.export.assign import nearest_gaussian
 
@@ -59,7 +59,7 @@ def nearest(tree: str, points: np.ndarray, means: np.ndarray) -> np.ndarray:
 
 
 def neighbors(tree: str, points: np.ndarray, queries: np.ndarray, k: int) -> np.ndarray:
-    """The k nearest points [Q, k] int32 of queries, by scipy or open3d."""
+    """Indices [Q, k] int32 of the k nearest points of each query, computed with scipy or open3d."""
     if tree == "scipy":
         from scipy.spatial import cKDTree
 
@@ -67,14 +67,14 @@ def neighbors(tree: str, points: np.ndarray, queries: np.ndarray, k: int) -> np.
         return found.reshape(len(queries), k).astype(np.int32)
     import open3d
 
-    tensor: Any = open3d.core.Tensor  # its type stubs do not know numpy arrays
+    tensor: Any = open3d.core.Tensor  # open3d's type stubs do not accept numpy arrays
     search = open3d.core.nns.NearestNeighborSearch(tensor(points))
     search.knn_index()
     return search.knn_search(tensor(queries), k)[0].numpy().astype(np.int32)
 
 
 def smoothed(tree: str, points: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Labels [P] after the vote of superpoints, the neighbours brought by one of TREES."""
+    """Labels [P] after the vote per superpoint. The neighbours come from one of TREES."""
     from perception.export.graph import list_edges, list_normals, scannet_weights
     from perception.export.smooth import felzenszwalb, segment_cloud, vote
     from perception.types import PointCloud
@@ -88,7 +88,7 @@ def smoothed(tree: str, points: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def measure(task: str, tree: str, args: argparse.Namespace) -> dict[str, Any]:
-    """One contender in this very process: seconds, CPU seconds, peak memory in MiB, and a mark of the answer."""
+    """Runs a task with one tree in this process: seconds, CPU seconds, peak memory in MiB, a checksum of the result."""
     if tree == "perception":
         import perception.export  # noqa: F401
     elif tree == "scipy":
@@ -131,7 +131,7 @@ COLUMNS: tuple[Column, ...] = (
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Prints the least of all turns; every turn is kept in the JSON."""
+    """Prints the minimum over all rounds. The JSON keeps every round."""
     parser = bench_parser("clouds", __doc__)
     parser.add_argument("--points", type=int, default=500_000)
     parser.add_argument("--gaussians", type=int, default=50_000)

@@ -1,4 +1,4 @@
-"""What the dataset benches share: a map of each scene, made or reused, and masks of its instances in given views."""
+"""Shared by the dataset benchmarks: a map of each scene, built or reused, and instance masks in given views."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ Masks = Mapping[tuple[str, str], np.ndarray]
 
 @dataclass(frozen=True)
 class Workplace:
-    """Folders and settings of one bench run. maps: <scene>.gsmap, reused when there.
+    """Folders and settings of one benchmark run. maps: folder of <scene>.gsmap files; existing ones are reused.
 
-    config: the settings for a scene's name and further KEY=VALUE pairs.
+    config: returns the settings for a scene's name and additional KEY=VALUE pairs.
     """
 
     work: Path
@@ -39,9 +39,9 @@ class Workplace:
     progress: Progress
 
     def map(self, scene: str, source: Path, held_out: list[str] | None = None) -> Map:
-        """The scene's map: read where it lies in `maps`, else built (an interrupted run goes on).
+        """The scene's map: read from `maps` if it is there, else built. An interrupted build is resumed.
 
-        held_out: photo names kept out of training. They are not known to a map that was brought along.
+        held_out: names of photos excluded from training. They have no effect on a map that already exists.
         """
         path = self.maps / f"{scene}.gsmap"
         if path.exists():
@@ -59,7 +59,7 @@ class Workplace:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options all dataset benches have."""
+    """Adds the options that all dataset benchmarks share."""
     parser.add_argument("dataset", type=Path, metavar="DIR", help="the dataset as downloaded")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="WORK", help="maps, predictions, result")
     parser.add_argument("--maps", type=Path, metavar="DIR", help="finished maps <scene>.gsmap (default WORK/maps)")
@@ -72,13 +72,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def workplace(args: argparse.Namespace) -> Workplace:
-    """Folders and settings as the arguments say."""
+    """Folders and settings from the parsed arguments."""
 
     def config(scene: str, more: Sequence[str] = ()) -> MapConfig:
         pairs = [*args.pairs, f"masks={args.masks.replace('{scene}', scene)}", *more]
         return load_config(args.config, pairs, args.preset)
 
-    config("scene")  # bad settings are told before the first scene
+    config("scene")  # invalid settings raise before the first scene
     return Workplace(args.output, args.maps or args.output / "maps", config, Progress(quiet=args.json))
 
 
@@ -93,9 +93,9 @@ def chosen_scenes(scenes: Mapping[str, Path], wanted: list[str] | None, dataset:
 def run_scenes(
     scenes: Mapping[str, Path], place: Workplace, predict: Callable[[str, Path, Path], None]
 ) -> dict[str, str]:
-    """Calls predict(name, scene folder, empty folder to fill) for each scene whose predictions are not there yet.
+    """Calls predict(name, scene folder, empty output folder) for each scene that has no predictions yet.
 
-    Returns why scenes failed, by name: a scene that cannot be mapped has no predictions and scores 0.
+    Returns the reason of failure by scene name. A scene that cannot be mapped has no predictions and scores 0.
     """
     failed = {}
     for name, folder in scenes.items():
@@ -160,7 +160,7 @@ def _map_facts(path: Path) -> dict[str, Any] | None:
 
 
 class InstanceViews:
-    """A map's instances as masks in its own views."""
+    """Renders a map's instances as masks in the map's own views."""
 
     def __init__(self, gmap: Map) -> None:
         self.gmap = gmap
@@ -187,9 +187,9 @@ class InstanceViews:
         return render_silhouettes(self.gaussians, self.gmap.instance_ids, pose, K, view.width, view.height).ids
 
     def silhouette(self, instances: list[int], view: View, occlusion: bool) -> np.ndarray:
-        """Accumulated weight [H, W] float32 in [0, 1] of the instances' Gaussians, white on black.
+        """Accumulated rendering weight [H, W] float32 in [0, 1] of the instances' Gaussians.
 
-        occlusion: the other Gaussians are in front where they are; else the instances are rendered alone.
+        occlusion: the other Gaussians of the map can hide them; without it the instances are rendered alone.
         """
         import torch
 
@@ -216,9 +216,9 @@ class InstanceViews:
 
 
 def by_words(gmap: Map, prompt: str, rule: str) -> list[int]:
-    """Ids of the instances that a prompt selects, by the map's own words, whether or not it says "present".
+    """Ids of the instances that a prompt selects by the map's own text query. The "present" threshold is not applied.
 
-    rule: "top-1", or "relative": all whose score, less the least, reaches .85 of the best's.
+    rule: "top-1", or "relative": all instances with (score − minimum) ≥ 0.85 (maximum − minimum).
     """
     hits = QueryMap.of(gmap).query(prompt, top_k=max(len(gmap.instances), 1), min_score=0.0)
     if not hits:
@@ -230,7 +230,7 @@ def by_words(gmap: Map, prompt: str, rule: str) -> list[int]:
 
 
 def by_reference(ids: np.ndarray, reference: np.ndarray, share: float = 0.7) -> list[int]:
-    """Instances of an id image [H, W] that lie to more than `share` within a reference mask (Gaussian Grouping)."""
+    """Instances of an id image [H, W] with more than `share` of their pixels in a mask (rule of Gaussian Grouping)."""
     import cv2
 
     if reference.shape != ids.shape:
@@ -243,7 +243,7 @@ def by_reference(ids: np.ndarray, reference: np.ndarray, share: float = 0.7) -> 
 
 
 def link(source: Path, target: Path) -> None:
-    """`target` as a link to `source`, or a copy where links cannot be made."""
+    """Creates `target` as a symbolic link to `source`, or as a copy where links are not supported."""
     if target.exists():
         return
     target.parent.mkdir(parents=True, exist_ok=True)

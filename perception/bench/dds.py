@@ -1,7 +1,7 @@
-"""Contenders of `bench query` that go through the query node on DDS: `dds` by its service, `dds-topics` by topics.
+"""DDS clients for `bench query`, through the query node: `dds` uses its service, `dds-topics` its topics.
 
-On topics every client gets the answers of all, and one that is more than 64 behind loses some: it asks again after two
-seconds, as a planner would, so such an answer is late (see the 99 %) and not lost.
+On topics every client receives all answers. A client that is more than 64 answers behind loses some and repeats its
+prompt after two seconds. Such an answer counts as late (see the 99th percentile), not as lost.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _SECONDS = 60.0
 
 @contextmanager
 def _node(path: Path) -> Iterator[tuple[NodeConfig, int]]:
-    """`perception node` in a process of its own on the loopback, on a domain nobody else here has."""
+    """`perception node` in a separate process on the loopback interface, on an otherwise unused DDS domain."""
     config = NodeConfig(
         namespace=f"bench{os.getpid()}", transport="dds", domain=20 + os.getpid() % 200, network="localhost"
     )
@@ -33,7 +33,7 @@ def _node(path: Path) -> Iterator[tuple[NodeConfig, int]]:
 
 @contextmanager
 def service_askers(path: Path) -> Iterator[Served]:
-    """Each client is a DDS participant that calls the query service; the answer is JSON."""
+    """Each client is a DDS participant that calls the query service. The answer is JSON."""
     with _node(path) as (config, process):
 
         def client() -> Ask:
@@ -54,7 +54,7 @@ def service_askers(path: Path) -> Iterator[Served]:
 
 @contextmanager
 def topic_askers(path: Path) -> Iterator[Served]:
-    """Each client publishes its prompt and waits for all four messages of the answer, points included."""
+    """Each client publishes its prompt and waits for all four messages of the answer, including the points."""
     with _node(path) as (config, process):
 
         def client() -> Ask:

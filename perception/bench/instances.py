@@ -16,7 +16,7 @@ from perception.bench.truth import read_scene, read_truth_cloud
 
 
 def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
-    """AP (protocol scannet, class-agnostic, exported with smoothing) and rendered mIoU of a map of a truth scene."""
+    """AP (protocol scannet, class-agnostic, exported labels with smoothing) and rendered mIoU against ground truth."""
     from perception.evaluate.instances import evaluate
     from perception.evaluate.rendered import rendered_miou
     from perception.export.transfer import export_labels

@@ -29,7 +29,7 @@ from perception.bench.datasets import (
 from perception.errors import InputError
 from perception.evaluate.layouts import read_mask_folder, run_lerf_mask
 
-RENDERED, SHARE = 0.2, 0.7  # Gaussian Grouping: rendered mask > .2, instances inside the reference by > .7
+RENDERED, SHARE = 0.2, 0.7  # Gaussian Grouping: rendered mask > 0.2; instances > 0.7 inside the reference mask
 SELECTION = {
     "query": "the map's own words, top-1 whether or not it says present",
     "truth": "instances inside the TRUE mask of the first test view by > .7: tells segmentation apart from language",
@@ -38,7 +38,7 @@ SELECTION = {
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line; see the module's docstring."""
+    """Command line entry point; see the module docstring."""
     parser = argparse.ArgumentParser(prog="perception bench lerf-mask", description=__doc__)
     add_arguments(parser)
     parser.add_argument(
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _only(args: argparse.Namespace, scenes: dict[str, Path]) -> Path:
-    """A folder of links to the truth of some scenes."""
+    """A folder of links to the ground truth of the given scenes."""
     from perception.bench.datasets import link
 
     folder: Path = args.output / "truth" / "+".join(scenes)
@@ -86,7 +86,7 @@ def _only(args: argparse.Namespace, scenes: dict[str, Path]) -> Path:
 def predict_scene(
     place: Workplace, name: str, scene: Path, select: str, references: Path | None
 ) -> dict[tuple[str, str], np.ndarray]:
-    """{(view, prompt): bool mask [H, W]} of one scene; views that were not registered have none."""
+    """{(view, prompt): bool mask [H, W]} of one scene. Views without a registered pose are absent."""
     truths = read_mask_folder(scene / "test_mask")
     tests = test_photos(scene, sorted({view for view, _ in truths}))
     shown = InstanceViews(place.map(name, scene, sorted(tests.values())))
@@ -109,7 +109,7 @@ def predict_scene(
 
 
 def test_photos(scene: Path, labels: Sequence[str]) -> dict[str, str]:
-    """{label: photo name} of the test views: by the photo's stem, or by number among the photos not trained on."""
+    """{label: photo name} of the test views. A label is a photo's stem or its number among the test photos."""
     photos = {path.stem: path.name for path in sorted((scene / "images").iterdir())}
     trained = scene / "images_train"
     stems = {path.stem for path in trained.iterdir()} if trained.is_dir() else set()

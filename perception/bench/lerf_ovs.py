@@ -36,7 +36,7 @@ SELECTION = {
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line; see the module's docstring."""
+    """Command line entry point; see the module docstring."""
     parser = argparse.ArgumentParser(prog="perception bench lerf-ovs", description=__doc__)
     add_arguments(parser)
     parser.add_argument("--select", choices=tuple(SELECTION), default="top-1")
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def predict_scene(
     place: Workplace, name: str, source: Path, label: Path, select: str, occlusion: bool, held_out: bool
 ) -> dict[tuple[str, str], np.ndarray]:
-    """{(frame, category): silhouette [H, W] in [0, 1]} of one scene; frames that were not registered have none."""
+    """{(frame, category): silhouette [H, W] in [0, 1]} of one scene. Frames without a registered pose are absent."""
     if not source.is_dir():
         raise InputError(f"{source}: no such folder; expected the scene's images/ and sparse/ there")
     truths = read_lerf_polygons(label)

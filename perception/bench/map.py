@@ -34,7 +34,7 @@ SIDES = (240, 360)
 
 
 def variants(masks: str | None) -> list[Variant]:
-    """The presets, then the default with one setting changed."""
+    """The presets, followed by the default settings with one setting changed at a time."""
 
     def one(group: str, name: object, *pairs: str) -> Variant:
         return Variant(group, str(name), pairs, masks)
@@ -50,7 +50,7 @@ def variants(masks: str | None) -> list[Variant]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line."""
+    """Command line entry point."""
     options = sweep_parser("map", __doc__).parse_args(arguments)
     sweep, scene, masks = prepare(options)
     rows = with_minutes(sweep.run(scene, chosen(variants(masks), options.only)))
@@ -83,7 +83,7 @@ def _plot(path: Path, scene: str, rows: Sequence[dict[str, Any]], native: int) -
                 style = {"marker": "*" if preset else "o", "s": 130 if preset else 28}
                 color = "#cc3311" if preset else "#4477aa" if row["pixels"] == native else "0.7"
                 axis.scatter(row["cpu_minutes"], row[key], color=color, zorder=3 if preset else 2, **style)
-                if preset or row[f"front_{key}"]:  # the others crowd around the default
+                if preset or row[f"front_{key}"]:  # labels of the other variants would overlap near the default
                     name = row["name"] if preset else f"{row['group']} {row['name']}"
                     place = {"ha": "left", "xytext": (7, -9)} if preset else {"ha": "right", "xytext": (-4, 4)}
                     at = (row["cpu_minutes"], row[key])

@@ -1,4 +1,4 @@
-"""What all benchmarks share: the parser, a table, where results go, the machine they were read on, a plot."""
+"""Shared by all benchmarks: argument parser, text table, output files, a description of the machine, plots."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from typing import Any
 from perception.io.atomic import atomic_file
 
 Column = tuple[str, str, str]
-"""(head, key of the row, format)."""
+"""(column header, key in the row, format specification)."""
 
 
 def bench_parser(name: str, about: str | None) -> argparse.ArgumentParser:
-    """A parser with what all benchmarks have: -o FOLDER and --json."""
+    """An argument parser with the options of all benchmarks: -o FOLDER and --json."""
     parser = argparse.ArgumentParser(
         prog=f"perception bench {name}", description=about, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -30,7 +30,7 @@ def bench_parser(name: str, about: str | None) -> argparse.ArgumentParser:
 
 
 def table(rows: Sequence[dict[str, Any]], columns: Sequence[Column], heads: Sequence[str] = ("group", "name")) -> str:
-    """Rows as aligned text; '-' where a figure is missing."""
+    """Rows as aligned text; '-' marks a missing value."""
     cells = [[*heads, *(head for head, _, _ in columns)]]
     for row in rows:
         figures = ["-" if row.get(key) is None else format(row[key], form) for _, key, form in columns]
@@ -45,8 +45,8 @@ def table(rows: Sequence[dict[str, Any]], columns: Sequence[Column], heads: Sequ
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores, and nanoseconds of one addition that waits for the last (numpy.cumsum of float64, the least
-    of five): three or four cycles, so it tells how fast this machine really was, shared or throttled as it may be."""
+    """Processor, cores, and nanoseconds per addition in a dependent chain (numpy.cumsum of float64, minimum of 5 runs).
+    An addition takes 3 or 4 cycles, so the value shows the effective clock rate of a shared or throttled machine."""
     import numpy as np
 
     numbers, least = np.ones(1_000_000), float("inf")
@@ -59,7 +59,7 @@ def machine() -> dict[str, Any]:
 
 
 def _processor() -> str:
-    """Name and the widest instruction set our kernels use on it."""
+    """Processor name and the widest SIMD level that our kernels use on it."""
     from perception.gaussians.rasterize import simd_levels
 
     name = platform.processor() or platform.machine()
@@ -67,12 +67,12 @@ def _processor() -> str:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         name = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
-        pass  # not Linux, or a processor that does not say
+        pass  # not Linux, or no model name in /proc/cpuinfo
     return f"{name}, {simd_levels()[0]}"
 
 
 def finish(name: str, options: argparse.Namespace, report: dict[str, Any], text: str) -> None:
-    """Prints `text`, or JSON with --json; keeps both in the output folder, with machine, versions and arguments."""
+    """Prints `text`, or JSON with --json. Writes both to the output folder, with machine, versions and arguments."""
     from perception.pipeline.record import versions
 
     facts = {"bench": name, "arguments": dict(vars(options)), "machine": machine(), "versions": versions(), **report}
@@ -85,7 +85,7 @@ def finish(name: str, options: argparse.Namespace, report: dict[str, Any], text:
 
 
 def save_plot(path: Path, draw: Callable[[Any], None], size: tuple[float, float] = (9, 5)) -> None:
-    """`draw(figure)` to a PNG; without matplotlib one line says so and the figures stay in the JSON."""
+    """Saves the plot made by `draw(figure)` as a PNG. Without matplotlib it prints one line and skips the plot."""
     try:
         from matplotlib.figure import Figure
     except ModuleNotFoundError:

@@ -1,4 +1,4 @@
-"""Processes of a benchmark's own: they run this very package, whatever folder the benchmark was started from."""
+"""Subprocesses of a benchmark. They import this installed package, whatever the current directory is."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import perception
 
 
 def _options() -> dict[str, Any]:
-    """cwd and env for subprocess: started in a repository's root, Python would find sources without their core."""
+    """cwd and env for subprocess. Started in a repository root, Python would import the sources without _core."""
     paths = [str(Path(perception.__file__).resolve().parents[1]), *(path for path in sys.path if path)]
     return {
         "cwd": tempfile.gettempdir(),
@@ -25,7 +25,7 @@ def _options() -> dict[str, Any]:
 
 
 def run_python(*arguments: str) -> str:
-    """The standard output of `python ARGUMENTS`; RuntimeError with what it said when it failed."""
+    """Standard output of `python ARGUMENTS`. RuntimeError with its standard error when it fails."""
     done = subprocess.run([sys.executable, *arguments], capture_output=True, check=False, **_options())
     if done.returncode:
         raise RuntimeError(f"python {' '.join(arguments)[:80]} ended with {done.returncode}: {done.stderr.strip()}")
@@ -34,7 +34,7 @@ def run_python(*arguments: str) -> str:
 
 @contextmanager
 def served(*arguments: str) -> Iterator[tuple[str, int]]:
-    """`perception ARGUMENTS` while the context is open: its first line, which begins with "serving", and its id."""
+    """Runs `perception ARGUMENTS` while the context is open. Yields its first line ("serving ...") and its pid."""
     command = [sys.executable, "-m", "perception.cli", *arguments]
     server = subprocess.Popen(command, stderr=subprocess.PIPE, **_options())
     try:

@@ -24,7 +24,7 @@ from perception.query import QueryMap, load_map
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Prints the figures, a line each; JSON goes to the output folder."""
+    """Prints one figure per line. JSON goes to the output folder."""
     parser = bench_parser("queries", __doc__)
     parser.add_argument("map", type=Path, metavar="MAP", help="a map in the frame of the scene's transforms.json")
     parser.add_argument("scene", type=Path, metavar="SCENE", help="folder with scene.json and gt_points.ply")
@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def measure(map_path: Path, scene: Path) -> dict[str, Any]:
-    """All figures by name. The cold query comes first, before anything else could warm it."""
+    """All figures by name. The cold query runs first, before other queries fill the caches."""
     queries, unseen = read_queries(scene)
     start = time.perf_counter()
     opened = load_map(map_path)
@@ -54,7 +54,7 @@ def measure(map_path: Path, scene: Path) -> dict[str, Any]:
 
 
 def read_queries(scene: Path) -> tuple[list[tuple[str, set[int]]], int]:
-    """Prompts of scene.json with the true ids that answer them, and how many were left out as never seen."""
+    """Prompts of scene.json with the true ids that answer them, and the number of prompts left out as never visible."""
     about = read_scene(scene)
     visible = {entry["id"] for entry in about["instances"] if entry.get("gt_points", 1)}
     queries = [(query["text"], set(query["instance_ids"]) & visible) for query in about["queries"]]
@@ -63,13 +63,13 @@ def read_queries(scene: Path) -> tuple[list[tuple[str, set[int]]], int]:
 
 
 def read_words(scene: Path) -> set[str]:
-    """Every word that scene.json uses for its objects: none of them may count as absent."""
+    """Every word that scene.json uses for its objects. None of them may count as absent."""
     texts = [query["text"] for query in read_scene(scene)["queries"]]
     return {singular(word) for text in texts for word in re.findall(r"[a-z]+", text.lower())}
 
 
 def true_objects(opened: QueryMap, scene: Path) -> list[int]:
-    """The true id under most exported points of each instance, −1 where none lies."""
+    """The true id that most exported points of each instance carry; −1 where no point has one."""
     from perception.export.transfer import export_labels
 
     cloud = read_truth_cloud(scene, opened.means)
@@ -113,10 +113,10 @@ def _figures(
 
 
 def latency(ranker: Ranker, texts: Sequence[str], name: str) -> dict[str, float]:
-    """Median and p99 milliseconds of a prompt never asked before, over at least 100 of them."""
+    """Median and 99th percentile latency in ms of prompts that are not cached, over at least 100 of them."""
     seconds = []
     for n in range(max(100, len(texts))):
-        text = f"{texts[n % len(texts)]} {n}"  # a number more, so that no cache knows it
+        text = f"{texts[n % len(texts)]} {n}"  # the added number makes the prompt new to every cache
         start = time.perf_counter()
         ranker.rank(text)
         seconds.append(time.perf_counter() - start)

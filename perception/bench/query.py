@@ -42,7 +42,7 @@ print(hits[0].instance_id, *times, status_mib("VmHWM"))
 
 
 def prompts(count: int) -> list[str]:
-    """`count` different names of things, without colour words, which would bring palettes in."""
+    """`count` different object names without colour words, so that queries do not use palettes."""
     from perception.language.colors import color_words
     from perception.language.conse import class_names
 
@@ -54,7 +54,7 @@ def prompts(count: int) -> list[str]:
 
 
 def cold_start(path: Path, name: str, expected: int, rounds: int) -> dict[str, Any]:
-    """Seconds from the start of a process to its first answer, wall and processor; peak memory in MiB."""
+    """Seconds from process start to the first answer, wall time and CPU time, and peak memory in MiB."""
     rows = []
     for _ in range(rounds):
         start = time.perf_counter()
@@ -73,7 +73,7 @@ def cold_start(path: Path, name: str, expected: int, rounds: int) -> dict[str, A
 
 
 def load_times(path: Path, turns: int) -> dict[str, float]:
-    """Milliseconds of load_map, and of load_map with the points of one instance, once the file cache is warm."""
+    """Milliseconds of load_map, alone and with reading the points of one instance. The file cache is warm."""
     from perception.query import load_map
 
     load_map(path)
@@ -88,7 +88,7 @@ def load_times(path: Path, turns: int) -> dict[str, float]:
 
 
 def place_times(path: Path, turns: int) -> dict[str, float]:
-    """Milliseconds, median over instances, of questions about places, each at or around another instance."""
+    """Milliseconds of spatial queries, each at or around another instance; median over instances."""
     from perception.query import axis_box, load_map
 
     gmap = load_map(path)
@@ -111,7 +111,7 @@ def place_times(path: Path, turns: int) -> dict[str, float]:
 
 
 def warm(path: Path, names: Sequence[str], queries: int) -> tuple[dict[str, Any], dict[str, Best]]:
-    """One thread: prompts for the first time, then `queries` repeats; and the answers, which must be the true ones."""
+    """One thread: new prompts, then `queries` repeated ones. Returns the figures (with correctness) and answers."""
     from perception.query import load_map
 
     gmap = load_map(path)
@@ -140,7 +140,7 @@ def warm(path: Path, names: Sequence[str], queries: int) -> tuple[dict[str, Any]
 
 
 def clients_at_once(contender: Contender, path: Path, answers: dict[str, Best], shares: list[list[str]]) -> Any:
-    """A client a share, all at once, each asking its prompts one after the other; every answer is compared."""
+    """Runs one client per share concurrently. Each sends its prompts in sequence, and every answer is compared."""
 
     def client(ask: Any, share: list[str]) -> tuple[list[float], int, int]:
         times, crossed, lost = [], 0, 0
@@ -174,7 +174,7 @@ def clients_at_once(contender: Contender, path: Path, answers: dict[str, Best], 
 
 
 def shares_of(names: Sequence[str], queries: int, clients: int) -> list[list[str]]:
-    """`queries` prompts dealt to `clients`, each going through `names` in an order of its own."""
+    """`queries` prompts divided among `clients`. Each client gets `names` in a different order."""
     return [[names[(n * 7 + c * 31) % len(names)] for n in range(queries // clients)] for c in range(clients)]
 
 
@@ -232,7 +232,7 @@ def _ms(seconds: Any) -> float:
 
 
 def _draw(report: dict[str, Any], clients: int) -> Callable[[Any], None]:
-    """Median and 99 % latency of every way to ask, on a logarithmic axis."""
+    """Median and 99th percentile latency of every kind of client, on a logarithmic axis."""
     rows = {"new prompt": report["warm"]["new_prompt"], "asked again": report["warm"]["repeated_prompt"]}
     for name, kinds in report["clients"].items():
         rows |= {f"{clients} clients,\n{name},\n{kind}": row for kind, row in kinds.items()}

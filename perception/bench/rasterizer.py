@@ -45,7 +45,7 @@ HEADS = ("scene", "simd", "dtype", "channels", "threads")
 
 @dataclass(frozen=True)
 class Case:
-    """What is timed: `rich` adds features and their variance to RGB."""
+    """One timed configuration. rich: features and their variance are rendered in addition to RGB."""
 
     simd: str
     dtype: str
@@ -57,14 +57,14 @@ class Case:
 class Turn:
     """One forward and backward pass."""
 
-    forward: float  # seconds of wall clock
+    forward: float  # seconds of wall time
     total: float
-    cpu: float  # of all threads
+    cpu: float  # seconds of CPU time, all threads
     stages: dict[str, float]
 
 
 def _render(scene: dict[str, Any], rich: bool, dtype: Any, **options: Any) -> tuple[Any, list[Tensor], list[Tensor]]:
-    """The result, its images, and the leaves that take gradients."""
+    """The rasterizer's result, the list of its images, and the leaf tensors that receive gradients."""
     from perception.gaussians.rasterize import rasterize
 
     inputs = {k: v.to(dtype) if hasattr(v, "dtype") else v for k, v in scene.items()}
@@ -76,7 +76,7 @@ def _render(scene: dict[str, Any], rich: bool, dtype: Any, **options: Any) -> tu
 
 
 def _cotangents(images: list[Tensor]) -> list[Tensor]:
-    """Noise in [-1, 1], the same for both precisions."""
+    """Cotangents drawn uniformly from [-1, 1], equal for both precisions."""
     import torch
 
     g = torch.Generator().manual_seed(1)
@@ -95,7 +95,7 @@ def _turn(scene: dict[str, Any], case: Case, cotangents: list[Tensor]) -> Turn:
 
 
 def _errors(scene: dict[str, Any], case: Case) -> dict[str, float]:
-    """Absolute error of the images, and relative L2 error of the gradients, to the float64 build of the same level."""
+    """Absolute image error and relative L2 gradient error against the float64 build of the same level."""
     import torch
 
     def run(dtype: Any) -> tuple[Tensor, Tensor]:
@@ -113,7 +113,7 @@ def _errors(scene: dict[str, Any], case: Case) -> dict[str, float]:
 
 
 def _peak_mib(scene: dict[str, Any], case: Case) -> float | None:
-    """MiB a first forward and backward pass add to this process, images and gradients included; None off Linux."""
+    """MiB that a first forward and backward pass adds, including images and gradients; None where it is not Linux."""
     import torch
 
     fresh_peak()
@@ -133,7 +133,7 @@ def cases(threads: Sequence[int], dtypes: Sequence[str]) -> list[Case]:
 
 
 def measure(name: str, scene: dict[str, Any], chosen: Sequence[Case], rounds: int) -> list[dict[str, Any]]:
-    """One row a case; the first round warms up and does not count."""
+    """One row per case. The first round is a warm-up and is not counted."""
     import torch
 
     turns: dict[Case, list[Turn]] = {case: [] for case in chosen}
@@ -155,7 +155,7 @@ def measure(name: str, scene: dict[str, Any], chosen: Sequence[Case], rounds: in
 
 
 def times_faster(turns: dict[Case, list[Turn]], case: Case, other: Case) -> float | None:
-    """Median over the rounds of the other case's wall time by this one's; None where the other was not timed."""
+    """Median over the rounds of (wall time of `other` / wall time of `case`); None where `other` was not timed."""
     if other not in turns:
         return None
     return statistics.median(b.total / a.total for a, b in zip(turns[case], turns[other], strict=True))

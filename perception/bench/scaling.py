@@ -31,7 +31,7 @@ def variants(masks: str | None, long_side: int, threads: Sequence[int]) -> list[
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line."""
+    """Command line entry point."""
     parser = sweep_parser("scaling", __doc__)
     parser.add_argument("--side", type=int, default=640, metavar="PX", help="long side at the most pixels")
     options = parser.parse_args(arguments)
@@ -69,7 +69,7 @@ def _plot(path: Path, scene: str, rows: Sequence[dict[str, Any]]) -> None:
             for axis in axes[:, column]:
                 axis.grid(alpha=0.3)
                 axis.set_xticks(places, [f"{place:.0f}" for place in places])
-        for axis in axes[:, 0]:  # shared by its row, so once all of it is drawn
+        for axis in axes[:, 0]:  # the limits are shared by a row, so they are set after all of it is drawn
             axis.set_ylim(bottom=0)
         axes[0][0].set_ylabel("seconds per 1000 iterations")
         axes[1][0].set_ylabel("peak memory, MiB")

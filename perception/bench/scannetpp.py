@@ -37,12 +37,12 @@ from perception.io.cloud import read_cloud
 
 MESH = "mesh_aligned_0.05"
 IGNORED = -2
-"""Truth id of vertices that the mask file names."""
+"""Truth id of vertices that the mask file lists."""
 
 
 @dataclass(frozen=True)
 class Classes:
-    """names: all classes in order, class id = place + 1. instance: those whose objects count."""
+    """names: all classes in order; class id = index + 1. instance: the classes evaluated as instances."""
 
     names: list[str]
     instance: set[str]
@@ -50,7 +50,7 @@ class Classes:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line; see the module's docstring."""
+    """Command line entry point; see the module docstring."""
     parser = argparse.ArgumentParser(prog="perception bench scannetpp", description=__doc__)
     add_arguments(parser)
     parser.add_argument("--protocol", default="scannetpp", choices=("scannet", "mask3d", "segment3d", "scannetpp"))
@@ -111,7 +111,7 @@ def _meshes(dataset: Path) -> list[Path]:
 
 
 def _gathered(work: Path, scenes: dict[str, Path]) -> Path:
-    """All scenes' submissions in one folder, as run_scannet wants them."""
+    """All scenes' submissions in one folder, the layout that run_scannet reads."""
     folder = work / "submission"
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("*.txt"):
@@ -146,9 +146,9 @@ def _test_photos(scene: Path) -> list[str]:
 
 
 def vertex_truth(scene: Path, classes: Classes, all_objects: bool) -> np.ndarray:
-    """Truth id [V] of the mesh's vertices: 1000 · class + number of the object in it, 0 = void, −2 = ignored.
+    """Truth id [V] of the mesh vertices: 1000 · class + index of the object in the class, 0 = void, −2 = ignored.
 
-    Where annotations overlap the smallest object wins, as in ScanNet++'s own preparation.
+    Where annotations overlap the smallest object takes the vertex, as in ScanNet++'s reference preparation.
     """
     scans = scene / "scans"
     segments = np.asarray(_json(scans / "segments.json")["segIndices"], np.int64)
@@ -172,7 +172,7 @@ def vertex_truth(scene: Path, classes: Classes, all_objects: bool) -> np.ndarray
 
 
 def read_classes(dataset: Path, scenes: dict[str, Path]) -> Classes:
-    """The benchmark's classes, or all labels that occur where the metadata folder was not downloaded."""
+    """The benchmark's classes, or all labels that occur when the metadata folder is absent."""
     folder = dataset / "metadata" / "semantic_benchmark"
     names, instance = folder / "top100.txt", folder / "top100_instance.txt"
     if names.is_file() and instance.is_file():

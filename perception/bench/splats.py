@@ -1,4 +1,4 @@
-"""Gaussians with one camera, to measure the rasterizer and training on."""
+"""Gaussians with one camera, used to benchmark the rasterizer and training."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SPLAT_KEYS = ("means", "quats", "scales", "opacities", "colors", "features")
 
 
 def synthetic_scene(n: int = 50_000, width: int = 640, height: int = 480) -> dict[str, Any]:
-    """A cloud of small Gaussians in front of one camera, float32; as `load_scene`."""
+    """A synthetic set of small Gaussians in front of one camera, float32, in the format of `load_scene`."""
     import torch
 
     g = torch.Generator().manual_seed(0)
@@ -31,9 +31,9 @@ def synthetic_scene(n: int = 50_000, width: int = 640, height: int = 480) -> dic
 
 
 def load_scene(path: Path) -> dict[str, Any]:
-    """A splats .npz: means, quats, scales, opacities, colors, features, viewmat, K, width, height.
+    """Reads a splats .npz: means, quats, scales, opacities, colors, features, viewmat, K, width, height.
 
-    Returned as the arguments of `perception.rasterize` for one camera, float32.
+    Returns the arguments of `perception.rasterize` for one camera, float32.
     """
     import zipfile
 

@@ -1,7 +1,7 @@
-"""The engine of `bench map` and `bench scaling`: one scene loaded once, many settings trained on it.
+"""Parameter sweeps of `bench map` and `bench scaling`: one scene is loaded once, many settings are trained on it.
 
-A row is kept on disk as soon as it is there, under everything it depends on (scene, settings, threads, the code that
-makes a map), so a sweep that was stopped goes on where it was, and a row is never told of another program.
+Each row is written to disk when it is measured. Its key covers the scene, the settings, the threads and the source code
+that makes a map. A stopped sweep therefore resumes, and rows of another version of the code are never reused.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from perception.types import View
 
 _CODE = ("gaussians", "instances", "export", "evaluate", "config.py", "_core*")
 QUICK = {"shorten": 6.0, "max_side": 320, "budget": 20_000}
-"""--quick: a sixth of the iterations on small photos. Shows tendencies; a figure to quote comes from a full run."""
+"""--quick: a sixth of the iterations on small photos. It shows tendencies only; quote figures from a full run."""
 TRUTH_CLOUD, TRUTH_MASKS = "gt_points.ply", "masks_gt"
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One cell of a sweep: what is varied, its value, and the settings that say so.
+    """One cell of a sweep: the varied setting (group), its value (name), and the settings that produce it.
 
-    settings: KEY=VALUE over the preset's. masks: folder of label images inside the scene; None = photos alone.
+    settings: KEY=VALUE pairs applied over the preset. masks: folder of label images in the scene; None = photos only.
     threads: 0 = all processors.
     """
 
@@ -50,7 +50,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class Limits:
-    """What makes a sweep shorter, for every variant alike: iterations divided by `shorten`, and upper bounds."""
+    """Limits that shorten every variant of a sweep. Iterations are divided by `shorten`; other fields are maxima."""
 
     shorten: float = 1.0
     iterations: int | None = None
@@ -59,7 +59,7 @@ class Limits:
     settings: tuple[str, ...] = ()
 
     def config(self, variant: Variant) -> MapConfig:
-        """The variant's settings within these limits. Growth keeps its number of steps as a run gets shorter."""
+        """The variant's settings within these limits. The number of densification steps is kept in a shorter run."""
         pairs = [*self.settings, *variant.settings, "language.encoder=none"]
         config = load_config(None, pairs, variant.preset)
         train, side = config.train, config.photos.max_side
@@ -73,8 +73,8 @@ class Limits:
 
 @dataclass
 class SweepScene:
-    """A scene with its photos and label images of one size at a time: of the size last asked for, so that none of
-    another is in a variant's memory. work: folder for what can be kept.
+    """A scene with photos and label images. Only the size requested last is kept, so that a variant's memory does not
+    include images of another size. work: folder for cached results.
     """
 
     folder: Path
@@ -116,11 +116,11 @@ class SweepScene:
         return self._views[max_side]
 
     def training(self, max_side: int, masks: str | None) -> list[Any]:
-        """Training views with the label images of folder `masks`; without it, photos alone."""
+        """Training views with the label images of folder `masks`. Without that folder, views without labels."""
         if masks is None or not (self.root / masks).is_dir():
             return self.photos(max_side)[0]
         if (max_side, masks) not in self._views:
-            labelled = self._labelled(max_side, masks)  # which may make room for its size first
+            labelled = self._labelled(max_side, masks)  # may first remove cached views of another size
             self._views[max_side, masks] = labelled
         return self._views[max_side, masks]
 
@@ -139,7 +139,7 @@ class SweepScene:
 
 
 def run_variant(scene: SweepScene, variant: Variant, config: MapConfig) -> dict[str, Any]:
-    """Trains one variant in this process and scores it; a JSON-able row."""
+    """Trains one variant in this process and scores it. Returns a JSON-serialisable row."""
     import torch
 
     from perception.gaussians.train import Trainer
@@ -192,8 +192,8 @@ def run_variant(scene: SweepScene, variant: Variant, config: MapConfig) -> dict[
 
 
 def _instance_scores(scene: SweepScene, gaussians: Any, found: Any, held: Sequence[View]) -> dict[str, Any]:
-    """AP of the exported truth cloud (protocol scannet, class-agnostic), and mIoU of the instances rendered in the
-    held-out views against the truth's masks; {} without truth or without instances.
+    """AP of the exported true cloud (protocol scannet, class-agnostic), and mIoU of the instances rendered in the
+    held-out views against the true masks. {} without ground truth or without instances.
     """
     from perception.evaluate.instances import evaluate
     from perception.evaluate.rendered import rendered_miou
@@ -214,7 +214,7 @@ def _instance_scores(scene: SweepScene, gaussians: Any, found: Any, held: Sequen
 
 
 class Sweep:
-    """Rows of a bench in `folder`/rows.json, each written as soon as it is measured."""
+    """Rows of a sweep in `folder`/rows.json. Each row is written as soon as it is measured."""
 
     def __init__(self, folder: Path, limits: Limits, tell: Callable[[str], None]):
         self.folder, self.limits, self.tell = folder, limits, tell
@@ -228,7 +228,7 @@ class Sweep:
         self._code = code_digest()
 
     def run(self, scene: SweepScene, variants: Sequence[Variant]) -> list[dict[str, Any]]:
-        """The rows of `variants`, in order; those on disk are taken from there, equal settings are trained once."""
+        """The rows of `variants`, in order. Rows on disk are reused, and equal settings are trained once."""
         rows = []
         for number, variant in enumerate(variants, start=1):
             config = self.limits.config(variant)
@@ -249,7 +249,7 @@ class Sweep:
 
 
 def sweep_parser(name: str, about: str | None) -> argparse.ArgumentParser:
-    """The options of a sweep over one scene."""
+    """An argument parser with the options of a sweep over one scene."""
     parser = bench_parser(name, about)
     parser.add_argument("scene", type=Path, metavar="SCENE", help="input of `map`")
     parser.add_argument("--quick", action="store_true", help="a sixth of the iterations, 320 pixels, 20 k Gaussians")
@@ -264,7 +264,7 @@ def sweep_parser(name: str, about: str | None) -> argparse.ArgumentParser:
 
 
 def limits_of(options: argparse.Namespace) -> Limits:
-    """--quick, and single options over it."""
+    """Limits from --quick and from the options that override it."""
     quick = QUICK if options.quick else {}
     given = {key: getattr(options, key) for key in ("shorten", "iterations", "max_side", "budget")}
     values: dict[str, Any] = {**quick, **{key: value for key, value in given.items() if value is not None}}
@@ -274,7 +274,7 @@ def limits_of(options: argparse.Namespace) -> Limits:
 
 
 def prepare(options: argparse.Namespace) -> tuple[Sweep, SweepScene, str | None]:
-    """The sweep, its scene, and the folder of masks (None: photos alone). Progress goes to stderr."""
+    """The sweep, its scene, and the folder of masks (None: photos only). Progress goes to stderr."""
     if not options.scene.exists():
         raise InputError(f"{options.scene}: does not exist; give a scene as `perception map` takes it")
     sweep = Sweep(options.output, limits_of(options), lambda text: print(text, file=sys.stderr, flush=True))
@@ -285,7 +285,7 @@ def prepare(options: argparse.Namespace) -> tuple[Sweep, SweepScene, str | None]
 
 
 def chosen(variants: Sequence[Any], only: str | None) -> list[Any]:
-    """Those whose group or name holds `only`; the first, which all are compared with, always."""
+    """The variants whose group or name contains `only`, and always the first one, which is the reference."""
     return [v for i, v in enumerate(variants) if i == 0 or only is None or only in f"{v.group} {v.name}"]
 
 
@@ -295,7 +295,7 @@ def with_minutes(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def code_digest() -> str:
-    """Of the files whose change may change a row."""
+    """Digest of the source files that can change a row."""
     root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
     for pattern in _CODE:
@@ -312,7 +312,7 @@ def _brief(row: dict[str, Any], known: bool) -> str:
 
 
 def pareto(points: Sequence[tuple[float, float | None]]) -> list[int]:
-    """Indices of (cost, value) pairs, cheapest first, that no other beats: at most as dear and at least as good."""
+    """Indices of the Pareto-optimal (cost, value) pairs by rising cost: lower cost and higher value are better."""
     kept: list[int] = []
     best = -np.inf
     for _, loss, index in sorted((cost, -value, i) for i, (cost, value) in enumerate(points) if value is not None):

@@ -1,4 +1,4 @@
-"""Maps whose answers are known: instance k is a ball of Gaussians in cell k of a grid, and is called names[k]."""
+"""Synthetic maps with known answers: instance k is a ball of Gaussians in cell k of a grid, with the name names[k]."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from perception.language.base import Encoder
 from perception.language.description import InstanceDescription, to_arrays
 
 CELL = 1.0
-"""Metres between the centres of neighbouring instances."""
+"""Distance in metres between the centres of neighbouring instances."""
 SIGMA = 0.08
-"""Spread of an instance's points along each axis; cut at three of these, so that balls never touch."""
+"""Standard deviation in metres of an instance's points per axis. Cut at three sigmas, so that balls do not touch."""
 _NOISE = 0.1
-"""Share of Gaussians that belong to no instance."""
+"""Share of Gaussians without an instance."""
 
 
 def write_synthetic_map(
@@ -33,10 +33,10 @@ def write_synthetic_map(
     encoder_spec: str = "conse",
     first_id: int = 0,
 ) -> None:
-    """Writes a map of `gaussians` Gaussians, rows shuffled, with an instance a name; ids count from `first_id`.
+    """Writes a map of `gaussians` Gaussians in random order, with one instance per name; ids start at `first_id`.
 
-    Its embeddings are those that `encoder` gives the names (none without one), under the name `encoder_spec`, so the
-    best answer to names[k] is instance first_id + k by construction.
+    Embeddings are those that `encoder` computes for the names (none without an encoder), stored as `encoder_spec`. The
+    best answer to names[k] is therefore instance first_id + k.
     """
     rng = np.random.default_rng(seed)
     owner = rng.integers(0, len(names), gaussians)

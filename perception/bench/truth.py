@@ -1,4 +1,4 @@
-"""The truth of a scene in the form of `perception demo --photos-only`, for scoring only."""
+"""Ground truth of a scene in the layout of `perception demo --photos-only`. Used only for scoring."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from perception.types import PointCloud
 
 
 def read_scene(scene: Path) -> dict[str, Any]:
-    """scene.json as it is. Raises InputError where there is none."""
+    """The content of scene.json. Raises InputError when the file is missing."""
     file = scene / "scene.json"
     if not file.is_file():
         raise InputError(f"{scene}: no scene.json there; expected the folder of a scene with truth")
@@ -22,7 +22,7 @@ def read_scene(scene: Path) -> dict[str, Any]:
 
 
 def read_truth_cloud(scene: Path, means: np.ndarray) -> PointCloud:
-    """gt_points.ply. Raises InputError where it lacks the label `instance_id`, or lies outside of `means` [N, 3]."""
+    """gt_points.ply. Raises InputError without the label `instance_id`, or with most points off `means` [N, 3]."""
     from perception.export.transfer import check_overlap
     from perception.io.cloud import read_cloud
 

@@ -1,4 +1,4 @@
-"""Photos of a made-up tabletop with exact truth, for `perception demo` and the tests."""
+"""Rendered photos of synthetic scenes with exact ground truth, for `perception demo` and the tests."""
 
 from perception.demo.scene import DemoTruth, load_truth, make_photos
 

@@ -1,4 +1,4 @@
-"""Cameras of the demo's scenes: arcs around the front of a table, and a walk through a room."""
+"""Camera trajectories of the demo scenes: arcs around the front of a table, and a walk through a room."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def intrinsics(width: int, height: int, focal_35mm: float) -> np.ndarray:
-    """[3, 3] of a lens of that focal length (mm) on a 36 mm wide frame."""
+    """K [3, 3] in pixels for a focal length in 35 mm equivalent (36 mm frame width along the longer side)."""
     focal = focal_35mm / 36 * max(width, height)
     return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
 
 
 def orbit(views: int, width: int, height: int, focal_35mm: float) -> list[Camera]:
-    """`views` cameras on three arcs around the front of a table, in the order taken, neighbours overlapping."""
+    """`views` cameras on three arcs around the front of a table, in capture order. Neighbouring views overlap."""
     K = intrinsics(width, height, focal_35mm)
     arcs = [  # (share of the views, half the swing in degrees, radius, height, aim)
         (0.36, 82.0, 0.98, 0.42, (0.0, 0.02, 0.05)),
@@ -59,7 +59,7 @@ def orbit(views: int, width: int, height: int, focal_35mm: float) -> list[Camera
     for k, ((_, swing, radius, lift, aim), count) in enumerate(zip(arcs, counts, strict=True)):
         angles = np.radians(np.linspace(-swing, swing, count) if count > 1 else np.zeros(count))
         for i, angle in enumerate(angles[:: -1 if k % 2 else 1]):
-            sway = 0.03 * np.sin(2.1 * i + k)  # nobody's hand draws a perfect circle
+            sway = 0.03 * np.sin(2.1 * i + k)  # deviation from the circle, as in hand-held capture
             eye = np.array([(radius + sway) * np.sin(angle), -(radius + sway) * np.cos(angle), lift + 0.6 * sway])
             target = np.array(aim) + np.array([0.12 * np.sin(angle) * (k == 2), 0, 0.4 * sway])
             cameras.append(Camera(K, look_at(eye, target), width, height))
@@ -67,10 +67,10 @@ def orbit(views: int, width: int, height: int, focal_35mm: float) -> list[Camera
 
 
 def walk(views: int, width: int, height: int, focal_35mm: float, half: np.ndarray) -> list[Camera]:
-    """`views` cameras at 1.2 to 1.6 m in a room that reaches `half` [2] metres from the origin, on three rounds: across
-    the room, at the walls from near, and down at the furniture."""
+    """`views` cameras at 1.2 to 1.6 m height in a room with half extents `half` [2] in metres, on three rounds: looking
+    across the room, close to the walls, and down at the furniture."""
     K = intrinsics(width, height, focal_35mm)
-    rounds = [  # (share of the views, where on the way from the middle to the walls, eye height, aim there, aim height)
+    rounds = [  # (share of the views, eye position from centre 0 to wall 1, eye height, target position, target height)
         (0.40, 0.46, 1.45, -0.75, 0.75),
         (0.36, 0.20, 1.30, 1.00, 0.95),
         (0.24, 0.42, 1.58, 0.85, 0.25),
@@ -82,9 +82,9 @@ def walk(views: int, width: int, height: int, focal_35mm: float, half: np.ndarra
         for i in range(count):
             angle = 2 * np.pi * (i + 0.35 * k) / max(count, 1)
             heading = np.array([np.cos(angle), np.sin(angle)])
-            sway = 0.04 * np.sin(2.1 * i + k)  # nobody walks a perfect ellipse
+            sway = 0.04 * np.sin(2.1 * i + k)  # deviation from the ellipse, as in hand-held capture
             eye = np.array([*(out + sway) * half * heading, lift + 0.8 * sway])
-            across = angle + 0.25 * np.sin(3 * angle + k)  # looks left and right of straight ahead
+            across = angle + 0.25 * np.sin(3 * angle + k)  # varies the heading left and right
             target = np.array([*aim * half * [np.cos(across), np.sin(across)], level + 2 * sway])
             cameras.append(Camera(K, look_at(eye, target), width, height))
     return cameras

@@ -1,4 +1,4 @@
-"""Furniture of plain shapes, built about the origin: metres, z up, standing on z = 0, its front to -y."""
+"""Furniture built from primitives, centred on the origin: metres, z up, standing on z = 0, front towards -y."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from perception.demo import textures as tex
 from perception.demo.light import Body, Part
 from perception.demo.shapes import Box, Ellipsoid, Lathe, Tube, rotation_from_axes, spin
 
-PIXELS = 260  # of a box's texture, a metre
+PIXELS = 260  # pixels per metre of a box's texture
 WOODS = {
     "oak": ("#c9925a", "#7d4a24"),
     "walnut": ("#7a4f30", "#3d2415"),
@@ -26,7 +26,7 @@ Point = Sequence[float]
 
 
 def wood(rng: np.random.Generator, kind: str) -> np.ndarray:
-    """A tile of one of WOODS, its grain along the width."""
+    """A texture of one of WOODS. The grain runs along the width."""
     return tex.wood(rng, 260, 720, 2, *WOODS[kind])
 
 
@@ -40,7 +40,7 @@ def block(
     top: np.ndarray | None = None,
     turn: np.ndarray | None = None,
 ) -> Part:
-    """A box cut from a material [h, w, 3]; front and top: pictures on its faces to -y and +z."""
+    """A box with a material texture [h, w, 3]. front, top: images for its faces towards -y and +z."""
     shape = Box(np.array(extent, float), np.eye(3) if turn is None else turn, np.array(center, float))
     sizes = np.clip(np.round(shape.face_sizes() * PIXELS).astype(int), 12, 560)
     width, height = sizes.max(0)
@@ -57,7 +57,7 @@ def block(
 def four_legs(
     rng: np.random.Generator, width: float, depth: float, height: float, thick: float, tile: np.ndarray
 ) -> list[Part]:
-    """Legs at the corners of a rectangle about the origin."""
+    """Four legs at the corners of a rectangle centred on the origin."""
     x, y = width / 2 - thick / 2, depth / 2 - thick / 2
     places = [(sx * x, sy * y, height / 2) for sx in (-1, 1) for sy in (-1, 1)]
     return [block(rng, (thick, thick, height), place, tile) for place in places]
@@ -66,7 +66,7 @@ def four_legs(
 def table(
     rng: np.random.Generator, name: str, extent: Point, kind: str, prompts: list[str], shelf: bool = False
 ) -> Body:
-    """A table of (width, depth, height) with four legs; shelf: a board below the top."""
+    """A table of size (width, depth, height) with four legs. shelf: adds a board below the top."""
     width, depth, height = extent
     tile = wood(rng, kind)
     parts = [block(rng, (width, depth, 0.035), (0, 0, height - 0.0175), tile, 0.1)]
@@ -81,7 +81,7 @@ def table(
 
 
 def chair(rng: np.random.Generator, name: str, kind: str, cloth: str) -> Body:
-    """A dining chair with an upholstered seat and a slatted back (its back at +y)."""
+    """A dining chair with an upholstered seat and a slatted back. The back is at +y."""
     tile, seat = wood(rng, kind), tex.fabric(rng, 200, 300, CLOTHS[cloth])
     parts = [
         block(rng, (0.43, 0.43, 0.05), (0, 0, 0.445), seat),
@@ -93,7 +93,7 @@ def chair(rng: np.random.Generator, name: str, kind: str, cloth: str) -> Body:
 
 
 def sofa(rng: np.random.Generator, name: str, width: float, cloth: str, seats: int) -> Body:
-    """A sofa, or with one seat an armchair."""
+    """A sofa. With one seat it is an armchair."""
     tile = tex.fabric(rng, 420, 760, CLOTHS[cloth])
     seam = tex.fabric(rng, 300, 300, tex.rgb_code(0.9 * tex.rgb(CLOTHS[cloth])))
     depth, inner = 0.86, width - 0.36
@@ -112,7 +112,7 @@ def sofa(rng: np.random.Generator, name: str, width: float, cloth: str, seats: i
 
 
 def cushion(rng: np.random.Generator, name: str, color: str) -> Body:
-    """A pillow that leans backwards, its lower edge on z = 0."""
+    """A pillow tilted backwards, with its lower edge on z = 0."""
     cloth = tex.fabric(rng, 260, 520, color, ["#f4efe2", "#22303c", "#e9c46a"])
     lean = rotation_from_axes([1, 0, 0], [0, 0.35, 1])
     pillow = Part(Ellipsoid(np.array([0.21, 0.075, 0.19]), lean, np.array([0, 0, 0.18])), cloth, 0.0, (24, 36))
@@ -120,7 +120,7 @@ def cushion(rng: np.random.Generator, name: str, color: str) -> Body:
 
 
 def bookcase(rng: np.random.Generator, name: str, kind: str, width: float, height: float) -> Body:
-    """Shelves with rows of books; the books belong to it."""
+    """Shelves with rows of books. The books belong to the same instance."""
     tile, depth, board = wood(rng, kind), 0.30, 0.022
     count = round(height / 0.36)
     pitch = (height - board) / count
@@ -141,7 +141,7 @@ def bookcase(rng: np.random.Generator, name: str, kind: str, width: float, heigh
 
 
 def cabinet(rng: np.random.Generator, name: str, kind: str, extent: Point, prompts: list[str], doors: int) -> Body:
-    """A closed cabinet on short feet, `doors` doors with handles on its front."""
+    """A closed cabinet on short feet, with `doors` doors and handles on its front."""
     width, depth, height = extent
     tile = wood(rng, kind)
     front = tex.crop(rng, tile, 420, max(421, int(420 * width / height))).copy()
@@ -170,7 +170,7 @@ def television(rng: np.random.Generator, name: str) -> Body:
 
 
 def laptop(rng: np.random.Generator, name: str) -> Body:
-    """An open laptop, its screen towards -y."""
+    """An open laptop. The screen faces -y."""
     shell = tex.fabric(rng, 200, 300, "#9fa3a8")
     keys = np.ascontiguousarray(tex.fabric(rng, 240, 340, "#9fa3a8"))
     for row in range(5):
@@ -198,7 +198,7 @@ def floor_lamp(rng: np.random.Generator, name: str, color: str) -> Body:
 
 
 def desk_lamp(rng: np.random.Generator, name: str, color: str) -> Body:
-    """A lamp with a bent arm and a cone of a shade."""
+    """A lamp with a bent arm and a conical shade."""
     paint = tex.glaze(rng, 240, 240, color, ["#ffffff", "#222222"], 60)
     foot = [(0.0, 0.0), (0.085, 0.0), (0.085, 0.012), (0.015, 0.022), (0.010, 0.05), (0.010, 0.24), (0.0, 0.24)]
     upright = np.stack([np.array([0, -1.0, 0]), np.array([0, 0, 1.0]), np.array([-1.0, 0, 0])], 1)
@@ -232,7 +232,7 @@ def plant(rng: np.random.Generator, name: str, leaves: int = 15) -> Body:
 
 
 def picture(rng: np.random.Generator, name: str, art: np.ndarray, width: float, frame: str) -> Body:
-    """A framed picture, its back at y = 0 and its middle at z = 0."""
+    """A framed picture. Its back is at y = 0 and its centre at z = 0."""
     height = width * art.shape[0] / art.shape[1]
     border = max(14, art.shape[1] // 26)
     front = np.pad(art, ((border, border), (border, border), (0, 0)))
@@ -275,7 +275,7 @@ def speaker(rng: np.random.Generator, name: str) -> Body:
 
 
 def turned(name: str, profile: list[tuple[float, float]], paint: np.ndarray, words: list[str]) -> Body:
-    """A thing of one turned surface."""
+    """A body with a single surface of revolution."""
     return Body(name, words, [Part(Lathe(np.array(profile)), paint, 0.2, (24, 36))])
 
 
@@ -286,7 +286,7 @@ stool = partial(turned, profile=STOOL, words=["stool"])
 
 
 def door(rng: np.random.Generator, name: str, kind: str) -> Body:
-    """A panelled door, its back at y = 0."""
+    """A panelled door with its back at y = 0."""
     front = np.ascontiguousarray(tex.crop(rng, wood(rng, kind), 820, 360))
     for x, y, w, h in ((40, 50, 120, 300), (200, 50, 120, 300), (40, 430, 120, 330), (200, 430, 120, 330)):
         cv2.rectangle(front, (x, y), (x + w, y + h), (tex.rgb(WOODS[kind][1]) * 0.75).tolist(), 6)

@@ -1,7 +1,7 @@
-"""Light baked once into small maps: round lamps with soft shadows, and light from all around.
+"""Baked lighting (light maps): disc lamps with soft shadows, and ambient light with occlusion.
 
-The scene is matte and still, so the light that leaves a surface point is the same in every photo: it is computed per
-map texel (rendering equation, one diffuse bounce off the body that an ambient ray meets) and kept.
+The scene is static and its surfaces are diffuse, so the light leaving a surface point is equal in every photo. It is
+computed once per texel of a light map: rendering equation, one diffuse bounce off the body that an ambient ray hits.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ import numpy as np
 from perception.demo.cameras import Camera
 from perception.demo.shapes import Box, Shape, placed, spin, to_local, to_world
 
-WORKERS = min(os.cpu_count() or 1, 8)  # a photo being cast holds about 150 MB
+WORKERS = min(os.cpu_count() or 1, 8)  # one photo being rendered needs about 150 MB
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """A round lamp at `center` [3] that faces the origin; radius in metres, color [3]: irradiance at one metre."""
+    """A disc lamp at `center` [3] facing the origin. radius in metres; color [3]: irradiance at one metre."""
 
     center: np.ndarray
     radius: float
@@ -31,8 +31,8 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Lighting:
-    """Lamps, and light `ambient` [3] from all around, dimmed by bodies nearer than `reach` metres. The first lamp makes
-    the highlights."""
+    """Lamps, and uniform ambient light `ambient` [3], occluded by bodies within `reach` metres. Highlights come from
+    the first lamp only."""
 
     lamps: list[Lamp]
     ambient: np.ndarray
@@ -41,9 +41,9 @@ class Lighting:
 
 @dataclass
 class Part:
-    """One surface with its paint (sRGB [h, w, 3] float32) and, once lit, the uint8 picture a camera sees.
+    """One surface: its paint (albedo, sRGB [h, w, 3] float32) and, once baked, the lit uint8 texture (`lit`).
 
-    gloss: strength of the highlight. light_texels: rows and columns of the baked light. casts: throws shadows.
+    gloss: strength of the highlight. light_texels: rows and columns of the light map. casts: whether it casts shadows.
     """
 
     shape: Shape
@@ -56,7 +56,7 @@ class Part:
 
 @dataclass
 class Body:
-    """An instance of the scene: its name, further prompts that name it, and the surfaces it is made of."""
+    """An instance of the scene: name, further prompts that name it, and its surfaces."""
 
     name: str
     prompts: list[str]
@@ -78,7 +78,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Scene:
-    """Lit bodies (their ids are 1 + their places), cameras(views, width, height), and the demo's prompts."""
+    """Lit bodies (id = index + 1), cameras(views, width, height), and the prompts of the demo."""
 
     bodies: list[Body]
     lighting: Lighting
@@ -88,7 +88,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Caster:
-    """What a shadow ray needs of a body: its shapes, a ball around them, the colour it lends to its neighbours."""
+    """A body as shadow rays need it: shapes, bounding sphere, and mean reflected colour for the diffuse bounce."""
 
     shapes: list[Shape]
     center: np.ndarray
@@ -97,7 +97,7 @@ class Caster:
 
 
 def casters(bodies: list[Body]) -> list[Caster]:
-    """The bodies that throw shadows, ready for `first_hits`."""
+    """The bodies that cast shadows, prepared for `first_hits`."""
     found = []
     for body in bodies:
         shapes = [part.shape for part in body.parts if part.casts]
@@ -122,18 +122,18 @@ def to_linear(srgb: np.ndarray) -> np.ndarray:
 
 
 def to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear light -> sRGB in [0, 1], highlights rolled off above 0.8 so that nothing clips hard."""
+    """Linear light -> sRGB in [0, 1]. Values above 0.8 are compressed smoothly to avoid clipping."""
     soft = np.where(linear > 0.8, 1 - 0.2 * np.exp(-(linear - 0.8) / 0.2), linear)
     return np.where(soft <= 0.0031308, 12.92 * soft, 1.055 * np.maximum(soft, 0) ** (1 / 2.4) - 0.055)
 
 
-_STEPS = 4096  # of the table below, per unit of linear light
+_STEPS = 4096  # table entries per unit of linear light
 _RECORD = np.round(255 * np.clip(to_srgb(np.arange(2 * _STEPS) / _STEPS), 0, 1)).astype(np.uint8)
 _LINEAR = to_linear(np.arange(1024) / 1023).astype(np.float32)
 
 
 def _linear(srgb: np.ndarray) -> np.ndarray:
-    """`to_linear` by table, for whole textures."""
+    """`to_linear` by table lookup, for whole textures."""
     return _LINEAR[(np.clip(srgb, 0, 1) * 1023 + 0.5).astype(np.int32)]
 
 
@@ -159,7 +159,7 @@ def first_hits(around: list[Caster], origins: np.ndarray, rays: np.ndarray) -> t
 
 
 def bake_all(bodies: list[Body], lighting: Lighting, rng: np.random.Generator, samples: int) -> None:
-    """Lights every part of every body. samples: rays per texel to each lamp and to all around."""
+    """Bakes the light of every part of every body. samples: rays per texel, for each lamp and for ambient light."""
     parts = [part for body in bodies for part in body.parts]
     seeds = rng.integers(0, 2**31, len(parts))
     around = casters(bodies)
@@ -167,12 +167,12 @@ def bake_all(bodies: list[Body], lighting: Lighting, rng: np.random.Generator, s
     def one(k: int) -> None:
         bake(around, parts[k], lighting, np.random.default_rng(seeds[k]), samples)
 
-    with ThreadPoolExecutor(WORKERS) as pool:  # numpy lets go of the interpreter lock in its loops
+    with ThreadPoolExecutor(WORKERS) as pool:  # numpy releases the GIL in its loops
         list(pool.map(one, range(len(parts))))
 
 
 def bake(around: list[Caster], part: Part, lighting: Lighting, rng: np.random.Generator, samples: int = 20) -> None:
-    """Fills `part.lit` with paint × light, as the 8-bit sRGB picture a camera would record."""
+    """Sets `part.lit` to paint × light, as an 8-bit sRGB texture."""
     rows, columns = part.light_texels
     v, u = np.mgrid[0:rows, 0:columns]
     u, v = (u.ravel() + 0.5) / columns, (v.ravel() + 0.5) / rows
@@ -184,14 +184,14 @@ def bake(around: list[Caster], part: Part, lighting: Lighting, rng: np.random.Ge
         light += _from_lamp(_between(around, start, lamp), start, normals, lamp, rng, samples)
     light += _from_around(_within(around, start, lighting.reach), start, normals, lighting, rng, samples)
     grid = light.reshape(rows, columns, 3).astype(np.float32)
-    faces = 6 if isinstance(part.shape, Box) else 1  # light of one face does not run over into the next
+    faces = 6 if isinstance(part.shape, Box) else 1  # faces are filtered apart: light must not bleed into the next one
     strips = zip(np.split(part.paint, faces), np.split(grid, faces), strict=True)
     part.lit = np.concatenate([_recorded(paint, strip) for paint, strip in strips])
 
 
 def _recorded(paint: np.ndarray, light: np.ndarray) -> np.ndarray:
     columns = light.shape[1]
-    wide = np.concatenate([light[:, -4:], light, light[:, :4]], 1)  # the chart of a round thing closes on itself
+    wide = np.concatenate([light[:, -4:], light, light[:, :4]], 1)  # the chart of a round surface is periodic along u
     wide = cv2.GaussianBlur(wide if wide.shape[1] > 12 else light, (0, 0), 0.8, borderType=cv2.BORDER_REPLICATE)
     light = wide[:, 4:-4] if wide.shape[1] > columns else wide
     height, width = paint.shape[:2]
@@ -200,14 +200,14 @@ def _recorded(paint: np.ndarray, light: np.ndarray) -> np.ndarray:
 
 
 def _within(around: list[Caster], start: np.ndarray, reach: float) -> list[Caster]:
-    """The casters that a ray no longer than `reach` from some start can meet."""
+    """The casters that a ray of at most `reach` metres from any of the start points can hit."""
     center = (start.min(0) + start.max(0)) / 2
     radius = np.linalg.norm(start - center, axis=1).max() + reach
     return [caster for caster in around if np.linalg.norm(caster.center - center) < radius + caster.radius]
 
 
 def _between(around: list[Caster], start: np.ndarray, lamp: Lamp) -> list[Caster]:
-    """The casters that a ray from some start to the lamp can meet."""
+    """The casters that a ray from any of the start points to the lamp can hit."""
     center = (start.min(0) + start.max(0)) / 2
     radius = np.linalg.norm(start - center, axis=1).max() + lamp.radius
     axis = lamp.center - center
@@ -222,7 +222,7 @@ def _between(around: list[Caster], start: np.ndarray, lamp: Lamp) -> list[Caster
 def _from_lamp(
     around: list[Caster], start: np.ndarray, normals: np.ndarray, lamp: Lamp, rng: np.random.Generator, samples: int
 ) -> np.ndarray:
-    """Light [N, 3] of a lamp: mean over its disc of visibility × cosine / distance²."""
+    """Irradiance [N, 3] from a lamp: mean over its disc of visibility × cosine / distance²."""
     total = np.zeros(len(start))
     shift = rng.random((len(start), 2))
     down = -lamp.center / np.linalg.norm(lamp.center)
@@ -251,7 +251,7 @@ def _from_around(
     rng: np.random.Generator,
     samples: int,
 ) -> np.ndarray:
-    """Ambient light [N, 3] by cosine-spread rays; one that meets a body brings a little of its colour."""
+    """Ambient irradiance [N, 3] from cosine-distributed rays. A ray that hits a body adds part of its colour."""
     tints = np.array([caster.tint for caster in around] + [np.zeros(3)])
     helper = np.where(np.abs(normals[:, :1]) > 0.7, [[0.0, 1, 0]], [[1.0, 0, 0]])
     side = np.cross(helper, normals)

@@ -1,4 +1,4 @@
-"""Photos by ray casting: every surface is hit analytically, the nearest one colours the sample."""
+"""Photos by ray casting: analytic ray-surface intersections; the nearest surface gives the colour of a sample."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from perception.demo.shapes import to_local, to_world
 
 @dataclass
 class Picture:
-    """rgb [H, W, 3] uint8; ids, parts [H, W] uint16: which body (from 1) and which of its parts (from 0) is seen, ids 0
-    = nothing; depth [H, W] float32 metres along the optical axis, inf = nothing."""
+    """rgb [H, W, 3] uint8; ids, parts [H, W] uint16: index of the visible body (from 1; 0 = none), its part (from 0);
+    depth [H, W] float32 metres along the optical axis, inf = none."""
 
     rgb: np.ndarray
     ids: np.ndarray
@@ -24,20 +24,20 @@ class Picture:
 
 
 def cast(bodies: list[Body], lamp: Lamp, camera: Camera, samples: int = 2) -> Picture:
-    """A noise-free picture with samples × samples rays a pixel; ids, parts and depth at the finer grid are reduced.
+    """A noise-free image with samples × samples rays per pixel. ids, parts and depth are reduced from the finer grid.
 
-    lamp: the one that makes highlights.
+    lamp: the lamp that produces highlights.
     """
     height, width = camera.height * samples, camera.width * samples
     rotation = camera.camera_from_world[:3, :3]
     x = ((np.arange(width) + 0.5) / samples - camera.K[0, 2]) / camera.K[0, 0]
     y = ((np.arange(height) + 0.5) / samples - camera.K[1, 2]) / camera.K[1, 1]
     grid = np.stack([*np.meshgrid(x, y), np.ones((height, width))], -1)
-    rays = (grid @ rotation).astype(np.float32)  # unit depth along the optical axis: t is the z-depth
+    rays = (grid @ rotation).astype(np.float32)  # unit depth along the optical axis, so t equals the z-depth
     depth = np.full((height, width), np.inf, np.float32)
     seen = np.zeros((height, width), np.uint16)
     color = np.full((height, width, 3), 40, np.uint8)
-    owners, places = [0], [0]  # of each part: number of its body, and its place there
+    owners, places = [0], [0]  # of each part: number of its body, and its index there
     for number, body in enumerate(bodies, start=1):
         for place, part in enumerate(body.parts):
             owners.append(number)
@@ -49,7 +49,7 @@ def cast(bodies: list[Body], lamp: Lamp, camera: Camera, samples: int = 2) -> Pi
     rgb = cv2.resize(color, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     part_blocks, depth_blocks = _blocks(seen, samples), _blocks(depth, samples)
     id_blocks = np.array(owners, np.uint16)[part_blocks]
-    # The second smallest of four ids is the majority wherever three agree; most blocks hold one id only.
+    # The second smallest of four ids is the majority wherever three agree. Most blocks hold one id only.
     middle, mean, parts = id_blocks[:, :, 0].copy(), depth_blocks.mean(-1), part_blocks[:, :, 0].copy()
     mixed = (id_blocks != middle[..., None]).any(-1)
     middle[mixed] = np.sort(id_blocks[mixed], -1)[:, (samples * samples - 1) // 2]
@@ -66,12 +66,12 @@ def _blocks(image: np.ndarray, samples: int) -> np.ndarray:
 
 
 def _window(part: Part, camera: Camera, samples: int) -> tuple[slice, slice] | None:
-    """The part of the fine grid where the part can be seen, from its projected bounds; None = out of sight."""
+    """The window of the fine grid that contains the part, from its projected bounds; None = not visible."""
     world = to_world(part.shape, corners(part.shape))
     pixels, z = camera.project(world)
     if (z <= 0.02).all():
         return None
-    if (z <= 0.02).any():  # reaches behind the camera: projected bounds mean nothing, the sides of the view do
+    if (z <= 0.02).any():  # partly behind the camera: projected bounds are invalid, use the frustum's sides
         local = world @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
         across = local[:, :2] * [camera.K[0, 0], camera.K[1, 1]] + local[:, 2:] * camera.K[:2, 2]
         beyond = local[:, 2:] * [camera.width, camera.height]
@@ -84,14 +84,14 @@ def _window(part: Part, camera: Camera, samples: int) -> tuple[slice, slice] | N
 
 @dataclass(frozen=True)
 class _Painter:
-    """Casts rays from `eye` at one part."""
+    """Intersects rays from `eye` with one part and shades the hits."""
 
     part: Part
     eye: np.ndarray
     lamp: Lamp
 
     def paint(self, number: int, rays: np.ndarray, depth: np.ndarray, seen: np.ndarray, color: np.ndarray) -> None:
-        """Writes where the part is nearest along the rays [h, w, 3] of a window: depth, `number`, color, in place."""
+        """Updates depth, `seen` (with `number`) and color in place where the part is nearest on the rays [h, w, 3]."""
         shape, lit = self.part.shape, self.part.lit
         origin = to_local(shape, self.eye[None])[0].astype(np.float32)
         local = rays @ shape.rotation.astype(np.float32)
@@ -108,7 +108,7 @@ class _Painter:
         color[rows, columns] = self._with_highlight(sampled, u, v) if self.part.gloss else sampled
 
     def _with_highlight(self, sampled: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Blinn-Phong highlight of the lamp, [N, 3] uint8."""
+        """Adds the Blinn-Phong highlight of the lamp. [N, 3] uint8."""
         points, normals = self.part.shape.point_normal(u, v)
         points, normals = to_world(self.part.shape, points), normals @ self.part.shape.rotation.T
         to_lamp, to_eye = self.lamp.center - points, self.eye - points
@@ -120,7 +120,7 @@ class _Painter:
 
 
 def _sample(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Bilinear lookup at [N] positions. OpenCV remaps at most 32767 rows, so the list is folded into a square."""
+    """Bilinear lookup at [N] positions. OpenCV remaps at most 32767 rows, so the list is reshaped into a square."""
     side = int(np.ceil(np.sqrt(len(x))))
     map_x, map_y = (np.pad(a, (0, side * side - len(a))).reshape(side, side) for a in (x, y))
     return cv2.remap(picture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).reshape(-1, 3)[: len(x)]

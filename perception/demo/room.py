@@ -1,4 +1,4 @@
-"""A furnished room: four walls with a group of furniture at each, a rug and a low table in the middle."""
+"""A furnished room: four walls with a group of furniture at each, and a rug with a low table in the centre."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from perception.demo.light import Body, Lamp, Lighting, Part, Scene, bake_all
 from perception.demo.shapes import Sheet, rotation_from_axes, spin
 
 VIEWS = 72
-FOCAL_35MM = 26  # of a phone's wide camera
+FOCAL_35MM = 26  # 35 mm equivalent of a phone's wide camera
 POINTS = 220_000
 HEIGHT = 2.6
 RUGS = [
@@ -32,24 +32,24 @@ class Room:
         self.bodies: list[Body] = []
 
     def stand(self, body: Body, wall: int, along: float, out: float, up: float = 0.0, turn: float = 0.0) -> None:
-        """Puts a body `out` metres from the wall (0 to 3: at +y, +x, -y, -x), facing into the room, `along` metres to
-        the right of the wall's middle as one looks at it, turned by `turn` degrees more."""
+        """Places a body `out` metres from the wall (0 to 3: at +y, +x, -y, -x), facing into the room, `along` metres to
+        the right of the wall's centre as seen from inside. turn: additional rotation in degrees."""
         yaw = -90.0 * wall
         reach = self.half[1] if wall % 2 == 0 else self.half[0]
         self.bodies.append(body.placed(yaw + turn, spin(yaw) @ np.array([along, reach - out, up])))
 
 
 def build(seed: int, light_samples: int = 20) -> Scene:
-    """The scene, painted and lit; the seed chooses measures, places, colours, materials and which wall has what.
+    """The painted and lit scene. The seed selects dimensions, positions, colours, materials and the group at each wall.
 
-    light_samples: rays per texel of the light maps, to each lamp and to all around; fewer are faster and noisier.
+    light_samples: rays per texel of the light maps, for each lamp and for ambient light; fewer are faster and noisier.
     """
     rng = np.random.default_rng((seed, 20))
     half = np.array([rng.uniform(2.55, 2.8), rng.uniform(2.25, 2.45)])
     room = Room(half)
     room.bodies += _shell(rng, half)
     walls = (np.array([0, 1, 2, 3]) + rng.integers(4)) % 4
-    side = 1 if rng.random() < 0.5 else -1  # the television is to the right of the sofa, or to its left
+    side = 1 if rng.random() < 0.5 else -1  # the television is to the right (1) or to the left (-1) of the sofa
     sitting, watching, dining, working = walls[::side].tolist()
     _sitting(rng, room, sitting, side)
     _watching(rng, room, watching)
@@ -68,7 +68,7 @@ def build(seed: int, light_samples: int = 20) -> Scene:
 
 
 def _shell(rng: np.random.Generator, half: np.ndarray) -> list[Body]:
-    """Floor, ceiling and four walls, each wall of its own paint."""
+    """Floor, ceiling and four walls. Each wall has its own paint."""
     grounds = rng.permutation(["#b9cdc4", "#cfc3ae", "#c2c7d8", "#d8c3c0", "#c9d4b6"])
     width, depth = (2 * half).tolist()
 
@@ -103,7 +103,7 @@ def _shell(rng: np.random.Generator, half: np.ndarray) -> list[Body]:
 
 
 def _art(rng: np.random.Generator, kind: str) -> np.ndarray:
-    """Pictures for the walls: mountains, lake, desert or abstract."""
+    """Images for framed pictures: mountains, lake, desert or abstract."""
     skies = {
         "mountain": (["#f4b183", "#f7e1b5"], ["#8a5a83", "#5d3f72", "#3c2f5c", "#241f42"]),
         "lake": (["#a9d6e5", "#eef4f7"], ["#61a5c2", "#2a6f97", "#014f86", "#013a63"]),
@@ -145,7 +145,7 @@ def _sitting(rng: np.random.Generator, room: Room, wall: int, side: int) -> None
     book = things.named_book(rng, str(rng.choice(list(things.BOOKS))))
     room.stand(book.placed(0, np.zeros(3), 1.2), wall, 0.30, out + 0.05, top, rng.uniform(-40, 40))
     chair = fur.sofa(rng, f"{other} armchair", 0.95, other, 1)
-    beside = (room.half[wall % 2] - 1.15) * side  # leaves room for what stands at the next wall
+    beside = (room.half[wall % 2] - 1.15) * side  # keeps clear of the group at the next wall
     room.stand(chair, wall, beside, 1.5, turn=-75 * side + rng.uniform(-12, 12))
 
 

@@ -1,4 +1,4 @@
-"""`make_photos`: a folder of photos of a made scene, and the truth about them."""
+"""`make_photos`: writes a folder of photos of a synthetic scene and its ground truth."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from perception.errors import InputError
 __all__ = ["SCENES", "DemoTruth", "load_truth", "make_photos"]
 
 SCENES = {"tabletop": tabletop, "room": room}
-LEAST_POINTS = 1200  # of an object, before those that no two photos see are dropped
-NOISE = 1.6  # sensor noise, deviation in 8-bit steps
+LEAST_POINTS = 1200  # minimum per object, before points that fewer than two photos see are dropped
+NOISE = 1.6  # standard deviation of the sensor noise in 8-bit steps
 QUALITY = 92
 
 
@@ -38,14 +38,14 @@ def make_photos(
     light_samples: int = 20,
     truth_folder: Path | None = None,
 ) -> DemoTruth:
-    """Writes JPEG photos (000.jpg ...) of one of SCENES into `folder`, and the truth into `truth_folder` (default: the
-    folder `truth` beside it).
+    """Writes JPEG photos (000.jpg ...) of one of SCENES into `folder`, and the ground truth into `truth_folder`
+    (default: the folder `truth` beside it).
 
-    The truth: transforms.json with exact poses; labels/*.png as a perfect segmenter gives them, labels_sam/*.png with a
-    segmenter's errors; masks_gt/*.png (16-bit instance ids, 0 = nothing), depth/*.png (16-bit millimetres along the
-    optical axis, 0 = nothing), scene.json (instances, prompts), gt_points.ply (instance_id, semantic_id).
-    light_samples: rays per texel of the light maps; fewer are faster and noisier. The same arguments give the same
-    photos. Metres, z up. Raises InputError for fewer than 3 views or views under 64 × 48.
+    Ground truth: transforms.json (exact poses); labels/*.png (label images without errors); labels_sam/*.png (with the
+    errors of a segmenter); masks_gt/*.png (16-bit instance ids, 0 = none); depth/*.png (16-bit millimetres along the
+    optical axis, 0 = none); scene.json (instances, prompts); gt_points.ply (instance_id, semantic_id).
+    light_samples: rays per texel of the light maps; fewer are faster and noisier. Equal arguments give equal photos.
+    Units are metres, z is up. Raises InputError for fewer than 3 views or views under 64 × 48.
     """
     if scene not in SCENES:
         raise InputError(f"demo photos: found scene '{scene}', expected one of: {', '.join(SCENES)}")
@@ -76,7 +76,7 @@ def make_photos(
             cv2.imwrite(str(home / name / f"{i:03d}.png"), image)
         return picture
 
-    with ThreadPoolExecutor(WORKERS) as pool:  # numpy and OpenCV let go of the interpreter lock in their loops
+    with ThreadPoolExecutor(WORKERS) as pool:  # numpy and OpenCV release the GIL in their loops
         pictures = list(pool.map(shoot, range(views)))
     cloud = _surface(made, maker.POINTS, np.random.default_rng((seed, views)))
     seen = _times_seen(cloud[0], cloud[1], cloud[3], cameras, pictures) >= 2
@@ -89,7 +89,7 @@ def make_photos(
 
 
 def _instances(made: Scene, ids: np.ndarray, pictures: list[Picture]) -> list[Truth]:
-    """One entry per body; categories are numbered in the order of their names."""
+    """One entry per body. Category ids follow the alphabetical order of the category names."""
     categories = sorted({body.category for body in made.bodies})
     points = np.bincount(ids, minlength=len(made.bodies) + 1)
     views = np.zeros(len(made.bodies) + 1, int)
@@ -111,7 +111,7 @@ def _instances(made: Scene, ids: np.ndarray, pictures: list[Picture]) -> list[Tr
 
 
 def _write_photo(path: Path, rgb: np.ndarray, focal_35mm: int, rng: np.random.Generator) -> None:
-    """Sensor noise, then a JPEG whose EXIF tells the focal length, as a phone's would."""
+    """Adds sensor noise and writes a JPEG. Its EXIF data holds the focal length, as in a phone's photo."""
     noisy = rgb + NOISE * rng.standard_normal(rgb.shape, dtype=np.float32)
     image = Image.fromarray(np.round(np.clip(noisy, 0, 255)).astype(np.uint8))
     exif = Image.Exif()
@@ -120,7 +120,7 @@ def _write_photo(path: Path, rgb: np.ndarray, focal_35mm: int, rng: np.random.Ge
 
 
 def _surface(made: Scene, total: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Points, normals, colours and ids on all surfaces: half by area, half on the objects alone, LEAST_POINTS each."""
+    """Points, normals, colours, ids on all surfaces: half by area, half on objects with at least LEAST_POINTS each."""
     charts = [(number, body, part) for number, body in enumerate(made.bodies, start=1) for part in body.parts]
     owners = np.array([number for number, _, _ in charts])
     area = np.array([np.prod(part.shape.size()) for _, _, part in charts])
@@ -142,9 +142,9 @@ def _surface(made: Scene, total: int, rng: np.random.Generator) -> tuple[np.ndar
 
 
 def _even(shape: Shape, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Chart coordinates even over the surface from even u, v in [0, 1]."""
+    """Chart coordinates uniform over the surface area, from uniform u, v in [0, 1]."""
     if isinstance(shape, Ellipsoid):
-        return u, np.arccos(1 - 2 * v) / np.pi  # exact on a ball
+        return u, np.arccos(1 - 2 * v) / np.pi  # exact for a sphere
     if isinstance(shape, Box):
         edges = np.concatenate([[0], np.cumsum(shape.face_sizes().prod(1))])
         return u, np.interp(v, edges / edges[-1], np.arange(7) / 6)
@@ -154,7 +154,7 @@ def _even(shape: Shape, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.nd
 def _times_seen(
     points: np.ndarray, normals: np.ndarray, ids: np.ndarray, cameras: list[Camera], pictures: list[Picture]
 ) -> np.ndarray:
-    """In how many photos each point is seen: inside the frame, facing the camera, its own body the nearest."""
+    """Number of photos that see each point: inside the frame, facing the camera, and not occluded."""
     seen = np.zeros(len(points), int)
     for camera, picture in zip(cameras, pictures, strict=True):
         pixels, depth = camera.project(points)

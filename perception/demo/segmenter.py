@@ -1,23 +1,23 @@
-"""Label images as a segmenter gives them for one photo: perfect ones, and ones with a segmenter's errors."""
+"""Label images for one photo as a 2D segmenter would give them: without errors, and with typical errors."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-SMALL = 150  # pixels under which a segmenter mostly misses an object
+SMALL = 150  # pixels; smaller objects are missed with probability MISSED_SMALL
 MISSED_SMALL = 0.8
 MISSED = 0.04
 CUT_INTO_PARTS = 0.35
 CUT_BACKGROUND = 0.3
 MERGED = 0.08
 RAGGED = 1.3  # pixels: standard deviation of a border's displacement
-HOLES = 1 / 9000  # a pixel
-_PART = 100  # pixels: smaller parts stay with the largest
+HOLES = 1 / 9000  # per pixel
+_PART = 100  # pixels; smaller parts keep the label of the largest part
 
 
 def perfect_labels(ids: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """ids [H, W] with their numbers shuffled, so that they tell nothing across photos; 0 stays 0. uint16."""
+    """ids [H, W] with randomly permuted labels, so that labels do not correspond across photos; 0 stays 0. uint16."""
     names = np.unique(ids[ids > 0])
     shuffled = np.zeros(int(ids.max()) + 1, np.uint16)
     shuffled[names] = 1 + rng.permutation(len(names))
@@ -25,10 +25,10 @@ def perfect_labels(ids: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def erring_labels(ids: np.ndarray, parts: np.ndarray, stuff: set[int], rng: np.random.Generator) -> np.ndarray:
-    """Masks with errors, [H, W] uint16: objects cut into parts, merged with a neighbour or missed, backgrounds cut in
-    two, ragged borders, holes.
+    """Label image with errors, [H, W] uint16: objects cut into parts, merged with a neighbour or missed, backgrounds
+    cut in two, ragged borders, holes.
 
-    ids, parts [H, W]: the instance and which of its surfaces is seen. stuff: ids of backgrounds.
+    ids, parts [H, W]: visible instance, and index of its visible surface. stuff: ids of backgrounds.
     """
     labels = ids.astype(np.int32)
     for name in np.unique(ids[ids > 0]).tolist():
@@ -48,7 +48,7 @@ def erring_labels(ids: np.ndarray, parts: np.ndarray, stuff: set[int], rng: np.r
 
 
 def _cut_into_parts(labels: np.ndarray, inside: np.ndarray, parts: np.ndarray) -> None:
-    """Gives every part that is large enough, but the largest, a label of its own."""
+    """Gives a new label to every part with at least _PART pixels, except the largest."""
     numbers, counts = np.unique(parts[inside], return_counts=True)
     for number in numbers[np.argsort(-counts)][1:][: int((counts >= _PART).sum())]:
         part = inside & (parts == number)
@@ -57,7 +57,7 @@ def _cut_into_parts(labels: np.ndarray, inside: np.ndarray, parts: np.ndarray) -
 
 
 def _merge(labels: np.ndarray, name: int, rng: np.random.Generator) -> None:
-    """Gives one label to an object and a neighbour of it."""
+    """Gives one label to an object and one of its neighbours."""
     inside = (labels == name).astype(np.uint8)
     rim = (cv2.dilate(inside, np.ones((5, 5), np.uint8)) > 0) & (inside == 0) & (labels > 0)
     neighbours = np.unique(labels[rim])
@@ -66,7 +66,7 @@ def _merge(labels: np.ndarray, name: int, rng: np.random.Generator) -> None:
 
 
 def _ragged(labels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Borders displaced by smooth noise, and left out here and there."""
+    """Displaces borders by smooth noise and removes the label of half of the border pixels."""
     rows, columns = np.mgrid[: labels.shape[0], : labels.shape[1]].astype(np.float32)
     moved = [axis + RAGGED * _smooth(rng, labels.shape, 2.0) for axis in (columns, rows)]
     ragged = cv2.remap(
@@ -88,6 +88,6 @@ def _with_holes(labels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _smooth(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> np.ndarray:
-    """Noise [H, W] float32 of unit deviation, smooth over `sigma` pixels."""
+    """Gaussian-filtered noise [H, W] float32 with unit standard deviation. sigma: of the filter, pixels."""
     noise = cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), sigma)
     return noise / noise.std()

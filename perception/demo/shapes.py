@@ -1,7 +1,7 @@
-"""Primitives a ray can hit: flat sheets, boxes, ellipsoids, turned (lathe) surfaces and bent tubes.
+"""Primitives with ray intersection: sheets, boxes, ellipsoids, surfaces of revolution (lathe) and bent tubes.
 
-Every shape lives in its own frame, `world_from_local = (rotation, origin)`, and is charted by u, v in [0, 1]:
-`point_normal` gives the surface at (u, v), `hit` finds the first crossing of a ray and its (u, v). Metres.
+Every shape is defined in a local frame, `world_from_local = (rotation, origin)`, with chart coordinates u, v in
+[0, 1]: `point_normal` evaluates the surface at (u, v); `hit` gives the first ray hit and its (u, v). Metres.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-NEAR = 1e-4  # hits closer than this (metres along the ray) are the surface the ray started from
+NEAR = 1e-4  # hits closer than this (metres along the ray) are self-intersections at the ray's start
 
 
 class Shape(Protocol):
-    """What the renderer and the light baker need of a surface. LENGTHS: the fields that scale with the shape."""
+    """Interface of a surface for the renderer and the light baker. LENGTHS: names of the fields that scale with it."""
 
     LENGTHS: ClassVar[tuple[str, ...]]
     rotation: np.ndarray
@@ -35,7 +35,7 @@ class Shape(Protocol):
         ...
 
     def size(self) -> tuple[float, float]:
-        """Typical lengths of the chart along u and v, metres: what a texture is scaled by."""
+        """Typical lengths of the chart along u and v in metres, used to scale textures."""
         ...
 
 
@@ -64,17 +64,16 @@ def _zero() -> np.ndarray:
 
 
 def _quadratic(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both roots of a t² + 2 b t + c = 0, ascending where a > 0; nan where there is none."""
+    """Both roots of a t² + 2 b t + c = 0, ascending where a > 0; nan where there is no real root."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        # The stable pair: the root without cancellation first, the other from the product of the roots.
+        # Numerically stable: first the root without cancellation, then the other from the product of the roots.
         q = -(b + np.copysign(np.sqrt(b * b - a * c), b))
         return q / a, c / q
 
 
 @dataclass
 class Sheet:
-    """A rectangle in the local xy plane, or an ellipse inscribed in it; the normal is +z. u along x, v along
-    -y."""
+    """A rectangle in the local xy plane, or the ellipse inscribed in it. Normal +z; u along x, v along -y."""
 
     LENGTHS: ClassVar[tuple[str, ...]] = ("width", "height")
     width: float
@@ -111,12 +110,12 @@ _FACES = np.array([  # of a box: axis and sign of the normal, of u, and of v
     (0, 1, 1, 1, 2, -1), (1, 1, 0, -1, 2, -1), (0, -1, 1, -1, 2, -1),
 ])  # fmt: skip
 _FACE_OF = np.array([[5, 3], [2, 4], [1, 0]])  # by axis and sign of the normal
-_RIM = 0.01  # share of a face's chart at its edges where the texture of the next face would bleed in
+_RIM = 0.01  # margin of each face's chart that is not sampled: the texture of the next face would bleed in
 
 
 @dataclass
 class Box:
-    """A cuboid of edge lengths `extent` [3] about its origin. v runs through six charts: +z, -z, -y, +x, +y, -x."""
+    """A cuboid with edge lengths `extent` [3], centred on its origin. v covers six charts: +z, -z, -y, +x, +y, -x."""
 
     LENGTHS: ClassVar[tuple[str, ...]] = ("extent",)
     extent: np.ndarray
@@ -199,10 +198,9 @@ class Ellipsoid:
 
 @dataclass
 class Lathe:
-    """A surface of revolution about z: the profile [S + 1, 2] of (radius, height), joined by cones and rings.
+    """A surface of revolution about z. The profile [S + 1, 2] holds (radius, height); its segments are cones or rings.
 
-    u is the angle, v the length along the profile. A profile that runs upwards on the outside has outward
-    normals.
+    u is the angle, v the arc length along the profile. Normals point outwards if the outer profile runs upwards.
     """
 
     LENGTHS: ClassVar[tuple[str, ...]] = ("profile",)
@@ -237,7 +235,7 @@ class Lathe:
         r, z = np.interp(v, self._v, self.profile[:, 0]), np.interp(v, self._v, self.profile[:, 1])
         tangent = np.diff(self.profile, axis=0) / np.diff(self._v)[:, None]
         middle = (self._v[1:] + self._v[:-1]) / 2
-        # Facet normals blended along the profile: the turned surface looks smooth.
+        # Facet normals are interpolated along the profile, for smooth shading.
         nr, nz = np.interp(v, middle, tangent[:, 1]), -np.interp(v, middle, tangent[:, 0])
         scale = 1 / np.maximum(np.hypot(nr, nz), 1e-12)
         cos, sin = np.cos(2 * np.pi * u), np.sin(2 * np.pi * u)
@@ -254,7 +252,7 @@ class Lathe:
 def _segment_roots(
     r0: float, z0: float, r1: float, z1: float, ray: tuple[np.ndarray, ...]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Crossings of rays with one cone or ring of a lathe: (t, position along the segment) for each root.
+    """Intersections of rays with one cone or ring of a lathe: (t, position along the segment) for each root.
 
     ray: (o_z, d_z, d_xy·d_xy, o_xy·d_xy, o_xy·o_xy).
     """
@@ -272,12 +270,10 @@ def _segment_roots(
 
 @dataclass
 class Tube:
-    """A tube bent along a circle of radius `bend` in the local xy plane, from angle `start` to `stop`
-    (radians).
+    """A tube along an arc of radius `bend` in the local xy plane, from angle `start` to `stop` in radians.
 
-    radii [S] are the tube's radii at equal steps along the arc. u runs around the tube, v along the arc.
-    Hits are found by sphere tracing: the distance bound is exact for constant radii, damped for tapering
-    ones.
+    radii [S]: tube radii at equal steps along the arc. u: angle around the tube; v: position along the arc. Hits are
+    found by sphere tracing. The distance bound is exact for constant radii and damped for varying ones.
     """
 
     LENGTHS: ClassVar[tuple[str, ...]] = ("bend", "radii")
@@ -324,7 +320,7 @@ class Tube:
             running = running[(gap > 2e-5) & (s[running] < leave.ravel()[alive[running]])]
             if not len(running):
                 break
-        s[running] = np.inf  # grazing rays that never settled
+        s[running] = np.inf  # grazing rays that did not converge
         s[s >= leave.ravel()[alive]] = np.inf
         t.ravel()[alive] = s
         ok = np.isfinite(s)

@@ -1,4 +1,4 @@
-"""A table against a papered wall in the corner of a room, with small things on it and posters around."""
+"""A table with small objects against a papered wall in the corner of a room, with posters on the walls."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from perception.demo.light import Body, Lamp, Lighting, Part, Scene, bake_all
 from perception.demo.shapes import Sheet, rotation_from_axes, spin
 
 VIEWS = 40
-FOCAL_35MM = 32  # of a phone
+FOCAL_35MM = 32  # 35 mm equivalent of a phone camera
 POINTS = 60_000
 TABLE = (1.10, 0.78)  # metres along x and y; its top is z = 0 and centred on the origin
 FLOOR = -0.72
@@ -25,9 +25,9 @@ LIGHTING = Lighting(
 
 
 def build(seed: int, light_samples: int = 20) -> Scene:
-    """The scene, painted and lit. Seed 0 is the demo's; any other chooses, colours and places the things itself.
+    """The painted and lit scene. Seed 0 is the demo scene. Other seeds select, colour and place the objects randomly.
 
-    light_samples: rays per texel of the light maps, to the lamp and to all around; fewer are faster and noisier.
+    light_samples: rays per texel of the light maps, for the lamp and for ambient light; fewer are faster and noisier.
     """
     rng = np.random.default_rng(seed)
     bodies = (_demo_things(rng) if seed == 0 else _chosen_things(rng)) + _room(rng, seed != 0)
@@ -55,7 +55,7 @@ def _demo_things(rng: np.random.Generator) -> list[Body]:
 
 
 def _chosen_things(rng: np.random.Generator) -> list[Body]:
-    """Things of a size, colour and place of their own: some stacked, some touching, the rest apart."""
+    """Objects with random size, colour and position: some stacked, some touching, the rest apart."""
     first, second, third = rng.permutation(list(things.COLORS))[:3]
     book, other = rng.permutation(list(things.BOOKS))[:2]
     fruits = rng.permutation(list(things.FRUITS))
@@ -85,13 +85,13 @@ def _chosen_things(rng: np.random.Generator) -> list[Body]:
         if spot is not None
     ]
     stacked = things.named_book(rng, other)
-    if spots[0] is not None:  # the largest thing always finds a place
+    if spots[0] is not None:  # the first disc always fits
         placed.append(stacked.placed(turns[0] + 25, np.array([*spots[0], 0.036 * scales[0]]), 0.85))
     return [*placed, things.clock(rng, "wall clock", np.array([rng.uniform(0.1, 0.4), WALL, 0.46]))]
 
 
 def _spots(rng: np.random.Generator, radii: list[float]) -> list[tuple[float, float] | None]:
-    """Places on the table for discs that must not overlap, every third against an earlier one; None where none fits."""
+    """Non-overlapping positions on the table for discs; every third touches an earlier disc. None where none fits."""
     found: list[tuple[float, float] | None] = []
     taken: list[tuple[float, float, float]] = []
     for k, radius in enumerate(radii):
@@ -113,7 +113,7 @@ def _spots(rng: np.random.Generator, radii: list[float]) -> list[tuple[float, fl
 
 
 def _room(rng: np.random.Generator, shuffled: bool) -> list[Body]:
-    """Table, walls, floor and posters; shuffled: in colours of the generator's choice."""
+    """Table, walls, floor and posters. shuffled: with random colours."""
     grounds = ["#b9cdc4", "#cfc3ae"]
     if shuffled:
         grounds = list(rng.permutation(["#b9cdc4", "#cfc3ae", "#c2c7d8", "#d8c3c0", "#c9d4b6", "#d9cfa8"])[:2])
@@ -152,7 +152,7 @@ def _wall(along, normal, center, width, height, paint, texels) -> Part:  # type:
 
 
 def _posters(rng: np.random.Generator) -> list[Body]:
-    """Framed prints on the walls: flat, 1 cm in front of the paper."""
+    """Framed prints on the walls: flat, 1 cm in front of the wallpaper."""
     alps = tex.landscape(
         rng, 640, 470, ["#f4b183", "#f7e1b5"], ["#8a5a83", "#5d3f72", "#3c2f5c", "#241f42"], "MOUNTAINS"
     )

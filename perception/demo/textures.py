@@ -1,5 +1,4 @@
-"""Pictures painted by formula: wood, glaze, peel, balls, posters. All are [h, w, 3] float32 sRGB in [0,
-1]."""
+"""Procedural textures: wood, glaze, fruit peel, balls, posters. All are [h, w, 3] float32 sRGB in [0, 1]."""
 
 from __future__ import annotations
 
@@ -18,10 +17,9 @@ def rgb(code: str) -> np.ndarray:
 def noise(
     rng: np.random.Generator, height: int, width: int, cells: tuple[float, float], octaves: int = 4
 ) -> np.ndarray:
-    """Fractal value noise [h, w] float32 of zero mean and about unit deviation, periodic along the width.
+    """Fractal value noise [h, w] float32 with zero mean and about unit standard deviation, periodic along the width.
 
-    cells: how many lattice cells the first octave has down and across; each octave doubles them at half the
-    weight.
+    cells: lattice cells of the first octave (vertical, horizontal). Each octave doubles them and halves the weight.
     """
     total = np.zeros((height, width), np.float32)
     weight = 1.0
@@ -36,7 +34,7 @@ def noise(
 
 
 def blend(amount: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """first where amount [h, w] is 0, second where it is 1."""
+    """Linear interpolation: `first` where amount [h, w] is 0, `second` where it is 1."""
     a = np.clip(amount, 0, 1)[..., None].astype(np.float32)
     return first * (1 - a) + second * a
 
@@ -44,7 +42,7 @@ def blend(amount: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarr
 def speckle(
     rng: np.random.Generator, picture: np.ndarray, count: int, sizes: tuple[int, int], colors: list[str]
 ) -> np.ndarray:
-    """`count` small blots of the given colours and radii (pixels) dropped on a copy of the picture."""
+    """A copy of the image with `count` random blots of the given radii (pixels) and colours."""
     out = np.ascontiguousarray(picture, np.float32).copy()
     height, width = out.shape[:2]
     for _ in range(count):
@@ -67,7 +65,7 @@ def wood(rng: np.random.Generator, height: int, width: int, planks: int, light: 
 def _plank(rng: np.random.Generator, height: int, width: int, light: np.ndarray, dark: np.ndarray) -> np.ndarray:
     y, x = np.mgrid[0:height, 0:width].astype(np.float32)
     warp = noise(rng, height, width, (2, 4), 3) * height * 0.05
-    for _ in range(int(rng.integers(1, 4))):  # knots bend the grain around them
+    for _ in range(int(rng.integers(1, 4))):  # the grain bends around knots
         ky, kx, r = rng.uniform(0, height), rng.uniform(0, width), rng.uniform(0.06, 0.12) * height
         warp += 2.2 * r * np.exp(-(((y - ky) / r) ** 2 + ((x - kx) / (3 * r)) ** 2) / 2) * np.sign(y - ky)
     rings = 0.5 + 0.5 * np.sin((y + warp) / height * rng.uniform(30, 46) + rng.uniform(0, 6))
@@ -115,7 +113,7 @@ def soccer_ball(rng: np.random.Generator, height: int, width: int) -> np.ndarray
         ]
     )
     hexagons /= np.linalg.norm(hexagons, axis=1, keepdims=True)
-    # Face distances of the solid with unit edge; a direction meets the face of greatest n·c / distance.
+    # Face distances of the solid with unit edge. A direction hits the face with the largest n·c / distance.
     heights = np.concatenate([np.full(12, 2.3274), np.full(20, 2.2673)])
     score = directions(height, width) @ (np.concatenate([pentagons, hexagons]) / heights[:, None]).T
     face = score.argmax(-1)
@@ -144,7 +142,7 @@ def glaze(rng: np.random.Generator, height: int, width: int, color: str, specks:
 
 
 def draw_text(picture: np.ndarray, text: str, center: tuple[float, float], size: int, color: str) -> np.ndarray:
-    """Text written on a copy of the picture, centred at (x, y) pixels, `size` pixels high."""
+    """A copy of the image with text centred at (x, y) pixels, `size` pixels high."""
     image = Image.fromarray((np.clip(picture, 0, 1) * 255).astype(np.uint8))
     font = ImageFont.load_default(size=size)
     ImageDraw.Draw(image).text(center, text, fill=color, font=font, anchor="mm")
@@ -152,7 +150,7 @@ def draw_text(picture: np.ndarray, text: str, center: tuple[float, float], size:
 
 
 def wallpaper(rng: np.random.Generator, height: int, width: int, ground: str, leaves: list[str]) -> np.ndarray:
-    """Plaster-toned paper with scattered leaves, no two alike, so that no feature is mistaken for another."""
+    """Plaster-coloured wallpaper with random leaves. No two leaves are equal, so image features are unambiguous."""
     paper = np.broadcast_to(rgb(ground), (height, width, 3)) * (
         1 + 0.035 * noise(rng, height, width, (height / 40, width / 40), 5)[..., None]
     )
@@ -216,7 +214,7 @@ def fur(rng: np.random.Generator, height: int, width: int, light: str, dark: str
 
 
 def fabric(rng: np.random.Generator, height: int, width: int, color: str, dots: list[str] | None = None) -> np.ndarray:
-    """Woven cloth of one colour, slightly mottled; with `dots`, strewn with small figures of these colours."""
+    """Woven cloth of one colour, slightly mottled. dots: colours of small figures scattered over it."""
     y, x = np.mgrid[:height, :width]
     weave = 0.05 * (np.sin(1.9 * x) * np.sin(1.7 * y)) + 0.07 * noise(rng, height, width, (height / 6, width / 6), 2)
     cloth = rgb(color) * (1 + weave + 0.045 * noise(rng, height, width, (5, 7), 5))[..., None]
@@ -240,7 +238,7 @@ def rgb_code(color: np.ndarray) -> str:
 
 
 def bricks(rng: np.random.Generator, height: int, width: int, color: str, course: int = 34) -> np.ndarray:
-    """A brick wall, every brick of its own tone; course: pixels a row."""
+    """A brick wall with a random tone per brick. course: height of a row in pixels."""
     wall = np.ascontiguousarray(np.broadcast_to(rgb("#b9ada0"), (height, width, 3)), np.float32).copy()
     length = int(2.9 * course)
     for row, top in enumerate(range(0, height, course)):
@@ -294,7 +292,7 @@ def spines(rng: np.random.Generator, height: int, width: int, pitch: float = 9.0
 
 
 def crop(rng: np.random.Generator, tile: np.ndarray, height: int, width: int) -> np.ndarray:
-    """[height, width] cut from a texture at random, its width along the longer side; repeated where it is too small."""
+    """A random crop [height, width] of a texture, its width along the longer side; repeated where it is too small."""
     if height > width:
         return np.ascontiguousarray(crop(rng, tile, width, height).transpose(1, 0, 2))
     down, across = -(-height // tile.shape[0]), -(-width // tile.shape[1])

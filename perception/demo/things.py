@@ -1,4 +1,4 @@
-"""Small everyday things of plain shapes. Metres; z up; they stand on z = 0."""
+"""Small household objects built from primitives. Metres; z up; they stand on z = 0."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def _at(place: Place, height: float = 0.0) -> np.ndarray:
 
 
 def mug(rng: np.random.Generator, name: str, place: Place, turn: float, paint: np.ndarray) -> Body:
-    """A mug of coffee: a turned cup with a thick rim and a bent handle that points to `turn` (degrees)."""
+    """A mug of coffee: a surface of revolution with a thick rim, and a bent handle at angle `turn` (degrees)."""
     profile = [
         (0.0, 0.0), (0.034, 0.0), (0.040, 0.005), (0.0425, 0.015), (0.0435, 0.092), (0.0425, 0.0965),
         (0.0405, 0.0965), (0.0395, 0.092), (0.039, 0.078), (0.0, 0.078),
@@ -34,7 +34,7 @@ def mug(rng: np.random.Generator, name: str, place: Place, turn: float, paint: n
 
 
 def mug_paint(rng: np.random.Generator, color: str, ink: str, hearts: bool) -> np.ndarray:
-    """Glaze with hearts or dots on the outer wall, a cream inside, coffee (the profile's last fifth)."""
+    """Texture of a mug: hearts or dots outside, cream colour inside, coffee (the last fifth of the profile)."""
     height, width = 480, 560
     paint = tex.glaze(rng, height, width, color, [ink, "#1c1c1c"], 60)
     for i in range(3 if hearts else 14):
@@ -42,7 +42,7 @@ def mug_paint(rng: np.random.Generator, color: str, ink: str, hearts: bool) -> n
         if hearts:
             a = np.linspace(0, 2 * np.pi, 60)
             rise = 13 * np.cos(a) - 5 * np.cos(2 * a) - 2 * np.cos(3 * a) - np.cos(4 * a)
-            shape = np.stack([x + 2.6 * 16 * np.sin(a) ** 3, y + 3.6 * rise], 1)  # rows run upwards
+            shape = np.stack([x + 2.6 * 16 * np.sin(a) ** 3, y + 3.6 * rise], 1)  # row 0 is the bottom of the profile
             cv2.fillPoly(paint, [shape.astype(np.int32)], tex.rgb(ink).tolist(), cv2.LINE_AA)
         else:
             cv2.ellipse(paint, (x, y), (11, 15), 0, 0, 360, tex.rgb(ink).tolist(), -1, cv2.LINE_AA)
@@ -92,7 +92,7 @@ def _painted_bands(rng: np.random.Generator, paint: np.ndarray, inks: tuple[str,
 
 
 def ball(name: str, place: Place, radius: float, paint: np.ndarray, tilt: list[float]) -> Body:
-    """A ball resting on the table, its pole along `tilt`."""
+    """A sphere standing on the table. Its pole points along `tilt`."""
     rotation = rotation_from_axes([1, 0.3, 0.1], tilt)
     part = Part(Ellipsoid(np.full(3, radius), rotation, _at(place, radius)), paint, 0.18, (36, 64))
     return Body(name, ["ball"], [part])
@@ -127,7 +127,7 @@ def box_parts(
     center: np.ndarray, extent: tuple[float, float, float], rotation: np.ndarray, paints: list[np.ndarray],
     texels: tuple[int, int] = (24, 24), casts: bool = True,
 ) -> list[Part]:  # fmt: skip
-    """Six sheets around a box: paints for +z, -z and the four sides (-y, +x, +y, -x), cycled when fewer."""
+    """Six sheets forming a box. paints: for +z, -z and the four sides (-y, +x, +y, -x), repeated if fewer."""
     x, y, z = extent
     faces = [
         ([0, 0, 1], [1, 0, 0], z, x, y), ([0, 0, -1], [1, 0, 0], z, x, y), ([0, -1, 0], [1, 0, 0], y, x, z),
@@ -143,14 +143,14 @@ def box_parts(
 
 
 GREEN_BOOK = ["#0d4f4a", "#1c8a78", "#2a9a7d", "#166b5d", "#0f4c46", "#0a3330"]
-"""Sky, its lower edge, then the hills of a cover; the last colour is the binding's."""
+"""Book cover colours: sky, horizon, then hills; the last colour is the binding."""
 
 
 def book(
     rng: np.random.Generator, name: str, place: Place, turn: float, colors: list[str] = GREEN_BOOK,
     title: tuple[str, str, str] = ("FIELD GUIDE", "BIRDS", "OF THE NORTH"),
 ) -> Body:  # fmt: skip
-    """A thick hardback lying flat, title up."""
+    """A thick hardback book lying flat, with the title up."""
     width, depth, thick = 0.150, 0.205, 0.036
     cover = tex.landscape(rng, 560, 410, colors[:2], colors[2:], title[0])
     cover = tex.draw_text(cover, title[1], (205, 320), 88, "#fff3cf")
@@ -191,7 +191,7 @@ def cactus(rng: np.random.Generator, name: str, place: Place) -> Body:
     for side, height, size in ((15.0, 0.135, 0.026), (195.0, 0.115, 0.024)):
         outward = spin(side)[:, 0]
         axes = np.stack([outward, np.array([0, 0, 1.0]), np.cross(outward, [0, 0, 1.0])], 1)
-        # A quarter bend: out of the stem sideways, then upwards.
+        # An arm bends by 90 degrees: out of the stem sideways, then upwards.
         origin = _at(place, height + size) + 0.028 * outward
         radii = np.array([0.009, 0.011, 0.0115, 0.0115, 0.011])
         bend = Tube(size, np.radians(-100), np.radians(20), radii, axes, origin)
@@ -200,7 +200,7 @@ def cactus(rng: np.random.Generator, name: str, place: Place) -> Body:
 
 
 def _ribs(rng: np.random.Generator, height: int, width: int, count: int) -> np.ndarray:
-    """Cactus skin: light ridges set with pale spines, dark valleys."""
+    """Cactus texture: light ribs with pale spines, dark valleys."""
     u = (np.arange(width) + 0.5) / width * count
     ridge = (0.5 + 0.5 * np.cos(2 * np.pi * u))[None] * np.ones((height, 1))
     skin = tex.blend(ridge + 0.12 * tex.noise(rng, height, width, (8, 8), 4), tex.rgb("#1f4a26"), tex.rgb("#5f9a4a"))
@@ -213,7 +213,7 @@ def _ribs(rng: np.random.Generator, height: int, width: int, count: int) -> np.n
 
 
 def clock(rng: np.random.Generator, name: str, center: np.ndarray) -> Body:
-    """A wall clock that faces -y: a turned black case and a white dial at ten past ten."""
+    """A wall clock facing -y: a black case (surface of revolution) and a white dial that shows 10:10."""
     facing = rotation_from_axes([1, 0, 0], [0, -1, 0])
     case = Lathe(np.array([(0.132, 0.0), (0.135, 0.02), (0.128, 0.03), (0.120, 0.029), (0.117, 0.018)]), facing, center)
     dial = tex.glaze(rng, 480, 480, "#f3f1ea", ["#dedacd", "#c8c4b8"], 120)
@@ -237,7 +237,7 @@ def clock(rng: np.random.Generator, name: str, center: np.ndarray) -> Body:
 
 
 def _binding(dark: str, light: str) -> list[str]:
-    """Colours of a cover as GREEN_BOOK has them, between two colours."""
+    """Cover colours in the layout of GREEN_BOOK, interpolated between two colours."""
     shares = (0.0, 0.7, 1.0, 0.6, 0.3, -0.2)
     return [tex.rgb_code(tex.rgb(dark) * (1 - share) + tex.rgb(light) * share) for share in shares]
 
@@ -290,7 +290,7 @@ def named_vase(rng: np.random.Generator) -> Body:
 
 
 def bowl(rng: np.random.Generator, name: str, color: str, filling: list[str] | None = None) -> Body:
-    """A turned bowl; filling: names of FRUITS that lie in it and belong to it."""
+    """A bowl. filling: names of FRUITS that lie in it and belong to the same instance."""
     profile = [
         (0.0, 0.0), (0.040, 0.0), (0.044, 0.006), (0.066, 0.030), (0.086, 0.062), (0.088, 0.066),
         (0.085, 0.066), (0.062, 0.034), (0.040, 0.012), (0.0, 0.010),
@@ -325,7 +325,7 @@ def bottle(rng: np.random.Generator, name: str, color: str) -> Body:
     label = tex.mosaic(rng, 140, 480, ["#d1495b", "#edae49", "#00798c", "#30638e"])
     for x in (120, 360):
         label = tex.draw_text(label, "CIDER", (x, 70), 54, "#22262b")
-    paint[190:330] = label[::-1]  # rows of a turned surface run upwards
+    paint[190:330] = label[::-1]  # row 0 is the bottom of a surface of revolution
     paint[570:] = tex.rgb("#b08d2e")
     return Body(name, ["bottle"], [Part(Lathe(np.array(profile)), paint, 0.7, (48, 36))])
 
@@ -339,7 +339,7 @@ def tin(rng: np.random.Generator, name: str) -> Body:
         cv2.circle(label, (x, 80), 46, tex.rgb("#e8e3d2").tolist(), -1, cv2.LINE_AA)
         cv2.circle(label, (x, 80), 34, tex.rgb("#d3271f").tolist(), -1, cv2.LINE_AA)
         label = tex.draw_text(label, "TOMATO", (x, 170), 42, "#fff3cf")
-    paint[96:316] = label[::-1]  # rows of a turned surface run upwards
+    paint[96:316] = label[::-1]  # row 0 is the bottom of a surface of revolution
     return Body(name, ["tin", "food tin", "can"], [Part(Lathe(np.array(profile)), paint, 0.4, (32, 40))])
 
 

@@ -1,4 +1,4 @@
-"""What is true about a made scene: for scoring what a map of it holds, never for making the map."""
+"""Ground truth of a synthetic scene. It is used to score a map, never to build one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes <-> the OpenGL axes
 @dataclass(frozen=True)
 class Truth:
     """One instance: id > 0, name, category and its id, prompts that name it, whether it is background (wall, floor...),
-    points of it in gt_points.ply, and photos that show it."""
+    number of its points in gt_points.ply, and number of photos that show it."""
 
     id: int
     name: str
@@ -35,11 +35,11 @@ class Truth:
 
 @dataclass
 class DemoTruth:
-    """Truth of a set of photos, metres, z up.
+    """Ground truth of a set of photos. Metres, z up.
 
     instances: by id. asked: the prompts of `perception demo`. names: photo file names. cameras: one per photo.
     points [N, 3] float32, normals [N, 3] float32, colors [N, 3] uint8, instance_ids [N] int32: surface points that at
-    least two photos see. folder: where the truth lies. photos: where the photos lie, relative to it.
+    least two photos see. folder: folder of the ground truth. photos: path of the photos relative to that folder.
     """
 
     instances: list[Truth]
@@ -55,12 +55,12 @@ class DemoTruth:
 
     @property
     def things(self) -> list[Truth]:
-        """The instances that are no background."""
+        """The instances that are not background."""
         return [instance for instance in self.instances if not instance.is_stuff]
 
     @property
     def queries(self) -> list[tuple[str, list[int]]]:
-        """Every prompt with the ids of the visible instances that carry it."""
+        """Every prompt with the ids of the visible instances that it names."""
         found: dict[str, list[int]] = {}
         for instance in self.instances:
             for text in dict.fromkeys([instance.name, instance.category, *instance.prompts]):
@@ -69,7 +69,7 @@ class DemoTruth:
         return sorted(found.items())
 
     def labels(self, name: str) -> np.ndarray:
-        """Instance ids [H, W] uint16 of a photo, 0 = nothing; the same id in every photo."""
+        """Instance ids [H, W] uint16 of a photo, 0 = none. Ids are consistent across photos."""
         path = self.folder / "masks_gt" / f"{Path(name).stem}.png"
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if image is None:

@@ -1,1 +1,1 @@
-"""From Gaussians with features to instances: cluster, tell apart, score, see."""
+"""Instances from Gaussians with features: clustering, splitting, scoring, rendering of silhouettes."""

@@ -1,4 +1,4 @@
-"""Single Gaussians: how well the masks of each agree with its instance, and reassignment where they do not."""
+"""Agreement of each Gaussian's masks with its instance, and reassignment of Gaussians that disagree."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ MARGIN = 0.15
 
 
 def mask_shares(table: Table) -> np.ndarray:
-    """[K, M]: of what a view's masks show of instance k, the share in each of them."""
+    """[K, M]: of the pixels of instance k under masks of a view, the fraction in each mask of that view."""
     return table.pixels / np.maximum(table.by_view[:, table.view], 1e-12)
 
 
 def affinities(votes: MaskVotes, shares: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """([R, K], [R]): mean over a Gaussian's pixels of the share of instance k in the pixel's mask; and its pixels."""
+    """Mean of `shares` over the pixels of each Gaussian [R, K], and its number of pixels under masks [R]."""
     weights = votes.weights[rows]
     pixels = np.asarray(weights.sum(axis=1)).reshape(-1)
     return np.asarray(weights @ shares.T) / np.maximum(pixels, 1e-12)[:, None], pixels
 
 
 def memberships(ids: np.ndarray, votes: MaskVotes) -> np.ndarray:
-    """[N] float32 in [0, 1]: how well each Gaussian's masks agree with its instance (`affinities`); 0 for noise."""
+    """[N] float32 in [0, 1]: agreement of each Gaussian's masks with its instance (`affinities`); 0 for noise."""
     count = int(ids.max(initial=-1)) + 1
     shares = mask_shares(votes.table(ids, count))
     found = np.zeros(len(ids), np.float32)
@@ -39,12 +39,12 @@ def memberships(ids: np.ndarray, votes: MaskVotes) -> np.ndarray:
 def reassign(
     ids: np.ndarray, means: np.ndarray, opacities: np.ndarray, votes: MaskVotes, min_opacity: float
 ) -> np.ndarray:
-    """Assigns undecided Gaussians and moves misplaced ones where masks and neighbours in space agree.
+    """Assigns unassigned Gaussians and corrects misassigned ones, where masks and spatial neighbours agree.
 
-    ids [N] int32 (−1 = none), means [N, 3], opacities [N]; Gaussians of `min_opacity` and more are voters. An undecided
-    Gaussian (too faint to vote, say) joins the instance of at least half of its 8 nearest voters if its own masks
-    agree with that one as with no other, by at least half. A voter moves to the instance of at least half of its
-    neighbours if the masks prefer that one clearly. Others stay as they are. Returns ids [N] int32.
+    ids [N] int32 (−1 = none), means [N, 3], opacities [N]. Voters are assigned Gaussians with at least `min_opacity`.
+    The candidate is the instance of at least half of a Gaussian's 8 nearest voters, with affinity ≥ LEAST_AGREEMENT. An
+    unassigned Gaussian joins it if no other instance has an affinity higher by more than MARGIN. An assigned one moves
+    if the candidate's affinity is higher than its instance's by MARGIN. Others are unchanged. Returns ids [N] int32.
     """
     count = int(ids.max(initial=-1)) + 1
     assigned = ids.astype(np.int32)
@@ -62,7 +62,7 @@ def reassign(
         affinity, pixels = affinities(votes, shares, rows)
         _, found = tree.query(means[rows], k=near, workers=-1)
         around = ids[voters[found]]
-        around[voters[found] == rows[:, None]] = -1  # not its own neighbour
+        around[voters[found] == rows[:, None]] = -1  # a Gaussian is not its own neighbour
         popular, support = _mode(around)
         at, own = np.arange(len(rows)), ids[rows]
         mine = np.where(own >= 0, affinity[at, own], 0)
@@ -75,7 +75,7 @@ def reassign(
 
 
 def _mode(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Most frequent id ≥ 0 of each row [R, k] (ties: the nearer) and how often it occurs; −1 and 0 where none is."""
+    """Most frequent id ≥ 0 of each row [R, k] (ties: the nearer one) and its count; −1 and 0 where there is none."""
     equal = (values[:, :, None] == values[:, None, :]) & (values[:, :, None] >= 0)
     counts = equal.sum(axis=2)
     first = counts.argmax(axis=1)

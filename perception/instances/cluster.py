@@ -1,6 +1,6 @@
-"""Gaussians into instances: HDBSCAN over the features, then spatially disconnected parts told apart.
+"""Clusters Gaussians into instances: HDBSCAN on the features, then a split into spatially connected components.
 
-HDBSCAN (Campello et al. 2013) as in the paper (§3.2.1): the number of instances is found, noise stays noise (−1).
+HDBSCAN (Campello et al. 2013) as in the paper (§3.2.1). It finds the number of instances; noise has the label −1.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import numpy as np
 from perception.config import InstanceConfig
 
 MIN_OPACITY = 0.1
-"""Opacity from which a Gaussian votes; fainter ones are haze between things."""
+"""Minimum opacity of Gaussians that are clustered. Fainter ones are mostly semi-transparent noise between objects."""
 MAX_CLUSTERED = 60_000
-"""Rows that HDBSCAN clusters exactly: its time and memory grow faster than their number."""
+"""Maximum number of rows for exact HDBSCAN, whose time and memory grow faster than linearly."""
 
 
 @dataclass(frozen=True)
 class Clusters:
-    """ids [N] int32 (−1 = noise), 0 … M − 1 by falling size; membership [N] float32 in [0, 1], 0 for noise."""
+    """ids [N] int32: −1 = noise, 0 … M − 1 by falling size; membership [N] float32 in [0, 1], 0 for noise."""
 
     ids: np.ndarray
     membership: np.ndarray
@@ -39,8 +39,8 @@ def cluster_gaussians(
 ) -> Clusters:
     """Instance ids of N Gaussians.
 
-    means [N, 3], scales [N, 3], opacities [N], features [N, D] float. Gaussians fainter than MIN_OPACITY do not
-    vote: they take the id of the nearest voter in space whose feature is close, else stay noise.
+    means [N, 3], scales [N, 3], opacities [N], features [N, D] float. Gaussians fainter than MIN_OPACITY, or with
+    non-finite features, are not clustered and stay noise.
     """
     count = len(means)
     ids = np.full(count, -1, np.int32)
@@ -56,10 +56,10 @@ def cluster_gaussians(
 
 
 def cluster_features(features: np.ndarray, config: InstanceConfig, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Labels and membership strengths of rows [N, D]; above MAX_CLUSTERED of them a sample speaks for the rest."""
+    """Labels and membership strengths of rows [N, D]. Above MAX_CLUSTERED rows, HDBSCAN runs on a random sample."""
     import hdbscan
 
-    # Equal rows make zero distances, which HDBSCAN turns into infinite densities: all features equal = one cluster.
+    # Equal rows have distance 0, which HDBSCAN turns into infinite density. All features equal: one cluster.
     if np.ptp(features, axis=0).max() < 1e-6:
         return np.zeros(len(features), np.int64), np.ones(len(features), np.float32)
     chosen = np.arange(len(features))
@@ -74,7 +74,7 @@ def cluster_features(features: np.ndarray, config: InstanceConfig, seed: int = 0
         allow_single_cluster=False,
     ).fit(features[chosen].astype(np.float64))
     labels, strengths = model.labels_, model.probabilities_
-    if labels.max(initial=-1) < 0:  # one blob without structure: one object
+    if labels.max(initial=-1) < 0:  # no cluster found: treat all rows as one object
         labels, strengths = np.zeros(len(chosen), np.int64), np.ones(len(chosen))
     if len(chosen) < len(features):
         labels, strengths = _spread(features, chosen, labels, strengths, config.min_samples)
@@ -84,10 +84,10 @@ def cluster_features(features: np.ndarray, config: InstanceConfig, seed: int = 0
 def _spread(
     features: np.ndarray, chosen: np.ndarray, labels: np.ndarray, strengths: np.ndarray, samples: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Labels of all rows [N, D] from those of the rows `chosen` [S], by HDBSCAN's own rule of membership.
+    """Extends the labels of the rows `chosen` [S] to all rows [N, D] with HDBSCAN's density criterion.
 
-    A row is of a cluster if it lies as densely as the cluster's loosest member: its core distance (to the
-    `samples`-th nearest sampled row) is no larger. It joins the cluster of its nearest member, else it is noise.
+    A row's core distance is its distance to the `samples`-th nearest sampled row. A row joins the cluster of its
+    nearest labelled neighbour if its core distance is at most the largest one in that cluster. Otherwise it is noise.
     """
     from scipy.spatial import cKDTree
 
@@ -105,11 +105,11 @@ def _spread(
 
 
 def split_disconnected(means: np.ndarray, scales: np.ndarray, ids: np.ndarray, smallest: int) -> np.ndarray:
-    """Gives each spatially connected part of a cluster an id of its own; parts under `smallest` become noise.
+    """Gives each spatially connected component of a cluster its own id. Components under `smallest` become noise.
 
-    Two Gaussians of a cluster touch when their means lie within twice the sum of their largest scales, or within
-    the cluster's own spacing (3 × the 95th percentile of nearest-neighbour distances), among the 12 nearest.
-    The paper never pushes apart objects that share no photo; their clusters may coincide, their places do not.
+    Two Gaussians are connected if one is among the 12 nearest of the other, and the distance of their means is at most
+    max(s, twice the sum of their largest scales) and at most 4 s, with s = 3 × the 95th percentile of nearest-neighbour
+    distances. Objects that share no photo need this: the loss does not separate their features.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -139,12 +139,12 @@ def split_disconnected(means: np.ndarray, scales: np.ndarray, ids: np.ndarray, s
 
 
 def by_falling_size(ids: np.ndarray) -> np.ndarray:
-    """Ids renumbered 0, 1, … by falling size (ties: the smaller old id first); −1 stays."""
+    """Renumbers ids to 0, 1, … by falling size (ties: the smaller old id first). −1 is kept."""
     count = int(ids.max(initial=-1)) + 1
     sizes = np.bincount(ids[ids >= 0], minlength=count)
     order = np.argsort(-sizes, kind="stable")
     rank = np.empty(count + 1, np.int32)
     rank[order] = np.arange(count)
-    rank[count] = -1  # ids of −1 index the last entry
+    rank[count] = -1  # id −1 indexes the last entry
     rank[:count][sizes == 0] = -1
     return rank[ids].astype(np.int32)

@@ -1,9 +1,9 @@
-"""A score in [0, 1] for each instance, from what is known without truth, calibrated to the chance that it is right.
+"""A score in [0, 1] per instance, computed without ground truth and calibrated to the probability of being correct.
 
     raw = geometric mean of  agreement · membership · (support + ½) / (support + 2½)
 
-agreement: IoU of its pixels with the best 2D mask under them, mean over the training views. membership: how well its
-Gaussians one by one agree with it. support: photos in which a mask singles it out.
+agreement: IoU with the 2D mask at each of its pixels, mean over its pixels in the training views. membership: mean
+of `assign.memberships` over its Gaussians. support: number of photos in which one mask matches it.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ CALIBRATION = (
     (0.85, 0.998),
     (1.0, 1.0),
 )
-"""Raw score → chance of IoU > .5 with a true object: isotonic fit on 662 instances of 40 random scenes of balls whose
-masks err, 537 of them right; made strictly rising by a hundredth, so that the order of raw scores is kept."""
+"""Raw score → probability of IoU > 0.5 with a true object: isotonic fit on 662 instances (537 correct) of 40 random
+scenes of balls with mask errors. Made strictly increasing, to keep the order of raw scores."""
 
 
 def raw_scores(ids: np.ndarray, membership: np.ndarray, found: Evidence) -> np.ndarray:
-    """[K] float64 in [0, 1]. ids [N] int32, membership [N] in [0, 1], evidence of the K instances."""
+    """[K] float64 in [0, 1] from ids [N] int32, membership [N] in [0, 1] and the evidence of the K instances."""
     count = len(found.pixels)
     member = ids >= 0
     sizes = np.maximum(np.bincount(ids[member], minlength=count), 1)
@@ -39,6 +39,6 @@ def raw_scores(ids: np.ndarray, membership: np.ndarray, found: Evidence) -> np.n
 
 
 def calibrated(raw: np.ndarray) -> np.ndarray:
-    """The chance, monotone in the raw score, that an instance overlaps a true one by more than half."""
+    """Probability that an instance has IoU > 0.5 with a true object; monotone in the raw score."""
     x, y = np.array(CALIBRATION).T
     return np.interp(raw, x, y)

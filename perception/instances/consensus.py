@@ -1,27 +1,26 @@
-"""Segments into instances by what the masks of all photos agree on: a merge tree, its best cut, and parts below it.
+"""Segments into instances by agreement of the masks of all photos: a merge tree, its best cut, and parts below it.
 
 i, j: segments or groups of them; v: a view; m ∈ v: its masks; P_im: pixels of mask m that i fills; B_iv: pixels of v
 without a mask that i fills; A_m: pixels of mask m; z_i: mean feature (a distance of 1 is the loss's margin).
 
-Affinity of two segments: the mean over views that show both of the cosine between what is labelled of them, with the
-features as a weak prior between neighbours in space:
-    T_iv = Σ_{m∈v} P_im + B_iv                      pixels that v shows of i
-    s_iv = T_iv / max_v T_iv                        the same, as a share of its best view
-    l_iv = 1 − B_iv / T_iv                          share of it that is labelled
-    c_ijv = Σ_{m∈v} P_im P_jm / (|P_i|_v |P_j|_v)   1: one mask holds both, 0: no mask does; |·|_v: norm over m ∈ v
+Affinity of two segments: mean, over the views that show both, of the cosine between their distributions over the masks
+of the view. The features are a weak prior for spatial neighbours:
+    T_iv = Σ_{m∈v} P_im + B_iv                      pixels of v that i fills
+    s_iv = T_iv / max_v T_iv                        the same, relative to its best view
+    l_iv = 1 − B_iv / T_iv                          labelled share of these pixels
+    c_ijv = Σ_{m∈v} P_im P_jm / (|P_i|_v |P_j|_v)   1: same mask, 0: no common mask; |·|_v: norm over m ∈ v
     w_ijv = min(s_iv, s_jv), but 0 up to LEAST_SHARE
-    both = l_iv l_jv,   one = l_iv + l_jv − 2 both  a view that labels one of the two speaks against the pair
+    both = l_iv l_jv,   one = l_iv + l_jv − 2 both  `one`: only one of the two is labelled, evidence against merging
     p_ij = near_ij · max(0, 1 − |z_i − z_j|²)
     a_ij = (Σ_v w both c + PRIOR p_ij) / (Σ_v w (both + ONE_SIDED one) + PRIOR)
 
-The pair of largest a_ij is merged, again and again; P, B and z of the merged segment are pooled (average linkage).
-How well a group g matches the masks, and the cut of the tree that matches best:
+The pair with the largest a_ij is merged repeatedly. P, B and z of the merged segment are pooled (average linkage).
+Agreement of a group g with the masks, and the cut of the tree with the best agreement:
     IoU_gm = P_gm / (T_gv + A_m − P_gm)
     matched_g = Σ_m P_gm IoU_gm
     best_g = max(matched_g, Σ_{children h of g} best_h)
-A whole that photos show as one mask beats its parts, parts that photos mostly keep apart beat a whole that few masks
-hold, and errors of the segmenter in some photos are outvoted by the others. Nodes below the cut that masks of their own
-single out are kept as parts.
+The cut keeps a whole if most photos show it as one mask, and its parts if most photos separate them. Segmentation
+errors in a few photos are outvoted. Nodes below the cut that have masks of their own are kept as parts.
 """
 
 from __future__ import annotations
@@ -32,19 +31,19 @@ import numpy as np
 
 from perception.instances.votes import Table
 
-LEAST_SHARE = 0.1  # of its best view: a view that shows less of a segment is no evidence about it
-ONE_SIDED = 0.5  # weight of a view that labels one of the two only, of that of a view that labels both
-PRIOR = 0.5  # views that the features count as much as
-LOWEST = 0.05  # affinity of the last pair that is merged
-SUPPORT = 0.6  # IoU with a mask from which on a photo singles a group out
-LEAST_PIXELS = 8.0  # under masks, for a view to show a group
-LARGEST_PART = 0.8  # of the whole's pixels: a part is not the whole once more
-PART_VIEWS = 2  # photos that must single a part out
+LEAST_SHARE = 0.1  # relative to its best view; a view that shows less of a segment is ignored
+ONE_SIDED = 0.5  # weight of a view that labels only one of the two, relative to a view that labels both
+PRIOR = 0.5  # weight of the feature prior, in views
+LOWEST = 0.05  # affinity below which merging stops
+SUPPORT = 0.6  # IoU with a mask from which a photo supports a group
+LEAST_PIXELS = 8.0  # pixels under masks from which a view shows a group
+LARGEST_PART = 0.8  # share of the whole's pixels; a larger part is nearly the whole
+PART_VIEWS = 2  # photos that must support a part
 
 
 @dataclass(frozen=True)
 class MergeTree:
-    """Leaves 0 … S − 1, then one node a merge, in order: children [R, 2] int64, affinity [R] float64 in [0, 1]."""
+    """Leaves 0 … S − 1, then one node per merge, in order: children [R, 2] int64, affinity [R] float64 in [0, 1]."""
 
     leaves: int
     children: np.ndarray
@@ -68,9 +67,9 @@ class MergeTree:
 
 
 class _Affinities:
-    """a_ij of all pairs of S segments, kept up to date while they merge.
+    """Affinities a_ij of all pairs of S segments, updated after every merge.
 
-    P [M, S], B and s and l [V, S], z [S, D] are stored mask-major, so that the few masks of a segment are whole rows;
+    P [M, S], B, s and l [V, S] have segments as columns, so the few masks of a segment select whole rows; z [S, D].
     unit: P_im / |P_i|_v. Merged segments have a_ij = −1.
     """
 
@@ -89,7 +88,7 @@ class _Affinities:
         self.a = np.stack([self._row(i) for i in range(count)]) if count else np.zeros((0, 0))
 
     def _update(self, i: int) -> None:
-        """unit, s and 1 − l of segment i from its P and B."""
+        """Updates unit, s and 1 − l of segment i from its P and B."""
         P, B = self.P[:, i], self.B[:, i]
         T = np.bincount(self.view, P, self.views) + B
         norm = np.sqrt(np.bincount(self.view, P**2, self.views))
@@ -116,7 +115,7 @@ class _Affinities:
         return a
 
     def merge(self, i: int, j: int) -> None:
-        """Segment j becomes part of i."""
+        """Merges segment j into segment i."""
         size = self.sizes[i] + self.sizes[j]
         self.z[i] = (self.z[i] * self.sizes[i] + self.z[j] * self.sizes[j]) / size
         self.sizes[i] = size
@@ -132,9 +131,9 @@ class _Affinities:
 
 
 def merge_tree(table: Table, prototypes: np.ndarray, sizes: np.ndarray, near: np.ndarray) -> MergeTree:
-    """Merges the pair of largest affinity until none reaches LOWEST.
+    """Repeatedly merges the pair with the largest affinity, until none reaches LOWEST.
 
-    table: of the S segments; prototypes [S, D]: z; sizes [S]: Gaussians; near [S, S] bool: neighbours in space.
+    table: of the S segments; prototypes [S, D]: z; sizes [S]: Gaussian counts; near [S, S] bool: spatial neighbours.
     """
     state = _Affinities(table, prototypes, sizes, near)
     count = len(sizes)
@@ -154,8 +153,8 @@ def merge_tree(table: Table, prototypes: np.ndarray, sizes: np.ndarray, near: np
 
 @dataclass(frozen=True)
 class Evidence:
-    """Of G groups. pixels [G]: Σ_m P_gm; matched [G]: see the module; views [G] int: that show it; fit [G, V]: the
-    largest IoU_gm of each view, 0 where the view shows too little of the group."""
+    """Evidence of G groups. pixels [G]: Σ_m P_gm; matched [G]: see the module; views [G] int: number that show it;
+    fit [G, V]: the largest IoU_gm of each view, 0 where the view does not show the group."""
 
     pixels: np.ndarray
     matched: np.ndarray
@@ -164,21 +163,21 @@ class Evidence:
 
     @property
     def support(self) -> np.ndarray:
-        """[G] views in which one mask singles the group out."""
+        """[G] number of views in which one mask has an IoU of at least SUPPORT with the group."""
         return np.asarray((self.fit >= SUPPORT).sum(axis=1))
 
     @property
     def agreement(self) -> np.ndarray:
-        """[G] in [0, 1]: mean over the group's pixels of the IoU with the pixel's mask; 0 where no mask covers it."""
+        """[G] in [0, 1]: mean over the group's pixels of the IoU with the pixel's mask; 0 if no mask covers it."""
         return self.matched / np.maximum(self.pixels, 1e-12)
 
 
 def evidence(table: Table) -> Evidence:
-    """Of the groups of a table; a view shows what fills at least LEAST_PIXELS of its masks.
+    """Evidence of the groups of a table. A view shows a group that fills at least LEAST_PIXELS of its masks.
 
-    Each pixel scores the IoU of its own mask, not of the best one, so a small thing on a large one does not profit from
-    the match of the large one. T_gv holds pixels without a mask too: a mask that ends at a thing's border is evidence
-    for that border even where the thing itself is unlabelled.
+    Each pixel counts the IoU of its own mask, not of the best mask. Otherwise a small object would profit from the good
+    match of the large object below it. T_gv includes unlabelled pixels, so a mask that ends at the border of an
+    unlabelled object is evidence for that border.
     """
     if table.pixels.shape[1] == 0:
         none = np.zeros(len(table.pixels))
@@ -203,7 +202,7 @@ def node_evidence(tree: MergeTree, table: Table) -> Evidence:
 
 
 def best_cut(tree: MergeTree, matched: np.ndarray) -> list[int]:
-    """The nodes, none below another and all leaves covered, with the largest sum of `matched` (ties: the whole)."""
+    """Nodes that cover every leaf exactly once, with the largest sum of `matched`; at ties the parent is taken."""
     best = matched.copy()
     for number, (a, b) in enumerate(tree.children.tolist()):
         node = tree.leaves + number
@@ -220,9 +219,9 @@ def best_cut(tree: MergeTree, matched: np.ndarray) -> list[int]:
 
 
 def parts_of(tree: MergeTree, node: int, found: Evidence) -> list[int]:
-    """The highest nodes below an instance that masks single out in PART_VIEWS photos or more, better than the whole.
+    """Highest nodes below an instance that PART_VIEWS or more photos support, with a larger IoU than the instance's.
 
-    A part fills at most LARGEST_PART of the pixels of the whole.
+    A part fills at most LARGEST_PART of the pixels of the instance.
     """
     parts, stack = [], tree.children_of(node)
     while stack:

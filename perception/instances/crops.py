@@ -1,10 +1,10 @@
-"""Which photos show an instance best, and the crops of them that an encoder sees (§3.2.2, eq. 10).
+"""Selection of photos per instance, and the image crops for the encoder (§3.2.2, eq. 10).
 
     s_vi = (mask pixels of i in v / pixels of v) · (Gaussians of i visible in v / Gaussians of i)
 
-The K views with the largest s_vi are kept, and each gives L square crops with growing margins (K = 5, L = 3 in the
-paper). Three variants were measured over 211 prompts of two scenes and gained nothing beyond the noise: views chosen
-for different directions, and backgrounds dimmed or blurred.
+The K views with the largest s_vi are kept. Each gives L square crops with growing margins (K = 5, L = 3 in the paper).
+Three variants gained nothing beyond the noise over 211 prompts of two scenes: views chosen for different directions,
+dimmed backgrounds, and blurred backgrounds.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 
 Box = tuple[int, int, int, int]
 
-EXPANSION = 0.3  # of the box's sides, added per level (OpenMask3D)
-FILL = 127  # letterbox grey: the middle of the range, near zero after any encoder's normalisation
+EXPANSION = 0.3  # margin added per level, relative to the box's sides (OpenMask3D)
+FILL = 127  # grey value of the padding: mid-range, near zero after any encoder's normalisation
 
 
 def view_scores(mask_pixels: np.ndarray, image_pixels: np.ndarray, visible_fraction: np.ndarray) -> np.ndarray:
@@ -23,16 +23,16 @@ def view_scores(mask_pixels: np.ndarray, image_pixels: np.ndarray, visible_fract
 
 
 def choose_views(scores: np.ndarray, k: int = 5) -> list[np.ndarray]:
-    """The k best views of each instance, best first: I arrays of at most k view indices, int64.
+    """The k views with the highest score of each instance, best first: I arrays of at most k view indices, int64.
 
-    scores: [I, V] ≥ 0; a view that scores 0 is never chosen.
+    scores: [I, V] ≥ 0. Views with score 0 are never chosen.
     """
     orders = (np.argsort(-row, kind="stable")[:k] for row in scores)
     return [order[row[order] > 0].astype(np.int64) for order, row in zip(orders, scores, strict=True)]
 
 
 def mask_box(mask: np.ndarray) -> Box | None:
-    """Tight box (x0, y0, x1, y1) in pixels, x1 and y1 exclusive, of a boolean mask [H, W]; None if it is empty."""
+    """Bounding box (x0, y0, x1, y1) in pixels, x1 and y1 exclusive, of a boolean mask [H, W]; None if it is empty."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return None
@@ -40,14 +40,14 @@ def mask_box(mask: np.ndarray) -> Box | None:
 
 
 def expand_box(box: Box, ratio: float, width: int, height: int) -> Box:
-    """The box with `ratio` of its sides added at either end, clipped to the image."""
+    """The box enlarged by `ratio` of its sides at either end, clipped to the image."""
     x0, y0, x1, y1 = box
     dx, dy = round((x1 - x0) * ratio), round((y1 - y0) * ratio)
     return max(0, x0 - dx), max(0, y0 - dy), min(width, x1 + dx), min(height, y1 + dy)
 
 
 def letterbox(image: np.ndarray, fill: int = FILL) -> np.ndarray:
-    """Centre an image [H, W, 3] in a square of side max(H, W), the rest filled; nothing is scaled."""
+    """Pads an image [H, W, 3] to a square of side max(H, W), centred, without scaling."""
     height, width = image.shape[:2]
     side = max(height, width)
     square = np.full((side, side, 3), fill, image.dtype)

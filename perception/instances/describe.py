@@ -1,4 +1,4 @@
-"""Descriptions of instances, photo by photo: embeddings of their crops (§3.2.2, eq. 11) and a palette of their colours.
+"""Descriptions of instances: embeddings of their crops (§3.2.2, eq. 11) and a palette of their colours.
 
 l_i = (1 / KL) Σ_k Σ_l l_ikl    over the L crops of the K best views, each of unit length; then scaled to length 1
 """
@@ -16,7 +16,7 @@ from perception.language.colors import palette
 from perception.language.description import InstanceDescription, unseen
 from perception.progress import Progress
 
-COLOR_SAMPLES = 2000  # pixels of a mask that its palette is made from, per view
+COLOR_SAMPLES = 2000  # pixels of a mask per view, from which the palette is computed
 Load = Callable[[int], tuple[np.ndarray, np.ndarray]]
 
 
@@ -30,8 +30,8 @@ def describe_instances(
 ) -> list[InstanceDescription]:
     """Descriptions of the I instances whose views `choices` lists (see `crops.choose_views`).
 
-    load(view) → photo [H, W, 3] uint8 and instance image [H, W] int32 (silhouettes with occlusion; value = position in
-    `choices`, −1 = none). One photo at a time is in memory.
+    load(view) → photo [H, W, 3] uint8 and instance image [H, W] int32: silhouettes with occlusion, value = index in
+    `choices`, −1 = none. Only one photo at a time is kept in memory.
     """
     wanted: dict[int, list[tuple[int, int]]] = {}
     for instance, views in enumerate(choices):
@@ -72,7 +72,7 @@ def _summary(found: dict[int, Any], dim: int) -> InstanceDescription:
 
 
 def _color_sample(photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Up to COLOR_SAMPLES pixels [P, 3] of the mask without its rim, where colours mix; of a thin mask, all of it."""
+    """Up to COLOR_SAMPLES pixels [P, 3] of the mask without its rim of mixed colours; the whole mask if it is thin."""
     import cv2
 
     inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)

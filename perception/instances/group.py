@@ -1,4 +1,4 @@
-"""Instances, their parts and their scores from Gaussians and the votes of the masks: the stages in order."""
+"""Instances, their parts and their scores from Gaussians and mask votes. Calls the stages in order."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from perception.instances.consensus import (
 from perception.instances.segments import over_segment, touching
 from perception.instances.votes import MaskVotes
 
-PER_SEGMENT = 16  # Gaussians; fewer make segments that photos say little about
-MAX_SEGMENTS = 1000  # the merge tree compares all pairs of them
-LEAST = 4  # Gaussians; fewer are no instance even if masks single them out
+PER_SEGMENT = 16  # Gaussians; smaller segments have too little evidence in the photos
+MAX_SEGMENTS = 1000  # the merge tree compares all pairs of segments
+LEAST = 4  # Gaussians; smaller groups are dropped even if masks support them
 
 
 @dataclass(frozen=True)
 class Grouping:
-    """ids [N] int32 (−1 = none), 0 … K − 1 by falling size; membership [N] float32 in [0, 1], 0 for noise;
-    raw [K] uncalibrated and scores [K] calibrated in [0, 1]; found: evidence of the K instances.
+    """ids [N] int32: −1 = none, 0 … K − 1 by falling size; membership [N] float32 in [0, 1], 0 for noise; raw [K] and
+    calibrated scores [K] in [0, 1]; found: evidence of the K instances.
 
-    part_ids [N] int32 (−1 = none): K, K + 1, …; parents: instance of each part, part_scores and part_views alike.
+    part_ids [N] int32: −1 = none, then K, K + 1, …; parents, part_scores, part_views: instance, score, views per part.
     """
 
     ids: np.ndarray
@@ -63,7 +63,7 @@ def group(
 ) -> Grouping:
     """Instances of N Gaussians: means [N, 3], scales [N, 3], opacities [N], features [N, D] float32.
 
-    margin: the loss's γ, the squared distance it keeps between features of different objects.
+    margin: γ of the loss, the squared distance that it keeps between features of different objects.
     """
     features = np.where(np.isfinite(features), features, 0) / np.sqrt(margin)
     if config.method == "hdbscan":
@@ -86,7 +86,7 @@ def _by_consensus(
     config: InstanceConfig,
     seed: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """ids [N] int32, parts [N] int64 (−1 = none, both) and the instance of each part."""
+    """ids [N] int32 and parts [N] int64 (−1 = none in both), and the instance of each part."""
     ids, parts = np.full(len(means), -1, np.int32), np.full(len(means), -1, np.int64)
     solid = np.flatnonzero((opacities >= MIN_OPACITY) & np.isfinite(means).all(axis=1))
     if len(solid) == 0:
@@ -120,8 +120,8 @@ def _cut(tree: MergeTree, found: Evidence) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _without_small(ids: np.ndarray, votes: MaskVotes, config: InstanceConfig) -> np.ndarray:
-    """ids with −1 for groups under `min_cluster_size` that fewer than two photos single out, and for those that none
-    does and that have under a quarter of the median group's Gaussians."""
+    """Sets ids to −1 for two kinds of groups: below `min_cluster_size` and supported by fewer than two photos;
+    supported by no photo and smaller than a quarter of the median group."""
     count = int(ids.max(initial=-1)) + 1
     if count == 0:
         return ids
@@ -133,11 +133,11 @@ def _without_small(ids: np.ndarray, votes: MaskVotes, config: InstanceConfig) ->
 
 
 def _scored(ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: MaskVotes) -> Grouping:
-    """Orders the instances by size and scores them and their parts."""
+    """Renumbers the instances by size, and scores them and their parts."""
     before = ids
     ids = by_falling_size(before)
     rename = np.full(max(int(before.max(initial=-1)) + 2, int(parents.max(initial=-1)) + 2), -1)
-    rename[before] = ids  # of groups without members −1; the last entry stands for −1
+    rename[before] = ids  # −1 for groups without members; the last entry is for id −1
     membership = memberships(ids, votes)
     found = evidence(votes.table(ids, int(ids.max(initial=-1)) + 1))
     raw = raw_scores(ids, membership, found)
@@ -148,7 +148,7 @@ def _scored(ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: Mask
 def _scored_parts(
     ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: MaskVotes
 ) -> tuple[np.ndarray, list[int], list[float], list[int]]:
-    """Part ids that follow the instances', and of each part its instance, score (agreement with masks) and views."""
+    """Part ids, numbered after the instances, and per part: its instance, its score (mask agreement), its views."""
     whole = np.append(parents, -1)[parts]
     inside = np.where((parts >= 0) & (whole == ids) & (ids >= 0), parts, -1)
     left = np.flatnonzero(np.bincount(inside[inside >= 0], minlength=len(parents)) >= LEAST)

@@ -1,4 +1,4 @@
-"""Labels of an old map transferred to the instances of a new one that fill the same place."""
+"""Transfers the user's labels from an old map to the instances of a new map that occupy the same place."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from perception.geometry import align_similarity, camera_centres
 from perception.io.store import Map
 
-SHARE = 0.5  # of the points of either that must lie nearest to the other: so each has at most one partner
-REACH = 0.1  # of an instance's size: nearest neighbours farther away belong to no common surface
-ALIGNED = 0.02  # of the cameras' spread: larger residuals mean that the camera paths of the two maps differ
-SAMPLES = 2000  # points of an instance that are looked at
+SHARE = 0.5  # of either's points must have their nearest point in the other; > ½, so partners are unique
+REACH = 0.1  # relative to the instance's size: more distant nearest neighbours are not counted
+ALIGNED = 0.02  # relative to the spread of the cameras: larger residuals mean different camera paths
+SAMPLES = 2000  # points used per instance
 
 
 @dataclass
 class LabelTransfer:
     """labels: new id -> name. dropped: (old id, name) of instances without a partner. aligned: whether the frames were
-    aligned by common cameras (else they are taken to be the same)."""
+    aligned by common cameras. Otherwise they are assumed equal."""
 
     labels: dict[int, str] = field(default_factory=dict)
     dropped: list[tuple[int, str]] = field(default_factory=list)
@@ -26,7 +26,7 @@ class LabelTransfer:
 
 
 def transfer_labels(old: Map, new: Map) -> LabelTransfer:
-    """Names of `old`'s instances for those of `new` that fill the same place (more than half, both ways)."""
+    """Names of `old`'s instances for the instances of `new` at the same place (more than half of both overlap)."""
     named = {entry["id"]: str(entry["label"]) for entry in old.instances if entry.get("label")}
     moved, aligned = _in_frame_of(new, old)
     partners = match_instances(moved, old.instance_ids, new.means, new.instance_ids, list(named))
@@ -42,10 +42,10 @@ def transfer_labels(old: Map, new: Map) -> LabelTransfer:
 def match_instances(
     old_points: np.ndarray, old_ids: np.ndarray, new_points: np.ndarray, new_ids: np.ndarray, wanted: list[int]
 ) -> dict[int, int]:
-    """Old id -> new id for those `wanted` that have a partner. Points [N, 3] in one frame, ids [N], −1 = none.
+    """Old id -> new id, for those of `wanted` that have a partner. Points [N, 3] in one frame, ids [N], −1 = none.
 
-    j is i's partner when more than SHARE of i's points have their nearest new point in j, and of j's points their
-    nearest old point in i, neighbours farther apart than REACH of i's size not counted.
+    j is the partner of i if more than SHARE of the points of i have their nearest new point in j, and more than SHARE
+    of the points of j have their nearest old point in i. Neighbours farther than REACH of the size of i do not count.
     """
     from scipy.spatial import cKDTree
 
@@ -75,15 +75,15 @@ def _neighbour_ids(tree: object, ids: np.ndarray, points: np.ndarray, reach: flo
 
 
 def _sample(points: np.ndarray) -> np.ndarray:
-    """At most SAMPLES of the points, evenly through their order."""
+    """At most SAMPLES of the points, evenly spaced by index."""
     step = max(1, len(points) // SAMPLES)
     return points[::step].astype(np.float64)
 
 
 def _in_frame_of(new: Map, old: Map) -> tuple[np.ndarray, bool]:
-    """`old`'s means [N, 3] in `new`'s frame, by a similarity (Umeyama 1991) that aligns the cameras of common photos.
+    """`old`'s means [N, 3] in `new`'s frame, by a similarity transform (Umeyama 1991) that aligns the common cameras.
 
-    Without three common photos, or when their paths differ, the frames are taken to be the same.
+    With fewer than three common photos, or with different camera paths, the frames are assumed equal.
     """
     place = {view.name: k for k, view in enumerate(old.views)}
     common = [(k, place[view.name]) for k, view in enumerate(new.views) if view.name in place]
@@ -92,7 +92,7 @@ def _in_frame_of(new: Map, old: Map) -> tuple[np.ndarray, bool]:
     rows = np.array(common)
     there, here = (camera_centres(m.poses)[c] for m, c in ((new, rows[:, 0]), (old, rows[:, 1])))
     if np.linalg.matrix_rank(here - here.mean(axis=0), tol=1e-3 * max(float(np.ptp(here)), 1e-12)) < 2:
-        return old.means, False  # cameras on a line leave the rotation about it open
+        return old.means, False  # collinear cameras do not determine the rotation about their line
     scale, rotation, shift = align_similarity(there, here)
     residual = np.linalg.norm(scale * here @ rotation.T + shift - there, axis=1)
     if np.median(residual) > ALIGNED * float(np.linalg.norm(np.ptp(there, axis=0))):
@@ -101,7 +101,7 @@ def _in_frame_of(new: Map, old: Map) -> tuple[np.ndarray, bool]:
 
 
 def transfer_text(transfer: LabelTransfer) -> str:
-    """What became of the old labels, a line each."""
+    """One line of text per old label: transferred or dropped."""
     lines = [f"instance {i} is called “{name}”" for i, name in transfer.labels.items()]
     lines += [f"warning: “{name}” (old instance {i}) has no partner; dropped" for i, name in transfer.dropped]
     return "\n".join(lines) or "the old map has no names"

@@ -1,19 +1,19 @@
-"""Over-segmentation: Gaussians that lie together in feature and in space, far more groups than there are objects."""
+"""Over-segmentation: groups of Gaussians with similar feature and position, many more than there are objects."""
 
 from __future__ import annotations
 
 import numpy as np
 
-ROUNDS = 12  # of Lloyd's algorithm: the groups are merged afterwards, so they need not have converged
-SAMPLE = 50_000  # rows the centres are found on; all rows then take the nearest
+ROUNDS = 12  # iterations of Lloyd's algorithm; groups are merged later, so convergence is not needed
+SAMPLE = 50_000  # rows from which the centres are computed; all rows are then assigned to the nearest centre
 CHUNK = 1 << 15
 
 
 def over_segment(means: np.ndarray, features: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
-    """Group [N] int64, 0 … S − 1 with S ≤ count, by k-means (Lloyd) on features beside positions.
+    """Group [N] int64, 0 … S − 1 with S ≤ count, by k-means (Lloyd) on concatenated features and positions.
 
-    means [N, 3], features [N, D]. Positions are scaled so that nine tenths of the Gaussians lie within 1 of the median,
-    the margin that the loss keeps between features: distant Gaussians are separated even where their features agree.
+    means [N, 3], features [N, D]. Positions are scaled so that 90 % of the Gaussians lie within 1 of the median. This
+    is also the loss's margin between features, so distant Gaussians are separated even if their features agree.
     """
     centred = means - np.median(means, axis=0)
     radius = float(np.quantile(np.linalg.norm(centred, axis=1), 0.9)) if len(means) else 1.0
@@ -36,10 +36,10 @@ def _nearest(rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
 
 
 def touching(means: np.ndarray, groups: np.ndarray, count: int, neighbours: int = 7, least: int = 3) -> np.ndarray:
-    """[S, S] bool: at least `least` pairs of near Gaussians lie across the two groups.
+    """[S, S] bool: whether at least `least` pairs of nearby Gaussians connect the two groups.
 
-    Near: among the `neighbours` nearest, and within 3 times the larger of the Gaussian's own nearest distance and
-    the median one.
+    Nearby: among the `neighbours` nearest, and within 3 × max(nearest-neighbour distance of the Gaussian, its median
+    over all Gaussians).
     """
     from scipy.spatial import cKDTree
 

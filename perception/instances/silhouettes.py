@@ -1,4 +1,4 @@
-"""What each photo shows of each instance: id images and silhouettes rendered with occlusion (paper §3.2.2)."""
+"""Instance images and silhouettes of each photo, rendered with occlusion (paper §3.2.2)."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
 
 BLOCK = 16
-"""Instances rendered in one pass: a feature width the kernel is specialised for."""
+"""Instances per rendering pass: a feature width that the kernel is specialised for."""
 
 
 @dataclass(frozen=True)
 class Silhouettes:
-    """One view. ids [H, W] int32: the instance that holds most of a pixel, −1 where none holds `threshold`;
-    pixels [M] its pixel counts; visible [M] Gaussians of each instance that contribute to some pixel."""
+    """One view. ids [H, W] int32: the instance with the largest weight in a pixel, −1 if it is below `threshold`;
+    pixels [M]: number of pixels per instance; visible [M]: Gaussians per instance that contribute to any pixel."""
 
     ids: np.ndarray
     pixels: np.ndarray
@@ -34,7 +34,7 @@ def render_silhouettes(
     height: int,
     threshold: float = 0.2,
 ) -> Silhouettes:
-    """Renders every instance white on black with all the others in front of it, then takes the largest a pixel.
+    """Renders each instance in white, with all other Gaussians in black as occluders; takes the maximum per pixel.
 
     ids [N] int32, −1 = none. camera_from_world [4, 4], K [3, 3] float32.
     """

@@ -1,8 +1,8 @@
 """The weight of every Gaussian in every 2D mask of every photo.
 
-The weight of Gaussian n in mask m is Σ_{p ∈ m} w_n(p), w_n(p) = its alpha times the transmittance before it: the
-weight of its colour in the rendered picture. Rendering is linear in features, so these sums are the gradient of the
-rendered mask indicator with respect to features, and one backward pass yields 16 masks for all Gaussians.
+The weight of Gaussian n in mask m is Σ_{p ∈ m} w_n(p), with w_n(p) = alpha · transmittance, the weight of its colour in
+pixel p. Rendering is linear in the features, so these sums are the gradient of the sum of the rendered features over
+the mask. One backward pass computes 16 masks for all Gaussians.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from perception.gaussians.rasterize import Settings, rasterize_backward, rasteri
 from perception.gaussians.train import TrainingView
 from perception.progress import Progress
 
-BLOCK = 16  # masks a pass: a feature width the kernel is specialised for
-FAINTEST = 0.02  # pixels; less than that is no evidence and only fills the matrix
+BLOCK = 16  # masks per pass: a feature width that the kernel is specialised for
+FAINTEST = 0.02  # pixels; smaller weights are dropped to keep the matrix sparse
 
 
 @dataclass(frozen=True)
 class Table:
-    """Pixels [R, M] of each mask and [R, V] of each view's void that R groups fill; view and area as of the votes."""
+    """Pixels that R groups fill: [R, M] per mask, void [R, V] per view without a mask. view, area: as in MaskVotes."""
 
     pixels: np.ndarray
     void: np.ndarray
@@ -36,12 +36,12 @@ class Table:
         return Table(self.pixels + other.pixels, self.void + other.void, self.view, self.area)
 
     def row(self, group: int) -> Table:
-        """One group's, still with its first axis."""
+        """The table of one group; the first axis is kept."""
         return Table(self.pixels[group : group + 1], self.void[group : group + 1], self.view, self.area)
 
     @property
     def starts(self) -> np.ndarray:
-        """[V] the first mask of each view, for `reduceat`."""
+        """[V] index of the first mask of each view, for `reduceat`."""
         return np.flatnonzero(np.diff(self.view, prepend=-1) > 0)
 
     @property
@@ -54,9 +54,9 @@ class Table:
 
 @dataclass(frozen=True)
 class MaskVotes:
-    """Evidence of V views that have M masks in all; weights are sparse, float32, in pixels.
+    """Weights of N Gaussians in the M masks of V views; sparse, float32, in pixels.
 
-    weights [N, M]: of each Gaussian in each mask. void [N, V]: where the view has no mask. view [M] int64: 0 … V − 1
+    weights [N, M]: per mask. void [N, V]: per view, where it has no mask. view [M] int64: view of each mask, 0 … V − 1
     ascending. area [M] float64: pixels of each mask.
     """
 
@@ -66,7 +66,7 @@ class MaskVotes:
     area: np.ndarray
 
     def table(self, ids: np.ndarray, count: int) -> Table:
-        """What the Gaussians of each id 0 … count − 1 (−1 = none) fill of each mask and of each view's void."""
+        """Sums the weights of the Gaussians of each id 0 … count − 1 (−1 = none), per mask and per view's void."""
         rows = np.flatnonzero(ids >= 0)
         ones = np.ones(len(rows), np.float32)
         gather = sparse.csr_matrix((ones, (ids[rows], rows)), shape=(count, len(ids)))
@@ -80,10 +80,10 @@ def mask_votes(
     half_resolution: bool = True,
     progress: Progress | None = None,
 ) -> MaskVotes:
-    """The votes of all masks of all views; label 0 (unlabelled) says nothing.
+    """The votes of all masks of all views. Label 0 means unlabelled: such pixels count as void.
 
-    half_resolution: masks are smooth enough for every other pixel, at a quarter of the time; areas are then in
-    pixels of that size too.
+    half_resolution: uses every other pixel per axis, at a quarter of the time. Masks are smooth enough for this. Areas
+    are then in pixels of that size too.
     """
     parts: list[sparse.csr_matrix] = []
     voids: list[sparse.csr_matrix] = []
@@ -108,7 +108,7 @@ def mask_votes(
 
 @torch.no_grad()
 def _of_view(gaussians: Gaussians, view: TrainingView) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """Weights [N, 1 + masks] and areas; the first column is what no mask covers."""
+    """Weights [N, 1 + masks] and areas of one view. Column 0 holds the pixels that no mask covers."""
     assert view.labels is not None  # told by the caller
     height, width = view.photo.shape[:2]
     names, dense = np.unique(np.append(view.labels.numpy(), 0), return_inverse=True)

@@ -1,4 +1,4 @@
-"""Masks: one label image per photo, from the user's files, a SAM model, or a segmentation without weights."""
+"""Masks: one label image per photo, from the user's files, a SAM model, or a segmentation without learned weights."""
 
 from __future__ import annotations
 

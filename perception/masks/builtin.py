@@ -1,6 +1,6 @@
-"""`builtin`, the segmentation that needs no weights: depth by stereo, one surface out of it, its patches merged.
+"""`builtin`, segmentation without a neural network: stereo depth, one fused surface, and patches merged to segments.
 
-Label ids agree between photos, since every photo shows the same segments of one surface.
+Label ids are consistent across photos, because every photo shows the same segments of one surface.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.progress import Progress
 from perception.types import View
 
-VERSION = 7  # raised whenever the label images change, so that cached ones are made anew
-_SMOOTH = 0.03  # of the depth: a pixel over which the surface jumps farther shows no surface
+VERSION = 7  # increased whenever the label images change, so that cached ones are recomputed
+_SMOOTH = 0.03  # relative to the depth: a pixel with a larger depth step is not part of the surface
 _LEAST_VOXELS = 100
 
 
 class BuiltinSegmentation:
-    """Whole objects in all photos together, once the map can tell about how far away things are."""
+    """Segments whole objects in all photos jointly. Needs approximate depth of every photo, which the map renders."""
 
     def __init__(self) -> None:
         import cv2
@@ -41,7 +41,7 @@ class BuiltinSegmentation:
         self._segment = np.zeros(0, np.int32)
 
     def check(self, views: list[View]) -> list[str]:
-        """Nothing is known of the views before the survey."""
+        """Returns no warnings: nothing is known about the views before `survey`."""
         return []
 
     def survey(
@@ -51,9 +51,9 @@ class BuiltinSegmentation:
         load_depth: Callable[[View], np.ndarray],
         progress: Progress | None = None,
     ) -> None:
-        """Segments the surface that all photos show together; load_depth gives [h, w] z-depths, 0 = none.
+        """Segments the surface seen by all photos jointly. load_depth: view -> [h, w] z-depth, 0 = none.
 
-        Nothing is segmented where fewer than two photos have depth, or none agree on it.
+        There are no segments if fewer than two photos have depth, or if no depths agree.
         """
         made = [make_stereo_view(view, load_photo(view), load_depth(view)) for view in views]
         found = [view for view in made if view is not None]
@@ -67,7 +67,7 @@ class BuiltinSegmentation:
         self._views = {view.name: view for view in found}
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
-        """[H, W] int32 labels of `photo` [H, W, 3] after `survey`; all 0 for a photo that shows none of the surface."""
+        """[H, W] int32 labels of `photo` [H, W, 3], after `survey`. All 0 if the photo does not show the surface."""
         import cv2
 
         if self._surface is None or view.name not in self._views:
@@ -77,7 +77,7 @@ class BuiltinSegmentation:
 
 
 def fuse(views: list[StereoView]) -> Surface:
-    """The surface that the confirmed pixels of all photos show."""
+    """Fuses the confirmed pixels of all photos into one surface."""
     footprints = np.concatenate([(view.depth[::4, ::4] / view.K[0, 0]).ravel() for view in views])
     builder = SurfaceBuilder(voxel_side(footprints))
     for view in views:
@@ -87,7 +87,7 @@ def fuse(views: list[StereoView]) -> Surface:
 
 
 def surface_graph(views: list[StereoView], surface: Surface) -> SurfaceGraph:
-    """Patches of the surface and what all photos say about their borders."""
+    """Patches of the surface, with the evidence of all photos about the borders between them."""
     edges = voxel_edges(surface)
     graph = SurfaceGraph(surface, patches(surface, edges), edges)
     for view in views:
@@ -99,7 +99,7 @@ def surface_graph(views: list[StereoView], surface: Surface) -> SurfaceGraph:
 
 
 def label_view(view: StereoView, surface: Surface, segment: np.ndarray) -> np.ndarray:
-    """[h, w] int32 segment of each pixel; pixels off the surface take the nearest segment in the image."""
+    """[h, w] int32 segment of each pixel. Pixels off the surface take the nearest segment in the image."""
     from scipy.ndimage import distance_transform_edt
 
     _, depth = view.cues()

@@ -1,4 +1,4 @@
-"""Features of pixels that tell borders of objects: colour and texture of the photo, steps and creases of depth."""
+"""Pixel features that indicate object borders: colour and texture of the photo, steps and creases of the depth."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_REACH = 4  # pixels to either side over which steps and creases are measured
+_REACH = 4  # pixels to either side, used to measure steps and creases
 _BINS = (4, 6, 6)  # of L, a, b
 COLOUR_BINS = 4 * 6 * 6
 
@@ -23,10 +23,10 @@ class PhotoCues:
 
 @dataclass(frozen=True)
 class DepthCues:
-    """The surface seen in each pixel, camera frame, float32: points, normals [h, w, 3] (facing the camera).
+    """Surface geometry per pixel in the camera frame, float32: points, normals [h, w, 3] (normals face the camera).
 
-    step: [2, h, w] how far the surface jumps across the pixel, in units of its depth; bend: [2, h, w] > 0
-    convex, < 0 concave, cosine-like. Index 0 looks along x, index 1 along y.
+    step: [2, h, w] depth discontinuity across the pixel, relative to its depth; bend: [2, h, w] cosine-like,
+    > 0 convex, < 0 concave. Index 0 is along x, index 1 along y.
     """
 
     points: np.ndarray
@@ -46,7 +46,7 @@ def photo_cues(photo: np.ndarray) -> PhotoCues:
 
 
 def depth_cues(depth: np.ndarray, K: np.ndarray) -> DepthCues:
-    """depth: [h, w] z-depth in any unit, 0 or not finite = none (filled in); K: [3, 3]."""
+    """depth: [h, w] z-depth in any unit; 0 or non-finite = none, filled from the nearest pixel. K: [3, 3]."""
     import cv2
 
     z = cv2.medianBlur(filled_depth(depth), 5)
@@ -61,7 +61,7 @@ def depth_cues(depth: np.ndarray, K: np.ndarray) -> DepthCues:
 
 
 def _gradient(image: np.ndarray) -> np.ndarray:
-    """[h, w] gradient length over all channels, per pixel."""
+    """[h, w] gradient magnitude over all channels."""
     import cv2
 
     x, y = cv2.Sobel(image, -1, 1, 0) / 8, cv2.Sobel(image, -1, 0, 1) / 8
@@ -69,7 +69,7 @@ def _gradient(image: np.ndarray) -> np.ndarray:
 
 
 def _colour_bins(lab: np.ndarray) -> np.ndarray:
-    """[h, w] int64 index of a coarse Lab bin; values beyond ±50 of a and b count to the last bin."""
+    """[h, w] int64 index of a coarse Lab bin. Values of a and b beyond ±50 count in the outermost bin."""
     scaled = [lab[..., 0] / 256, (lab[..., 1] - 128) / 100 + 0.5, (lab[..., 2] - 128) / 100 + 0.5]
     index = np.zeros(lab.shape[:2], np.int64)
     for value, bins in zip(scaled, _BINS, strict=True):
@@ -78,7 +78,7 @@ def _colour_bins(lab: np.ndarray) -> np.ndarray:
 
 
 def filled_depth(depth: np.ndarray) -> np.ndarray:
-    """[h, w] float32 > 0: pixels without depth take that of the nearest pixel that has one."""
+    """[h, w] float32 > 0. Pixels without depth take the depth of the nearest pixel that has one."""
     from scipy.ndimage import distance_transform_edt
 
     known = np.isfinite(depth) & (depth > 0)
@@ -94,7 +94,7 @@ def _unproject(z: np.ndarray, K: np.ndarray) -> np.ndarray:
 
 
 def _tangent(points: np.ndarray, axis: int, reach: int = 3) -> np.ndarray:
-    """[h, w, 3] along x (axis 0) or y (axis 1): central where smooth, else of the side with less change."""
+    """[h, w, 3] tangent along x (axis 0) or y (axis 1): central difference if smooth, else the smaller side's."""
     along = 1 - axis
     chord = np.take(points, range(reach, points.shape[along]), along)
     chord = chord - np.take(points, range(points.shape[along] - reach), along)
@@ -117,7 +117,7 @@ def _across(points: np.ndarray, normals: np.ndarray, axis: int) -> tuple[np.ndar
 
 
 def _shifted(image: np.ndarray, axis: int, by: int) -> np.ndarray:
-    """image[y, x + by] (axis 0) or image[y + by, x] (axis 1), the border repeated."""
+    """image[y, x + by] (axis 0) or image[y + by, x] (axis 1), with the border replicated."""
     along = 1 - axis
     index = np.clip(np.arange(image.shape[along]) + by, 0, image.shape[along] - 1)
     return np.take(image, index, axis=along)

@@ -1,4 +1,4 @@
-"""`labels:DIR`: label images made elsewhere, one PNG per photo, in the geometry of the original photo."""
+"""`labels:DIR`: label images from other tools, one PNG per photo, at the size of the original (distorted) photo."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ _COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RG
 
 
 class LabelFolder:
-    """Label images read from a folder: `a/0001.jpg` is labelled by `a/0001.png`, or by `0001.png`.
+    """Label images read from a folder. The photo `a/0001.jpg` uses `a/0001.png`, or `0001.png` if stems are unique.
 
-    The second form is taken only while no two photos share a stem. 8 or 16 bit grey, or an 8-bit palette
-    whose index is the label; 0 = unlabelled.
+    Format: 8 or 16 bit grey, or an 8-bit palette whose index is the label. 0 = unlabelled.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -33,7 +32,7 @@ class LabelFolder:
         self._files: dict[str, Path] = {}
 
     def check(self, views: list[View]) -> list[str]:
-        """Every view must have a label image of its photo's size; one without a view is a warning."""
+        """Checks that every view has a label image of its photo's size. Label images without a view give a warning."""
         self._files = {view.name: file for view in views if (file := self._find(view, views)) is not None}
         missing = [view.name for view in views if view.name not in self._files]
         if missing:
@@ -44,7 +43,7 @@ class LabelFolder:
         for view in views:
             _check_header(self._files[view.name], *_photo_size(view))
         used = set(self._files.values())
-        # Photos kept out of training, or that found no place, have label images with good reason.
+        # No warning for photos that were kept out of training or not registered.
         folders = {view.photo.parent for view in views if view.photo.parent.is_dir()} - {self.folder}
         photos = {file.stem for folder in folders for file in folder.iterdir()}
         left = [file for file in _pngs(self.folder) if file not in used]

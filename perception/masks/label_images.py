@@ -1,7 +1,7 @@
-"""Label images on disk: one compressed 16-bit PNG per photo, each written whole or not at all.
+"""Label images on disk: one compressed 16-bit PNG per photo, written atomically.
 
-A PNG carries the key of what made it (source, photo, undistortion), so a second run skips exactly the photos
-whose label image would come out the same.
+Each PNG stores a key computed from its inputs (source, photo, undistortion). A second run skips the photos whose key is
+unchanged.
 """
 
 from __future__ import annotations
@@ -38,11 +38,10 @@ def compute_masks(
     load_depth: Callable[[View], np.ndarray] | None = None,
     depth_key: str = "",
 ) -> dict[str, Any]:
-    """Writes the label image of every view below `folder`, skipping those already there; returns a report.
+    """Writes the label image of every view below `folder`, skipping up-to-date files. Returns a report.
 
-    load_photo: view -> [h, w, 3] uint8 RGB, undistorted.
-    load_depth: view -> [h, w] z-depth, 0 = none, needed by a GeometryMaskSource. depth_key: changes whenever the depth
-    does.
+    load_photo: view -> [h, w, 3] uint8 RGB, undistorted. load_depth: view -> [h, w] z-depth, 0 = none; required by a
+    GeometryMaskSource. depth_key: a string that changes whenever the depth changes.
     Report: source, identity, photos, skipped, seconds, masks (mean per photo), empty (names), warnings.
     """
     warnings = source.check(views)
@@ -83,7 +82,7 @@ def compute_masks(
 
 
 def label_file(folder: Path, view: View) -> Path:
-    """Where a view's label image lies. The photo's suffix is kept: `a.jpg` and `a.png` may both exist."""
+    """Path of a view's label image. The photo's suffix is kept, because `a.jpg` and `a.png` may both exist."""
     return folder / f"{safe_name(view.name, view.photo)}.png"
 
 
@@ -92,14 +91,14 @@ def load_labels(folder: Path, view: View) -> np.ndarray:
     file = label_file(folder, view)
     if not file.is_file():
         raise InputError(f"{file}: no label image for photo {view.name}; run the masks stage again")
-    header = read_png_header(file)  # a damaged size must not cost gigabytes
+    header = read_png_header(file)  # a corrupt size field must not allocate gigabytes
     if header.width * header.height > 4 * view.width * view.height:
         raise InputError(f"{file}: {header.width}×{header.height} pixels of a smaller photo; the PNG is damaged")
     return read_labels(file)
 
 
 def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
-    """labels: [h, w] integers ≥ 0. Ids are renumbered 1.. when they would not fit into 16 bit."""
+    """labels: [h, w] integers ≥ 0. Ids that exceed 16 bit are renumbered from 1."""
     from PIL import Image, PngImagePlugin
 
     if labels.max(initial=0) > 65535:
@@ -116,14 +115,14 @@ def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
             Image.fromarray(labels.astype(np.uint16)).save(temporary, "PNG", compress_level=4, pnginfo=info)
             temporary.replace(file)
         finally:
-            with suppress(OSError):  # a read-only disk is told by what was tried first
+            with suppress(OSError):  # on a read-only disk the first error is the one to report
                 temporary.unlink()
     except OSError as error:
         raise InputError(f"{file}: cannot be written ({error.strerror or error})") from error
 
 
 def stored_key(file: Path) -> str | None:
-    """The key a label image was written with; None when there is no readable one."""
+    """The key that a label image was written with; None if the file or the key cannot be read."""
     from PIL import Image
 
     from perception.io.photos import DECODE_ERRORS
@@ -139,7 +138,7 @@ def stored_key(file: Path) -> str | None:
 
 
 def _key(view: View, source: MaskSource, depth_key: str) -> str:
-    """Everything a label image depends on, as a short digest."""
+    """A short digest of everything that a label image depends on."""
     digest = hashlib.sha256(f"{source.identity}\n{view.name} {view.width} {view.height} {view.lens}\n".encode())
     digest.update(depth_key.encode())
     digest.update(np.ascontiguousarray(view.K, dtype=np.float64).tobytes())
@@ -151,7 +150,7 @@ def _key(view: View, source: MaskSource, depth_key: str) -> str:
 
 @dataclass(frozen=True)
 class PngHeader:
-    """The IHDR chunk: size in pixels, bits per sample, colour type as PNG numbers it."""
+    """The IHDR chunk: size in pixels, bits per sample, colour type (PNG's numbers)."""
 
     width: int
     height: int
@@ -160,7 +159,7 @@ class PngHeader:
 
 
 def read_png_header(file: Path) -> PngHeader:
-    """Reads 26 bytes, so thousands of label images are checked in an instant."""
+    """Reads only 26 bytes of the file, so that thousands of label images can be checked quickly."""
     with file.open("rb") as stream:
         head = stream.read(26)
     if len(head) < 26 or not head.startswith(_SIGNATURE):
@@ -169,7 +168,7 @@ def read_png_header(file: Path) -> PngHeader:
 
 
 def read_labels(file: Path) -> np.ndarray:
-    """[H, W] int32. Pillow keeps palette indices, where OpenCV would turn them into colours."""
+    """[H, W] int32. Pillow keeps palette indices, whereas OpenCV converts them to colours."""
     from PIL import Image
 
     from perception.io.photos import DECODE_ERRORS

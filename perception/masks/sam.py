@@ -1,7 +1,7 @@
-"""`sam:PATH`: automatic masks of a Segment Anything model (Kirillov et al. 2023, app. B) in onnxruntime.
+"""`sam:PATH`: automatic mask generation with Segment Anything (Kirillov et al. 2023, app. B) in onnxruntime.
 
-A grid of points prompts the model; masks that are sure, stable and no duplicates are kept. The rules and defaults are
-those of the published `SamAutomaticMaskGenerator`, whose default output (without crops) the paper uses (§4).
+A grid of points prompts the model. Masks are filtered by predicted IoU, by stability, and by non-maximum suppression.
+Rules and defaults are those of the published `SamAutomaticMaskGenerator` without crops, as used in the paper (§4).
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from perception.masks.sam_models import SamModel, open_sam
 from perception.types import View
 
 POINTS_PER_BATCH = 64
-STABILITY_OFFSET = 1.0  # of the logits' threshold, up and down
-BOX_NMS = 0.7  # IoU of boxes from which on two masks are duplicates
-_BATCH_BYTES = 512 << 20  # of one batch's masks, which some graphs give at full size
+STABILITY_OFFSET = 1.0  # added to and subtracted from the logit threshold
+BOX_NMS = 0.7  # box IoU above which two masks are duplicates
+_BATCH_BYTES = 512 << 20  # masks of one batch; some graphs return them at full size
 
 
 @dataclass(frozen=True)
 class SamSettings:
-    """points_per_side: of the grid of prompts. pred_iou, stability: the least of each that a mask must have."""
+    """points_per_side: of the prompt grid. pred_iou, stability: minimum values of a mask."""
 
     points_per_side: int = 32
     pred_iou: float = 0.88
@@ -34,8 +34,8 @@ class SamSettings:
 
 @dataclass(frozen=True)
 class SamMask:
-    """A mask of a photo. packed: its bits, deflated (mostly a thousandth of a byte a pixel); shape: (h, w);
-    box: [4] int64, see `mask_box`; pred_iou: the model's own guess; point: [2] (x, y), the prompt in pixels."""
+    """A mask of a photo. packed: its bits, compressed with deflate; shape: (h, w); box: [4] int64, see `mask_box`;
+    pred_iou: IoU predicted by the model; point: [2] (x, y), the prompt in pixels."""
 
     packed: bytes
     shape: tuple[int, int]
@@ -51,7 +51,7 @@ class SamMask:
 
 
 class SamSource:
-    """The mask source of `sam:PATH`; the models are opened and recognised here."""
+    """The mask source of `sam:PATH`. The constructor opens the models and checks their signatures."""
 
     def __init__(self, spec: str) -> None:
         self.model = open_sam(spec)
@@ -60,16 +60,16 @@ class SamSource:
         self.identity = f"sam {self.model.fingerprint} {self.settings}"
 
     def check(self, views: list[View]) -> list[str]:
-        """Warnings of an accelerator that did not load."""
+        """Returns warnings about an accelerator that could not be loaded."""
         return list(self.model.warnings)
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
-        """photo: [h, w, 3] uint8 RGB. Returns [h, w] int32, 0 where no mask lies."""
+        """photo: [h, w, 3] uint8 RGB. Returns [h, w] int32, 0 where there is no mask."""
         return paint(automatic_masks(self.model, photo, self.settings), (photo.shape[0], photo.shape[1]))
 
 
 def automatic_masks(model: SamModel, photo: np.ndarray, settings: SamSettings) -> list[SamMask]:
-    """The masks of photo [h, w, 3] uint8 RGB, best predicted IoU first."""
+    """Masks of photo [h, w, 3] uint8 RGB, sorted by falling predicted IoU."""
     height, width = photo.shape[:2]
     embedding = model.encode(np.ascontiguousarray(photo))
     points = point_grid(settings.points_per_side) * np.array([width, height])
@@ -82,7 +82,7 @@ def automatic_masks(model: SamModel, photo: np.ndarray, settings: SamSettings) -
 
 
 def paint(masks: list[SamMask], shape: tuple[int, int]) -> np.ndarray:
-    """Label image [h, w] int32: masks painted in ascending pred_iou · stability, so the best wins a pixel (§4)."""
+    """Label image [h, w] int32. Masks are painted by ascending pred_iou · stability: the best one gets a pixel (§4)."""
     labels = np.zeros(shape, np.int32)
     scores = np.array([mask.pred_iou * mask.stability for mask in masks])
     for label, row in enumerate(np.argsort(scores, kind="stable"), start=1):
@@ -98,7 +98,7 @@ def point_grid(side: int) -> np.ndarray:
 
 
 def stability(logits: np.ndarray) -> np.float32:
-    """logits: [h, w]. IoU of the masks cut at ± STABILITY_OFFSET, in float32; NaN where both are empty."""
+    """IoU of the masks of `logits` [h, w] thresholded at ± STABILITY_OFFSET, in float32; NaN where both are empty."""
     inner, outer = (np.count_nonzero(logits > offset) for offset in (STABILITY_OFFSET, -STABILITY_OFFSET))
     return np.float32(inner) / np.float32(outer) if outer else np.float32(math.nan)
 
@@ -112,9 +112,9 @@ def mask_box(mask: np.ndarray) -> np.ndarray:
 
 
 def box_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.ndarray:
-    """Greedy non-maximum suppression: indices kept, best score first, ties in input order.
+    """Greedy non-maximum suppression. Returns the kept indices, best score first; ties keep the input order.
 
-    boxes: [M, 4], scores: [M]. IoU in float32 with areas (x1 − x0)(y1 − y0), as torchvision computes it.
+    boxes: [M, 4], scores: [M]. IoU in float32 with areas (x1 − x0)(y1 − y0), as in torchvision.
     """
     x0, y0, x1, y1 = boxes.astype(np.float32).T
     areas = (x1 - x0) * (y1 - y0)
@@ -133,12 +133,12 @@ def box_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.ndarr
 
 
 def _good_masks(model: SamModel, embedding: Any, points: np.ndarray, settings: SamSettings) -> Iterator[SamMask]:
-    """Masks of points [P, 2] that are sure and stable; at the photo's size one at a time."""
+    """Masks for points [P, 2] that pass both thresholds. One mask at a time is upscaled to the photo's size."""
     raw, pred_iou = model.decode(embedding, points)
     for point, which in np.argwhere(pred_iou > settings.pred_iou):
         logits = model.upscale(embedding, raw[point, which])
         stable = stability(logits)
-        if stable >= np.float32(settings.stability):  # in float32, as published; false for NaN
+        if stable >= np.float32(settings.stability):  # compared in float32, as published; false for NaN
             mask = logits > 0
             packed = zlib.compress(np.packbits(mask).tobytes(), 1)
             shape = (mask.shape[0], mask.shape[1])

@@ -1,11 +1,11 @@
-"""Segment Anything exports with separate encoder and decoder, recognised by their inputs and outputs.
+"""Segment Anything exports with separate encoder and decoder, recognised by the names of their inputs and outputs.
 
-| family | encoder takes | decoder takes points in |
+| family | encoder input | coordinates of decoder points |
 |---|---|---|
 | SAM, MobileSAM | HWC 0–255, or 1×3×S×S normalised and padded bottom and right | pixels of the square |
 | EfficientSAM | 1×3×h×w in 0–1, original size | pixels of the photo |
-| SAM 2 | 1×3×S×S normalised, squashed | pixels of the square |
-| SAM by optimum | 1×3×S×S as SAM | pixels of the square |
+| SAM 2 | 1×3×S×S normalised, resized without keeping the aspect ratio | pixels of the square |
+| SAM exported by optimum | 1×3×S×S as SAM | pixels of the square |
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from perception.errors import InputError
 from perception.io.model_store import known_names, resolve
 from perception.io.onnx_sessions import dtype_of, fingerprint, open_session, provider_warning, shape_of, signature
 
-# One role, the names it goes by in public exporters.
+# Role -> names of it in public exporters.
 _ALIASES = {
     "image": ("input_image", "image", "batched_images", "pixel_values", "x", "input", "images"),
     "embedding": ("image_embeddings", "image_embed", "image_embedding", "embeddings"),
@@ -32,7 +32,7 @@ _ALIASES = {
     "mask_input": ("mask_input",),
     "has_mask": ("has_mask_input",),
     "size": ("orig_im_size",),
-    # Low resolution first: some exports froze the size of the photo they were traced with.
+    # Low resolution first: some exports fix the photo size that they were traced with.
     "masks": ("low_res_masks", "pred_masks", "masks", "output_masks"),
     "iou": ("iou_predictions", "iou_scores", "iou_preds"),
 }
@@ -59,7 +59,7 @@ class Graph:
         return "image" in self.inputs and "embedding" in self.outputs and "points" not in self.inputs
 
     def run(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """values by role, cast to the types the graph asks for; outputs by role."""
+        """Runs the graph. values: inputs by role, cast to the graph's dtypes. Returns the outputs by role."""
         feeds: dict[str, np.ndarray] = {
             x.name: values[role].astype(dtype_of(x), copy=False) for role, x in self.inputs.items()
         }
@@ -69,7 +69,7 @@ class Graph:
 
 @dataclass(frozen=True)
 class Encoded:
-    """size, used, canvas: (h, w) of photo, of it in the model, of the input; scale: (x, y) used / size."""
+    """size, used, canvas: (h, w) of the photo, of the photo in the input, of the input; scale: (x, y) used / size."""
 
     tensors: dict[str, np.ndarray]
     size: tuple[int, int]
@@ -79,7 +79,7 @@ class Encoded:
 
 
 class SamModel:
-    """An encoder and a decoder that fit each other."""
+    """An encoder and a matching decoder."""
 
     def __init__(self, encoder: Graph, decoder: Graph) -> None:
         self.encoder, self.decoder = encoder, decoder
@@ -106,12 +106,12 @@ class SamModel:
 
     @property
     def _batched(self) -> bool:
-        """Whether the graph takes many single-point prompts at once: the axis is named, not fixed to 1."""
+        """Whether the graph accepts several single-point prompts per call: the axis is dynamic, not fixed to 1."""
         axis = 1 if self.family in ("EfficientSAM", "SAM by optimum") else 0
         return shape_of(self.decoder.inputs["points"])[axis] is None
 
     def _prepare(self, photo: np.ndarray) -> tuple[np.ndarray, tuple[int, int], tuple[int, int]]:
-        """The encoder's input, the (h, w) the photo fills in it, and its whole (h, w)."""
+        """The encoder's input, the (h, w) that the photo covers in it, and the input's (h, w)."""
         shape = shape_of(self.encoder.inputs["image"])
         if self.family == "EfficientSAM":
             return photo.transpose(2, 0, 1)[None] / np.float32(255), photo.shape[:2], photo.shape[:2]
@@ -126,7 +126,7 @@ class SamModel:
         used = (int(photo.shape[0] * ratio + 0.5), int(photo.shape[1] * ratio + 0.5))
         resized = _resize(photo, *used).astype(np.float32)
         if raw and shape[0] is None:
-            return resized, used, used  # the graph pads by itself
+            return resized, used, used  # the graph pads internally
         padded = np.zeros((height, width, 3), np.float32)
         padded[: used[0], : used[1]] = resized if raw else (resized - _MEAN) / _STD
         return (padded if raw else padded.transpose(2, 0, 1)[None]), used, (height, width)
@@ -137,7 +137,7 @@ class SamModel:
         masks, iou = result["masks"], result["iou"]
         masks = masks.reshape(len(points), -1, *masks.shape[-2:]).astype(np.float32, copy=False)
         iou = iou.reshape(len(points), -1).astype(np.float32, copy=False)
-        if iou.shape[1] == 4:  # the first is the answer to many prompts at once, not to a single point
+        if iou.shape[1] == 4:  # index 0 is the output for several prompts, not for a single point
             masks, iou = masks[:, 1:], iou[:, 1:]
         return masks, iou
 
@@ -147,7 +147,7 @@ class SamModel:
         if self.family in ("EfficientSAM", "SAM by optimum"):  # [1, P, 1, 2]: one image, P queries
             size = np.array(embedding.size)
             return {"points": scaled[None], "labels": labels[None], "size": size}
-        # A point without a box is followed by a padding point, as in the published predictor.
+        # A point prompt without a box is followed by a padding point, as in the published predictor.
         scaled = np.concatenate([scaled, np.zeros_like(scaled)], axis=1)
         labels = np.concatenate([labels, -labels], axis=1)
         rows, height, width = self._mask_shape(len(points), 4 * embedding.tensors["embedding"].shape[-1])
@@ -160,28 +160,28 @@ class SamModel:
         }
 
     def _mask_shape(self, points: int, side: int) -> tuple[int, int, int]:
-        """Rows, height and width of the (empty) mask prompt: one row, or one a point where left open."""
+        """Rows, height and width of the (empty) mask prompt: one row, or one row per point if the axis is dynamic."""
         argument = self.decoder.inputs.get("mask_input")
         shape = [1, 1, side, side] if argument is None else shape_of(argument)
         return shape[0] or points, shape[2] or side, shape[3] or side
 
     def _whole_photo(self, embedding: Encoded) -> bool:
-        """Whether the decoder may be told the photo's size: its scaling then is the one that `encode` did.
+        """Whether the decoder may upscale to the photo's size itself, i.e. whether its scaling equals that of `encode`.
 
-        SAM's graph assumes that the long side fills the square; encoders of a fixed oblong size do otherwise.
+        SAM's graph assumes that the long side fills the square. Encoders with a fixed non-square input differ.
         """
         if self.family == "SAM 2":
             return True
         return max(embedding.used) == _square(embedding) and max(embedding.canvas) == max(embedding.used)
 
     def upscale(self, embedding: Encoded, raw: np.ndarray) -> np.ndarray:
-        """raw: one mask as the graph gave it. Logits [h, w] float32 at the photo's size."""
+        """raw: one mask as output by the graph. Returns logits [h, w] float32 at the photo's size."""
         import cv2
 
         height, width = embedding.size
         if raw.shape == (height, width):
             return raw
-        if self.family != "SAM 2":  # a quarter of the padded square, of which the photo fills the top left
+        if self.family != "SAM 2":  # a quarter of the padded square; the photo covers its top left
             if raw.shape != embedding.canvas:
                 side = _square(embedding)
                 raw = cv2.resize(raw, (side, side), interpolation=cv2.INTER_LINEAR)
@@ -190,7 +190,7 @@ class SamModel:
 
 
 def open_sam(spec: str) -> SamModel:
-    """spec: a folder with both graphs, the encoder with its decoder beside it, `ENCODER,DECODER`, or a stored name."""
+    """spec: a folder with both graphs, an encoder file next to its decoder, `ENCODER,DECODER`, or a stored name."""
     spec = resolve(spec)
     if "," in spec:
         graphs = [open_graph(Path(part.strip())) for part in spec.split(",")]
@@ -214,21 +214,21 @@ def open_sam(spec: str) -> SamModel:
 
 
 def open_graph(path: Path) -> Graph:
-    """Opens an ONNX file and names its inputs and outputs by role."""
+    """Opens an ONNX file and assigns roles to its inputs and outputs."""
     session = open_session(path)
     inputs = {_ROLES.get(argument.name, argument.name): argument for argument in session.get_inputs()}
     return Graph(path, session, inputs, _outputs([argument.name for argument in session.get_outputs()]))
 
 
 def _outputs(names: list[str]) -> dict[str, str]:
-    """Role -> name; of several mask outputs the first in the order of the aliases."""
+    """Role -> output name. Of several mask outputs the first in the order of _ALIASES is used."""
     outputs: dict[str, str] = {}
     for role in ("embedding", "high_res_0", "high_res_1", "positional", "masks", "iou"):
         found = [alias for alias in _ALIASES[role] if alias in names]
         if found:
             outputs[role] = found[0]
     if len(names) == 1 and not outputs:
-        outputs["embedding"] = names[0]  # encoders with a nameless single output
+        outputs["embedding"] = names[0]  # encoders whose only output has a generic name
     return outputs
 
 
@@ -250,7 +250,7 @@ def _candidates(path: Path) -> list[Path]:
 
 
 def decoder_family(decoder: Graph) -> str:
-    """The family of a decoder, by the names of its inputs."""
+    """The family of a decoder, from the names of its inputs."""
     names = {argument.name for argument in decoder.session.get_inputs()}
     if "batched_point_coords" in names:
         return "EfficientSAM"
@@ -260,7 +260,7 @@ def decoder_family(decoder: Graph) -> str:
 
 
 def encoder_family(encoder: Graph) -> str:
-    """The family of an encoder as far as it can be told without its decoder."""
+    """The family of an encoder as far as it can be determined without its decoder."""
     if "high_res_0" in encoder.outputs:
         return "SAM 2"
     return "EfficientSAM" if encoder.inputs["image"].name == "batched_images" else "SAM"
@@ -278,12 +278,12 @@ def _check_pair(encoder: Graph, decoder: Graph) -> None:
 
 
 def _square(embedding: Encoded) -> int:
-    """Side of the padded square: SAM's encoders have a stride of 16."""
+    """Side of the padded square in pixels. SAM's encoders have a stride of 16."""
     return 16 * embedding.tensors["embedding"].shape[-1]
 
 
 def _resize(photo: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Bilinear with anti-aliasing, as Pillow and so the published predictor does it."""
+    """Bilinear resize with anti-aliasing by Pillow, as in the published predictor."""
     from PIL import Image
 
     return np.asarray(Image.fromarray(photo).resize((width, height), Image.Resampling.BILINEAR))

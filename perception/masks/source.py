@@ -1,4 +1,4 @@
-"""What a mask source is, and how the text of `--masks` becomes one."""
+"""The interface of mask sources, and the parser of the `--masks` option."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from perception.types import View
 
 
 class MaskSource(Protocol):
-    """Gives every photo a label image of its own; ids need not agree between photos.
+    """Gives each photo a label image. Ids need not be consistent across photos.
 
-    name: short, for messages. identity: changes whenever the label images could (the key of the cache).
+    name: short, for messages. identity: cache key; it changes whenever the label images could change.
     """
 
     name: str
     identity: str
 
     def check(self, views: list[View]) -> list[str]:
-        """Validates everything that can be told up front. Raises InputError; returns warnings."""
+        """Validates everything that can be checked before any work. Returns warnings. Raises InputError."""
         ...
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
@@ -36,7 +36,7 @@ class MaskSource(Protocol):
 
 @runtime_checkable
 class GeometryMaskSource(MaskSource, Protocol):
-    """A source that needs to know about how far away each pixel is: `survey` comes before `label_image`."""
+    """A source that needs an approximate depth of each pixel. `survey` is called before `label_image`."""
 
     def survey(
         self,
@@ -45,17 +45,17 @@ class GeometryMaskSource(MaskSource, Protocol):
         load_depth: Callable[[View], np.ndarray],
         progress: Progress | None = None,
     ) -> None:
-        """Looks at all photos together, once; load_depth: view -> [h, w] z-depth, 0 = none."""
+        """Processes all photos jointly, once. load_depth: view -> [h, w] z-depth, 0 = none."""
         ...
 
 
 def make_source(spec: str) -> MaskSource:
-    """`auto`, `builtin`, `labels:DIR`, or `sam:PATH` (folder, encoder file, or `ENCODER,DECODER`).
+    """Parses `auto`, `builtin`, `labels:DIR`, or `sam:PATH` (folder, encoder file, or `ENCODER,DECODER`).
 
-    `auto` takes the SAM named by the environment variable PERCEPTION_SAM or by `masks.sam` in the user's
-    configuration (`perception/config.toml` under XDG_CONFIG_HOME), or made the default by `perception models add
-    --default`; else the built-in segmentation.
-    Files, signatures and packages are checked here, before any work; InputError names what is missing or wrong.
+    `auto` uses the first SAM found: the environment variable PERCEPTION_SAM, `masks.sam` in the user's configuration
+    (`perception/config.toml` under XDG_CONFIG_HOME), or the default set by `perception models add --default`. Without
+    one it is `builtin`. Files, model signatures and packages are checked here, before any work. InputError names what
+    is missing or wrong.
     """
     kind, _, argument = spec.partition(":")
     if kind == "auto" and not argument:
@@ -77,7 +77,7 @@ def make_source(spec: str) -> MaskSource:
 
 
 def configured_sam() -> str | None:
-    """The user's SAM, a path or a stored name, or None."""
+    """The configured SAM as a path or a stored model name, or None."""
     from_environment = os.environ.get("PERCEPTION_SAM", "").strip()
     if from_environment:
         return from_environment

@@ -1,9 +1,9 @@
-"""Depth of every photo from its neighbours: a plane sweep (Collins 1996), smoothed by semi-global matching.
+"""Depth of every photo by multi-view stereo: plane sweep (Collins 1996) and semi-global matching (Hirschmüller 2008).
 
-The depth that a half-trained map renders explains colours, not surfaces, so it serves as a prior only. Planes across
-the optical axis, evenly spaced in inverse depth, carry neighbouring photos into this one; zero-mean correlation says
-where they agree; Hirschmüller's (2008) recurrence along four directions chooses a smooth depth among the planes; depths
-that no neighbour confirms are left out.
+The depth rendered from a partly trained map fits colours and not surfaces, so it is only a prior. Planes perpendicular
+to the optical axis, evenly spaced in inverse depth, warp neighbouring photos into this one. The matching cost comes
+from zero-mean normalised cross-correlation. Semi-global aggregation along four directions selects a smooth depth.
+Depths that no neighbour confirms are dropped.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from perception.progress import Progress
 
 PLANES = 96
 NEIGHBOURS = 6
-_WINDOW = 7  # pixels a side, of the correlation
-_BEST = 2  # neighbours that must agree with a plane; the others may be hidden from what it shows
-_P1, _P2 = 0.06, 0.6  # cost of a step to the next plane, and to any other, where the photo is even
-_PRIOR_COST = (0.02, 0.16)  # cost of every plane away from the depth known so far, and its limit
-_CONFIRMED = 2  # photos that must agree with a depth for it to shape the surface
-_AGREE = 0.03  # relative difference of depths that confirm each other
+_WINDOW = 7  # pixels, side of the correlation window
+_BEST = 2  # neighbours whose correlation counts per plane; the point may be occluded in the others
+_P1, _P2 = 0.06, 0.6  # cost of a step to the next plane, and to any other plane, where the photo has no gradient
+_PRIOR_COST = (0.02, 0.16)  # cost per plane of distance from the prior depth, and its upper limit
+_CONFIRMED = 2  # photos that must agree with a depth before it contributes to the surface
+_AGREE = 0.03  # largest relative difference of depths that confirm each other
 
 
 def measure_depths(views: list[StereoView], progress: Progress | None = None) -> None:
-    """Replaces the depths of all views by those of stereo, and says where other views confirm them."""
+    """Replaces the depths of all views by stereo depths, and marks the pixels confirmed by other views."""
     chosen = choose_neighbours(views)
 
     def depth_of(i: int) -> np.ndarray:
@@ -41,7 +41,7 @@ def measure_depths(views: list[StereoView], progress: Progress | None = None) ->
             if progress is not None:
                 progress.update("masks (stereo)", done, len(views))
     finally:
-        pool.shutdown(cancel_futures=True)  # Ctrl-C waits for the photos begun, not for all
+        pool.shutdown(cancel_futures=True)  # Ctrl-C waits only for photos already started
     for view, depth, near in zip(views, depths, chosen, strict=True):
         if near:
             agreeing, mean = confirmed(depth, view, [views[j] for j in near], [depths[j] for j in near])
@@ -49,7 +49,7 @@ def measure_depths(views: list[StereoView], progress: Progress | None = None) ->
 
 
 def sweep(view: StereoView, others: list[StereoView]) -> np.ndarray:
-    """[h, w] float32 depth of `view` by its neighbours `others`; every pixel gets one."""
+    """[h, w] float32 depth of `view` from its neighbours `others`, dense."""
     inverse = plane_depths(view.prior)
     volume = matching_cost(view, others, inverse)
     expected = (1 / np.where(view.prior > 0, view.prior, np.inf) - inverse[0]) / (inverse[1] - inverse[0])
@@ -62,13 +62,13 @@ def sweep(view: StereoView, others: list[StereoView]) -> np.ndarray:
 
 
 def plane_depths(prior: np.ndarray) -> np.ndarray:
-    """[PLANES] inverse depths, near to far, that cover the depths known so far with a margin."""
+    """[PLANES] inverse depths, near to far, covering the prior's range with a margin."""
     near, far = np.percentile(prior[prior > 0], [1, 99])
     return np.linspace(1 / (0.75 * near), 1 / (1.35 * far), PLANES).astype(np.float32)
 
 
 def matching_cost(view: StereoView, others: list[StereoView], inverse: np.ndarray) -> np.ndarray:
-    """[h, w, PLANES] float32 in [0, 1]: half of one minus the mean of the best correlations with `others`."""
+    """[h, w, PLANES] float32 in [0, 1]: (1 − mean of the _BEST best correlations with `others`) / 2."""
     import cv2
 
     h, w = view.grey.shape
@@ -87,7 +87,7 @@ def matching_cost(view: StereoView, others: list[StereoView], inverse: np.ndarra
             seen_mean = cv2.blur(seen, box)
             spread = np.sqrt(np.maximum(cv2.blur(seen * seen, box) - seen_mean * seen_mean, 0)) + 1.0
             score[:] = (cv2.blur(seen * view.grey, box) - seen_mean * mean) / (spread * deviation)
-            score[seen_mean < 0] = 0.0  # outside the picture: no evidence
+            score[seen_mean < 0] = 0.0  # outside the image: no evidence
         best = min(_BEST, len(others))
         chosen = np.partition(scores, len(others) - best, axis=0)[-best:]
         volume[..., plane] = 0.5 - 0.5 * chosen.mean(axis=0)
@@ -95,9 +95,9 @@ def matching_cost(view: StereoView, others: list[StereoView], inverse: np.ndarra
 
 
 def homographies(view: StereoView, other: StereoView) -> tuple[np.ndarray, np.ndarray]:
-    """(A, B): A + B / z carries pixels of `view` to `other` for the plane at depth z; pixel centres at +0.5."""
+    """(A, B): A + B / z maps pixels of `view` to `other` for the plane at depth z; pixel centres at +0.5."""
     other_from_view = other.camera_from_world @ np.linalg.inv(view.camera_from_world)
-    half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])  # OpenCV counts pixel centres from 0
+    half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])  # OpenCV's pixel centres are at whole numbers
     inverse_K = np.linalg.inv(half @ view.K)
     still = half @ other.K @ other_from_view[:3, :3] @ inverse_K
     moving = half @ other.K @ np.outer(other_from_view[:3, 3], [0, 0, 1.0]) @ inverse_K
@@ -140,13 +140,13 @@ def _between_planes(total: np.ndarray, inverse: np.ndarray) -> np.ndarray:
 
 
 def choose_neighbours(views: list[StereoView]) -> list[list[int]]:
-    """Of each photo, up to NEIGHBOURS others that together see what it sees, from helpful angles (5° to 25°)."""
+    """Up to NEIGHBOURS other views per view that jointly observe its points, preferably at angles of 5° to 25°."""
     chosen: list[list[int]] = []
     for i, view in enumerate(views):
         points = _sample(view)
         useful = np.stack([_usefulness(view, other, points) for other in views])
         useful[i] = 0
-        first = second = np.zeros(len(points))  # how well the best two so far serve each point
+        first = second = np.zeros(len(points))  # usefulness of the best two chosen views for each point
         found: list[int] = []
         while len(found) < min(NEIGHBOURS, len(views) - 1):
             gain = np.maximum(useful, first) + np.clip(np.minimum(useful, first), second, None) - first - second
@@ -172,7 +172,7 @@ def _sample(view: StereoView, every: int = 24) -> np.ndarray:
 
 
 def _usefulness(view: StereoView, other: StereoView, points: np.ndarray) -> np.ndarray:
-    """[P] in [0, 1]: whether `other` sees each of `points`, weighted by how well the angle between the rays suits."""
+    """[P] in [0, 1]: 0 where `other` does not see a point, else a weight from ray angle and distance ratio."""
     local = points @ other.camera_from_world[:3, :3].T + other.camera_from_world[:3, 3]
     z = np.maximum(local[:, 2], 1e-9)
     pixel = local @ other.K.T / z[:, None]
@@ -183,14 +183,14 @@ def _usefulness(view: StereoView, other: StereoView, points: np.ndarray) -> np.n
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     width = np.where(angle < 12, 5.0, 10.0)
     closeness = np.linalg.norm(b, axis=1) / np.maximum(np.linalg.norm(a, axis=1), 1e-12)
-    alike = np.minimum(closeness, 1 / np.maximum(closeness, 1e-12))  # a photo from twice as far shows half as much
+    alike = np.minimum(closeness, 1 / np.maximum(closeness, 1e-12))  # at twice the distance the resolution is half
     return np.asarray(inside * alike * np.exp(-(((angle - 12) / width) ** 2) / 2))
 
 
 def confirmed(
     depth: np.ndarray, view: StereoView, others: list[StereoView], their_depths: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How many of `others` agree with each depth, [h, w] int32, and the mean [h, w] of what those and it say."""
+    """Number of `others` that agree with each depth [h, w] int32, and the mean [h, w] of it and the agreeing depths."""
     h, w = depth.shape
     y, x = np.mgrid[:h, :w]
     rays = np.stack([x + 0.5, y + 0.5, np.ones((h, w))], axis=-1) @ np.linalg.inv(view.K).T
@@ -202,7 +202,7 @@ def confirmed(
         pixel = np.floor(local @ other.K.T / z[..., None])[..., :2]
         inside = (local[..., 2] > 0) & (pixel >= 0).all(axis=-1) & (pixel < np.array(theirs.shape[::-1])).all(axis=-1)
         column, row = (np.where(inside, pixel[..., i], 0).astype(np.int64) for i in (0, 1))
-        ratio = theirs[row, column] / z  # seen from nearly the same side, a change of their depth is one of ours
+        ratio = theirs[row, column] / z  # for similar view directions, both depths scale by the same ratio
         agrees = inside & (np.abs(ratio - 1) < _AGREE)
         count += agrees
         ratios += np.where(agrees, ratio, 0)

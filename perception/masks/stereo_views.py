@@ -1,4 +1,4 @@
-"""Photos at the size at which depth is matched, with their cameras and their depth."""
+"""Photos at stereo resolution, with their cameras and depth."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from perception.masks.cues import DepthCues, PhotoCues, depth_cues, filled_depth, photo_cues
 from perception.types import View
 
-SIDE = 320  # pixels of the long side, at which depth is matched
-_LEAST_DEPTH = 0.05  # share of a photo's pixels that must have depth for it to take part
+SIDE = 320  # pixels of the long side at stereo resolution
+_LEAST_DEPTH = 0.05  # share of a photo's pixels that must have depth; other photos are not used
 
 
 @dataclass
 class StereoView:
     """One photo. photo: [h, w, 3] uint8 RGB; grey: [h, w] float32; K: [3, 3]; camera_from_world: [4, 4] float64.
 
-    prior: [h, w] the depth known before stereo, 0 = none. depth: [h, w] the best depth so far; confirmed: [h, w] bool,
-    pixels whose depth other photos agree with.
+    prior: [h, w] depth known before stereo, 0 = none. depth: [h, w] current best depth. confirmed: [h, w] bool, pixels
+    whose depth other photos agree with.
     """
 
     name: str
@@ -32,7 +32,7 @@ class StereoView:
 
     @property
     def center(self) -> np.ndarray:
-        """[3] the camera's position in the world."""
+        """[3] camera centre in the world frame."""
         return -self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3]
 
     @property
@@ -41,12 +41,12 @@ class StereoView:
         return np.asarray(np.linalg.inv(self.camera_from_world))
 
     def cues(self) -> tuple[PhotoCues, DepthCues]:
-        """Of photo and depth, computed at every call: keeping them would cost 20 times the photo's memory."""
+        """Cues of photo and depth. They are recomputed at every call, because they take 20 times the photo's memory."""
         return photo_cues(self.photo), depth_cues(self.depth, self.K)
 
 
 def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray) -> StereoView | None:
-    """photo: [H, W, 3] uint8 RGB; depth: [H, W] as known so far, 0 = none. None for a photo with too little depth."""
+    """photo: [H, W, 3] uint8 RGB; depth: [H, W] prior, 0 = none. Returns None if too few pixels have depth."""
     import cv2
 
     height, width = photo.shape[:2]

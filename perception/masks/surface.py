@@ -1,4 +1,4 @@
-"""The surface that all depth images show together: voxels with a mean point, normal and colour."""
+"""Fuses all depth images into one surface: voxels with mean point, normal and colour."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 
 from perception.masks.cues import DepthCues, PhotoCues
 
-_FOOTPRINTS = 4.0  # side of a voxel in pixels at the median depth: above the noise of depth
-_MOST = 400_000  # voxels; a larger scene takes larger ones
-_LEAST_PIXELS = 3  # over all photos that must fall into a voxel for it to be kept
-_OFFSET = 1 << 20  # makes voxel indices positive; 2^21 of them a side
+_FOOTPRINTS = 4.0  # voxel side in pixel footprints at the median depth; above the noise of the depth
+_MOST = 400_000  # voxels; larger scenes use larger voxels
+_LEAST_PIXELS = 3  # over all photos, minimum for a voxel to be kept
+_OFFSET = 1 << 20  # makes voxel indices positive; 2^21 values per axis
 
 
 @dataclass(frozen=True)
 class Surface:
-    """V voxels of side `size`. keys [V] int64 ascending; pixels [V] that fell into each, over all photos;
-    points, normals, lab [V, 3] float32 means in the world frame (Lab on the 8-bit scale)."""
+    """V voxels of side `size`. keys [V] int64 ascending; pixels [V]: number of pixels in each, over all photos;
+    points, normals, lab [V, 3] float32 means in the world frame (Lab in 8-bit scale)."""
 
     size: float
     keys: np.ndarray
@@ -30,7 +30,7 @@ class Surface:
         return len(self.keys)
 
     def voxel_of(self, points: np.ndarray) -> np.ndarray:
-        """[...] int32 voxel that holds each of points [..., 3], −1 where there is none."""
+        """[...] int32 index of the voxel that contains each of points [..., 3]; −1 where there is none."""
         keys = voxel_keys(points.reshape(-1, 3), self.size)
         place = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
         return np.where(self.keys[place] == keys, place, -1).astype(np.int32).reshape(points.shape[:-1])
@@ -38,14 +38,14 @@ class Surface:
 
 @dataclass
 class SurfaceBuilder:
-    """Adds one photo after the other; memory grows with the surface, not with the number of photos."""
+    """Accumulates photos one by one. Memory grows with the surface, not with the number of photos."""
 
     size: float
     _keys: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     _sums: np.ndarray = field(default_factory=lambda: np.zeros((0, 10)))
 
     def add(self, photo: PhotoCues, depth: DepthCues, known: np.ndarray, world_from_camera: np.ndarray) -> None:
-        """known: [h, w] bool, the pixels whose depth is to be believed. world_from_camera: [4, 4]."""
+        """Adds one photo. known: [h, w] bool, pixels with reliable depth. world_from_camera: [4, 4]."""
         points = to_world(depth.points[known], world_from_camera)
         normals = depth.normals[known] @ world_from_camera[:3, :3].T
         keys, index = np.unique(voxel_keys(points, self.size), return_inverse=True)
@@ -63,7 +63,7 @@ class SurfaceBuilder:
             self._coarsen()
 
     def _coarsen(self) -> None:
-        """Doubles the voxels' side: eight become one."""
+        """Doubles the side of the voxels: eight voxels become one."""
         self.size *= 2
         old, self._keys = unpack_voxels(self._keys) // 2, np.zeros(0, np.int64)
         keys, index = np.unique(pack_voxels(old), return_inverse=True)
@@ -72,7 +72,7 @@ class SurfaceBuilder:
         self._merge(keys, sums)
 
     def build(self) -> Surface:
-        """The voxels that enough pixels fell into."""
+        """The voxels with at least _LEAST_PIXELS pixels."""
         rows = self._sums[:, 0] >= _LEAST_PIXELS
         sums = self._sums[rows]
         count = np.maximum(sums[:, :1], 1)
@@ -88,27 +88,27 @@ class SurfaceBuilder:
 
 
 def voxel_side(footprints: np.ndarray) -> float:
-    """The side to begin with, from footprints [P] of pixels (depth / focal length, the scene's unit)."""
+    """Initial voxel side, from the pixel footprints [P] (depth / focal length, in scene units)."""
     return _FOOTPRINTS * float(np.median(footprints))
 
 
 def to_world(points: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
-    """points [..., 3] of a camera's frame in the world's, float64."""
+    """Transforms points [..., 3] from the camera frame to the world frame, float64."""
     return points.astype(np.float64) @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
 
 
 def voxel_keys(points: np.ndarray, size: float) -> np.ndarray:
-    """[P] int64, equal for points [P, 3] in one voxel."""
+    """[P] int64 key of the voxel that contains each of points [P, 3]."""
     return pack_voxels(np.floor(points / size).astype(np.int64))
 
 
 def pack_voxels(index: np.ndarray) -> np.ndarray:
-    """Three voxel indices [P, 3] as one number [P]."""
+    """Packs three voxel indices [P, 3] into one int64 [P]."""
     i = np.clip(index + _OFFSET, 0, 2 * _OFFSET - 1)
     return (i[:, 0] << 42) | (i[:, 1] << 21) | i[:, 2]
 
 
 def unpack_voxels(keys: np.ndarray) -> np.ndarray:
-    """The three voxel indices [P, 3] of each key: the inverse of `pack_voxels`."""
+    """The three voxel indices [P, 3] of each key; inverse of `pack_voxels`."""
     mask = (1 << 21) - 1
     return np.stack([(keys >> 42) & mask, (keys >> 21) & mask, keys & mask], axis=1) - _OFFSET

@@ -1,8 +1,8 @@
-"""A graph of patches of the scene's surface, with the evidence of all photos for and against their being one object.
+"""A graph of surface patches. Its edges hold the evidence of all photos whether two patches are one object.
 
-Everything a decision needs is a sum over pixels, border pixels or voxels, so the evidence of a merged patch is the sum
-of that of its parts. The convexity of patches follows Stein et al. 2014; what the shape of two together
-tells (two mugs side by side are longer than either, a box's side and its top are not) is our own.
+All evidence is a sum over pixels, border pixels or voxels, so the evidence of a merged patch is the sum over its parts.
+Convexity of patches follows Stein et al. 2014. The features of the joint shape are our own: two mugs side by side are
+longer than either one, the side and the top of a box are not.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from perception.masks.surface import Surface
 
 FEATURES = 35
 NEIGHBOURS = 8
-_STEP = 0.012  # of the depth: what counts as a step between surfaces
+_STEP = 0.012  # relative to depth: minimum size of a step between surfaces
 _STEP_CAP = 0.06
-_TURN, _OFFSET = 0.02, 0.025  # of one plane: 1 − cosine of the normals; distance, in units of the depth
-_ALIKE = 0.5  # share of their colours that parts of one plane have in common when they do not touch
-_SHARP = 12.0  # border gradient that counts as an edge
+_TURN, _OFFSET = 0.02, 0.025  # coplanar: 1 − cosine of the normals; offset relative to depth
+_ALIKE = 0.5  # histogram intersection of colours above which coplanar parts that do not touch are joined
+_SHARP = 12.0  # border gradient above which it counts as an edge
 
-# Columns of the sums over a patch's pixels and voxels, and over border pixels of two patches.
+# Columns of the sums over a patch's pixels and voxels, then of the sums over border pixels of two patches.
 _AREA, _LAB, _TEXTURE, _DEPTH = 0, slice(1, 4), 4, 5
 _VOXELS, _NORMAL, _POINT, _SQUARES, _COLOURS = 6, slice(7, 10), slice(10, 13), slice(13, 19), slice(19, None)
 _LENGTH, _EDGE, _SHARPS, _STEPS, _BROKEN, _CONCAVE, _CONVEX, _CONTACT = range(8)
@@ -29,7 +29,7 @@ _UPPER = np.triu_indices(3)
 
 
 def voxel_edges(surface: Surface) -> np.ndarray:
-    """[E, 2] int32, a < b: each voxel and its nearest neighbours, no farther than three voxels."""
+    """[E, 2] int32, a < b: pairs of nearest-neighbour voxels, at most three voxel sides apart."""
     from scipy.spatial import cKDTree
 
     k = min(NEIGHBOURS + 1, len(surface))
@@ -42,7 +42,7 @@ def voxel_edges(surface: Surface) -> np.ndarray:
 
 
 def patches(surface: Surface, edges: np.ndarray, scale: float = 4.0, smallest: int = 12) -> np.ndarray:
-    """[V] int32 patch of each voxel, even in colour and normal (Felzenszwalb & Huttenlocher 2004)."""
+    """[V] int32 patch of each voxel, uniform in colour and normal (Felzenszwalb & Huttenlocher 2004)."""
     a, b = edges[:, 0], edges[:, 1]
     colour = (surface.lab[a] - surface.lab[b]) / np.array([14.0, 7.0, 7.0], np.float32)
     turn = (surface.normals[a] - surface.normals[b]) / 0.25
@@ -53,10 +53,10 @@ def patches(surface: Surface, edges: np.ndarray, scale: float = 4.0, smallest: i
 
 
 class SurfaceGraph:
-    """sums: [R, C] over each patch; borders: patch -> neighbour -> [B]. Neighbours touch in space."""
+    """sums: [R, C] per patch; borders: patch -> neighbour -> [B] sums. Neighbours are patches with touching voxels."""
 
     def __init__(self, surface: Surface, patch: np.ndarray, edges: np.ndarray) -> None:
-        """patch: [V] int, ids 0..R−1 all in use; edges: [E, 2] voxels that touch."""
+        """patch: [V] int, ids 0..R−1, all used; edges: [E, 2] touching voxels."""
         count = int(patch.max()) + 1
         self.surface, self.patch, self.count = surface, patch, count
         self.unit = surface.size**2
@@ -74,7 +74,7 @@ class SurfaceGraph:
         self.borders: list[dict[int, np.ndarray]] = []
 
     def add(self, regions: np.ndarray, photo: PhotoCues, depth: DepthCues) -> None:
-        """Takes in what one photo says. regions: [h, w] patch seen in each pixel, −1 = none."""
+        """Adds the evidence of one photo. regions: [h, w] patch of each pixel, −1 = none."""
         inside = regions >= 0
         flat = regions[inside]
         z = depth.points[..., 2]
@@ -98,7 +98,7 @@ class SurfaceGraph:
             self._border[:, :_CONTACT] += _sum_by(place[touching], values, len(self._keys))
 
     def link(self) -> None:
-        """Makes the borders, once all photos are in."""
+        """Builds `borders`. Call it after all photos are added."""
         self.borders = [{} for _ in range(self.count)]
         for key, row in zip(self._keys.tolist(), self._border, strict=True):
             if row[_LENGTH] > 0:
@@ -107,11 +107,11 @@ class SurfaceGraph:
         self.contacts = np.array([sum(row[_CONTACT] for row in links.values()) for links in self.borders])
 
     def size(self, patch: int) -> float:
-        """Voxels."""
+        """Number of voxels."""
         return float(self.sums[patch, _VOXELS])
 
     def features(self, a: int, others: list[int]) -> np.ndarray:
-        """Evidence that `a` and each of `others` are one object: [M, FEATURES]."""
+        """Features [M, FEATURES] for the decision whether `a` and each of `others` are one object."""
         border = np.stack([self.borders[a][b] for b in others])
         length = border[:, _LENGTH]
         one, two = self.sums[a], self.sums[others]
@@ -161,20 +161,20 @@ class SurfaceGraph:
         )
 
     def depth(self, a: int) -> float:
-        """Mean depth at which the photos show it."""
+        """Mean depth over the pixels that show the patch."""
         return float(self.sums[a, _DEPTH] / max(self.sums[a, _AREA], 1))
 
     def area(self, a: int) -> float:
-        """Area in squared distances that it was photographed from."""
+        """Area divided by the squared mean depth (no unit)."""
         return float(self.sums[a, _VOXELS] * self.unit / max(self.depth(a), 1e-9) ** 2)
 
     def flatness(self, a: int) -> float:
-        """Standard deviation across its own plane, in units of its depth."""
+        """Standard deviation across the patch's plane, relative to its depth."""
         return float(_extents(self.sums[a][None] / self.sums[a, _VOXELS])[0, 0] / max(self.depth(a), 1e-9))
 
     def one_plane(self, a: int, b: int) -> bool:
-        """Whether both are parts of one plane: they lie in it, and touch without an edge (a picture lies in the plane
-        of its wall), or do not touch but have the same colours."""
+        """Whether the two patches are parts of one plane. They must be coplanar. If they touch, there must be no edge
+        between them (unlike a picture on its wall); if they do not touch, their colours must agree."""
         shape_a, shape_b = (self.sums[i] / self.sums[i, _VOXELS] for i in (a, b))
         normal_a, normal_b = _direction(shape_a), _direction(shape_b)
         chord = shape_b[_POINT] - shape_a[_POINT]
@@ -188,7 +188,7 @@ class SurfaceGraph:
         return bool(np.minimum(*words).sum() > _ALIKE)
 
     def merge(self, a: int, b: int) -> None:
-        """Patch b becomes part of patch a: sums and borders of b are added to those of a, in place."""
+        """Merges patch b into patch a: the sums and borders of b are added to those of a, in place."""
         self.contacts[a] += self.contacts[b] - 2 * self.borders[a].pop(b)[_CONTACT]
         self.sums[a] += self.sums[b]
         for other, row in self.borders[b].items():
@@ -205,7 +205,7 @@ def neighbours(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _surface_features(shape_a: np.ndarray, shape_b: np.ndarray, depth: np.ndarray) -> list[np.ndarray]:
-    """How two patches, each taken as a plane through its mean point, lie to each other."""
+    """Geometric relation of two patches. Each is approximated by a plane through its mean point."""
     normal_a = shape_a[_NORMAL] / (np.linalg.norm(shape_a[_NORMAL]) + 1e-9)
     normal_b = shape_b[:, _NORMAL] / (np.linalg.norm(shape_b[:, _NORMAL], axis=1, keepdims=True) + 1e-9)
     chord = shape_b[:, _POINT] - shape_a[_POINT]
@@ -224,12 +224,12 @@ def _growth_features(
     depth: np.ndarray,
     least: float,
 ) -> np.ndarray:
-    """[11, M] how the extents of two patches' union come from theirs (see `_extents`).
+    """[11, M] relation of the extents of the union of two patches to their own extents (see `_extents`).
 
-    Their distance in units of both extents along it; for each axis the union's extent over the larger patch's, the
-    larger patch's and the smaller one's over the depth; the volume of the union over both. All but the first in logs.
-    one: [C] sums of a patch; two: [M, C] of its neighbours; extents: [1, 3] and [M, 3] theirs. least: what an extent is
-    taken for at least, so that logs are finite.
+    Distance of the patches in units of both extents along it. For each axis: extent of the union over that of the
+    larger patch; extents of the larger and of the smaller patch over the depth. Volume of the union over both. All but
+    the first are logarithms. one: [C] sums of a patch; two: [M, C] of its neighbours; extents: [1, 3] and [M, 3]
+    of these. least: lower limit of an extent, so that logarithms are finite.
     """
     shape_a, shape_b, union = (sums / sums[:, _VOXELS, None] for sums in (one[None], two, one + two))
     chord = shape_b[:, _POINT] - shape_a[:, _POINT]
@@ -247,12 +247,12 @@ def _growth_features(
 
 
 def _direction(shape: np.ndarray) -> np.ndarray:
-    """[3] the normal of the plane through a patch, of either sign, from its mean point and squares [C]."""
+    """[3] normal (sign arbitrary) of the plane through a patch, from its mean point and squares [C]."""
     return np.asarray(np.linalg.eigh(_covariance(shape[None])[0])[1][:, 0])
 
 
 def _covariance(shape: np.ndarray) -> np.ndarray:
-    """[M, 3, 3] of the voxels of each patch, from mean points and squares [M, C]."""
+    """[M, 3, 3] covariance of the voxels of each patch, from mean points and squares [M, C]."""
     full = np.zeros((len(shape), 3, 3))
     full[:, _UPPER[0], _UPPER[1]] = full[:, _UPPER[1], _UPPER[0]] = shape[:, _SQUARES]
     mean = shape[:, _POINT]
@@ -260,11 +260,11 @@ def _covariance(shape: np.ndarray) -> np.ndarray:
 
 
 def _extents(shape: np.ndarray) -> np.ndarray:
-    """[M, 3] standard deviations of the voxels of each patch along its main axes, rising: the first is its thickness,
-    across its own plane."""
+    """[M, 3] standard deviations of the voxels of each patch along its principal axes, ascending. The first is the
+    thickness across the patch's plane."""
     return np.sqrt(np.maximum(np.linalg.eigvalsh(_covariance(shape)), 0))
 
 
 def _sum_by(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """[count, C] sums of the rows of `values` [P, C] by `index` [P]."""
+    """[count, C] sums of the rows of `values` [P, C], grouped by `index` [P]."""
     return np.stack([np.bincount(index, weights=column, minlength=count) for column in values.T], axis=1)
