@@ -1,4 +1,4 @@
-"""Photos, intrinsics and poses out of ROS bags (ROS 1, ROS 2, MCAP), for the mapper."""
+"""Extracts photos, intrinsics and poses from ROS bags (ROS 1, ROS 2, MCAP), as input for mapping."""
 
 from perception.bags.frames import FrameOptions, run_frames
 

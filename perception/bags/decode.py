@@ -1,4 +1,4 @@
-"""sensor_msgs/Image and CompressedImage as pictures."""
+"""Decodes sensor_msgs/Image and CompressedImage."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _EIGHT_BIT: dict[str, tuple[int, int | None]] = {
 
 
 def decode_image(message: Any, where: str) -> np.ndarray:
-    """An Image or CompressedImage as [H, W, 3] uint8 BGR. InputError naming `where` for what is no 8-bit picture."""
+    """An Image or CompressedImage as [H, W, 3] uint8 BGR. InputError naming `where` if it is not an 8-bit image."""
     if hasattr(message, "encoding"):
         return _raw(message, where)
     picture = cv2.imdecode(np.frombuffer(bytes(message.data) or b"\0", np.uint8), cv2.IMREAD_COLOR)
@@ -61,7 +61,7 @@ def _raw(message: Any, where: str) -> np.ndarray:
 
 
 def encoded(message: Any, picture: np.ndarray) -> tuple[str, bytes]:
-    """(suffix, bytes) of a file with the picture: a compressed message as it came, else PNG."""
+    """(suffix, bytes) of an image file: a compressed message is written unchanged, others as PNG."""
     if not hasattr(message, "encoding"):
         data = bytes(message.data)
         if data[:2] == b"\xff\xd8":
@@ -69,5 +69,5 @@ def encoded(message: Any, picture: np.ndarray) -> tuple[str, bytes]:
         if data[:4] == b"\x89PNG":
             return ".png", data
     done, buffer = cv2.imencode(".png", picture)
-    assert done  # an 8-bit picture can always be written
+    assert done  # encoding an 8-bit image as PNG does not fail
     return ".png", buffer.tobytes()

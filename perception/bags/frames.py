@@ -1,4 +1,4 @@
-"""`perception frames`: sharp, well-spaced photos of a bag with the camera's intrinsics and, where there, its poses."""
+"""`perception frames`: extracts sharp, well-spaced photos from a bag, with intrinsics and, if available, poses."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from perception.types import Lens
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """topic: of the images (None: the bag's only one). camera_info: its topic (None: beside the images').
+    """topic: of the images (None: the only one in the bag). camera_info: its topic (None: the one next to the images).
 
-    camera: a camera file used instead of camera_info. poses: use tf and odometry where there. fixed_frame: the world
+    camera: file that replaces camera_info. poses: use tf and odometry if available. fixed_frame: the world frame
     (None: map, odom, world, or the root of the tree). odometry: topic (None: all). max_frames, spacing: see Chooser.
     """
 
@@ -42,9 +42,9 @@ class FrameOptions:
 def run_frames(
     source: Path, output: Path, options: FrameOptions | None = None, tell: Callable[[str], None] | None = None
 ) -> tuple[dict[str, Any], str]:
-    """Writes `output`/images, camera.yaml and, with poses, transforms.json: (JSON-able result, text).
+    """Writes `output`/images, camera.yaml and, with poses, transforms.json: (JSON-serialisable result, text).
 
-    The mapper takes `output` where there are poses, else `output`/images with --camera `output`/camera.yaml.
+    Map `output` if there are poses. Otherwise map `output`/images with --camera `output`/camera.yaml.
     """
     options, tell = options or FrameOptions(), tell or (lambda line: None)
     if output.exists() and any(output.iterdir()):
@@ -87,7 +87,7 @@ def run_frames(
 
 @dataclass
 class Placed:
-    """Poses of written images: known[name] = camera_from_world, in order; fixed, frame: the world's and camera's."""
+    """Poses of written images: known[name] = camera_from_world, in order; fixed: world frame; frame: of the camera."""
 
     known: dict[str, np.ndarray]
     stamps: dict[str, int]
@@ -109,7 +109,7 @@ def _image_topic(bag: Bag, wanted: str | None) -> str:
 
 
 def _camera_info(bag: Bag, topic: str, wanted: str | None) -> Any:
-    """The first CameraInfo of the camera that took `topic`."""
+    """The first CameraInfo of the camera that publishes `topic`."""
     topics = bag.of_type(CAMERA_INFO)
     base = topic.removesuffix("/compressed").rpartition("/")[0]
     beside = f"{base}/camera_info"
@@ -140,7 +140,7 @@ def _write_camera(path: Path, camera: Path | None, info: Any, topic: str, size: 
 
 
 def _write_images(bag: Bag, topic: str, chosen: list[int], folder: Path) -> tuple[dict[str, int], str]:
-    """Writes the chosen images; returns their times in ns by name, in order, and the camera's frame."""
+    """Writes the chosen images. Returns their times in ns by name, in order, and the camera frame."""
     folder.mkdir()
     wanted, stamps, frame = set(chosen), {}, ""
     for number, (_, recorded, message) in enumerate(bag.messages([topic])):
@@ -155,7 +155,7 @@ def _write_images(bag: Bag, topic: str, chosen: list[int], folder: Path) -> tupl
 
 
 def _place(poses: Poses, stamps: dict[str, int], frame: str, fixed: str | None) -> Placed:
-    """Poses in the first world of FIXED_FRAMES (or the tree's root) that knows four images in five, else the most."""
+    """Poses in the first of FIXED_FRAMES (or the tree's root) with poses for 80 % of the images, else with the most."""
     best = Placed({}, stamps, fixed, frame)
     for name in [fixed] if fixed else [*FIXED_FRAMES, poses.root(frame)]:
         found = {image: poses.camera_from_world(name, frame, time) for image, time in stamps.items()}
@@ -168,7 +168,7 @@ def _place(poses: Poses, stamps: dict[str, int], frame: str, fixed: str | None) 
 
 
 def _write_transforms(path: Path, placed: Placed, lens: Lens) -> None:
-    """nerfstudio's form: frames with a pose only, OpenGL camera axes, pixel centres at +0.5."""
+    """nerfstudio's format: only frames with a pose, OpenGL camera axes, pixel centres at +0.5."""
     frames = [
         {
             "file_path": f"images/{name}",

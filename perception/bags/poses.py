@@ -12,7 +12,7 @@ from perception.geometry import inverse_se3
 
 FIXED_FRAMES = ("map", "odom", "world")
 MAX_GAP = 0.5
-"""Seconds between two samples of a moving frame over which a pose is still interpolated."""
+"""Maximum time in seconds between two samples of a moving frame for a pose to be interpolated."""
 
 
 class Poses:
@@ -25,7 +25,7 @@ class Poses:
         self._arrays: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def add(self, parent: str, child: str, time: int, parent_from_child: np.ndarray, static: bool = False) -> None:
-        """One sample [4, 4] at a time in ns. The first parent of a frame stays its parent."""
+        """Adds one sample [4, 4] at a time in ns. A frame keeps its first parent."""
         parent, child = parent.lstrip("/"), child.lstrip("/")
         if self.parents.setdefault(child, parent) != parent:
             return
@@ -41,7 +41,7 @@ class Poses:
         return seen[-1]
 
     def chain(self, fixed: str, frame: str) -> list[str] | None:
-        """Frames from `frame` up to just below `fixed`; None when they are not connected that way."""
+        """Frames from `frame` up to just below `fixed`; None if `fixed` is not an ancestor of `frame`."""
         fixed, frames = fixed.lstrip("/"), [frame.lstrip("/")]
         while frames[-1] != fixed:
             parent = self.parents.get(frames[-1])
@@ -51,7 +51,7 @@ class Poses:
         return frames[:-1]
 
     def camera_from_world(self, fixed: str, frame: str, time: int) -> np.ndarray | None:
-        """[4, 4] at a time in ns, interpolated; None where the frames are not connected or no sample is near."""
+        """[4, 4] at a time in ns, interpolated; None if the frames are not connected or there is no sample nearby."""
         chain = self.chain(fixed, frame)
         if not chain:
             return None
@@ -84,7 +84,7 @@ class Poses:
 
 
 def read_poses(bag: Bag, odometry: str | None = None) -> Poses:
-    """All transforms of a bag; odometry [topic] (default: all odometry) joins the tree where tf does not say."""
+    """All transforms of a bag. odometry [topic] (default: all odometry) adds frames that tf does not define."""
     poses = Poses()
     for topic, _, message in bag.messages(bag.of_type(*TRANSFORMS)):
         for entry in message.transforms:

@@ -1,4 +1,4 @@
-"""A bag's topics and messages, through the optional package `rosbags`."""
+"""Reads topics and messages of a bag with the optional package `rosbags`."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ class Bag:
         return sorted(topic for topic, kind in self.topics.items() if kind in types)
 
     def messages(self, topics: list[str]) -> Iterator[tuple[str, int, Any]]:
-        """(topic, time of recording in ns, message) in the order of time; a message that is broken is an InputError."""
+        """(topic, recording time in ns, message) in order of time. Raises InputError for a corrupt message."""
         chosen = [c for c in self._reader.connections if c.topic in topics]
         if not chosen:
             return
         for connection, time, raw in self._reader.messages(connections=chosen):
             try:
                 yield connection.topic, time, self._reader.deserialize(raw, connection.msgtype)
-            except Exception as error:  # the library's errors have no common root
+            except Exception as error:  # the library's exceptions have no common base class
                 raise InputError(f"{self.path}: a message on {connection.topic} cannot be read ({error})") from error
 
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Opens a ROS 1 .bag, a ROS 2 bag folder (SQLite or MCAP) or an .mcap file. InputError when it is none."""
+    """Opens a ROS 1 .bag, a ROS 2 bag folder (SQLite or MCAP) or an .mcap file. InputError if it is none of these."""
     try:
         from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
@@ -49,7 +49,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     if not path.exists():
         raise InputError(f"{path}: no such bag; expected a .bag, an .mcap, or the folder of a ROS 2 bag")
     try:
-        store = None if path.suffix == ".bag" else get_typestore(Stores.LATEST)  # old ROS 2 bags carry no definitions
+        store = None if path.suffix == ".bag" else get_typestore(Stores.LATEST)  # old ROS 2 bags lack definitions
         reader = AnyReader([path], default_typestore=store)
         reader.open()
     except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:

@@ -1,4 +1,4 @@
-"""Measurements that anyone can rerun: `perception bench NAME`. Each module has `main(arguments)`."""
+"""Benchmarks: `perception bench NAME`. Each module has `main(arguments)`."""
 
 BENCHES = (
     "rasterizer",

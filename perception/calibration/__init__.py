@@ -1,4 +1,4 @@
-"""Cameras calibrated from pictures of a board: corners, lens parameters with their uncertainty, and refusals."""
+"""Camera calibration from photos of a board: corner detection, lens parameters with uncertainty, acceptance checks."""
 
 from perception.calibration.board import Board
 from perception.calibration.calibrate import run_calibration

@@ -1,4 +1,4 @@
-"""Calibration boards and their corners in pictures."""
+"""Calibration boards and detection of their corners."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from perception.calibration.refine import refine
 from perception.errors import InputError
 
 MIN_CORNERS = 8
-"""Corners without which a picture says too little: a pose alone takes three."""
+"""Minimum number of corners per image. The pose alone needs three."""
 
 
 @dataclass(frozen=True)
 class Detection:
-    """One picture of the board. name: of the picture; board_points [N, 3] float32 in the board's frame (its unit,
-    z = 0); pixels [N, 2] float32, OpenCV's way: the centre of the first pixel is (0, 0)."""
+    """The board in one image. name: of the image; board_points [N, 3] float32 in the board frame (its unit, z = 0);
+    pixels [N, 2] float32 in OpenCV's convention: the centre of the first pixel is (0, 0)."""
 
     name: str
     board_points: np.ndarray
@@ -29,7 +29,7 @@ class Detection:
 @dataclass(frozen=True)
 class Board:
     """A printed board. kind: "charuco" or "checkerboard"; squares: (columns, rows) of squares, not of corners;
-    square, marker: side lengths in metres (or any unit); dictionary: of the markers, as OpenCV names it."""
+    square, marker: side lengths in metres (or any unit); dictionary: OpenCV's name of the marker dictionary."""
 
     kind: str
     squares: tuple[int, int]
@@ -56,14 +56,14 @@ class Board:
         return f"{self.kind} of {self.squares[0]}x{self.squares[1]} squares{markers}"
 
     def detect(self, name: str, picture: np.ndarray) -> Detection | None:
-        """The corners of the board in a grey picture [H, W] uint8; None with fewer than MIN_CORNERS."""
+        """Detects the board in a grey image [H, W] uint8; None with fewer than MIN_CORNERS corners."""
         found = self._charuco(picture) if self.kind == "charuco" else self._checkerboard(picture)
         if found is None or len(found[0]) < MIN_CORNERS or _on_a_line(found[0]):
             return None
         return Detection(name, found[0].astype(np.float32), found[1].astype(np.float32))
 
     def texture(self, pixels_per_square: int = 60, margin: int = 30) -> np.ndarray:
-        """The board as a picture [H, W] uint8, its top left square starting `margin` pixels from the corner."""
+        """The board as an image [H, W] uint8. Its top left square starts `margin` pixels from the image corner."""
         columns, rows = self.squares
         if self.kind == "charuco":
             return self._print(self._charuco_board(), pixels_per_square, margin)
@@ -79,8 +79,8 @@ class Board:
 
     @cached_property
     def _detectors(self) -> list[tuple[Any, np.ndarray, np.ndarray]]:
-        """(detector, corners, print) of today's pattern, then of boards printed with OpenCV before 4.6, which differ
-        for even rows."""
+        """(detector, corners, texture) of the current ChArUco pattern, and of the legacy pattern (OpenCV before 4.6),
+        which differs for an even number of rows."""
         boards = [self._charuco_board(legacy) for legacy in (False, True)]
         return [
             (cv2.aruco.CharucoDetector(board), np.asarray(board.getChessboardCorners()), self._print(board))

@@ -1,4 +1,4 @@
-"""`perception calibrate`: pictures of a board in, a camera file and its proof out."""
+"""`perception calibrate`: computes a camera file and its quality report from photos of a board."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from perception.io.camera_file import write_camera
 
 MODELS = ("auto", "pinhole", "fisheye")
 MAX_VIEWS = 60
-"""Views that are solved for; more of them change nothing but the time."""
+"""Maximum number of views used. More of them increase the run time without changing the result."""
 
 
 def run_calibration(
@@ -31,11 +31,11 @@ def run_calibration(
     pictures: Path | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, Any], str]:
-    """Calibrates a camera from a folder of photos or a video of a board: (JSON-able result, table).
+    """Calibrates a camera from a folder of photos or a video of a board: (JSON-serialisable result, table).
 
-    Writes `output` (ROS camera_info YAML), beside it a .json with every figure, and into `pictures` the detections
-    and the coverage. Photos are turned upright as their EXIF data says, as the mapper does. InputError when the
-    board is not seen, in too few or too similar views.
+    Writes `output` (ROS camera_info YAML) and next to it a .json with all figures. Draws detections and coverage into
+    `pictures`. Photos are rotated according to EXIF, as in mapping. Raises InputError if no board is found, or if the
+    views are too few or too similar.
     """
     if model not in MODELS:
         raise InputError(f"--model is '{model}'; expected one of {', '.join(MODELS)}")
@@ -59,7 +59,7 @@ def run_calibration(
 
 
 def best_model(views: list[Detection], size: tuple[int, int], model: str = "auto") -> Solution:
-    """The solution under a model; "auto": of both, the one with less error, pinhole where they are within 5 %."""
+    """Solves for one model. "auto" solves both and takes the smaller error; within 5 % it takes pinhole."""
     if model != "auto":
         return solve(model, views, size)
     solved = []
@@ -67,7 +67,7 @@ def best_model(views: list[Detection], size: tuple[int, int], model: str = "auto
         try:
             solved.append(solve(name, views, size))
         except (InputError, cv2.error, np.linalg.LinAlgError):
-            continue  # a model that cannot explain the views at all
+            continue  # this model does not fit the views
     if not solved:
         raise InputError("neither a pinhole nor a fisheye camera explains the boards found; is the board flat?")
     if len(solved) == 2 and solved[1].rms > 0.95 * solved[0].rms:

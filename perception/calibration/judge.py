@@ -1,4 +1,4 @@
-"""Whether views suffice: how many there are that differ, how they are tilted, and how sure the answer is."""
+"""Checks whether views suffice: number of distinct views, tilt, coverage, and uncertainty of the focal length."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from perception.errors import InputError
 
 MIN_VIEWS = 5
 MIN_TILT_SPREAD = 20.0
-"""Degrees between the most different directions of the board: parallel views do not tell focal length from distance."""
+"""Required angle in degrees between two board normals. Parallel views do not separate focal length and distance."""
 MAX_FOCAL_SIGMA = 0.01
-"""Standard deviation of the focal length over itself, beyond which a calibration does more harm than a guess."""
+"""Maximum relative standard deviation of the focal length of an accepted calibration."""
 MIN_COVERAGE, GOOD_COVERAGE = 0.25, 0.6
-"""Share of the picture's area within the hull of all corners: refused below the first, warned below the second."""
+"""Share of the image area inside the convex hull of all corners: error below the first, warning below the second."""
 SAME_VIEW = 0.03
-"""Views whose corners moved by less than this share of the picture's width are one."""
+"""Views count as equal if their corners move by less than this share of the image width."""
 
 
 def distinct_views(views: Sequence[Detection], width: int) -> list[Detection]:
-    """The views less those that repeat an earlier one (a still video, bursts)."""
+    """The views without those that repeat an earlier one (static video, burst photos)."""
     kept: list[Detection] = []
     for view in views:
         if all(_motion(view, other) > SAME_VIEW * width for other in kept):
@@ -32,7 +32,7 @@ def distinct_views(views: Sequence[Detection], width: int) -> list[Detection]:
 
 
 def _motion(a: Detection, b: Detection) -> float:
-    """Median way in pixels that the corners seen in both have moved; infinite when they share fewer than 4."""
+    """Median displacement in pixels of the corners that both views show; infinite if they share fewer than 4."""
     places = {tuple(p): q for p, q in zip(a.board_points.round(6).tolist(), a.pixels, strict=True)}  # type: ignore[misc]
     shared = [
         float(np.linalg.norm(places[tuple(p)] - q))
@@ -43,19 +43,19 @@ def _motion(a: Detection, b: Detection) -> float:
 
 
 def coverage(solution: Solution) -> float:
-    """Share of the picture's area within the convex hull of all corners."""
+    """Share of the image area within the convex hull of all corners."""
     hull = cv2.convexHull(np.concatenate([view.pixels for view in solution.views]).astype(np.float32))
     return float(cv2.contourArea(hull)) / (solution.size[0] * solution.size[1])
 
 
 def tilt_spread(solution: Solution) -> float:
-    """Largest angle in degrees between the board's directions in two views."""
+    """Largest angle in degrees between the board normals of two views."""
     normals = np.stack([cv2.Rodrigues(pose[:3])[0][:, 2] for pose in solution.poses])
     return float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1, 1))))
 
 
 def check_count(views: Sequence[Detection], found: int, looked_at: int, what: str, source: str) -> None:
-    """InputError when the board was not seen, or in too few places."""
+    """Raises InputError if no board was found, or too few distinct views of it."""
     if found == 0:
         raise InputError(
             f"{source}: no {what} was found in {looked_at} pictures; check --board, --squares (of squares, not "
@@ -69,7 +69,7 @@ def check_count(views: Sequence[Detection], found: int, looked_at: int, what: st
 
 
 def check_solution(solution: Solution, source: str) -> list[str]:
-    """Warnings; InputError when the views are too alike to trust what came out."""
+    """Returns warnings. Raises InputError if the views do not determine the camera."""
     spread = tilt_spread(solution)
     if spread < MIN_TILT_SPREAD:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Pictures to calibrate from: a folder of photos or a video; and pictures that show what was found."""
+"""Input images for calibration, from a folder of photos or a video; and images that show the detections."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from perception.errors import InputError
 from perception.io.photos import SUFFIXES
 
 MAX_FRAMES = 240
-"""Frames of a video that are looked at, evenly spread."""
+"""Maximum number of video frames that are read, evenly spaced."""
 
 
 def read_pictures(source: Path) -> Iterator[tuple[str, np.ndarray]]:
-    """(name, grey picture [H, W] uint8) of a folder's photos in order of name, or of a video's frames."""
+    """(name, grey image [H, W] uint8) of a folder's photos in order of name, or of a video's frames."""
     if source.is_dir():
         files = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
         if not files:
@@ -54,7 +54,7 @@ def _video(source: Path) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def draw_detection(picture: np.ndarray, view: Detection, residuals: np.ndarray, magnify: float = 50) -> np.ndarray:
-    """A picture [H, W, 3] BGR with the corners found (green) and what is left of them, `magnify` times (red)."""
+    """An image [H, W, 3] BGR with the detected corners (green) and their residuals, `magnify` times enlarged (red)."""
     out = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
     size = max(picture.shape[1] // 320, 2)
     for (x, y), (dx, dy) in zip(view.pixels.tolist(), residuals.tolist(), strict=True):
@@ -65,7 +65,7 @@ def draw_detection(picture: np.ndarray, view: Detection, residuals: np.ndarray, 
 
 
 def draw_coverage(solution: Solution, magnify: float = 100) -> np.ndarray:
-    """All corners of all views on white [H, W, 3] BGR, residuals `magnify` times: holes tell where nothing is known."""
+    """Corners of all views on white [H, W, 3] BGR, residuals `magnify` times enlarged. Shows uncovered image areas."""
     width, height = solution.size
     out = np.full((height, width, 3), 255, np.uint8)
     for view, residuals in zip(solution.views, solution.residuals, strict=True):

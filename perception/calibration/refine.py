@@ -1,8 +1,8 @@
-"""Corners of a ChArUco board to a twentieth of a pixel, from the board's known print.
+"""Refines corners of a ChArUco board to 0.05 pixels, using the known printed pattern.
 
-OpenCV refines a corner within the white rim between it and the markers, a few pixels, and that biases it by a tenth of
-a pixel. Here a patch of the print around each corner, markers and all, is laid over the picture by the homography of
-the corners nearby and moved until it fits (Lucas-Kanade with gain and offset, 4 unknowns).
+OpenCV refines a corner in the few white pixels between it and the markers, which biases it by 0.1 pixels. Here the
+pattern around each corner, including markers, is warped into the image by the homography of nearby corners. It is then
+aligned by Lucas-Kanade with gain and offset (4 unknowns).
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-_HALF, _SAMPLES = 0.3, 17  # of a square to either side; samples along a side
-_NEAR = 1.6  # squares: corners whose homography lays the patch
+_HALF, _SAMPLES = 0.3, 17  # half side of the patch in squares; samples along a side
+_NEAR = 1.6  # squares: distance of the corners used for the homography
 _ITERATIONS = 8
-_MOST = 1.5  # pixels that a corner may move; beyond, the detection stays
+_MOST = 1.5  # pixels: if a corner moves farther, the detection is kept
 
 
 def refine(
@@ -25,9 +25,9 @@ def refine(
     per_square: float,
     margin: float,
 ) -> np.ndarray:
-    """Refined pixels [N, 2] of board points [N, 3] found at `pixels` in a grey picture.
+    """Refined pixels [N, 2] of board points [N, 3] detected at `pixels` in a grey image.
 
-    texture: the print, `per_square` pixels a square, the board's origin `margin` pixels from its corner.
+    texture: printed pattern with `per_square` pixels a square; the board's origin is `margin` pixels from its corner.
     """
     image = picture.astype(np.float32)
     slopes = [cv2.Sobel(image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (1, 0)]
@@ -44,7 +44,7 @@ def refine(
             continue
         at = _apply(laid, corner + patch)
         side = np.sqrt(np.abs(_area(laid, corner, square)))
-        # The print is seen through a pixel's square: blur it alike, in steps of a quarter octave.
+        # A pixel averages over its area: the texture is blurred accordingly, in steps of a quarter octave.
         blur = float(2 ** (np.round(4 * np.log2(max(0.5 * per_square / max(side, 1), 0.3))) / 4))
         if blur not in smooth:
             smooth[blur] = cv2.GaussianBlur(texture.astype(np.float32), (0, 0), blur)
@@ -58,7 +58,7 @@ def refine(
 
 
 def _fit(image: np.ndarray, slopes: list[np.ndarray], at: np.ndarray, template: np.ndarray) -> np.ndarray | None:
-    """The shift [2] that lays picture positions `at` [S, 2] onto what the template shows; None where it slips."""
+    """The shift [2] that aligns the image at positions `at` [S, 2] with the template; None if it diverges."""
     inside = (at.min(axis=0) > 2).all() and (at.max(axis=0) < np.array(image.shape[::-1]) - 3).all()
     if not inside:
         return None
@@ -78,7 +78,7 @@ def _fit(image: np.ndarray, slopes: list[np.ndarray], at: np.ndarray, template: 
 
 
 def _sample(image: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Bilinear values [S] at positions [S, 2] (x, y), pixel centres at whole numbers."""
+    """Bilinear values [S] at positions [S, 2] (x, y), pixel centres at integers."""
     where = np.ascontiguousarray(at, np.float32).reshape(-1, 1, 2)
     return cv2.remap(image, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel().astype(np.float64)  # type: ignore[call-overload]
 
@@ -89,6 +89,6 @@ def _apply(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _area(homography: np.ndarray, corner: np.ndarray, square: float) -> float:
-    """Signed area in pixels of the parallelogram that a square at `corner` is seen as."""
+    """Signed area in pixels² of the image of a board square at `corner`."""
     base, right, down = _apply(homography, corner + np.array([[0, 0], [square, 0], [0, square]]))
     return float((right - base)[0] * (down - base)[1] - (right - base)[1] * (down - base)[0])

@@ -1,12 +1,12 @@
 """Lens parameters and board poses of least reprojection error, with their uncertainty.
 
-Levenberg-Marquardt on all intrinsics and poses at once; Jacobians are OpenCV's, of its pinhole model (plumb_bob) and
-its fisheye model (equidistant, Kannala-Brandt). The covariance of the estimate is σ² (JᵀJ)⁻¹ with σ² from the
-residuals, poses taken into account.
+Levenberg-Marquardt over all intrinsics and poses jointly. Jacobians are from OpenCV: its pinhole model (plumb_bob) and
+its fisheye model (equidistant, Kannala-Brandt). The covariance of the estimate is σ² (JᵀJ)⁻¹, with σ² from the
+residuals and poses included.
 
-The solver is our own because it adds up JᵀJ view by view: 60 views of 70 corners take 0.3 s.
-scipy.optimize.least_squares with the same Jacobians finds the same camera in 6 to 23 s ("lm"), and with sparse ones
-("trf", "lsmr") in 9 to 23 s with less precision.
+The solver accumulates JᵀJ view by view: 60 views of 70 corners take 0.3 s. With the same Jacobians,
+scipy.optimize.least_squares finds the same camera in 6 to 23 s ("lm"); with sparse Jacobians ("trf", "lsmr") it takes
+9 to 23 s and is less precise.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ _ITERATIONS = 60
 class Solution:
     """A calibrated camera.
 
-    model: "pinhole" or "fisheye"; values and sigmas [P] as NAMES[model], pixels in OpenCV's convention; free [P]: which
-    were solved for (the others are 0). views: less their outliers. poses [V, 6]: rotation vector and translation,
-    camera_from_board. residuals: per view [N, 2] pixels, found − predicted. rms: over all coordinates, pixels.
+    model: "pinhole" or "fisheye"; values and sigmas [P] in the order of NAMES[model], pixels in OpenCV's convention;
+    free [P]: which ones were estimated (the others are 0). views: without outliers. poses [V, 6]: camera_from_board as
+    rotation vector and translation. residuals: per view [N, 2] pixels, detected − predicted. rms: pixels.
     """
 
     model: str
@@ -67,10 +67,10 @@ def project(model: str, values: np.ndarray, pose: np.ndarray, points: np.ndarray
 
 
 def solve(model: str, views: Sequence[Detection], size: tuple[int, int]) -> Solution:
-    """Calibrates from at least two views of a board; size: (width, height) of the pictures.
+    """Calibrates from at least two views of a board. size: (width, height) of the images.
 
-    k3 of the pinhole model is kept only where it can be told from 0 (beyond three standard deviations). Gross
-    outliers among the corners are left out, and the rest solved again.
+    k3 of the pinhole model is kept only if it differs from 0 by more than three standard deviations. Outlier corners
+    are removed, and the rest is solved again.
     """
     free = np.ones(len(NAMES[model]), bool)
     if model == "pinhole":
@@ -87,7 +87,7 @@ def solve(model: str, views: Sequence[Detection], size: tuple[int, int]) -> Solu
 
 
 def _without_outliers(views: Sequence[Detection], solution: Solution) -> list[Detection]:
-    """The views less corners farther off than six robust standard deviations (at least a pixel)."""
+    """The views without corners whose error exceeds six robust standard deviations (at least a pixel)."""
     lengths = [np.linalg.norm(r, axis=1) for r in solution.residuals]
     limit = max(6 * 1.4826 * float(np.median(np.concatenate(lengths))), 1.0)
     kept = []
@@ -106,7 +106,7 @@ def _descend(
     poses: np.ndarray,
     free: np.ndarray,
 ) -> Solution:
-    """Levenberg-Marquardt from a start; parameters that are not free are set to 0."""
+    """Levenberg-Marquardt from initial values; parameters that are not free are set to 0."""
     values, poses = np.where(free, values, 0.0), poses.copy()
     damping = 1e-3
     residuals, normal, gradient = _linearised(model, views, values, poses, free)
@@ -162,7 +162,7 @@ def _linearised(
 
 
 def _start(model: str, views: Sequence[Detection], size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters and poses to start from: the focal length of a ladder under which the boards' poses fit best."""
+    """Initial parameters and poses: from a list of focal lengths, the one with the smallest reprojection error."""
     width, height = size
     best: tuple[float, np.ndarray, np.ndarray] | None = None
     for factor in (0.25, 0.32, 0.4, 0.5, 0.65, 0.8, 1.0, 1.3, 1.7, 2.3, 3.0):
@@ -185,12 +185,12 @@ def _start(model: str, views: Sequence[Detection], size: tuple[int, int]) -> tup
 
 
 def _pose(model: str, values: np.ndarray, view: Detection) -> np.ndarray | None:
-    """camera_from_board [6] of a view under given parameters; None where they cannot explain it."""
+    """camera_from_board [6] of a view for given parameters; None if the view does not fit them."""
     K = np.array([[values[0], 0, values[2]], [0, values[1], values[3]], [0, 0, 1.0]])
     pixels = view.pixels.astype(np.float64).reshape(-1, 1, 2)
     if model == "fisheye":
         radius = np.linalg.norm((view.pixels - values[2:4]) / values[:2], axis=1)
-        if radius.max() > 1.5:  # 86 degrees off the axis: a plane's picture ends there
+        if radius.max() > 1.5:  # 86 degrees from the axis: a plane cannot be imaged beyond 90
             return None
         rays = cv2.fisheye.undistortPoints(pixels, K, values[4:])
     else:

@@ -1,4 +1,4 @@
-"""Judging results by the field's own rules; every figure carries the protocol that made it."""
+"""Evaluation with the standard benchmark protocols. Every result names the protocol that produced it."""
 
 from perception.evaluate.images import run_images
 from perception.evaluate.labelled_clouds import run_instances

@@ -1,8 +1,9 @@
 """Instance average precision as ScanNet defines it, on contingency tables pooled over scenes.
 
-Rules (ScanNet benchmark, 3D semantic instance evaluation): strict IoU > threshold; the truth is walked in order, and
-predictions in input order; the first match uses a prediction up, later ones are false positives at the lower score; an
-unmatched prediction is a false positive unless its share of void and too-small truth exceeds the threshold.
+Rules (ScanNet benchmark, 3D semantic instance evaluation): IoU must be strictly above the threshold. True instances are
+visited in order, predictions in input order. The first match uses the prediction. Each further match is a false
+positive at the lower of the two scores. An unmatched prediction is a false positive unless its share of void and of too
+small true instances exceeds the threshold.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from perception.evaluate.overlap import Overlap
 
 @dataclass
 class Matches:
-    """What one class at one threshold yields: scored true/false positives, misses, and the matched pairs."""
+    """Result for one class at one threshold: scores of true and false positives, number of misses, matched pairs."""
 
     scores: list[float] = field(default_factory=list)
     positive: list[bool] = field(default_factory=list)
@@ -28,7 +29,7 @@ class Matches:
 
 
 def match(scenes: Sequence[Overlap], label: int, threshold: float, min_region: int) -> Matches:
-    """Greedy matching of the predictions and truths of one class at one IoU threshold, over all scenes."""
+    """Greedy matching of predictions and true instances of one class at one IoU threshold, over all scenes."""
     result = Matches()
     for number, scene in enumerate(scenes):
         preds = np.flatnonzero((scene.pred_classes == label) & (scene.pred_sizes >= max(min_region, 1)))
@@ -51,7 +52,7 @@ def _match_truth(
         if not candidates:
             result.misses += 1
             continue
-        used.add(candidates[0])  # only the first is used up: a duplicate may still match another truth
+        used.add(candidates[0])  # only the first is used: a duplicate may still match another true instance
         best = float(scene.pred_scores[candidates[0]])
         for p in candidates[1:]:
             score = float(scene.pred_scores[p])
@@ -73,7 +74,7 @@ def _unmatched(
     min_region: int,
     result: Matches,
 ) -> None:
-    """Predictions that meet no truth of their class, not even a small one, are false positives unless ignored."""
+    """Adds a false positive for each prediction that matches no true instance of its class, unless it is ignored."""
     small = truths[scene.gt_sizes[truths] < min_region]
     for p in preds[~hit[np.ix_(preds, truths)].any(axis=1)].tolist():
         ignored = scene.pred_void[p] + scene.intersections[p, small].sum()
@@ -83,9 +84,9 @@ def _unmatched(
 
 
 def average_precision(matches: Matches) -> float:
-    """Area under the precision-recall curve: one point per distinct score, closed by (recall 0, precision 1).
+    """Area under the precision-recall curve: one point per distinct score, plus the point (recall 0, precision 1).
 
-    NaN without truth, 0 without predictions or when all of them are ignored.
+    NaN without true instances; 0 without predictions or when all predictions are ignored.
     """
     if not matches.has_truth:
         return float("nan")
@@ -94,7 +95,7 @@ def average_precision(matches: Matches) -> float:
     scores = np.array(matches.scores)
     order = np.argsort(scores, kind="stable")
     positive = np.array(matches.positive, float)[order]
-    first = np.unique(scores[order], return_index=True)[1]  # of each distinct score, ascending
+    first = np.unique(scores[order], return_index=True)[1]  # first index of each distinct score, ascending
     true_above = positive.sum() - np.concatenate(([0.0], np.cumsum(positive)))[first]
     precision = np.append(true_above / (len(scores) - first), 1.0)
     recall = np.append(true_above / (positive.sum() + matches.misses), 0.0)

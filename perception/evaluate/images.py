@@ -1,4 +1,4 @@
-"""PSNR and SSIM between pictures."""
+"""PSNR and SSIM between images."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ PROTOCOL = {
 
 
 def psnr(prediction: np.ndarray, truth: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB of pictures [H, W, 3] in [0, 1]; infinite when they are equal."""
+    """Peak signal-to-noise ratio in dB of images [H, W, 3] in [0, 1]; infinite when they are equal."""
     error = float(np.mean((prediction.astype(np.float64) - truth) ** 2))
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
 def ssim(prediction: np.ndarray, truth: np.ndarray) -> float:
-    """Structural similarity of pictures [H, W, 3] in [0, 1] (Wang et al. 2004, equation 13), mean over channels.
+    """Structural similarity of images [H, W, 3] in [0, 1] (Wang et al. 2004, equation 13), mean over channels.
 
-    scikit-image's, in the paper's variant: Gaussian window of 11 × 11 pixels, σ = 1.5, K1 = 0.01, K2 = 0.03, biased
-    covariances, mean over the windows that lie wholly inside the picture. The loss and its curve in training take
-    zeros beyond the border instead, as 3DGS does. InputError for pictures smaller than the window.
+    Equal to scikit-image's with the paper's parameters: Gaussian window of 11 × 11 pixels, σ = 1.5, K1 = 0.01, K2 =
+    0.03, biased covariances, mean over windows that lie completely inside the image. The training loss and its curve
+    differ: they pad with zeros, as 3DGS does. Raises InputError for images smaller than the window.
     """
     from skimage.metrics import structural_similarity
 
@@ -47,7 +47,7 @@ def ssim(prediction: np.ndarray, truth: np.ndarray) -> float:
 
 
 def read_rgb(path: Path) -> np.ndarray:
-    """A picture as [H, W, 3] float64 in [0, 1]; 8 or 16 bit, grey is repeated, alpha is dropped."""
+    """An image as [H, W, 3] float64 in [0, 1]. 8 or 16 bit; grey is repeated to 3 channels, alpha is dropped."""
     raw = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), cv2.IMREAD_UNCHANGED)
     if raw is None or raw.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path}: is not a readable 8 or 16 bit picture")
@@ -57,7 +57,7 @@ def read_rgb(path: Path) -> np.ndarray:
 
 
 def pictures(folder: str | Path) -> dict[str, Path]:
-    """Pictures below a folder by relative path without suffix."""
+    """Images below a folder, keyed by relative path without suffix."""
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; expected a folder of pictures")
@@ -71,7 +71,7 @@ def pictures(folder: str | Path) -> dict[str, Path]:
 
 
 def evaluate_images(prediction_dir: str | Path, truth_dir: str | Path) -> dict[str, Any]:
-    """PSNR and SSIM of each true picture and their means; pictures are paired by stem, a missing one scores 0."""
+    """PSNR and SSIM of each reference image and their means. Images are paired by stem; a missing one scores 0."""
     predictions, truths = pictures(prediction_dir), pictures(truth_dir)
     if not truths:
         raise InputError(f"{truth_dir}: holds no pictures")
@@ -103,7 +103,7 @@ def evaluate_images(prediction_dir: str | Path, truth_dir: str | Path) -> dict[s
 
 
 def run_images(prediction_dir: str | Path, truth_dir: str | Path) -> tuple[dict[str, Any], str]:
-    """PSNR and SSIM of a folder of renders against the true pictures: (result, table)."""
+    """PSNR and SSIM of a folder of rendered images against the reference images: (result, table)."""
     result = evaluate_images(prediction_dir, truth_dir)
     width = max([len(name) for name in result["views"]] + [4]) + 2
     lines = [f"{'view':<{width}}{'PSNR':>8}{'SSIM':>8}"]

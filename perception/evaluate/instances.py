@@ -1,4 +1,4 @@
-"""Instance AP of point labellings and masks: ScanNet's rules and the variations the field uses."""
+"""Instance AP of point labels and of masks: ScanNet's rules and common variants."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from perception.evaluate.overlap import (
 
 @dataclass(frozen=True)
 class Protocol:
-    """Every switch that moves a figure; printed with each result.
+    """All options that change a result. They are printed with each result.
 
-    thresholds: the IoU thresholds averaged into AP; extra_thresholds are reported beside (AP25).
-    constant_score: all confidences 1.0 (Segment3D). remove_ignored: points marked "ignore" (truth ids below
-    −1, or a mask) leave truth and prediction before anything is counted (ScanNet++); elsewhere they are void.
+    thresholds: IoU thresholds averaged into AP; extra_thresholds are reported separately (AP25).
+    constant_score: all confidences are 1.0 (Segment3D). remove_ignored: ignored points (truth ids below −1, or a mask)
+    are removed from truth and prediction before counting (ScanNet++); without it they are void.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Protocol:
     valid_classes: tuple[int, ...] | None = None
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able, with the rules that have no switch named too."""
+        """JSON-serialisable; includes the fixed rules that have no option."""
         rules = {
             "matching": "greedy in truth order, strict IoU > threshold, duplicates are false positives",
             "unmatched": "false positive unless the share of void and too-small truth exceeds the threshold",
@@ -60,7 +60,7 @@ PROTOCOLS = {
 
 
 def get_protocol(protocol: str | Protocol, **changes: Any) -> Protocol:
-    """A protocol by name ("scannet", "mask3d", "segment3d", "scannetpp"), switches changed where given."""
+    """A protocol by name ("scannet", "mask3d", "segment3d", "scannetpp"), with the given fields changed."""
     if isinstance(protocol, str):
         if protocol not in PROTOCOLS:
             raise InputError(f"protocol '{protocol}' is unknown; expected one of {', '.join(PROTOCOLS)}")
@@ -79,10 +79,10 @@ def evaluate(
     ignore: np.ndarray | None = None,
     **changes: Any,
 ) -> dict[str, Any]:
-    """AP of a labelling against the truth, both [N] int over the same points; negative prediction = no instance.
+    """AP of predicted labels against true labels, both [N] int over the same points; negative prediction = none.
 
-    pred_scores: confidence by id (None: all 1). *_semantics [N] int are needed for by_class and valid_classes; a
-    prediction's class is the most frequent semantic id of its points. ignore [N] bool. changes: switches of Protocol.
+    pred_scores: confidence by id (None: all 1). *_semantics [N] int are required for by_class and valid_classes. The
+    class of a prediction is the most frequent semantic id of its points. ignore: [N] bool. changes: fields of Protocol.
     """
     rules = get_protocol(protocol, **changes)
     pred_ids, gt_ids = np.asarray(pred_ids), np.asarray(gt_ids)
@@ -112,9 +112,9 @@ def mask_overlap(
     gt_semantics: np.ndarray | None,
     ignore: np.ndarray | None,
 ) -> Overlap:
-    """Overlap of one scene's masks (each bool [N]; they may overlap) with its truth ids [N] under a protocol.
+    """Overlap of one scene's masks (each bool [N]; they may overlap) with its true ids [N] under a protocol.
 
-    The masks' order is the input order.
+    The order of the masks is the input order of the matching rules.
     """
     for i, mask in enumerate(masks):
         if len(mask) != len(gt_ids):
@@ -134,7 +134,7 @@ def mask_overlap(
 def _truth(
     rules: Protocol, gt_ids: np.ndarray, gt_semantics: np.ndarray | None, ignore: np.ndarray | None
 ) -> tuple[np.ndarray | slice, Truth]:
-    """(points that are judged, truth of those points)."""
+    """Selection of the evaluated points, and the ground truth of these points."""
     keep: np.ndarray | slice = slice(None)
     if rules.remove_ignored:
         keep = gt_ids >= -1
@@ -154,7 +154,7 @@ def _truth(
 
 
 def evaluate_overlaps(scenes: Sequence[Overlap], rules: Protocol) -> dict[str, Any]:
-    """AP over scenes pooled as the benchmarks pool them. NaN (no truth of a class) becomes null in the result."""
+    """AP over scenes, pooled as in the benchmarks. NaN (class without true instances) becomes null in the result."""
     thresholds = [*rules.thresholds, *rules.extra_thresholds]
     labels = sorted({int(c) for scene in scenes for c in scene.gt_classes})
     table = np.full((len(labels), len(thresholds)), np.nan)
@@ -198,7 +198,7 @@ def _number(value: Any) -> float | None:
 
 
 def _best(scene: Overlap, number: int) -> list[dict[str, Any]]:
-    """For each true instance the prediction that overlaps it best, class left aside."""
+    """For each true instance, the prediction with the largest IoU, ignoring classes."""
     iou = scene.iou
     rows = []
     for g, gt_id in enumerate(scene.gt_ids.tolist()):

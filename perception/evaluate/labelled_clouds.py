@@ -1,4 +1,4 @@
-"""`perception eval instances`: average precision of a labelled cloud against a true one, from files."""
+"""`perception eval instances`: average precision of a labelled point cloud file against a ground truth file."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def run_instances(
     scores: str | Path | None = None,
     **changes: Any,
 ) -> tuple[dict[str, Any], str]:
-    """Instance AP of a labelled cloud against the truth: (result, table).
+    """Instance AP of a labelled cloud against ground truth: (result, table).
 
-    Confidences come from `scores` or the sidecar JSON beside the prediction; without either all are 1, and
-    the result says so. A truth property `ignore` marks points by a non-zero value.
+    Confidences come from `scores`, else from the sidecar JSON next to the prediction. Without either they are all 1,
+    and the result says so. Points with a non-zero property `ignore` in the ground truth are ignored.
     """
     pred, gt = read_cloud(prediction), read_cloud(truth)
     pred_ids, gt_ids = _ids(pred, prediction), _ids(gt, truth)
@@ -74,7 +74,7 @@ def _ids(cloud: PointCloud, path: str | Path) -> Any:
 
 
 def instances_table(result: dict[str, Any]) -> str:
-    """AP, AP50, AP25, by class where asked for, and the protocol's switches."""
+    """Table with AP, AP50, AP25, per-class rows if computed, and the protocol's options."""
     rules = result["protocol"]
     lines = [f"{'':<12}{'AP':>8}{'AP50':>8}{'AP25':>8}"]
     lines += [_row(f"class {name}", row) for name, row in result.get("classes", {}).items()]

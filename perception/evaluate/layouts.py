@@ -1,8 +1,8 @@
-"""Dataset directories of the field, as downloaded, and the runners that judge predictions against them.
+"""Directory layouts of public datasets, as downloaded, and functions that evaluate predictions in them.
 
 LERF-mask (Gaussian Grouping): <scene>/test_mask/<view>/<prompt>.png|jpg; predictions alike. LERF-OVS:
-label/<scene>/frame_*.json with polygons. ScanNet and ScanNet++: <scene>.txt with truth ids (1000 · class + instance,
-one a vertex), predictions as submission files <scene>.txt that name masks, or <scene>.json with run-length masks.
+label/<scene>/frame_*.json with polygons. ScanNet and ScanNet++: <scene>.txt with true ids (1000 · class + instance, one
+per vertex); predictions are submission files <scene>.txt that name mask files, or <scene>.json with run-length masks.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def read_mask_folder(folder: str | Path) -> dict[tuple[str, str], np.ndarray]:
 
 
 def read_lerf_polygons(folder: str | Path) -> dict[tuple[str, str], np.ndarray]:
-    """{(view, category): mask [H, W] bool} of LERF-OVS label files frame_*.json; polygons of a category are united."""
+    """{(view, category): mask [H, W] bool} of LERF-OVS label files frame_*.json. Polygons are united."""
     masks: dict[tuple[str, str], np.ndarray] = {}
     files = sorted(Path(folder).glob("*.json"))
     if not files:
@@ -71,7 +71,7 @@ def run_lerf_mask(
 def run_lerf_ovs(prediction: str | Path, dataset: str | Path, **switches: Any) -> tuple[dict[str, Any], str]:
     """LERF-OVS 3D selection over the scenes of a dataset folder: (result, table).
 
-    dataset: label/<scene>/frame_*.json; prediction: <scene>/<view>/<prompt>.*, silhouettes as pictures (255 = 1).
+    dataset: label/<scene>/frame_*.json; prediction: <scene>/<view>/<prompt>.*, silhouettes as images (255 = 1).
     """
     root = Path(dataset) / "label" if (Path(dataset) / "label").is_dir() else Path(dataset)
     folders = {p.name: p for p in sorted(root.iterdir()) if p.is_dir()} if root.is_dir() else {}
@@ -95,7 +95,7 @@ def _scenes(dataset: str | Path, inner: str) -> dict[str, Path]:
 
 
 def _predicted(prediction: str | Path, scene: str, inner: str) -> dict[tuple[str, str], np.ndarray]:
-    """Predicted masks of a scene; an absent scene has none, and so scores 0."""
+    """Predicted masks of a scene. A missing scene has none and therefore scores 0."""
     prediction = Path(prediction)
     if not prediction.is_dir():
         raise InputError(f"{prediction}: is no folder; expected predictions as <scene>/<view>/<prompt>.png")
@@ -124,8 +124,8 @@ def run_scannet(
 ) -> tuple[dict[str, Any], str]:
     """Instance AP over all scenes of a ScanNet or ScanNet++ layout: (result, table).
 
-    truth: <scene>.txt, one id a vertex (1000 · class + instance, 0 = void); prediction: <scene>.txt naming masks, or
-    <scene>.json with run-length masks. A scene without a prediction has none and is counted with its misses.
+    truth: <scene>.txt, one id per vertex (1000 · class + instance, 0 = void); prediction: <scene>.txt naming mask
+    files, or <scene>.json with run-length masks. For a scene without prediction all true instances count as missed.
     """
     from perception.evaluate.labelled_clouds import instances_table
 
@@ -136,7 +136,7 @@ def run_scannet(
     overlaps, missing = [], []
     for path in files:
         ids = _read_ids(path)
-        ids = np.where(ids >= 1000, ids, np.minimum(ids, 0))  # class 0 is none; below -1: ignored
+        ids = np.where(ids >= 1000, ids, np.minimum(ids, 0))  # class 0 means no class; below -1: ignored
         found = _read_prediction(Path(prediction), path.stem, len(ids))
         if found is None:
             missing.append(path.stem)
@@ -184,7 +184,7 @@ def _read_prediction(folder: Path, scene: str, points: int) -> _Prediction | Non
 def _read_rle(path: Path, points: int) -> _Prediction:
     """ScanNet++ predictions: a list of {"label_id", "confidence", "segmentation": {"length", "counts"}}.
 
-    counts: pairs of start (from 1) and length of runs, as a list or a string of numbers.
+    counts: pairs of start (1-based) and length of runs, as a list or as a string of numbers.
     """
     masks, classes, scores = [], [], []
     try:

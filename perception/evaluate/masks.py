@@ -1,4 +1,4 @@
-"""Masks in pictures: IoU, boundary IoU, and the tables of LERF-mask and LERF-OVS."""
+"""2D mask metrics: IoU, boundary IoU, and the results of LERF-mask and LERF-OVS."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def mask_iou(prediction: np.ndarray, truth: np.ndarray) -> float:
 
 
 def mask_boundary(mask: np.ndarray, dilation_ratio: float = 0.02) -> np.ndarray:
-    """The mask's pixels within round(ratio · image diagonal) (at least 1) of its border or the picture's edge.
+    """The mask's pixels within round(ratio · image diagonal) (at least 1) of its border or of the image border.
 
-    Boundary IoU (Cheng et al. 2021): 3x3 erosions with zeros beyond the picture.
+    Boundary IoU (Cheng et al. 2021): 3x3 erosions with zero padding.
     """
     height, width = mask.shape
     iterations = max(round(dilation_ratio * float(np.hypot(height, width))), 1)
     padded = cv2.copyMakeBorder(mask.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
-    # n erosions by 3x3 equal one by a square of side 2n + 1; the frame of zeros eats inwards with each.
+    # n erosions by 3x3 equal one erosion by a square of side 2n + 1. The zero padding erodes from the image border too.
     eroded = cv2.erode(padded, np.ones((3, 3), np.uint8), iterations=iterations)
     return mask & ~eroded[1:-1, 1:-1].astype(bool)
 
@@ -38,11 +38,11 @@ def boundary_iou(prediction: np.ndarray, truth: np.ndarray, dilation_ratio: floa
 
 
 def evaluate_lerf_mask(predictions: Masks, truths: Masks, *, missing: str = "zero", **switches: Any) -> dict[str, Any]:
-    """LERF-mask (Gaussian Grouping): mIoU and mean boundary IoU, mean per prompt over views, then over prompts.
+    """LERF-mask (Gaussian Grouping): mIoU and mean boundary IoU; mean per prompt over views, then over prompts.
 
-    truths: {(view, prompt): 8-bit mask, object > 128}; predictions alike, or bool, resized to the truth by
-    nearest neighbour. missing: "zero" scores an absent prediction 0; "skip" leaves it out, as the original
-    script does. switches (how instances are selected and rendered) are printed with the figures.
+    truths: {(view, prompt): 8-bit mask, object > 128}. predictions: the same, or bool; resized to the truth by nearest
+    neighbour. missing: "zero" scores a missing prediction 0; "skip" leaves it out, as the original script does.
+    switches: how instances are selected and rendered; printed with the result.
     """
     if missing not in ("zero", "skip"):
         raise InputError(f"missing is '{missing}'; expected zero or skip")
@@ -84,11 +84,11 @@ def evaluate_lerf_mask(predictions: Masks, truths: Masks, *, missing: str = "zer
 
 
 def evaluate_lerf_ovs(predictions: Masks, truths: Masks, **switches: Any) -> dict[str, Any]:
-    """LERF-OVS in 3D (OpenGaussian) of one scene: flat mean of IoU over (view, object), and mAcc@.25 (strict).
+    """LERF-OVS in 3D (OpenGaussian), one scene: mean of IoU over all (view, object), and mAcc@.25 (strict).
 
-    truths: {(view, prompt): 8-bit mask, object > 10}; predictions: silhouettes in [0, 1] of the selected
-    Gaussians (object > .7), or bool. An absent prediction scores 0. switches (selection rule, occlusion,
-    held-out views) are printed with the figures.
+    truths: {(view, prompt): 8-bit mask, object > 10}. predictions: silhouettes in [0, 1] of the selected Gaussians
+    (object > .7), or bool. A missing prediction scores 0. switches: selection rule, occlusion, held-out views; printed
+    with the result.
     """
     if not truths:
         raise InputError("LERF-OVS: there are no truth masks")
@@ -119,7 +119,7 @@ def evaluate_lerf_ovs(predictions: Masks, truths: Masks, **switches: Any) -> dic
 
 
 def mean_over_scenes(scenes: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Mean of each figure that all scenes have, every scene counted once."""
+    """Mean over scenes of each figure that all scenes have, with equal weight per scene."""
     if not scenes:
         raise InputError("there are no scenes to average")
     keys = set.intersection(*({k for k, v in s.items() if isinstance(v, float)} for s in scenes.values()))
@@ -127,7 +127,7 @@ def mean_over_scenes(scenes: Mapping[str, Mapping[str, Any]]) -> dict[str, float
 
 
 def _fitted(mask: np.ndarray, shape: tuple[int, ...], threshold: float) -> np.ndarray:
-    """A prediction as bool of the truth's size (nearest neighbour)."""
+    """A prediction as a bool mask of the true mask's size (nearest neighbour)."""
     found = mask if mask.dtype == bool else mask > threshold
     if found.shape == shape:
         return found

@@ -1,4 +1,4 @@
-"""The contingency table between predicted and true instances, from which all overlap figures follow."""
+"""The contingency table between predicted and true instances, from which all overlap metrics are computed."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 from perception.errors import InputError
 
-OBJECT = 1  # the one class of class-agnostic evaluation
+OBJECT = 1  # the only class in class-agnostic evaluation
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """Sizes and intersections in points; P predictions in input order, G true instances in ascending id.
+    """Sizes and intersections in points, for P predictions in input order and G true instances by ascending id.
 
     pred_ids, pred_classes, pred_sizes, pred_void [P] int64; pred_scores [P] float64; gt_ids, gt_classes, gt_sizes [G]
-    int64; intersections [P, G] int64. pred_void counts a prediction's points that the truth leaves void.
+    int64; intersections [P, G] int64. pred_void: number of points of a prediction that are void in the ground truth.
     """
 
     pred_ids: np.ndarray
@@ -39,7 +39,7 @@ class Overlap:
 
 @dataclass(frozen=True)
 class Truth:
-    """Per-point truth in compact form: index [N] into ids (−1 = void), classes and sizes per instance."""
+    """Ground truth per point in compact form: index [N] into ids (−1 = void); class and size per instance."""
 
     index: np.ndarray
     ids: np.ndarray
@@ -55,9 +55,9 @@ def read_truth(
     valid_classes: Sequence[int] | None = None,
     by_class: bool = False,
 ) -> Truth:
-    """Compact the truth ids [N] int. Void: negative ids, `void_ids`, and points of a class outside `valid_classes`.
+    """Compacts the true ids [N] int. Void: negative ids, `void_ids`, and points with a class not in `valid_classes`.
 
-    With `by_class` an instance's class is its points' semantic id (the most frequent one); else all are OBJECT.
+    by_class: the class of an instance is the most frequent semantic id of its points; otherwise it is OBJECT.
     """
     index, ids = compact(gt_ids, void_ids)
     semantics = None if gt_semantics is None else np.asarray(gt_semantics, np.int64)
@@ -82,8 +82,8 @@ def compact(ids: np.ndarray, void_ids: Sequence[int] = ()) -> tuple[np.ndarray, 
     if ids.ndim != 1 or ids.dtype.kind not in "iu":
         raise InputError(f"instance ids must be whole numbers [N]; found {ids.dtype} {list(ids.shape)}")
     ids = ids.astype(np.int64)
-    if len(ids) and 0 <= (high := int(ids.max())) < max(4 * len(ids), 1 << 16):  # no sorting: mark what occurs
-        seen = np.zeros(high + 2, bool)  # the last cell stands for all negative ids
+    if len(ids) and 0 <= (high := int(ids.max())) < max(4 * len(ids), 1 << 16):  # lookup table instead of sorting
+        seen = np.zeros(high + 2, bool)  # the last entry represents all negative ids
         seen[np.where(ids < 0, high + 1, ids)] = True
         seen[[v for v in void_ids if 0 <= v <= high] + [high + 1]] = False
         values = np.flatnonzero(seen)
@@ -96,7 +96,7 @@ def compact(ids: np.ndarray, void_ids: Sequence[int] = ()) -> tuple[np.ndarray, 
 
 
 def mode_by_group(group: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """The most frequent value of each group 0..count−1 [count]; ties go to the smallest value; group −1 is left out."""
+    """Most frequent value of each group 0..count−1 [count]; ties: the smallest value; group −1 is ignored."""
     inside = group >= 0
     distinct, index = np.unique(values[inside], return_inverse=True)
     if len(distinct) == 0:
@@ -112,9 +112,9 @@ def overlap_of_ids(
     truth: Truth,
     pred_classes: dict[int, int] | None = None,
 ) -> Overlap:
-    """Overlap of a labelling: pred_ids [N] int, negative = none. Predictions stand in ascending id.
+    """Overlap of point labels pred_ids [N] int, negative = none. Predictions are ordered by ascending id.
 
-    pred_scores and pred_classes: by id; None gives every prediction the score 1, the class OBJECT.
+    pred_scores, pred_classes: by id. None means score 1 and class OBJECT for every prediction.
     """
     _same_length(len(pred_ids), len(truth.index))
     index, ids = compact(pred_ids)
@@ -132,7 +132,7 @@ def overlap_of_ids(
 def overlap_of_masks(
     masks: Sequence[np.ndarray], scores: Sequence[float], truth: Truth, classes: Sequence[int] | None = None
 ) -> Overlap:
-    """Overlap of P masks, each bool [N] or an array of point indices; masks may overlap each other, order is kept."""
+    """Overlap of P masks, each bool [N] or an array of point indices. Masks may overlap; their order is kept."""
     if len(scores) != len(masks) or (classes is not None and len(classes) != len(masks)):
         raise InputError(
             f"prediction: {len(masks)} masks, {len(scores)} scores; one score (and class) per mask is needed"

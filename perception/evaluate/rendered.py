@@ -1,8 +1,8 @@
-"""mIoU of a map's rendered instance masks against true masks, in views the map need not have been trained on.
+"""mIoU of a map's rendered instance masks against true masks, in views that may be held out from training.
 
-The map's ids and the truth's are matched once for the scene, one to one (Hungarian method on the IoU of pixels pooled
-over all views), so an instance that changes its name between views is not forgiven. An instance's score is the mean IoU
-over the views that show it; a true instance without a partner scores 0.
+The map's ids and the true ids are matched once per scene, one to one (Hungarian method on the IoU of pixels pooled over
+all views). An instance whose id changes between views is therefore penalised. The score of an instance is its mean IoU
+over the views that show it. A true instance without a match scores 0.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from perception.gaussians.model import Gaussians
 from perception.instances.silhouettes import render_silhouettes
 from perception.types import View
 
-SMALLEST = 50  # pixels of a true instance in a view, below which it does not count there
+SMALLEST = 50  # pixels of a true instance in a view; with fewer, the view is not counted for it
 
 
 def rendered_miou(gaussians: Gaussians, ids: np.ndarray, views: Sequence[View], truth_dir: str | Path) -> float:
-    """The figure of `evaluate_rendered` alone. ids [N] int32, −1 = none."""
+    """The miou value of `evaluate_rendered`. ids [N] int32, −1 = none."""
     return float(evaluate_rendered(gaussians, ids, views, truth_dir)["miou"])
 
 
@@ -49,7 +49,7 @@ def evaluate_rendered(
 
 
 def read_truth_mask(folder: str | Path, view: View) -> np.ndarray:
-    """[H, W] int64 instance ids of a view, in the view's pinhole picture."""
+    """[H, W] int64 true instance ids of a view, resampled to the view's pinhole image."""
     import cv2
 
     from perception.io.photos import warp_labels
@@ -67,8 +67,8 @@ def read_truth_mask(folder: str | Path, view: View) -> np.ndarray:
 def mask_miou(pairs: Iterable[tuple[np.ndarray, np.ndarray]], smallest: int = SMALLEST) -> dict[str, Any]:
     """mIoU of predicted against true id images, each pair [H, W] int: prediction −1 = none, truth 0 = void.
 
-    Void pixels count nowhere. Returns miou (mean over true instances of the mean over the views with at least
-    `smallest` of its pixels), pooled_miou (IoU of all views' pixels together), and per instance both with its match.
+    Void pixels are ignored. Returns miou (mean over true instances of the mean over the views with at least `smallest`
+    of its pixels), pooled_miou (IoU of the pixels of all views together), and both per instance with its match.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -119,7 +119,7 @@ def mask_miou(pairs: Iterable[tuple[np.ndarray, np.ndarray]], smallest: int = SM
 
 
 def _contingency(pred: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(predicted id, true id, pixels) of every pair that occurs where the truth is not void."""
+    """(predicted id, true id, number of pixels) of every pair that occurs outside void."""
     if pred.shape != truth.shape:
         raise InputError(f"rendered masks: prediction is {pred.shape}, truth {truth.shape}; expected one size")
     judged = truth > 0
@@ -128,7 +128,7 @@ def _contingency(pred: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _iou(table: np.ndarray) -> np.ndarray:
-    """[T, P] IoU from counts [T, P + 1], whose last column holds the pixels of no prediction."""
+    """[T, P] IoU from counts [T, P + 1]; the last column counts pixels without a prediction."""
     inside = table[:, :-1]
     union = table.sum(axis=1, keepdims=True) + inside.sum(axis=0) - inside
     return inside / np.maximum(union, 1)

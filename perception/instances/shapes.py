@@ -1,20 +1,20 @@
-"""What the shape of an instance says of its kind: floor, wall, table, picture on a wall, rug, ball, box.
+"""Shape scores: how well each instance's geometry fits a floor, wall, ceiling, picture, rug, table, ball or box.
 
-A classifier of single pictures knows no walls and floors, but a map has geometry: which way is up, which planes are
-level or upright, what lies lowest, what is flat on a wall. All lengths are compared with the scene's own, so no metric
-scale is needed. With ramp(x; p, q) rising linearly from 0 at p to 1 at q, [·] one or zero, and of each instance
+An image classifier does not recognise walls and floors, but a map has geometry: the up direction, level and upright
+planes, the lowest surface, flat objects on a wall. All lengths are relative to the scene's own, so no metric scale is
+needed. ramp(x; p, q) rises linearly from 0 at p to 1 at q; [·] is 1 if true, else 0. Of each instance:
 
-    n, z, a, t: normal, height of the middle, area and thickness of its best plane; h: its height from low to high
-    top, s, rests: height and share of points of its fullest level slab, and the number of smaller things on it
+    n, z, a, t: normal, height of the centre, area and thickness of its best plane; h: its height from low to high
+    top, s, rests: height and share of points of its fullest horizontal slab, and the number of smaller objects on it
     gap: distance to the nearest parallel wall
 
-and of the scene
+Of the scene:
 
     span: height of all instances together; e: median height of the cameras
-    a_max, a_up, a_typ: largest area, largest upright one, typical one
+    a_max, a_up, a_typ: largest area, largest upright area, typical area
     ground: height of the lowest large level plane, if nothing lies much lower
 
-the scores are
+Scores:
 
     flat = ramp(t; .35, .2)   level = flat ramp(|n_z|; .85, .95)   upright = flat ramp(|n_z|; .3, .15)
     wall = upright ramp(a / a_up; .15, .35) ramp(h; .2 span, .4 span)
@@ -26,7 +26,7 @@ the scores are
             · ramp(top; e + .05 span, e − .05 span) · ramp(top; ground + .05 span, ground + .12 span)
     ball: see `roundness`   box: see `boxiness`
 
-The floor may also be a table top, seen from close by: it scores half as a table, wherever its top is.
+A table top seen from close by can look like a floor. The floor therefore gets half a table score, whatever its height.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ import numpy as np
 from perception.geometry import camera_centres
 from perception.language.shape_words import KINDS
 
-LEVEL = 0.12  # largest mean square of the cameras' roll (its sine) at which they count as held level
-SAMPLES = 1000  # points of an instance that are looked at
-LEAST = 20  # points; fewer have no shape
+LEVEL = 0.12  # largest mean square of the sine of the cameras' roll at which they count as level
+SAMPLES = 1000  # points used per instance
+LEAST = 20  # points; instances with fewer get no scores
 
 
 @dataclass(frozen=True)
 class Body:
-    """An instance's points [P, 3] without outliers, measured in a frame with z up; names as in the module."""
+    """Points [P, 3] of an instance without outliers, in a frame with z up, and measures of them (see the module)."""
 
     points: np.ndarray
     center: np.ndarray
@@ -61,16 +61,16 @@ class Body:
 
 
 def up_from_cameras(camera_from_world: np.ndarray) -> np.ndarray | None:
-    """The upward direction [3] in the world's frame from poses [C, 4, 4]; None when the cameras are not held level.
+    """The up direction [3] in the world frame, from poses [C, 4, 4]; None when the cameras were not held level.
 
-    The right-hand axes of level cameras are level themselves, so up is the direction they have least of.
+    The x axes of level cameras are horizontal, so up is the direction of their smallest mean squared component.
     """
     if len(camera_from_world) < 3:
         return None
     right, down = camera_from_world[:, 0, :3], camera_from_world[:, 1, :3]
     values, vectors = np.linalg.eigh(right.T @ right / len(right))
     up = vectors[:, 0]
-    if values[1] < 2 * values[0] + 1e-3:  # a walk without turns: right-hand axes are all alike
+    if values[1] < 2 * values[0] + 1e-3:  # a path without turns: all x axes are parallel
         up = -down.mean(axis=0)
         up /= max(float(np.linalg.norm(up)), 1e-9)
     if float(((right @ up) ** 2).mean()) > LEVEL or abs(float((down @ up).mean())) < 0.3:
@@ -81,9 +81,9 @@ def up_from_cameras(camera_from_world: np.ndarray) -> np.ndarray | None:
 def shape_scores(
     means: np.ndarray, instance_ids: np.ndarray, wanted: list[int], camera_from_world: np.ndarray
 ) -> np.ndarray:
-    """How much each instance of `wanted` looks like each of shape_words.KINDS: [I, K] in [0, 1].
+    """Shape scores of the instances `wanted` for each of shape_words.KINDS: [I, K] in [0, 1].
 
-    means [N, 3], instance_ids [N]; camera_from_world [C, 4, 4]. Where up is not known, only balls are told.
+    means [N, 3], instance_ids [N]; camera_from_world [C, 4, 4]. If the up direction is unknown, only "ball" is scored.
     """
     scores = np.zeros((len(wanted), len(KINDS)))
     up = up_from_cameras(camera_from_world)
@@ -103,7 +103,7 @@ def shape_scores(
 
 
 def level_frame(up: np.ndarray) -> np.ndarray:
-    """A rotation [3, 3] whose third row is up."""
+    """A rotation [3, 3] whose third row is the up direction."""
     side = np.eye(3)[int(np.argmin(np.abs(up)))]
     x = np.cross(up, side)
     x /= np.linalg.norm(x)
@@ -111,7 +111,7 @@ def level_frame(up: np.ndarray) -> np.ndarray:
 
 
 def measure(points: np.ndarray) -> Body | None:
-    """A Body of points [P, 3] in a frame with z up; None for fewer than LEAST.
+    """A Body from points [P, 3] in a frame with z up; None for fewer than LEAST points.
 
     thickness = Q(n) / √(Q(u) Q(v)), Q: interquartile range along the plane's normal n and its axes u, v.
     area = E(u) E(v), E: extent from the 3rd to the 97th percentile.
@@ -135,9 +135,9 @@ def measure(points: np.ndarray) -> Body | None:
 
 
 def roundness(points: np.ndarray) -> float:
-    """1 for points x [P, 3] on a sphere or most of one, 0 for anything else.
+    """1 for points x [P, 3] on a sphere or most of one, 0 for other shapes.
 
-    The best sphere (o, r) by least squares:  2 x · o + (r² − |o|²) = |x|²;  then
+    Least-squares sphere (o, r):  2 x · o + (r² − |o|²) = |x|²;  then
     ramp(smallest extent / 2r; .6, .8) · ramp(mean | |x − o| − r | / r; .10, .05)
     """
     rows = np.concatenate([2 * points, np.ones((len(points), 1))], axis=1)
@@ -145,14 +145,14 @@ def roundness(points: np.ndarray) -> float:
     radii = np.linalg.norm(points - solution[:3], axis=1)
     radius = float(np.median(radii))
     size = np.percentile(points, 97, axis=0) - np.percentile(points, 3, axis=0)
-    whole = ramp(float(size.min()) / max(2 * radius, 1e-9), 0.6, 0.8)  # a shallow cap of a large sphere is no ball
+    whole = ramp(float(size.min()) / max(2 * radius, 1e-9), 0.6, 0.8)  # a shallow cap of a large sphere is not a ball
     return whole * ramp(float(np.abs(radii - radius).mean()) / max(radius, 1e-9), 0.10, 0.05)
 
 
 def boxiness(points: np.ndarray) -> float:
-    """1 for points [P, 3] on the faces of an upright box (z up), 0 for round or ragged things.
+    """1 for points [P, 3] on the faces of an upright box (z up), 0 for round or irregular shapes.
 
-    Of the upright boxes that hold the points, that of smallest ground area, turned in steps of 5°, with sides S:
+    Uses the upright bounding box with the smallest ground area, with rotations in steps of 5° and sides S:
     ramp(mean distance to the nearest face / √(min S · median S); .11, .06) · ramp(share near upright edges; .02, .08)
     """
     best = None
@@ -165,19 +165,19 @@ def boxiness(points: np.ndarray) -> float:
             best = (size[0] * size[1], turned, low, high, size)
     assert best is not None
     _, turned, low, high, size = best
-    inside = np.minimum(turned - low, high - turned)  # distance to the nearer of two faces, along each axis
+    inside = np.minimum(turned - low, high - turned)  # distance to the nearer of the two faces along each axis
     nearest = np.abs(inside / np.sqrt(size.min() * np.median(size))).min(axis=1)
     corners = np.abs(inside[:, :2] / size[:2]).max(axis=1) < 0.12  # a box has upright edges, a cylinder has none
     return ramp(float(nearest.mean()), 0.11, 0.06) * ramp(float(corners.mean()), 0.02, 0.08)
 
 
 def ramp(x: Any, zero: float, one: float) -> Any:
-    """0 at `zero`, 1 at `one`, linear between and clipped beyond; of a number or an array."""
+    """0 at `zero`, 1 at `one`, linear between, clamped outside. x: a number or an array."""
     return np.clip((x - zero) / (one - zero), 0.0, 1.0)
 
 
 def room_scores(bodies: list[Body], e: float) -> dict[str, np.ndarray]:
-    """Scores [B] of the kinds that need the other instances for comparison; e: median height of the cameras."""
+    """Scores [B] of the kinds that depend on the other instances. e: median height of the cameras."""
     n_z = np.abs([body.normal[2] for body in bodies])
     z = np.array([body.center[2] for body in bodies])
     t, a, low, high, top, s = (
@@ -191,7 +191,7 @@ def room_scores(bodies: list[Body], e: float) -> dict[str, np.ndarray]:
     a_typ = min(float(np.median(a)), 0.03 * a_max)
     ground = z[(level > 0.5) & (z < e) & (a > 0.1 * a_max)].min(initial=np.inf)
     if ground > float(np.percentile(np.concatenate([body.points[:, 2] for body in bodies]), 2)) + 0.1 * span:
-        ground = np.inf  # something lies deeper: a table top, and the floor is not in the map
+        ground = np.inf  # something lies lower: this is a table top, and the floor is not in the map
     known = bool(np.isfinite(ground))
     at_ground = (level > 0.5) & (z < ground + 0.05 * span) & known
     floor = at_ground & (np.arange(len(a)) == np.where(at_ground, a, -1).argmax())
@@ -213,7 +213,7 @@ def room_scores(bodies: list[Body], e: float) -> dict[str, np.ndarray]:
 
 
 def _plane_normal(points: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Normal of the plane that most points lie on: principal axes, twice refitted to the nearer points."""
+    """Normal of the dominant plane of points: principal axes, refitted twice to the points nearest to the plane."""
     kept = points
     normal = np.array([0.0, 0.0, 1.0])
     for _ in range(3):
@@ -226,7 +226,7 @@ def _plane_normal(points: np.ndarray, center: np.ndarray) -> np.ndarray:
 
 
 def _slab(points: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """Height of the level slab that holds most points, their share, and its bounding rectangle [2, 2]."""
+    """Height of the horizontal slab with the most points, its share of the points, its bounding rectangle [2, 2]."""
     heights = np.sort(points[:, 2])
     thin = 0.04 * float(np.linalg.norm(np.ptp(points, axis=0))) + 1e-9
     counts = np.searchsorted(heights, heights + thin, side="right") - np.arange(len(heights))
@@ -237,13 +237,13 @@ def _slab(points: np.ndarray) -> tuple[float, float, np.ndarray]:
 
 
 def _rests_on(upper: Body, lower: Body, span: float) -> bool:
-    """Whether a smaller thing stands on a body's top slab."""
+    """Whether a smaller body stands on the top slab of `lower`."""
     inside = ((upper.center[:2] > lower.footprint[0]) & (upper.center[:2] < lower.footprint[1])).all()
     return bool(inside and upper.area < lower.area and abs(upper.low - lower.top) < 0.06 * span)
 
 
 def _gap(body: Body, wall: Body) -> float:
-    """Distance of a body's middle from a wall's plane if both are parallel, else infinite."""
+    """Distance of a body's centre from a wall's plane if both are parallel, else infinity."""
     if abs(float(body.normal @ wall.normal)) < 0.95:
         return float("inf")
     return float(abs((body.center - wall.center) @ wall.normal))

@@ -1,1 +1,1 @@
-"""Words for instances: encoders behind one protocol, descriptions, and the ranking of a prompt's answers."""
+"""Text queries on instances: the encoder protocol and encoders, instance descriptions, ranking for a prompt."""

@@ -1,4 +1,4 @@
-"""The protocol of all encoders, how their similarities are to be read, and checks that they share."""
+"""The encoder protocol, how to interpret an encoder's similarities, and shared input checks."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from perception.errors import InputError, missing_extra
 
 @dataclass(frozen=True)
 class Part:
-    """A stretch of an embedding's numbers that is compared on its own.
+    """A slice of an embedding that is compared separately.
 
-    stop: where it ends (it begins where the last one ended). weight: its share of the relevancy. references: [R, d]
-    unit rows of many common words in this part, the ruler for how specific a text is; None without one.
+    stop: its end; it begins where the previous part ends. weight: its share of the relevancy. references: [R, d] unit
+    rows of many common words in this part, used to measure how specific a text is; None: not measured.
     """
 
     stop: int
@@ -28,11 +28,11 @@ class Part:
 
 @dataclass(frozen=True)
 class Reading:
-    """How an encoder's similarities are to be read.
+    """How an encoder's similarities are interpreted.
 
-    parts: of its embeddings; none: the whole is one. margin: spreads above the map's probes from which an answer is
-    believed. canonical: phrases that fit anything, which a prompt must beat; none where sentences do not describe
-    pictures in general. zooms: crops a view that it does best with (the paper's 3 for what reads context well).
+    parts: slices of its embeddings; empty: one part. margin: required distance above the map's probe scores, in their
+    standard deviations. canonical: generic phrases that a prompt must exceed (LERF); empty for encoders whose sentence
+    embeddings do not describe images in general. zooms: best number of crops per view (3 in the paper).
     """
 
     parts: tuple[Part, ...] = ()
@@ -42,17 +42,17 @@ class Reading:
 
 
 def reading_of(encoder: Encoder) -> Reading:
-    """The encoder's own `reading` where it has one, else the plain one."""
+    """The encoder's `reading` attribute if it has one, else the default `Reading()`."""
     known = getattr(encoder, "reading", None)
     return known if isinstance(known, Reading) else Reading()
 
 
 class Encoder(Protocol):
-    """Images and texts in one space, where the dot product of two unit rows says how well they fit.
+    """Embeds images and texts in one space. The dot product of two unit rows measures how well they match.
 
-    identity: model, version and preprocessing; a map stores it and refuses embeddings of another.
-    dim: length of an embedding. templates: sentences with one {} that a prompt is put into; their embeddings are
-    averaged. An encoder may have a `reading` too, see `reading_of`.
+    identity: model, version and preprocessing. A map stores it, and embeddings of another encoder are refused.
+    dim: length of an embedding. templates: sentences with one {} for the prompt; their embeddings are averaged.
+    An encoder may also have a `reading`, see `reading_of`.
     """
 
     @property
@@ -69,12 +69,12 @@ class Encoder(Protocol):
         ...
 
     def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
-        """Texts in any script → float32 [n, dim], unit rows. An empty text is an InputError."""
+        """Texts in any script → float32 [n, dim], unit rows. Raises InputError for an empty text."""
         ...
 
 
 def check_texts(texts: Sequence[str]) -> list[str]:
-    """Texts with their white space tidied; an empty one is an InputError."""
+    """Texts with normalised white space. Raises InputError for an empty text."""
     if isinstance(texts, str):
         raise InputError(f"texts: expected a list of texts, found the single text '{texts[:40]}'")
     tidy = [" ".join(text.split()) for text in texts]
@@ -85,7 +85,7 @@ def check_texts(texts: Sequence[str]) -> list[str]:
 
 
 def check_images(images: Sequence[np.ndarray]) -> None:
-    """Every picture must be RGB uint8 [H, W, 3] and hold a pixel."""
+    """Raises InputError unless every image is RGB uint8 [H, W, 3] and not empty."""
     for n, image in enumerate(images):
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
             raise InputError(
@@ -94,15 +94,15 @@ def check_images(images: Sequence[np.ndarray]) -> None:
 
 
 def unit_rows(x: np.ndarray) -> np.ndarray:
-    """Rows scaled to length 1, float32; a zero row stays zero."""
+    """Rows scaled to length 1, float32. Zero rows stay zero."""
     norms = np.linalg.norm(x.astype(np.float64), axis=-1, keepdims=True)
     return (x / np.where(norms > 0, norms, 1.0)).astype(np.float32)
 
 
 def packaged_file(package: str, pattern: str) -> Path:
-    """A file of weights that an installed package ships, which is not imported for it.
+    """Path of a weight file that an installed package contains. The package is not imported.
 
-    pattern: as of Path.glob below the package's folder. InputError where the package or the file is missing.
+    pattern: for Path.glob, relative to the package's folder. Raises InputError if the package or the file is missing.
     """
     spec = importlib.util.find_spec(package)
     if spec is None or spec.origin is None:

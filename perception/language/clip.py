@@ -1,7 +1,7 @@
-"""The CLIP family through onnxruntime: a pair of ONNX files, or one file with both towers.
+"""CLIP-family encoders through onnxruntime: a pair of ONNX files, or one file with both towers.
 
-Exports name their inputs and outputs differently (open_clip, transformers, optimum, immich), so they are recognised by
-shape: one input takes pixels, one takes token ids, and one output is a row per picture or text.
+Exporters (open_clip, transformers, optimum, immich) name inputs and outputs differently. They are therefore recognised
+by type and shape: one input takes pixels, one takes token ids, and one output has a row per image or text.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ _TEXT_OUTPUTS = ("text_embeds", "text_features", "text_embedding", "pooler_outpu
 
 
 class ClipEncoder:
-    """Image and text towers of a CLIP, open_clip, MobileCLIP or SigLIP export; both are opened and checked at once."""
+    """Image and text towers of a CLIP, open_clip, MobileCLIP or SigLIP export. Both are opened and checked at once."""
 
-    # Canonical phrases: LERF's. Untested on trained weights, which no package ships: margin and zooms are the defaults.
+    # LERF's canonical phrases. No package ships trained weights to tune with: margin and zooms are the defaults.
     reading = Reading(canonical=("object", "things", "stuff", "texture"))
     templates: tuple[str, ...] = ("an image of {}", "a photo of a {}", "{}")
 
@@ -59,7 +59,7 @@ class ClipEncoder:
 
     @classmethod
     def from_spec(cls, argument: str) -> ClipEncoder:
-        """From "IMAGE.onnx,TEXT.onnx", "BOTH.onnx", a folder that holds them under a usual name, or a stored name."""
+        """From "IMAGE.onnx,TEXT.onnx", "BOTH.onnx", a folder with files of the usual names, or a stored model name."""
         argument = resolve(argument)
         parts = [Path(part.strip()).expanduser() for part in argument.split(",")]
         if len(parts) == 2:
@@ -74,7 +74,7 @@ class ClipEncoder:
 
     @cached_property
     def identity(self) -> str:
-        """Family, fingerprints of the files, preprocessing: anything that changes an embedding."""
+        """Family, file fingerprints and preprocessing: everything that changes an embedding."""
         files = "+".join(dict.fromkeys(fingerprint(p) for p in (self._image_path, self._text_path)))
         return f"clip/{family_of(self._image_path)}/{files}/{self.preprocess}/{self._tokenizer.length}"
 
@@ -92,7 +92,7 @@ class ClipEncoder:
         return unit_rows(np.concatenate(rows))
 
     def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
-        """Texts, as they are (no template) → float32 [n, dim], unit rows."""
+        """Texts, used as they are without a template → float32 [n, dim], unit rows."""
         tidy = check_texts(texts)
         step = shape_of(self._ids)[0] or BATCH
         rows = [self._run_text(tidy[start : start + step]) for start in range(0, len(tidy), step)]
@@ -108,7 +108,7 @@ class ClipEncoder:
         return self._run(self._text, self._text_output, feed)[: len(texts)]
 
     def _run(self, session: Any, output: Any, feed: dict[str, np.ndarray]) -> np.ndarray:
-        """One output [n, dim] float32; where both towers share a file, the other one's inputs get placeholders."""
+        """One output [n, dim] float32. If both towers share a file, the inputs of the other tower get placeholders."""
         for value in session.get_inputs():
             if value.name in feed:
                 continue
@@ -123,7 +123,7 @@ class ClipEncoder:
 
 
 def _find_pair(folder: Path) -> tuple[Path, Path]:
-    """Image and text model under one of the names that public exports use, in the folder or its `onnx/`."""
+    """Image and text model in the folder or its `onnx/`, under one of the usual names of public exports."""
     for home in (folder, folder / "onnx"):
         image = next((home / f"{n}.onnx" for n in _IMAGE_FILES if (home / f"{n}.onnx").is_file()), None)
         text = next((home / f"{n}.onnx" for n in _TEXT_FILES if (home / f"{n}.onnx").is_file()), None)
@@ -157,7 +157,7 @@ def _ids_input(session: Any, path: Path) -> Any:
 
 
 def _row_output(session: Any, names: Sequence[str], path: Path) -> Any:
-    """The output with one row per item: by its usual names, else the only one of rank 2."""
+    """The output with one row per item: recognised by a usual name, else the only output of rank 2."""
     rows = [v for v in session.get_outputs() if len(v.shape) == 2]
     found = next((value for name in names for value in rows if value.name == name), None)
     if found is not None or len(rows) == 1:
@@ -166,7 +166,7 @@ def _row_output(session: Any, names: Sequence[str], path: Path) -> Any:
 
 
 def _padded(batch: np.ndarray, fixed: int | None) -> np.ndarray:
-    """Repeat the last row up to a fixed batch size."""
+    """Repeats the last row up to a fixed batch size."""
     if fixed is None or len(batch) == fixed:
         return batch
     return np.concatenate([batch, np.repeat(batch[-1:], fixed - len(batch), axis=0)])

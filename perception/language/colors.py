@@ -1,8 +1,8 @@
-"""Colours of instances as measured, and colour words.
+"""Measured colours of instances, and colour words.
 
-An instance has a palette: the commonest colours of its own pixels in CIELAB, with their shares. A colour word is a few
-sRGB examples e. With d² = (LIGHTNESS ΔL*)² + Δa*² + Δb*² to the nearest example, the share of an instance that it names
-is Σ share · exp(−d² / 2 SIGMA²) over the palette. Lightness counts less than hue, because exposure and shade change it.
+The palette of an instance: the most frequent CIELAB colours of its pixels with their shares. A colour word is defined
+by a few sRGB examples e. With d² = (LIGHTNESS ΔL*)² + Δa*² + Δb*² to the nearest example, the word covers the fraction
+Σ share · exp(−d² / 2 SIGMA²) of an instance. Lightness has less weight, because exposure and shade change it.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 PALETTE = 24  # colours kept per instance
 BIN = 8.0  # CIELAB units per histogram cell
 SIGMA = 15.0  # CIELAB distance at which a colour counts 60 %
-LIGHTNESS = 0.6  # weight of a lightness difference against one of hue or chroma
+LIGHTNESS = 0.6  # weight of a lightness difference relative to one of hue or chroma
 
-# Examples of the English colour words, sRGB 0–255; several where a word covers a wide range.
+# Examples of the English colour words, sRGB 0–255. Words with a wide range have several.
 _EXAMPLES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "red": ((200, 25, 30), (150, 20, 25), (220, 60, 50)),
     "orange": ((240, 130, 30), (215, 105, 30), (250, 160, 60)),
@@ -44,7 +44,7 @@ _SYNONYMS = {
 }  # fmt: skip
 _MANY = {"colorful", "colourful", "multicolored", "multicoloured", "rainbow"}
 _PATTERN = re.compile(r"[^\W\d_]+")
-# The fruit, the metal: a colour word that names the thing itself when one of these words follows.
+# Fruit and metals: before one of these nouns the word is part of the object's name, not a colour.
 _NOT_A_COLOR = {
     ("orange", "juice"), ("orange", "tree"), ("gold", "fish"), ("black", "board"), ("white", "board"),
     ("black", "pepper"), ("red", "wine"), ("white", "wine"), ("green", "tea"), ("black", "tea"),
@@ -52,7 +52,7 @@ _NOT_A_COLOR = {
 
 
 def color_words(text: str) -> list[str]:
-    """Colour words of a text in canonical spelling, in order, without repeats ("many" for colourful things)."""
+    """Colour words of a text in canonical spelling, in order, without duplicates. "many" stands for multicoloured."""
     words = [word.lower() for word in _PATTERN.findall(text)]
     found: list[str] = []
     for n, word in enumerate(words):
@@ -67,7 +67,7 @@ def color_words(text: str) -> list[str]:
 
 
 def without_color_words(text: str) -> str:
-    """The text less its colour words; the text itself where nothing else would be left."""
+    """The text without its colour words. Returns the text unchanged if nothing else would be left."""
     drop = set(color_words(text))
 
     def keep(word: str) -> bool:
@@ -82,9 +82,9 @@ def without_color_words(text: str) -> str:
 
 
 def palette(pixels: np.ndarray) -> np.ndarray:
-    """The commonest colours of sRGB pixels [P, 3] uint8: float32 [PALETTE, 4] rows (L*, a*, b*, share), falling.
+    """Most frequent colours of sRGB pixels [P, 3] uint8: float32 [PALETTE, 4] rows (L*, a*, b*, share), share falling.
 
-    Shares sum to 1 (rows of zeros pad short palettes); no pixels give all zeros.
+    Shares sum to 1. Short palettes are padded with zero rows. Without pixels all rows are zero.
     """
     out = np.zeros((PALETTE, 4), np.float32)
     if not len(pixels):
@@ -117,7 +117,7 @@ def lab_of(pixels: np.ndarray) -> np.ndarray:
 
 
 def color_share(palettes: np.ndarray, word: str) -> np.ndarray:
-    """How much of each instance a colour word names: palettes [I, P, 4] → [I] in [0, 1]."""
+    """Fraction of each instance that a colour word covers: palettes [I, P, 4] → [I] in [0, 1]."""
     weights = palettes[..., 3]
     if word == "many":
         return _variety(palettes)
@@ -129,7 +129,7 @@ def color_share(palettes: np.ndarray, word: str) -> np.ndarray:
 
 
 def color_match(palettes: np.ndarray, words: Sequence[str]) -> np.ndarray:
-    """How well each instance fits all the colour words: [I] in [0, 1]; 1 where half of it has the colour."""
+    """Match of each instance with all colour words: [I] in [0, 1]; 1 where half of the instance has the colour."""
     match = np.ones(len(palettes))
     for word in words:
         match *= np.minimum(1.0, color_share(palettes, word) / (0.5 / len(words)))
@@ -137,7 +137,7 @@ def color_match(palettes: np.ndarray, words: Sequence[str]) -> np.ndarray:
 
 
 def _variety(palettes: np.ndarray) -> np.ndarray:
-    """Share-weighted spread of the chroma plane, 1 at 40 CIELAB units."""
+    """Share-weighted standard deviation in the a*b* plane, scaled to 1 at 40 CIELAB units."""
     weights = palettes[..., 3:]
     mean = (weights * palettes[..., 1:3]).sum(axis=1, keepdims=True)
     spread = (weights[..., 0] * ((palettes[..., 1:3] - mean) ** 2).sum(axis=-1)).sum(axis=1)

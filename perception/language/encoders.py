@@ -1,4 +1,4 @@
-"""Encoders by name: what `language.encoder` and `--encoder` may say."""
+"""Creates encoders from the value of `language.encoder` or `--encoder`."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from perception.language.conse import ConseEncoder
 
 
 def make_encoder(spec: str) -> Encoder | None:
-    """The encoder named by `spec`; its files and their signatures are checked here, before any work.
+    """The encoder that `spec` names. Files and model signatures are checked here, before any work.
 
     "conse": the offline default. "clip:IMAGE.onnx,TEXT.onnx" or "clip:DIR": a CLIP-family pair. "none": None.
-    Raises InputError for an unknown name, a package or a file that is missing, and towers that do not fit.
+    Raises InputError for an unknown name, a missing package or file, and towers that do not match.
     """
     kind, _, argument = spec.partition(":")
     if kind == "none" and not argument:

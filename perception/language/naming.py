@@ -1,4 +1,4 @@
-"""The likeliest names of instances, for people to read: from a list of common words, by the same ranking as prompts."""
+"""Likely names of instances for display: a list of common words, ranked in the same way as prompts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from perception.language.ranking import Ranker
 from perception.language.shape_words import HINTS, KINDS
 
-SURE = 0.7  # a shape that geometry alone decides is named first from this score on
+SURE = 0.7  # shape score from which a kind decided by geometry alone is named first
 PLAIN_WORDS = (
     "apple", "bag", "blanket", "bread", "broom", "cabinet", "chair", "clock", "coat", "cup", "door", "fruit", "glass",
     "hat", "jar", "knife", "lamp", "painting", "pan", "paper", "plant", "pot", "shelf", "shoe", "sofa", "spoon",
@@ -18,7 +18,7 @@ PLAIN_WORDS = (
 
 
 def likely_names(ranker: Ranker, count: int = 3) -> list[list[str]]:
-    """For each instance its `count` likeliest names, best first; none for an instance that no photo shows."""
+    """The `count` most likely names of each instance, best first; empty for an instance that no photo shows."""
     words = vocabulary()
     relevancy = ranker.relevancy(words)
     shapes = ranker.shapes
@@ -36,7 +36,7 @@ def likely_names(ranker: Ranker, count: int = 3) -> list[list[str]]:
 
 @lru_cache(maxsize=1)
 def vocabulary() -> list[str]:
-    """The first name of every ImageNet class, and plain words that those are too special for."""
+    """The first name of every ImageNet class, and common words where the class names are too specific."""
     from perception.language.conse import class_names
 
     return list(dict.fromkeys([group[0] for group in class_names()] + list(PLAIN_WORDS)))

@@ -1,4 +1,4 @@
-"""How the CLIP family wants its pictures: size, resize mode, filter, mean and standard deviation."""
+"""Image preprocessing of the CLIP family: size, resize mode, filter, mean and standard deviation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Preprocess:
-    """Resize to `size` (shortest edge, then centre crop; or squash to a square), scale to [0, 1], normalise."""
+    """Resizes to `size` (shortest edge with centre crop, or directly to a square), scales to [0, 1], normalises."""
 
     size: int = 224
     mode: Literal["shortest", "squash"] = "shortest"
@@ -35,7 +35,7 @@ class Preprocess:
             picture = picture.resize((self.size, self.size), resample)
         else:
             scale = self.size / min(height, width)
-            # Both reference pipelines floor the long side.
+            # Both reference pipelines round the long side down.
             size = [self.size if side == min(height, width) else int(scale * side) for side in (width, height)]
             picture = picture.resize((size[0], size[1]), resample)
             left, top = (size[0] - self.size) // 2, (size[1] - self.size) // 2
@@ -55,13 +55,13 @@ MOBILECLIP = Preprocess(size=256, resample="bilinear", mean=(0.0, 0.0, 0.0), std
 
 
 def find_preprocess(model: Path, input_side: int | None) -> Preprocess:
-    """Preprocessing from the config files beside a model, else from its name; input_side: of the model, if fixed."""
+    """Preprocessing from config files next to a model, else from its name. input_side: the model's, if fixed."""
     found = _from_configs(model) or _from_name(model)
     return replace(found, size=input_side) if input_side else found
 
 
 def family_of(model: Path) -> str:
-    """ "siglip", "mobileclip" or "clip" by the names of the file and its two folders, or by config.json."""
+    """ "siglip", "mobileclip" or "clip", from the names of the file and its two parent folders, or from config.json."""
     names = " ".join([model.name, *(parent.name for parent in list(model.parents)[:2])]).lower()
     config = read_config(model, "config.json")
     names += " " + str(config.get("model_type", "")).lower()
@@ -71,7 +71,7 @@ def family_of(model: Path) -> str:
 
 
 def read_config(model: Path, name: str) -> dict[str, Any]:
-    """A JSON file in the model's folder or the one above (exports lie in `onnx/`); {} where there is none."""
+    """A JSON file in the model's folder or its parent (exports often lie in `onnx/`); {} if there is none."""
     for folder in (model.parent, model.parent.parent):
         path = folder / name
         if path.is_file():

@@ -1,18 +1,18 @@
-"""Which instances answer a prompt, and whether any does.
+"""Ranks instances for a prompt, and decides whether any of them matches.
 
-The relevancy of instance i for a prompt t is judged against the map's other instances: with ē the mean
-embedding of the map, x_ti = cos(t, e_i − β ē) / σ_t takes away what all instances share, and σ_t, the spread
-of cos(t, ·) over the encoder's reference words, makes specific and vague prompts comparable; where an encoder's
-embedding has parts, x is their weighted sum. Whether the
-best is good enough is told by probes: LERF's canonical phrases (object, things, stuff, texture) and a list
-of things that a scene seldom holds. Their best relevancies in this very map, under this very encoder, are
-the distribution of "not here", and
-    score_ti = Φ((x_ti − m) / s),   m: their median, s: such that their 80 % quantile scores .8,
-so .8 means "fits better than four probes in five", and less the encoder's own `margin`: what a thing that is not
-there but resembles one that is (a laptop, a book) reaches above the probes. Encoders with canonical phrases must find
-the prompt likelier than each of them as well (LERF's relevancy, temperature 10). Colour words are answered by measured
-colour, words for shapes (floor, wall, picture, ball: see `shape_words`) by the measured shape too, and a label given by
-the user counts as the instance's name.
+The relevancy of instance i for a prompt t is relative to the other instances of the map. With ē the map's mean,
+x_ti = cos(t, e_i − β ē) / σ_t removes what all instances share. σ_t is the standard deviation of cos(t, ·) over the
+encoder's reference words; it makes specific and vague prompts comparable. For an encoder with parts, x is the weighted
+sum over the parts.
+
+Probes decide whether the best instance is good enough: LERF's canonical phrases (object, things, stuff, texture) and a
+list of objects that are rarely in a scene. Their best relevancies in this map are the distribution of "not present":
+    score_ti = Φ((x_ti − m) / s − margin),   m: their median,   s: chosen so that their 80 % quantile scores .8.
+Without margin, .8 means "fits better than four of five probes". `margin` is a property of the encoder: absent objects
+that resemble a present one (a laptop, a book) score above the probes. For encoders with canonical phrases, the prompt
+must also be more likely than each phrase (LERF's relevancy, temperature 10). Colour words are matched with measured
+colours, shape words (floor, wall, picture, ball: see `shape_words`) also with the measured shape. A label set by the
+user counts as a name of the instance.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from perception.language.colors import color_match, color_words, without_color_w
 from perception.language.description import InstanceDescription
 from perception.language.shape_words import HINTS, KINDS, shape_kind
 
-PRESENT = 0.8  # default least score of a hit; the probes are harder than the usual absent thing (see bench)
+PRESENT = 0.8  # default minimum score of a hit; the probes are harder than typical absent objects (see bench)
 QUANTILE, NORMAL_QUANTILE = 0.8, 0.8416  # Φ(.8416) = .8
-BETA = 0.5  # share of the map's mean embedding that is taken away
-SHAPE_WEIGHT = 6.0  # spreads between no and a full match of shape, for kinds that geometry alone decides
-SHAPE_HINT = 2.0  # what a full match adds for kinds that shape only makes likelier: not every box is closed
+BETA = 0.5  # fraction of the map's mean embedding that is subtracted
+SHAPE_WEIGHT = 6.0  # difference in z between no and full match of shape, for kinds that geometry alone decides
+SHAPE_HINT = 2.0  # added to z for a full match of the kinds in HINTS, where shape is only supporting evidence
 TEMPERATURE = 10.0  # LERF's
-COLOR_WEIGHT = 2.0  # spreads between no and a full match of colour: enough to tell two things of one kind apart
-LABEL_MARGIN = 2.0  # a label means the prompt from 2 + Φ⁻¹(score) spreads above what probes mean to it
+COLOR_WEIGHT = 2.0  # difference in z between no and full match of colour: separates two objects of one kind
+LABEL_MARGIN = 2.0  # subtracted from z of a label, where z is the similarity of label and prompt relative to the probes
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Ranked (position of the instance, score in [0, 1]), best first; whether the best reaches the threshold."""
+    """hits: (index of the instance, score in [0, 1]), best first. present: whether the best reaches the threshold."""
 
     text: str
     hits: list[tuple[int, float]]
@@ -52,7 +52,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class _Part:
-    """A part of the embeddings made ready: where it lies, its weight, the instances' unit rows [I, d], its ruler."""
+    """A prepared part of the embeddings: its slice, weight, unit rows [I, d] of the instances, reference words."""
 
     place: slice
     weight: float
@@ -61,7 +61,7 @@ class _Part:
 
 
 class Ranker:
-    """A map's descriptions made ready for prompts: one text encoding and one matrix product each."""
+    """Descriptions of a map, prepared for prompts. A prompt costs one text encoding and one matrix product."""
 
     def __init__(
         self,
@@ -70,8 +70,8 @@ class Ranker:
         labels: Sequence[str | None] | None = None,
         shapes: Callable[[], np.ndarray] | None = None,
     ) -> None:
-        """labels: the user's name of each instance or None. shapes: gives [I, K], scores of `shape_words.KINDS`; asked
-        when a prompt first names one.
+        """labels: the user's name of each instance, or None. shapes: returns scores [I, K] of `shape_words.KINDS`. It
+        is called when a prompt first names a shape.
         """
         if labels is not None and len(labels) != len(descriptions):
             raise InputError(f"labels: expected one per instance ({len(descriptions)}), found {len(labels)}")
@@ -98,11 +98,11 @@ class Ranker:
         self._label_null = _middle_and_spread(self._label_rows @ texts.T)
 
     def over(self, descriptions: Sequence[InstanceDescription], shapes: np.ndarray | None = None) -> Ranker:
-        """The same encoder over other instances, without labels. shapes: as of `self.shapes`, for them."""
+        """A Ranker with the same encoder for other instances, without labels. shapes: as `self.shapes`, for these."""
         return Ranker(descriptions, self._encoder, shapes=None if shapes is None else lambda: shapes)
 
     def rank(self, prompt: str, min_score: float | None = None) -> Answer:
-        """Score every instance for one prompt; see the module's docstring."""
+        """Scores every instance for one prompt; see the module docstring."""
         text = check_texts([prompt])[0]
         least = PRESENT if min_score is None else min_score
         if not len(self._plain):
@@ -127,11 +127,11 @@ class Ranker:
 
     @cached_property
     def shapes(self) -> np.ndarray | None:
-        """Scores [I, K] of `shape_words.KINDS`; None where they were never measured."""
+        """Scores [I, K] of `shape_words.KINDS`; None if shapes are not available."""
         return None if self._measure_shapes is None else self._measure_shapes()
 
     def _shape_bonus(self, text: str) -> np.ndarray | float:
-        """What the instances' shapes add [I], in spreads; 0 where the prompt names no shape."""
+        """Contribution of the instances' shapes to z [I]; 0 if the prompt names no shape."""
         kind = shape_kind(text)
         if kind is None or self.shapes is None:
             return 0.0
@@ -139,12 +139,12 @@ class Ranker:
         return SHAPE_HINT * match if kind in HINTS else SHAPE_WEIGHT * (match - 0.5)
 
     def _against_canonical(self, row: np.ndarray) -> np.ndarray:
-        """LERF's relevancy [I]: how likely the prompt [1, D] is beside the canonical phrase that fits best."""
+        """LERF's relevancy [I]: probability of the prompt [1, D] against the best-matching canonical phrase."""
         rival = (self._plain @ self._canonical.T).max(axis=1)
         return 1.0 / (1.0 + np.exp(TEMPERATURE * (rival - self._plain @ row[0])))
 
     def _with_labels(self, scores: np.ndarray, text: str) -> np.ndarray:
-        """The better of picture and label: 1 where the label is the prompt, Φ(z − margin) where it means the same."""
+        """Combines image score and label: 1 if the label equals the prompt, else max(score, Φ(z − LABEL_MARGIN))."""
         if not len(self._named):
             return scores
         z = (self._label_rows @ self._encode([text])[0] - self._label_null[0]) / self._label_null[1]
@@ -154,11 +154,11 @@ class Ranker:
         return scores
 
     def relevancy(self, texts: Sequence[str]) -> np.ndarray:
-        """How well each text fits each instance [T, I], colours, shapes and labels left aside."""
+        """Relevancy of each text for each instance [T, I], without colours, shapes and labels."""
         return self._relevancy(self._encode(texts))
 
     def _relevancy(self, texts: np.ndarray) -> np.ndarray:
-        """x [T, I] of text embeddings [T, D] in units of a usual prompt's spread, summed over the parts."""
+        """x [T, I] of text embeddings [T, D], in units of a typical prompt's deviation, summed over the parts."""
         x = np.zeros((len(texts), len(self._plain)))
         for part, usual in zip(self._parts, self._usual_spreads, strict=True):
             fits = unit_rows(texts[:, part.place]) @ part.rows.T
@@ -166,7 +166,7 @@ class Ranker:
         return x
 
     def _compared(self, rows: np.ndarray) -> list[_Part]:
-        """The parts of the instances' embeddings [I, D], each less its share of the map's mean and of length 1."""
+        """The parts of the embeddings [I, D]: each minus BETA times the map's mean, then scaled to length 1."""
         seen, start, parts = rows[self.seen], 0, []
         for part in self._reading.parts or (Part(self._encoder.dim),):
             place = slice(start, part.stop)
@@ -183,7 +183,7 @@ class Ranker:
         return np.maximum((unit_rows(texts[:, part.place]) @ part.references.T).std(axis=1), 1e-3)
 
     def _encode(self, texts: Sequence[str]) -> np.ndarray:
-        """Mean over the encoder's templates, unit rows [T, D]."""
+        """Text embeddings, averaged over the encoder's templates; unit rows [T, D]."""
         if not len(texts):
             return np.zeros((0, self._encoder.dim), np.float32)
         templates = self._encoder.templates
@@ -192,7 +192,7 @@ class Ranker:
         return unit_rows(rows.mean(axis=0))
 
     def _best_of_absent(self, probe_rows: np.ndarray) -> tuple[float, float]:
-        """m and s of the module: the median of the probes' best relevancies in this map, and their spread."""
+        """m and s of the module docstring: median and scale of the probes' best relevancies in this map."""
         if not self.seen.any():
             return 0.0, 1.0
         best = self._relevancy(probe_rows)[:, self.seen].max(axis=1)
@@ -201,7 +201,7 @@ class Ranker:
 
 
 def probes() -> list[str]:
-    """Things that a scene hardly holds, one a line in probes.txt."""
+    """Objects that are rarely in a scene, one per line in probes.txt."""
     return (Path(__file__).parent / "probes.txt").read_text(encoding="utf-8").split("\n")[:-1]
 
 

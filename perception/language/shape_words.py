@@ -1,6 +1,6 @@
-"""Words that a shape can answer: which of KINDS the head noun of a prompt names.
+"""Shape words: which of KINDS the head noun of a prompt names.
 
-English only; a prompt in another language is left to the encoder.
+English only. Prompts in other languages are ranked by the encoder alone.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ import re
 
 KINDS = ("floor", "ceiling", "wall", "table", "picture", "rug", "ball", "box")
 HINTS = ("ball", "box", "rug", "table")
-"""Kinds for which shape raises the score but does not decide: a ball may be flat, a box open, a desk covered."""
+"""Kinds for which shape supports the score but does not decide it: a ball may be flat, a box open, a desk covered."""
 
-# Words of each kind. A carton is a box whose lid may be a gable; a desk is a table with another name.
+# Words of each kind. A carton may have a gable top and still counts as a box; a desk counts as a table.
 _WORDS = {
     "floor": "floor ground flooring",
     "ceiling": "ceiling",
@@ -23,7 +23,7 @@ _WORDS = {
     "box": "box carton package packet crate cube",
 }
 _KIND = {word: kind for kind, words in _WORDS.items() for word in words.split()}
-# Where the thing itself ends and the rest of a prompt begins: "the rug ON the floor".
+# Words after which the object itself is no longer named: "the rug ON the floor".
 _RELATIONS = re.compile(
     r"\b(?:on|of|with|without|under|in|inside|at|by|from|near|for|behind|above|below|beside|next|over|to|that|which|"
     r"between|full|against|beneath|underneath|and|or)\b"
@@ -33,16 +33,16 @@ _WORD = re.compile(r"[^\W\d_]+")
 
 
 def head_noun(text: str) -> str:
-    """The noun that says what is asked for, singular: "a framed picture of a forest" → "picture"; "" if none."""
+    """The singular noun that names the object: "a framed picture of a forest" → "picture"; "" if there is none."""
     thing = _MEASURES.sub(" ", text.lower())
     words = _WORD.findall(_RELATIONS.split(thing)[0]) or _WORD.findall(thing)
-    while len(words) > 1 and len(words[-1]) == 1:  # "wall E": a letter names which one
+    while len(words) > 1 and len(words[-1]) == 1:  # "wall E": a single letter is an identifier
         words = words[:-1]
     return _singular(words[-1]) if words else ""
 
 
 def shape_kind(text: str) -> str | None:
-    """The kind of shape that a prompt asks for, or None."""
+    """The kind of shape that a prompt names, or None."""
     return _KIND.get(head_noun(text))
 
 

@@ -1,4 +1,4 @@
-"""Tokens for the text models of the CLIP family, from the `tokenizer.json` that exports bring along."""
+"""Tokenizer for the text models of the CLIP family, from the `tokenizer.json` that exports include."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Tokenizer:
     """Texts → ids and attention mask of one fixed length."""
 
     def __init__(self, backend: Any, length: int, pad: int, end: int | None) -> None:
-        """backend: a `tokenizers.Tokenizer`; end: id that must close a text cut at `length`, None to leave it cut."""
+        """backend: a `tokenizers.Tokenizer`; end: id placed last if a text is cut at `length`, None: it is only cut."""
         self._backend, self.length, self.pad, self._end = backend, length, pad, end
         backend.no_padding()
         backend.no_truncation()
@@ -35,9 +35,9 @@ class Tokenizer:
 
 
 def find_tokenizer(model: Path, length: int | None) -> Tokenizer:
-    """The tokenizer beside a text model or in the folder above it (exports lie in `onnx/`, `textual/`).
+    """The tokenizer next to a text model or in the parent folder (exports often lie in `onnx/`, `textual/`).
 
-    length: of the model's input, None where it is dynamic: then as the configs say, else 77 (SigLIP 64).
+    length: of the model's input; None if it is dynamic. Then the config files decide, else it is 77 (SigLIP: 64).
     """
     try:
         import tokenizers

@@ -1,7 +1,7 @@
 """Label images on disk: one compressed 16-bit PNG per photo, written atomically.
 
-Each PNG stores a key computed from its inputs (source, photo, undistortion). A second run skips the photos whose key is
-unchanged.
+Each PNG stores a key computed from its inputs (source, photo, undistortion). A second run skips photos with an
+unchanged key.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
 | SAM, MobileSAM | HWC 0–255, or 1×3×S×S normalised and padded bottom and right | pixels of the square |
 | EfficientSAM | 1×3×h×w in 0–1, original size | pixels of the photo |
 | SAM 2 | 1×3×S×S normalised, resized without keeping the aspect ratio | pixels of the square |
-| SAM exported by optimum | 1×3×S×S as SAM | pixels of the square |
+| SAM by optimum | 1×3×S×S as SAM | pixels of the square |
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Small inline SVG charts: a curve and columns. Colours come from the page's style sheet; text is escaped."""
+"""Small inline SVG charts: line charts and bar charts. The page's style sheet sets the colours; text is escaped."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 WIDTH, HEIGHT = 320, 170
 LEFT, RIGHT, TOP, BASE = 40, WIDTH - 12, 12, HEIGHT - 22
-"""The plotted area in pixels; tick labels stand outside it."""
+"""The plot area in pixels; tick labels are outside it."""
 
 
 def ticks(low: float, high: float, count: int = 4) -> list[float]:
@@ -20,7 +20,7 @@ def ticks(low: float, high: float, count: int = 4) -> list[float]:
     unit = 10 ** np.floor(np.log10(rough))
     step = float(min((m * unit for m in (1, 2, 5, 10)), key=lambda step: abs(np.log(step / rough))))
     marks = np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step
-    return [float(x) for x in marks + 0.0]  # + 0.0: no "-0"
+    return [float(x) for x in marks + 0.0]  # + 0.0 turns -0.0 into 0.0
 
 
 def short(value: float) -> str:
@@ -40,7 +40,7 @@ def clock(seconds: float) -> str:
 
 
 def curve(points: Sequence[tuple[float, float]], label: str, unit: str = "") -> Markup:
-    """A line through (x, y); points that are not finite are left out; empty for fewer than two."""
+    """A line chart of (x, y). Non-finite points are left out; the chart is empty for fewer than two points."""
     kept = np.array([p for p in points if np.isfinite(p).all()], float).reshape(-1, 2)
     if len(kept) < 2:
         return Markup()
@@ -57,7 +57,7 @@ def curve(points: Sequence[tuple[float, float]], label: str, unit: str = "") -> 
 
 
 def columns(values: Mapping[str, float], label: str, unit: str) -> Markup:
-    """One upright bar per name, written below where there is room, and the mean; what is not finite is left out."""
+    """A bar per name, with the name below if there is room, and the mean. Non-finite values are left out."""
     kept = {name: value for name, value in values.items() if np.isfinite(value)}
     if not kept:
         return Markup()
@@ -79,7 +79,7 @@ def columns(values: Mapping[str, float], label: str, unit: str) -> Markup:
 
 
 def _scale(low: float, high: float, start: float, end: float) -> Callable[[float], float]:
-    """The linear map that takes low to start and high to end."""
+    """The linear function that maps low to start and high to end."""
     return lambda value: start + (value - low) / (high - low) * (end - start)
 
 

@@ -1,5 +1,5 @@
-"""A map's report: its data, and `write_report`, which makes one self-contained HTML page of it (pictures inlined,
-no script, nothing fetched). The page is the Jinja2 template page.html, which escapes every value."""
+"""The HTML report of a map: its data, and `write_report`, which writes one self-contained page (images inlined, no
+scripts, no external resources). The page is the Jinja2 template page.html, which escapes every value."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from perception.io.atomic import atomic_file
 from perception.pictures import error_map
 from perception.report.charts import clock, columns, curve
 
-LIMIT = 3_000_000  # bytes the page should stay under
-SIZES = ((460, 82), (360, 74), (260, 66), (180, 55), (120, 45))  # (longest side, quality) tried in turn
-MOST_VIEWS = 4  # held-out views shown as pictures
+LIMIT = 3_000_000  # maximum size of the page in bytes
+SIZES = ((460, 82), (360, 74), (260, 66), (180, 55), (120, 45))  # (longest side, JPEG quality), tried in this order
+MOST_VIEWS = 4  # maximum number of held-out views shown as images
 
 
 @dataclass(frozen=True)
 class ViewRow:
-    """A held-out view. photo, render: [H, W, 3] uint8 of one size; psnr in dB, ssim in [0, 1]; note: why shown."""
+    """A held-out view. photo, render: [H, W, 3] uint8 of equal size; psnr in dB, ssim in [0, 1]; note: why shown."""
 
     name: str
     psnr: float | None = None
@@ -38,7 +38,7 @@ class ViewRow:
 
 @dataclass(frozen=True)
 class InstanceRow:
-    """An instance: best crop, the user's label or the likeliest names, score in [0, 1], box sides in map units."""
+    """An instance: best crop, the user's label or the most likely names, score in [0, 1], box sides in map units."""
 
     id: int
     crop: np.ndarray | None = None
@@ -51,9 +51,9 @@ class InstanceRow:
 
 @dataclass(frozen=True)
 class QueryRow:
-    """A text query and its hits, best first: (instance id, score). picture: the best hit outlined in a photo.
+    """A text query and its hits, best first: (instance id, score). picture: a photo with the best hit outlined.
 
-    expected: the ids that are right where the truth is known.
+    expected: the correct ids if ground truth is available.
     """
 
     text: str
@@ -64,7 +64,7 @@ class QueryRow:
 
     @property
     def verdict(self) -> str:
-        """ "right" or "wrong" where the truth is known, else ""."""
+        """ "right" or "wrong" with ground truth, else ""."""
         if self.expected is None:
             return ""
         right = self.hits[0][0] in self.expected if self.present and self.hits else not self.expected
@@ -73,13 +73,13 @@ class QueryRow:
 
 @dataclass(frozen=True)
 class ReportData:
-    """All of a report; everything but the title may be missing and is then left out.
+    """Content of a report. Everything except the title is optional; missing parts are left out.
 
-    figures: name -> value as it should read, for the header ({"PSNR held-out": "28.4 dB"}). seconds: by stage, in
-    order. psnr_curve: (iteration, dB); ssim_curve: (iteration, SSIM as trained, zero-padded); gaussians_curve:
-    (iteration, count). views: held-out views; those with pictures are shown, worst first, all with figures appear in
-    the bars. overview: title -> picture (top view, feature colours). metric: whether extents are metres.
-    settings: name -> value. command: what makes this map again.
+    figures: name -> formatted value, for the header ({"PSNR held-out": "28.4 dB"}). seconds: by stage, in order.
+    psnr_curve: (iteration, dB); ssim_curve: (iteration, SSIM as in training, zero-padded); gaussians_curve: (iteration,
+    count). views: held-out views; those with images are shown, worst first, and all with figures appear in the bar
+    chart. overview: title -> image (top view, feature colours). metric: whether extents are in metres. settings: name
+    -> value. command: command line that reproduces the map.
     """
 
     title: str
@@ -100,7 +100,7 @@ class ReportData:
 
 
 def write_report(path: Path | str, data: ReportData) -> Path:
-    """Writes the report as one HTML file, replacing an old one in one step. Pictures shrink until it is under 3 MB."""
+    """Writes the report as one HTML file, replacing an old one atomically. Images shrink until it is under LIMIT."""
     path = Path(path)
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined
@@ -118,7 +118,7 @@ def write_report(path: Path | str, data: ReportData) -> Path:
     page = b""
     for side, quality in SIZES:
         text = template.render(shown, image=partial(_image, side=side, quality=quality))
-        page = text.encode(errors="replace")  # a lone surrogate of a file name has no UTF-8
+        page = text.encode(errors="replace")  # an unpaired surrogate in a file name cannot be encoded as UTF-8
         if len(page) < LIMIT:
             break
     with atomic_file(path) as aside:
@@ -127,7 +127,7 @@ def write_report(path: Path | str, data: ReportData) -> Path:
 
 
 def _image(picture: np.ndarray, side: int, quality: int) -> tuple[int, int, str]:
-    """(width, height, data URI) of a [H, W, 3] uint8 picture, its longer side at most `side` pixels."""
+    """(width, height, data URI) of an image [H, W, 3] uint8, with a longer side of at most `side` pixels."""
     from PIL import Image
 
     image = Image.fromarray(np.ascontiguousarray(picture[..., :3], np.uint8))
@@ -139,7 +139,7 @@ def _image(picture: np.ndarray, side: int, quality: int) -> tuple[int, int, str]
 
 
 def _views(views: Sequence[ViewRow]) -> list[dict[str, np.ndarray]]:
-    """{caption: picture} of the held-out views that have pictures, worst first."""
+    """{caption: image} of the held-out views that have images, worst first."""
     rows = []
     for view in sorted(views, key=lambda view: view.psnr if view.psnr is not None else float("inf")):
         if view.photo is None or view.render is None:
@@ -170,7 +170,7 @@ def _charts(data: ReportData) -> dict[str, Markup]:
 
 
 def _sides(extent: Sequence[float], scale: float) -> str:
-    """Box sides times `scale`, with as many decimals as give the longest three digits."""
+    """Box sides times `scale`, with so many decimals that the longest has three digits."""
     sides = [scale * side for side in extent]
     decimals = int(np.clip(2 - np.floor(np.log10(max(*sides, 1e-12))), 0, 6))
     return " × ".join(f"{side:.{decimals}f}" for side in sides)
