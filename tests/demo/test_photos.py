@@ -11,6 +11,8 @@ from PIL import Image
 from perception.demo import DemoTruth, load_truth, make_photos
 from perception.errors import InputError
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, DemoTruth]:
@@ -84,7 +86,6 @@ def test_every_thing_is_seen_and_every_query_has_its_answer(made: tuple[Path, De
     assert red[0] > 2 * red[2] and blue[2] > 2 * blue[0]
 
 
-@pytest.mark.slow
 def test_same_seed_same_photos_other_seed_other_photos(made: tuple[Path, DemoTruth], tmp_path: Path) -> None:
     folder, truth = made
     again = make_photos(tmp_path / "again" / "photos", views=5, width=160, height=120, light_samples=2)

@@ -15,7 +15,7 @@ from fuzz.core import SHELL, CoreTarget, guarded, intact
 from fuzz.run import LONGEST, load, names
 from perception.io import triangulate
 
-pytestmark = pytest.mark.filterwarnings("ignore")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 target_of = cache(load)
 
 

@@ -25,6 +25,8 @@ from perception.pipeline.mapping import build_map
 from perception.pipeline.summary import shares, speed
 from perception.types import PointCloud
 
+pytestmark = pytest.mark.slow
+
 
 def stopping(rate: float, scores: list[float], counts: list[int] | None = None) -> EarlyStopping:
     return EarlyStopping(rate, scores, counts or [])
@@ -79,7 +81,6 @@ def test_rates_cool_down_over_the_last_share_only() -> None:
 SMALL = ["train.budget=3000", "densify.every=20", "language.encoder=none", "photos.holdout=6"]
 
 
-@pytest.mark.slow
 def test_a_run_stops_at_the_quality_that_was_asked(small_scene: Path, tmp_path: Path) -> None:
     source, labels = small_scene / "transforms.json", f"masks=labels:{small_scene / 'labels'}"
     pairs = [*SMALL, labels, "train.iterations=400"]
@@ -92,7 +93,6 @@ def test_a_run_stops_at_the_quality_that_was_asked(small_scene: Path, tmp_path: 
     assert early.info["quality"]["psnr"] >= asked - 0.2 and len(early.instances) > 3
 
 
-@pytest.mark.slow
 def test_growth_and_training_end_where_they_do_not_pay(small_scene: Path, tmp_path: Path) -> None:
     scene = tmp_path / "scene"
     shutil.copytree(small_scene, scene)

@@ -27,6 +27,8 @@ from perception.language.minilm import WEIGHTS, MiniLM  # noqa: E402
 from perception.language.ranking import Ranker  # noqa: E402
 from support.truth_scenes import TruthScene  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 TEXTS = ["red mug", "a longer sentence about a kitchen, with commas", "杯子 красный 🙂", "word " * 400]
 
 
@@ -126,7 +128,6 @@ def test_texts_and_classes_share_the_space(encoder: Any) -> None:
     assert np.allclose(np.linalg.norm(words, axis=1), 1, atol=1e-6)
 
 
-@pytest.mark.slow
 def test_batching_changes_nothing(encoder: Any) -> None:
     """10,000 texts at once equal texts one by one."""
     many = [f"thing {n % 50}" for n in range(10_000)]
@@ -157,7 +158,6 @@ def test_bad_input(encoder: Any) -> None:
         encoder.encode_images([np.zeros((8, 8), np.uint8)])
 
 
-@pytest.mark.slow
 def test_a_true_scene_answers(encoder: Any) -> None:
     """Six objects of tabletop_a, perfect silhouettes: plain prompts find them, absent things mostly find nothing."""
     data = os.environ.get("PERCEPTION_DATA")

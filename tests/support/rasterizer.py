@@ -15,9 +15,15 @@ IMAGES = ("colors", "alphas", "depths", "features", "feature_variance")
 GIVEN = ("means", "quats", "scales", "opacities", "colors", "features", "viewmats", "background")
 
 
-@pytest.fixture(params=simd_levels(), autouse=True)
+LEVELS = [pytest.param(level, marks=[pytest.mark.slow] * (level != simd_levels()[0])) for level in simd_levels()]
+
+
+@pytest.fixture(params=LEVELS, autouse=True)
 def every_simd_level(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Where it is imported, every test of the file runs once at each level that the processor has."""
+    """Where it is imported, every test of the file runs once at each level that the processor has.
+
+    The quick part of the suite runs the first, which is the widest.
+    """
     set_simd(request.param)
     yield request.param
     set_simd("auto")
