@@ -72,6 +72,7 @@ std::size_t undirected(Lists neighbors, Array<std::int32_t, nb::shape<-1, 2>> ed
   const std::size_t count = neighbors.shape(0), k = neighbors.shape(1);
   if (edges.shape(0) < count * k) throw nb::value_error("edges must have room for N * k pairs");
   if (!within(neighbors, count)) throw nb::value_error("neighbors: an index lies outside the points");
+  if (k == 0) return 0;  // an empty array may have any number of rows
   nb::gil_scoped_release release;
   return perception::graph::undirected(neighbors.data(), count, k, edges.data());
 }
