@@ -23,13 +23,27 @@ class Lens:
 
 
 @dataclass(frozen=True)
+class DepthImage:
+    """The depth that a sensor measured for a photo: an image of distances along the optical axis.
+
+    path: PNG or TIFF of one channel, or NumPy .npy, [h, w]; 0 = nothing measured. scale: scene units per stored unit.
+    lens: camera that took it, at the photo's pose; None when it shows what the photo shows, at any resolution.
+    """
+
+    path: Path
+    scale: float
+    lens: Lens | None = None
+
+
+@dataclass(frozen=True)
 class View:
     """One posed photo, seen through an ideal pinhole camera (K, width, height) obtained by undistorting `lens`.
 
     name: file name of the photo relative to its folder, unique in the scene ("a/0001.jpg").
     photo: path of the photo. lens: None when the photo is already a pinhole image of size width × height.
     K: [3, 3] float64, pixels. camera_from_world: [4, 4] float64, OpenCV axes (x right, y down, z forward).
-    held_out: whether the view was used for evaluation of a finished map and not for training.
+    held_out: whether the view was used for evaluation of a finished map and not for training. depth: None without a
+    depth sensor.
     """
 
     name: str
@@ -40,6 +54,7 @@ class View:
     camera_from_world: np.ndarray
     lens: Lens | None = None
     held_out: bool = False
+    depth: DepthImage | None = None
 
 
 @dataclass

@@ -16,7 +16,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.safe_names import safe_name
-from perception.types import Lens, View
+from perception.types import DepthImage, Lens, View
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def stored_view(view: View, folder: Path, held_out: bool = False) -> StoredView:
         size = None
     K, pose = np.asarray(view.K, np.float64), np.asarray(view.camera_from_world, np.float64)
     beside = _relative(photo, folder)
-    return StoredView(view.name, photo, K, view.width, view.height, pose, view.lens, held_out, beside, size)
+    return StoredView(view.name, photo, K, view.width, view.height, pose, view.lens, held_out, None, beside, size)
 
 
 def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
@@ -87,8 +87,7 @@ def _relative(photo: Path, folder: Path) -> str | None:
 
 
 def view_json(view: View) -> dict[str, Any]:
-    """A view as JSON, with the photo record if `view` is a `StoredView`."""
-    lens = view.lens
+    """A view as JSON, with the photo record if `view` is a `StoredView`, and with its depth image if it has one."""
     entry = {
         "name": view.name,
         "photo": str(absolute(view.photo)),
@@ -96,16 +95,18 @@ def view_json(view: View) -> dict[str, Any]:
         "width": view.width,
         "height": view.height,
         "camera_from_world": np.asarray(view.camera_from_world).tolist(),
-        "lens": None if lens is None else [lens.model, list(lens.params), lens.width, lens.height],
+        "lens": _lens_json(view.lens),
     }
     if isinstance(view, StoredView):
         entry |= {name: getattr(view, name) for name in ("held_out", "photo_beside", "photo_bytes")}
+    if view.depth is not None:
+        entry["depth"] = [str(absolute(view.depth.path)), view.depth.scale, _lens_json(view.depth.lens)]
     return entry
 
 
 def view_from_json(entry: dict[str, Any]) -> StoredView:
     """The inverse of `view_json`. ValueError, TypeError or KeyError for an invalid entry."""
-    lens, beside, size = entry.get("lens"), entry.get("photo_beside"), entry.get("photo_bytes")
+    beside, size, depth = entry.get("photo_beside"), entry.get("photo_bytes"), entry.get("depth")
     K, pose = (np.array(entry[name], np.float64) for name in ("K", "camera_from_world"))
     if K.shape != (3, 3) or pose.shape != (4, 4) or not (np.isfinite(K).all() and np.isfinite(pose).all()):
         raise ValueError(f"{entry['name']}: K or camera_from_world is no finite matrix")
@@ -119,11 +120,20 @@ def view_from_json(entry: dict[str, Any]) -> StoredView:
         width,
         height,
         pose,
-        None if lens is None else Lens(str(lens[0]), tuple(map(float, lens[1])), int(lens[2]), int(lens[3])),
+        _lens_of(entry.get("lens")),
         bool(entry.get("held_out", False)),
+        None if depth is None else DepthImage(Path(depth[0]), float(depth[1]), _lens_of(depth[2])),
         None if beside is None else str(beside),
         None if size is None else int(size),
     )
+
+
+def _lens_json(lens: Lens | None) -> list[Any] | None:
+    return None if lens is None else [lens.model, list(lens.params), lens.width, lens.height]
+
+
+def _lens_of(entry: list[Any] | None) -> Lens | None:
+    return None if entry is None else Lens(str(entry[0]), tuple(map(float, entry[1])), int(entry[2]), int(entry[3]))
 
 
 def views_of_facts(info: dict[str, Any], file: Path, cameras: dict[str, np.ndarray]) -> list[StoredView]:

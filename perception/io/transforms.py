@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from perception.io.safe_names import safe_name
 from perception.io.triangulate import posed_scene
 from perception.io.views import fit_lens, make_view, rigid_pose
 from perception.progress import Progress
-from perception.types import Lens, Scene, View
+from perception.types import DepthImage, Lens, Scene, View
 
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _PERSPECTIVE = (
@@ -30,6 +31,10 @@ _PERSPECTIVE = (
     "FULL_OPENCV",
     "PERSPECTIVE",
 )
+
+
+MILLIMETRE = 1e-3
+"""Unit of depth images without `depth_unit_scale_factor` or `integer_depth_scale`, in metres: nerfstudio's default."""
 
 
 def read_transforms(file: Path, workdir: Path, seed: int, progress: Progress, strict: bool = False) -> Scene:
@@ -88,7 +93,8 @@ def _views(
         if name in views:
             notes.add(f"{name} is listed more than once; the first pose is used")
             continue
-        views[name] = make_view(name, photo, lens, _pose(file, frame), file)
+        view = make_view(name, photo, lens, _pose(file, frame), file)
+        views[name] = replace(view, depth=_depth(file, data, frame))
         if note:
             notes.add(note)
     return [views[name] for name in sorted(views)], sorted(notes)
@@ -150,6 +156,22 @@ def _pose(file: Path, frame: dict[str, Any]) -> np.ndarray:
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
     return OPENCV_FROM_OPENGL @ inverse_se3(rigid_pose(matrix, what))
+
+
+def _depth(file: Path, data: dict[str, Any], frame: dict[str, Any]) -> DepthImage | None:
+    """The depth image that a frame names; the unit is a millimetre unless a scale is given, as in nerfstudio."""
+    listed = frame.get("depth_file_path", frame.get("depth_path"))
+    if not listed:
+        return None
+    path = _find(file.parent, str(listed))
+    if path is None:
+        raise InputError(f"{file}: depth image {brief(listed)} does not exist; remove the entry or add the file")
+    what = f"{file}: {frame['file_path']}"
+    scales = (_number({**data, **frame}, key, what) for key in ("depth_unit_scale_factor", "integer_depth_scale"))
+    scale = next((scale for scale in scales if scale is not None), MILLIMETRE)
+    if scale <= 0:
+        raise InputError(f"{what}: the scale of its depth must be above 0, found {scale:g}")
+    return DepthImage(path, scale)
 
 
 def _lens(file: Path, values: dict[str, Any], photo: Path | None) -> Lens:

@@ -12,19 +12,12 @@ import numpy as np
 from perception.geometry import inverse_se3
 from perception.io.features import build_features
 from perception.io.lens import camera_from_lens, lens_text, load_pycolmap
+from perception.io.views import view_lens
 from perception.progress import Progress
-from perception.types import Lens, Scene, View
+from perception.types import Scene, View
 
 MIN_POINTS = 50
 FALLBACK_POINTS = 5000
-
-
-def view_lens(view: View) -> Lens:
-    """The lens of the view's photo; a pinhole when the photo needs no undistortion."""
-    if view.lens is not None:
-        return view.lens
-    K = view.K
-    return Lens("PINHOLE", tuple(map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))), view.width, view.height)
 
 
 def posed_scene(

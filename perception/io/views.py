@@ -53,3 +53,11 @@ def fit_lens(lens: Lens, photo: Path, source: Path) -> tuple[Lens, str | None]:
         f"{source}: {photo.name} is {size[0]}×{size[1]} but its camera says {lens.width}×{lens.height}; "
         "give the camera of these photos or the photos of this camera"
     )
+
+
+def view_lens(view: View) -> Lens:
+    """The lens of the view's photo; a pinhole when the photo needs no undistortion."""
+    if view.lens is not None:
+        return view.lens
+    K = view.K
+    return Lens("PINHOLE", tuple(map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))), view.width, view.height)
