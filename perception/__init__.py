@@ -27,4 +27,22 @@ def __getattr__(name: str) -> Any:
         import importlib
 
         return getattr(importlib.import_module(_HOMES[name]), name)
+    if name == "_core":
+        return _compiled()
     raise AttributeError(f"module 'perception' has no attribute '{name}'")
+
+
+def _compiled() -> Any:
+    """The compiled core. In sources that are not built, Python would import the folder of its stubs in its place."""
+    from importlib import import_module
+    from importlib.machinery import PathFinder
+
+    found = PathFinder.find_spec("perception._core", __path__)
+    if found is None or found.origin is None:
+        from perception.errors import InputError
+
+        raise InputError(
+            f"the compiled core is not in {__path__[0]}; build it with csrc/build_inplace.sh, "
+            "or run outside the source tree to use an installed package"
+        )
+    return import_module("perception._core")

@@ -219,13 +219,20 @@ def _kinds(field: FieldInfo) -> tuple[Any, ...]:
 def _unknown(key: str, known: list[str]) -> str:
     if any(name.startswith(f"{key}.") for name in known):
         return f"'{key}' is a group of settings, write {key}.NAME=VALUE"
-    last = {name: name.rpartition(".")[2] for name in known}
-    near = difflib.get_close_matches(key.rpartition(".")[2], set(last.values()), 1, 0.6)
-    named = [name for name in known if last[name] in near] or difflib.get_close_matches(key, known, 1, 0.8)
-    if named:
-        return f"unknown setting '{key}', did you mean {' or '.join(named)}?"
-    group = [name for name in known if name.startswith(f"{key.partition('.')[0]}.")] or known
+    head, _, last = key.rpartition(".")
+    group = [name for name in known if name.startswith(f"{head}.")] if head else []
+    near = _like(last, group, 0.6) or _like(last, known, 0.75) or difflib.get_close_matches(key, known, 1, 0.8)
+    if near:
+        return f"unknown setting '{key}', did you mean {' or '.join(near)}?"
+    group = group or known
     return f"unknown setting '{_short(key)[1:-1]}', expected one of: {', '.join(group)}"
+
+
+def _like(word: str, known: list[str], least: float) -> list[str]:
+    """The settings whose last name is the one nearest to `word`, when their similarity is at least `least`."""
+    last = {name: name.rpartition(".")[2] for name in known}
+    near = difflib.get_close_matches(word, sorted(set(last.values())), 1, least)
+    return [name for name in known if last[name] in near]
 
 
 def _short(value: Any, most: int = 80) -> str:

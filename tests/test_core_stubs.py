@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import ast
 import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -63,3 +66,15 @@ def test_stubs_say_what_is_compiled(module: ModuleType, file: str) -> None:
     assert set(truth) - set(stub) == set() == {n for n in set(stub) - set(truth) if not n.endswith("__init__")}, REMEDY
     for name, calls in truth.items():
         assert stub[name] == calls, f"{name}: {REMEDY}"
+
+
+def test_sources_that_are_not_built_say_so(tmp_path: Path) -> None:
+    """Python takes the stubs' folder for a namespace package: its names would be missing one by one."""
+    sources = Path(perception.__file__).parent
+    for name in ("__init__.py", "errors.py", "_core/__init__.pyi"):
+        (tmp_path / "perception" / name).parent.mkdir(exist_ok=True)
+        shutil.copy(sources / name, tmp_path / "perception" / name)
+    words = [sys.executable, "-c", "from perception import _core"]
+    told = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert told.stderr.splitlines()[-1].startswith("perception.errors.InputError: the compiled core is not in")
+    assert str(tmp_path) in told.stderr and "csrc/build_inplace.sh" in told.stderr

@@ -9,18 +9,44 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
 from fuzz.core import Dice
-from fuzz.targets import Target, map_store
+from fuzz.targets import Target, in_memory, map_store
 from perception.errors import InputError
 
 
-class HttpTarget:
-    """One request: a line METHOD PATH, header lines, an empty line, the body. It must be answered, below 500."""
+_NASTY = (
+    1e308, -1e308, 1e200, 5e-324, -0.0, 10**400, 2**63, -1, 0, 1e39, "\ud800", "", "mug", "\x00", "a" * 1001, None, True,
+    [], {}, [[]], [0, 0, 0], [1e308] * 3, [1e-200] * 3, np.eye(4).tolist(), (1e200 * np.eye(3)).tolist(), [[0, 0]] * 70,
+)  # fmt: skip
+"""Values that replace those of a sound request."""
 
-    decides = False
+
+def spoiled(dice: Dice, value: Any) -> Any:
+    """A JSON value with one of its parts replaced, left out or said twice."""
+    if not isinstance(value, (list, dict)) or not value or dice.below(6) == 0:
+        return dice.pick(_NASTY)
+    changed: Any = value.copy()
+    key = dice.pick(list(value) if isinstance(value, dict) else range(len(value)))
+    if dice.below(8) == 0:
+        del changed[key]
+    elif isinstance(changed, list) and dice.below(8) == 0:
+        changed.insert(key, changed[key])
+    else:
+        changed[key] = spoiled(dice, value[key])
+    return changed
+
+
+class HttpTarget:
+    """One request: a line METHOD PATH, header lines, an empty line, the body. It must be answered, below 500.
+
+    Input that does not begin with a letter is decisions instead: a sound request of which a few values are spoiled.
+    """
+
+    decides = True
     memory = 1024
     words = (
         "GET /", "POST /", "query", "instances/", "/crop.jpg", "?map_id=", "?side=", "?format=ply", "\n\n", "host: ",
@@ -39,6 +65,7 @@ class HttpTarget:
         engine = QueryEngine(path, watch=None, encoders=encoders, timeout=60)
         self._app = build_app(engine, ServeSettings(rate=0))
         self._loop = asyncio.new_event_loop()
+        self._asked = [seed.partition(b"\n\n") for seed in self.seeds() if seed.startswith(b"POST")]
 
     def seeds(self) -> list[bytes]:
         """Requests that are answered with 200."""
@@ -61,8 +88,18 @@ class HttpTarget:
         paths = ("", "health", "instances", "instances/1", "instances/1/points?format=ply", "openapi.json")
         return asked + [f"GET /{path}\nhost: localhost\n\n".encode() for path in paths]
 
+    def _decided(self, data: bytes) -> bytes:
+        dice = Dice(data)
+        head, _, body = dice.pick(self._asked)
+        value = json.loads(body)
+        for _ in range(1 + dice.below(3)):
+            value = spoiled(dice, value)
+        return head + b"\n\n" + json.dumps(value).encode()
+
     def run(self, data: bytes) -> bool:
         """True for 200."""
+        if not data[:1].isalpha():
+            data = self._decided(data)
         head, _, body = data.partition(b"\n\n")
         line, *headers = head.split(b"\n")
         method, _, target = line.partition(b" ")
@@ -70,7 +107,8 @@ class HttpTarget:
         scope = {
             "type": "http", "http_version": "1.1", "method": method.decode("latin-1").upper(), "scheme": "http",
             "path": path.decode("utf-8", "replace"), "raw_path": path, "query_string": query, "root_path": "",
-            "headers": [(n.strip().lower(), v.strip()) for n, _, v in (one.partition(b":") for one in headers)],
+            "headers": [(n.strip().lower(), v.strip()) for n, _, v in (one.partition(b":") for one in headers)]
+            or [(b"host", b"localhost")],
             "client": ("127.0.0.1", 1), "server": ("127.0.0.1", 2),
         }  # fmt: skip
         sent: list[dict[str, Any]] = []
@@ -175,14 +213,27 @@ class ViewerTarget:
     _TEXTS = ("", " ", "pear", "<img src=x>", "\x00", "\ud800", "a" * 2000, "é\n*", "&#60;", "[x](y)")
 
     def __init__(self) -> None:
-        from perception.io.store import write_map
+        from perception.io.store import map_signature, read_map
         from perception.viewer.guard import Guard
+
+        self._folder = TemporaryDirectory(prefix="fuzz-", dir=in_memory())
+        self._path = Path(self._folder.name, "m.gsmap")
+        self._guard = Guard("the token of this viewer", "127.0.0.1")
+        self._renew()
+        opened = read_map(self._path)  # reading it for every input would be most of the time
+
+        def read(path: Path) -> Any:
+            return opened if map_signature(path) == self._signature else read_map(path)
+
+        self._read = read
+
+    def _renew(self) -> None:
+        """The map as it was before an input saved another."""
+        from perception.io.store import map_signature, write_map
         from support.viewer_maps import small_map
 
-        self._folder = TemporaryDirectory(prefix="fuzz-")
-        self._path = Path(self._folder.name, "m.gsmap")
         write_map(self._path, small_map(60))
-        self._guard = Guard("the token of this viewer", "127.0.0.1")
+        self._signature = map_signature(self._path)
 
     def seeds(self) -> list[bytes]:
         """Every kind of message once."""
@@ -190,6 +241,15 @@ class ViewerTarget:
 
     def run(self, data: bytes) -> bool:
         """True when nothing was refused."""
+        from perception.io.store import map_signature
+
+        with patch("perception.editing.editor.read_map", self._read):
+            taken = self._run(data)
+        if map_signature(self._path) != self._signature:
+            self._renew()
+        return taken
+
+    def _run(self, data: bytes) -> bool:
         from perception.viewer.panel import Panel
         from perception.viewer.session import Session
 

@@ -71,13 +71,17 @@ class Target:
 
     def _place(self) -> Path:
         if self.folder is None:
-            memory = Path("/dev/shm")
-            self.folder = TemporaryDirectory(prefix="fuzz-", dir=memory if memory.is_dir() else None)
+            self.folder = TemporaryDirectory(prefix="fuzz-", dir=in_memory())
             for name, content in self.files.items():
                 file = Path(self.folder.name, name)
                 file.parent.mkdir(parents=True, exist_ok=True)
                 file.write_bytes(content)
         return Path(self.folder.name)
+
+
+def in_memory() -> Path | None:
+    """A folder that is not on a disk, where there is one."""
+    return Path("/dev/shm") if Path("/dev/shm").is_dir() else None
 
 
 def _refuse_memory_errors(error: BaseException) -> None:
