@@ -10,99 +10,94 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from perception.bench.output import Column, finish, save_plot, table
-from perception.bench.sweep import Variant, chosen, pareto, prepare, sweep_parser, with_minutes
+import numpy as np
 
-FIGURES: tuple[Column, ...] = (
+from perception.bench.output import Column, finish, save_plot, table
+from perception.bench.sweep import Variant, run_sweep, sweep_parser
+
+COLUMNS: tuple[Column, ...] = (
     ("PSNR", "psnr", ".2f"),
     ("SSIM", "ssim", ".4f"),
     ("AP", "ap", ".3f"),
     ("AP50", "ap50", ".3f"),
     ("AP25", "ap25", ".3f"),
     ("mIoU", "miou", ".3f"),
-)
-COSTS: tuple[Column, ...] = (
     ("minutes", "minutes", ".2f"),
     ("CPU min", "cpu_minutes", ".2f"),
     ("Gaussians", "gaussians", "d"),
     ("MiB", "peak_mib", ".0f"),
+    ("front", "front", "s"),
 )
-PRESET_NAMES = ("default", "fast", "quality")
-BUDGETS = (12_500, 25_000, 50_000, 200_000)
-ITERATIONS = (750, 1500, 6000)
-SIDES = (240, 360)
+QUALITY = {"psnr": "held-out PSNR, dB", "ssim": "SSIM", "ap": "AP"}
+PRESETS = ("default", "fast", "quality")
+VALUES = {
+    "train.budget": (12_500, 25_000, 50_000, 200_000),
+    "train.iterations": (750, 1500, 6000),
+    "train.sh_degree": (0, 1, 2, 3),
+    "photos.max_side": (240, 360),
+    "losses.feature_dim": (4, 16),
+}
+"""Values of each setting that is varied alone."""
 
 
-def variants(masks: str | None) -> list[Variant]:
+def variants() -> list[Variant]:
     """The presets, followed by the default settings with one setting changed at a time."""
-
-    def one(group: str, name: object, *pairs: str) -> Variant:
-        return Variant(group, str(name), pairs, masks)
-
-    return [
-        *(Variant("preset", name, (), masks, preset=name) for name in PRESET_NAMES),
-        *(one("budget", n, f"train.budget={n}") for n in BUDGETS),
-        *(one("iterations", n, f"train.iterations={n}") for n in ITERATIONS),
-        *(one("harmonics", d, f"train.sh_degree={d}") for d in range(4)),
-        *(one("max_side", n, f"photos.max_side={n}") for n in SIDES),
-        *(one("d", n, f"losses.feature_dim={n}") for n in (4, 16) if masks is not None),
+    cells = [Variant("preset", name, preset=name) for name in PRESETS]
+    return cells + [
+        Variant(key.partition(".")[2], str(value), (f"{key}={value}",))
+        for key, values in VALUES.items()
+        for value in values
     ]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line entry point."""
+def pareto(points: Sequence[tuple[float, float | None]]) -> list[int]:
+    """Indices of the Pareto-optimal (cost, value) pairs by rising cost: lower cost and higher value are better."""
+    kept: list[int] = []
+    best = -np.inf
+    for _, loss, index in sorted((cost, -value, i) for i, (cost, value) in enumerate(points) if value is not None):
+        if -loss > best:
+            kept.append(index)
+            best = -loss
+    return kept
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Prints the table; JSON and a plot go to the output folder."""
     options = sweep_parser("map", __doc__).parse_args(arguments)
-    sweep, scene, masks = prepare(options)
-    rows = with_minutes(sweep.run(scene, chosen(variants(masks), options.only)))
-    native = rows[0]["pixels"]
-    for key in ("psnr", "ssim", "ap"):
-        points = [(row["cpu_minutes"], row.get(key) if row["pixels"] == native else None) for row in rows]
-        front = set(pareto(points))
-        for index, row in enumerate(rows):
-            row[f"front_{key}"] = index in front
-    for row in rows:
-        row["front"] = " ".join(key for key in ("psnr", "ssim", "ap") if row[f"front_{key}"])
-        row["note"] = row["front"] if row["pixels"] == native else "other resolution"
-    text = f"{scene.name}; on the front (CPU minutes against ...):\n"
-    text += table(rows, (*FIGURES, *COSTS, ("front", "note", "s")))
-    _plot(options.output / "map.png", scene.name, rows, native)
-    finish("map", options, {"scene": scene.name, "rows": rows}, text)
-    return 0
+    rows = run_sweep(options, variants())
+    comparable = [row["max_side"] == rows[0]["max_side"] for row in rows]
+    fronts = {
+        key: pareto(
+            [(r["cpu_minutes"], r.get(key) if same else None) for r, same in zip(rows, comparable, strict=True)]
+        )
+        for key in QUALITY
+    }
+    for index, row in enumerate(rows):
+        on = " ".join(key for key, front in fronts.items() if index in front)
+        row["front"] = on if comparable[index] else "other resolution"
+    text = f"{options.scene.name}; on the front (CPU minutes against ...):\n{table(rows, COLUMNS)}"
+    _plot(options.output / "map.png", options.scene.name, rows, fronts)
+    finish("map", options, {"scene": options.scene.name, "rows": rows}, text)
 
 
-def _plot(path: Path, scene: str, rows: Sequence[dict[str, Any]], native: int) -> None:
+def _plot(path: Path, scene: str, rows: Sequence[dict[str, Any]], fronts: dict[str, list[int]]) -> None:
+    """One axis for each measure of quality: all rows, the front as a line, and names on it."""
+
     def draw(figure: Any) -> None:
-        from matplotlib.ticker import LogLocator, NullFormatter
-
-        parts = [(key, label) for key, label in (("psnr", "held-out PSNR, dB"), ("ssim", "SSIM"), ("ap", "AP"))]
-        parts = [(key, label) for key, label in parts if any(row.get(key) is not None for row in rows)]
-        for axis, (key, label) in zip(figure.subplots(1, len(parts), squeeze=False)[0], parts, strict=True):
-            held = [row for row in rows if row.get(key) is not None]
-            for row in held:
-                preset = row["group"] == "preset"
-                style = {"marker": "*" if preset else "o", "s": 130 if preset else 28}
-                color = "#cc3311" if preset else "#4477aa" if row["pixels"] == native else "0.7"
-                axis.scatter(row["cpu_minutes"], row[key], color=color, zorder=3 if preset else 2, **style)
-                if preset or row[f"front_{key}"]:  # labels of the other variants would overlap near the default
-                    name = row["name"] if preset else f"{row['group']} {row['name']}"
-                    place = {"ha": "left", "xytext": (7, -9)} if preset else {"ha": "right", "xytext": (-4, 4)}
-                    at = (row["cpu_minutes"], row[key])
-                    axis.annotate(name, at, fontsize=7, textcoords="offset points", annotation_clip=False, **place)
-            front = sorted((row["cpu_minutes"], row[key]) for row in held if row[f"front_{key}"])
-            axis.plot(*zip(*front, strict=True), color="#4477aa", linewidth=1, zorder=1)
-            axis.set_xscale("log")
-            axis.margins(x=0.15)
-            axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axis.xaxis.set_major_formatter("{x:g}")
-            axis.xaxis.set_minor_formatter(NullFormatter())
-            axis.set_xlabel("CPU minutes of training")
-            axis.set_ylabel(label)
+        shown = [key for key in QUALITY if any(row.get(key) is not None for row in rows)]
+        for axis, key in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
+            for index, row in enumerate(rows):
+                if row.get(key) is None:
+                    continue
+                color = "0.7" if row["front"] == "other resolution" else "#4477aa"
+                axis.scatter(row["cpu_minutes"], row[key], color=color, marker="*" if row["group"] == "preset" else "o")
+                if index in fronts[key] or row["group"] == "preset":
+                    axis.annotate(f"{row['group']} {row['name']}", (row["cpu_minutes"], row[key]), fontsize=7)
+            front = [rows[index] for index in fronts[key]]
+            axis.plot([row["cpu_minutes"] for row in front], [row[key] for row in front], color="#4477aa")
+            axis.set(xscale="log", xlabel="CPU minutes", ylabel=QUALITY[key])
             axis.grid(alpha=0.3)
         figure.suptitle(f"{scene}: grey points were scored at another resolution", fontsize=10)
 
     if any(row.get("psnr") is not None for row in rows):
         save_plot(path, draw, (12, 4.6))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

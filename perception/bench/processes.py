@@ -14,19 +14,18 @@ from typing import Any
 import perception
 
 
-def _options() -> dict[str, Any]:
+def _options(threads: int | None = None) -> dict[str, Any]:
     """cwd and env for subprocess. Started in a repository root, Python would import the sources without _core."""
     paths = [str(Path(perception.__file__).resolve().parents[1]), *(path for path in sys.path if path)]
-    return {
-        "cwd": tempfile.gettempdir(),
-        "env": {**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))},
-        "text": True,
-    }
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))}
+    if threads is not None:
+        env["OMP_NUM_THREADS"] = str(threads)
+    return {"cwd": tempfile.gettempdir(), "env": env, "text": True}
 
 
-def run_python(*arguments: str) -> str:
+def run_python(*arguments: str, threads: int | None = None) -> str:
     """Standard output of `python ARGUMENTS`. RuntimeError with its standard error when it fails."""
-    done = subprocess.run([sys.executable, *arguments], capture_output=True, check=False, **_options())
+    done = subprocess.run([sys.executable, *arguments], capture_output=True, check=False, **_options(threads))
     if done.returncode:
         raise RuntimeError(f"python {' '.join(arguments)[:80]} ended with {done.returncode}: {done.stderr.strip()}")
     return done.stdout
@@ -39,10 +38,10 @@ def served(*arguments: str) -> Iterator[tuple[str, int]]:
     server = subprocess.Popen(command, stderr=subprocess.PIPE, **_options())
     try:
         assert server.stderr is not None
-        told = server.stderr.readline()
-        if not told.startswith("serving "):
-            raise RuntimeError(f"perception {arguments[0]} did not start: {told}{server.stderr.read()}")
-        yield told, server.pid
+        line = server.stderr.readline()
+        if not line.startswith("serving "):
+            raise RuntimeError(f"perception {arguments[0]} did not start: {line}{server.stderr.read()}")
+        yield line, server.pid
     finally:
         server.terminate()
         server.wait()

@@ -18,26 +18,21 @@ from typing import Any
 
 import numpy as np
 
-from perception.bench.askers import CONTENDERS, Best, Contender
-from perception.bench.dds import DDS_CONTENDERS
+from perception.bench.clients import WAYS, Best
 from perception.bench.memory import status_mib
-from perception.bench.output import bench_parser, finish, save_plot
+from perception.bench.output import bench_parser, finish
 from perception.bench.processes import run_python
 from perception.bench.synthetic_map import write_synthetic_map
 from perception.errors import InputError
 
-_WAYS = {**CONTENDERS, **DDS_CONTENDERS}
-
 _COLD = """
-import sys, resource
+import sys, time
 from perception.bench.memory import status_mib
 from perception.query import load_map
 gmap = load_map(sys.argv[1])
-opened = resource.getrusage(resource.RUSAGE_SELF)
+opened = time.process_time()
 hits = gmap.query(sys.argv[2], 1)
-used = resource.getrusage(resource.RUSAGE_SELF)
-times = (opened.ru_utime + opened.ru_stime, used.ru_utime + used.ru_stime)
-print(hits[0].instance_id, *times, status_mib("VmHWM"))
+print(hits[0].instance_id, opened, time.process_time(), status_mib("VmHWM"))
 """
 
 
@@ -53,61 +48,34 @@ def prompts(count: int) -> list[str]:
     return unique[:count]
 
 
-def cold_start(path: Path, name: str, expected: int, rounds: int) -> dict[str, Any]:
+def cold_start(path: Path, name: str, rounds: int) -> dict[str, Any]:
     """Seconds from process start to the first answer, wall time and CPU time, and peak memory in MiB."""
     rows = []
     for _ in range(rounds):
         start = time.perf_counter()
-        out = run_python("-c", _COLD, str(path.resolve()), name).split()
-        rows.append([time.perf_counter() - start, *map(float, out[1:])])
-        if int(out[0]) != expected:
-            raise RuntimeError(f"{name}: answered {out[0]}, expected {expected}")
-    wall, opened, used, peak = np.median(rows, axis=0)
-    return {
-        "first_answer_s": round(float(wall), 2),
-        "first_answer_cpu_s": round(float(used), 2),
-        "until_map_open_cpu_s": round(float(opened), 2),
-        "peak_mib": round(float(peak)) if np.isfinite(peak) else None,
-        "rounds": rounds,
-    }
+        instance, *figures = map(float, run_python("-c", _COLD, str(path.resolve()), name).split())
+        rows.append([time.perf_counter() - start, *figures])
+        if instance != 0:
+            raise RuntimeError(f"{name}: answered {instance:.0f}, expected 0")
+    wall, opened, used, peak = (round(float(value), 2) for value in np.median(rows, axis=0))
+    return {"first_answer_s": wall, "until_map_open_cpu_s": opened, "first_answer_cpu_s": used, "peak_mib": peak}
 
 
-def load_times(path: Path, turns: int) -> dict[str, float]:
-    """Milliseconds of load_map, alone and with reading the points of one instance. The file cache is warm."""
-    from perception.query import load_map
-
-    load_map(path)
-    opening, pointing = [], []
-    for _ in range(turns):
-        start = time.perf_counter()
-        gmap = load_map(path)
-        opening.append(time.perf_counter() - start)
-        gmap.get(0)
-        pointing.append(time.perf_counter() - start)
-    return {"load_map_ms": _ms(np.median(opening)), "load_map_and_points_ms": _ms(np.median(pointing))}
-
-
-def place_times(path: Path, turns: int) -> dict[str, float]:
-    """Milliseconds of spatial queries, each at or around another instance; median over instances."""
+def open_map_times(path: Path, turns: int) -> dict[str, float]:
+    """Median milliseconds of load_map (file cache warm), of an instance's points, and of spatial queries at others."""
     from perception.query import axis_box, load_map
 
     gmap = load_map(path)
     hits = gmap.find()[:: max(1, len(gmap.instances) // (8 * turns))]
-    questions: dict[str, Callable[[Any], Any]] = {
-        "nearest": lambda hit: gmap.nearest(hit.centroid, 3),
-        "instance_at": lambda hit: gmap.instance_at(hit.centroid),
-        "in_box": lambda hit: gmap.in_box(axis_box(hit.centroid - 1.5, hit.centroid + 1.5)),
-        "describe": lambda hit: gmap.describe(hit.instance_id),
+    calls: dict[str, tuple[Callable[[Any], Any], Sequence[Any]]] = {
+        "load_map": (lambda _: load_map(path), range(turns)),
+        "load_map_and_points": (lambda _: load_map(path).get(0), range(turns)),
+        "nearest": (lambda hit: gmap.nearest(hit.centroid, 3), hits),
+        "instance_at": (lambda hit: gmap.instance_at(hit.centroid), hits),
+        "in_box": (lambda hit: gmap.in_box(axis_box(hit.centroid - 1.5, hit.centroid + 1.5)), hits),
+        "describe": (lambda hit: gmap.describe(hit.instance_id), hits),
     }
-    found = {}
-    for name, ask in questions.items():
-        times = []
-        for hit in hits:
-            start = time.perf_counter()
-            ask(hit)
-            times.append(time.perf_counter() - start)
-        found[f"{name}_ms"] = _ms(np.median(times))
-    return found
+    return {f"{name}_ms": _ms(np.median(_seconds(call, over)[0])) for name, (call, over) in calls.items()}
 
 
 def warm(path: Path, names: Sequence[str], queries: int) -> tuple[dict[str, Any], dict[str, Best]]:
@@ -116,19 +84,14 @@ def warm(path: Path, names: Sequence[str], queries: int) -> tuple[dict[str, Any]
 
     gmap = load_map(path)
     gmap.warm()
-    answers: dict[str, Best] = {}
-    first, again = [], []
-    for name in names:
-        start = time.perf_counter()
-        hits = gmap.query(name, 1)
-        first.append(time.perf_counter() - start)
-        answers[name] = (hits[0].instance_id, len(hits[0].points)) if hits else None
+    first, found = _seconds(lambda name: gmap.query(name, 1), names)
+    answers: dict[str, Best] = {
+        name: (hits[0].instance_id, len(hits[0].points)) if hits else None
+        for name, hits in zip(names, found, strict=True)
+    }
     before = status_mib("VmRSS")
-    for n in range(queries):
-        start = time.perf_counter()
-        gmap.query(names[n % len(names)], 1)
-        again.append(time.perf_counter() - start)
-    right = sum(answers[name] is not None and answers[name][0] == k for k, name in enumerate(names))  # type: ignore[index]
+    again, _ = _seconds(lambda n: len(gmap.query(names[n % len(names)], 1)), range(queries))
+    right = sum(best is not None and best[0] == k for k, best in enumerate(answers.values()))
     facts = {
         "new_prompt": _spread(first),
         "repeated_prompt": _spread(again),
@@ -139,10 +102,10 @@ def warm(path: Path, names: Sequence[str], queries: int) -> tuple[dict[str, Any]
     return facts, answers
 
 
-def clients_at_once(contender: Contender, path: Path, answers: dict[str, Best], shares: list[list[str]]) -> Any:
+def clients_at_once(way: Any, path: Path, answers: dict[str, Best], shares: list[list[str]]) -> dict[str, Any]:
     """Runs one client per share concurrently. Each sends its prompts in sequence, and every answer is compared."""
 
-    def client(ask: Any, share: list[str]) -> tuple[list[float], int, int]:
+    def run(ask: Any, share: list[str]) -> tuple[list[float], int, int]:
         times, crossed, lost = [], 0, 0
         for name in share:
             start = time.perf_counter()
@@ -155,10 +118,9 @@ def clients_at_once(contender: Contender, path: Path, answers: dict[str, Best], 
             crossed += answer != answers[name]
         return times, crossed, lost
 
-    with contender(path) as served, ThreadPoolExecutor(len(shares)) as pool:
+    with way(path) as served, ThreadPoolExecutor(len(shares)) as pool:
         before, start = status_mib("VmRSS", served.process), time.perf_counter()
-        asked = [pool.submit(client, served.client(), share) for share in shares]
-        results = [future.result() for future in asked]
+        results = [future.result() for future in [pool.submit(run, served.client(), share) for share in shares]]
         seconds = time.perf_counter() - start
         after = status_mib("VmRSS", served.process)
     times = [t for row, _, _ in results for t in row]
@@ -179,41 +141,41 @@ def shares_of(names: Sequence[str], queries: int, clients: int) -> list[list[str
 
 
 def measure(options: argparse.Namespace, folder: Path) -> tuple[dict[str, Any], str]:
-    """All figures, and a text with the main ones."""
+    """All figures, and a text of them."""
     from perception.language.encoders import make_encoder
 
     names, encoder = prompts(options.instances), make_encoder("conse")
     report: dict[str, Any] = {"maps": {}, "clients": {}}
-    lines = []
     for size in options.sizes:
         path = folder / f"{size}.gsmap"
         write_synthetic_map(path, names, encoder, gaussians=size)
-        row = {**load_times(path, options.turns), **cold_start(path, names[0], 0, options.rounds)}
-        report["maps"][size] = row | place_times(path, options.turns)
-        lines += [f"{size} Gaussians", *(f"  {key}: {value}" for key, value in report["maps"][size].items())]
+        report["maps"][f"{size} Gaussians"] = {
+            **open_map_times(path, options.turns),
+            **cold_start(path, names[0], options.rounds),
+        }
     report["warm"], answers = warm(path, names, options.queries)
-    for kind in ("new_prompt", "repeated_prompt"):
-        lines.append(f"one thread, {kind.replace('_', ' ')}: {_told(report['warm'][kind])}")
-    before, after = report["warm"]["resident_before_mib"], report["warm"]["resident_after_mib"]
-    lines.append(f"resident before and after {options.queries} queries: {before:.0f}, {after:.0f} MiB")
-    lines.append(f"right by construction: {report['warm']['right_by_construction']}")
     new = [f"{a} on a {b}" for a, b in zip(names, names[1:] + names[:1], strict=True)][: options.new]
     alone = warm(path, new, 0)[1]
     for name in options.via:
-        repeated = shares_of(names, options.queries, options.clients)
         shares = [new[c :: options.clients] for c in range(options.clients)]
-        rows = {
-            "new prompts": clients_at_once(_WAYS[name], path, alone, shares),
-            "repeated prompts": clients_at_once(_WAYS[name], path, answers, repeated),
+        repeated = shares_of(names, options.queries, options.clients)
+        report["clients"] |= {
+            f"{options.clients} clients, {name}, new": clients_at_once(WAYS[name], path, alone, shares),
+            f"{options.clients} clients, {name}, repeated": clients_at_once(WAYS[name], path, answers, repeated),
         }
-        report["clients"][name] = rows
-        lines += [
-            f"{options.clients} clients, {name}, {kind}: {_told(row)}, {row['per_second']} a second; "
-            f"{row['asked']} asked, {row['lost']} lost, {row['crossed']} crossed; "
-            f"server {row['server_after_mib']:.0f} MiB"
-            for kind, row in rows.items()
-        ]
+    groups = {**report["maps"], "one thread": report["warm"], **report["clients"]}
+    lines = [f"{head}\n" + "\n".join(f"  {key}: {value}" for key, value in row.items()) for head, row in groups.items()]
     return report, "\n".join(lines)
+
+
+def _seconds(call: Callable[[Any], Any], over: Sequence[Any]) -> tuple[list[float], list[Any]]:
+    """Wall-clock seconds of call(item) for each item, and what it returned."""
+    seconds, results = [], []
+    for item in over:
+        start = time.perf_counter()
+        results.append(call(item))
+        seconds.append(time.perf_counter() - start)
+    return seconds, results
 
 
 def _spread(seconds: Sequence[float]) -> dict[str, float]:
@@ -223,36 +185,12 @@ def _spread(seconds: Sequence[float]) -> dict[str, float]:
     return {"median_ms": _ms(median), "q25_ms": _ms(low), "q75_ms": _ms(high), "p99_ms": _ms(last)}
 
 
-def _told(row: dict[str, Any]) -> str:
-    return f"median {row['median_ms']} ms [{row['q25_ms']}, {row['q75_ms']}], p99 {row['p99_ms']} ms"
-
-
 def _ms(seconds: Any) -> float:
     return round(1e3 * float(seconds), 3)
 
 
-def _draw(report: dict[str, Any], clients: int) -> Callable[[Any], None]:
-    """Median and 99th percentile latency of every kind of client, on a logarithmic axis."""
-    rows = {"new prompt": report["warm"]["new_prompt"], "asked again": report["warm"]["repeated_prompt"]}
-    for name, kinds in report["clients"].items():
-        rows |= {f"{clients} clients,\n{name},\n{kind}": row for kind, row in kinds.items()}
-
-    def draw(figure: Any) -> None:
-        axes = figure.subplots()
-        places = np.arange(len(rows))
-        for shift, key, label in ((-0.2, "median_ms", "median"), (0.2, "p99_ms", "99 %")):
-            bars = axes.bar(places + shift, [row[key] for row in rows.values()], 0.4, label=label)
-            axes.bar_label(bars, fmt="%.3g", fontsize=8)
-        axes.set(yscale="log", ylabel="ms", xticks=places, title="One prompt, asked and answered")
-        axes.set_xticklabels(list(rows))
-        axes.legend(frameon=False, ncols=2, loc="upper left")
-        axes.margins(y=0.25)
-
-    return draw
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Prints the figures; JSON and a plot go to the output folder."""
+    """Prints the figures; JSON goes to the output folder."""
     parser = bench_parser("query", __doc__)
     parser.add_argument("--sizes", type=int, nargs="+", default=[200_000, 1_000_000], help="Gaussians of the maps")
     parser.add_argument("--instances", type=int, default=200)
@@ -261,11 +199,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--clients", type=int, default=8)
     parser.add_argument("--rounds", type=int, default=3, help="processes started for the cold figures")
     parser.add_argument("--turns", type=int, default=7, help="times each map is opened")
-    parser.add_argument("--via", nargs="+", default=list(_WAYS), choices=list(_WAYS))
+    parser.add_argument("--via", nargs="+", default=list(WAYS), choices=list(WAYS))
     options = parser.parse_args(arguments)
     if min(*options.sizes, options.queries, options.new, options.clients, options.rounds, options.turns) < 1:
         raise InputError("bench query: sizes and counts must be at least 1")
     with tempfile.TemporaryDirectory() as folder:
         report, text = measure(options, Path(folder))
-    save_plot(options.output / "query.png", _draw(report, options.clients), (8, 3.6))
     finish("query", options, report, text)

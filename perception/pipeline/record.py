@@ -10,7 +10,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 
@@ -33,24 +32,6 @@ def peak_memory_mib() -> float:
     """Largest resident memory of this process so far, MiB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(peak / (1024 * 1024 if sys.platform == "darwin" else 1024), 1)
-
-
-class PeakMemory:
-    """Peak resident memory since construction (Linux), or since the start of the process (other systems)."""
-
-    def __init__(self) -> None:
-        self._since = True
-        try:  # proc(5): writing 5 resets the high-water mark
-            Path("/proc/self/clear_refs").write_text("5")
-        except OSError:
-            self._since = False
-
-    def mib(self) -> float:
-        if self._since:
-            for line in Path("/proc/self/status").read_text().splitlines():
-                if line.startswith("VmHWM:"):
-                    return round(int(line.split()[1]) / 1024, 1)
-        return peak_memory_mib()
 
 
 def versions() -> dict[str, str]:

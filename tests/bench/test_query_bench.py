@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from perception.bench.askers import Best, Served, engine_askers
-from perception.bench.query import clients_at_once, load_times, shares_of, warm
+from perception.bench.clients import Best, Served, by_engine
+from perception.bench.query import clients_at_once, open_map_times, shares_of, warm
 from perception.io.store import read_map
 from support.query_maps import NAMES, encoders, write_map_of
 
@@ -23,9 +23,9 @@ def test_the_bench_finds_every_answer_right(tmp_path: Path, monkeypatch: pytest.
     assert facts["right_by_construction"] == f"{len(NAMES)} of {len(NAMES)}"
     ids = read_map(path).instance_ids
     assert answers == {name: (n, int((ids == n).sum())) for n, name in enumerate(NAMES)}
-    row = clients_at_once(engine_askers, path, answers, shares_of(NAMES, 80, 4))
+    row = clients_at_once(by_engine, path, answers, shares_of(NAMES, 80, 4))
     assert (row["asked"], row["lost"], row["crossed"]) == (80, 0, 0)
-    assert load_times(path, 2)["load_map_ms"] > 0
+    assert min(open_map_times(path, 2).values()) > 0
 
 
 def test_lost_and_crossed_answers_are_counted(tmp_path: Path) -> None:

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import json
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from perception.bench import map as bench_map
 from perception.bench import scaling, sweep
+from perception.bench.map import pareto
 from perception.bench.memory import fresh_peak, status_mib
 from perception.bench.output import table
-from perception.bench.sweep import Limits, Sweep, SweepScene, Variant, limits_of, pareto, sweep_parser
+from perception.bench.sweep import Variant, run_sweep, settings_of, sweep_parser
 from perception.cli import main
-from perception.config import load_config
+from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.evaluate import run_instances
-from perception.pipeline.mapping import build_map
 
 
 def test_the_front_is_what_brute_force_says() -> None:
@@ -37,53 +36,52 @@ def test_the_front_is_what_brute_force_says() -> None:
     assert pareto([(1.0, None), (2.0, 3.0)]) == [1]
 
 
-@pytest.mark.parametrize(
-    "cells",
-    [
-        bench_map.variants("labels"),
-        scaling.variants(None, 640, (1, 2)),
-    ],
-)
-def test_every_variant_is_a_valid_setting_of_its_own(cells: list[Variant]) -> None:
+@pytest.mark.parametrize("cells", [bench_map.variants(), scaling.variants(640, (1, 2))])
+def test_every_variant_is_a_valid_setting_of_its_own(cells: list[Variant], tmp_path: Path) -> None:
     assert len({(v.group, v.name) for v in cells}) == len(cells)
     for cell in cells:
-        Limits().config(cell)
+        settings_of(cell, options_of(tmp_path))
 
 
-def test_limits_shorten_every_variant_alike() -> None:
-    limits = Limits(shorten=10, max_side=320, budget=2000)
-    plain = limits.config(Variant("a", "b"))
-    rich = limits.config(Variant("a", "b", preset="quality"))
-    full = Limits().config(Variant("a", "b")).train.iterations
-    assert plain.train.iterations == round(full / 10) and rich.train.iterations > plain.train.iterations
-    assert (rich.photos.max_side, rich.train.budget) == (320, 2000)
+def options_of(scene: Path, *more: str) -> argparse.Namespace:
+    return sweep_parser("x", None).parse_args([str(scene), "-o", str(scene / "out"), *more])
+
+
+def test_every_variant_is_shortened_alike(tmp_path: Path) -> None:
+    def config(preset: str, *more: str) -> MapConfig:
+        return load_config(None, settings_of(Variant("a", "b", preset=preset), options_of(tmp_path, *more)), preset)
+
+    plain, rich = config("default", "--shorten", "10"), config("quality", "--shorten", "10")
+    full = config("default")
+    assert plain.train.iterations == round(full.train.iterations / 10) < rich.train.iterations
+    assert plain.densify.every < full.densify.every and plain.train.budget == full.train.budget
+    quick = config("default", "--quick")
+    assert (quick.photos.max_side, quick.train.budget) == (320, 20_000)
     with pytest.raises(InputError, match="--shorten"):
-        limits_of(sweep_parser("x", None).parse_args(["scene", "--shorten", "0"]))
+        config("default", "--shorten", "-1")
 
 
 def test_an_interrupted_sweep_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trained: list[str] = []
     stop = {"c"}
 
-    def train(scene: SweepScene, variant: Variant, config: object) -> dict[str, float]:
+    def train(scene: Path, variant: Variant, pairs: object, row: Path) -> dict[str, float]:
         if variant.name in stop:
             stop.clear()
             raise KeyboardInterrupt
         trained.append(variant.name)
-        return {"seconds": 1.0, "psnr": 20.0}
+        return {"minutes": 1.0, "psnr": 20.0}
 
-    monkeypatch.setattr(sweep, "run_variant", train)
-    scene = SweepScene(tmp_path, tmp_path / "work")
+    monkeypatch.setattr(sweep, "map_variant", train)
     cells = [Variant("g", name, (f"losses.margin={margin}",)) for name, margin in (("a", 1), ("b", 2), ("c", 3))]
     with pytest.raises(KeyboardInterrupt):
-        Sweep(tmp_path, Limits(), lambda text: None).run(scene, cells)
-    rows = Sweep(tmp_path, Limits(), lambda text: None).run(scene, [*cells, Variant("g", "as a", ("losses.margin=1",))])
+        run_sweep(options_of(tmp_path), cells)
+    rows = run_sweep(options_of(tmp_path), [*cells, Variant("g", "as a", ("losses.margin=1",))])
     assert trained == ["a", "b", "c"] and [row["name"] for row in rows] == ["a", "b", "c", "as a"]
-    Sweep(tmp_path, Limits(settings=("losses.start=0.5",)), lambda text: None).run(scene, cells[:1])
+    run_sweep(options_of(tmp_path, "--set", "losses.start=0.5", "--only", "nothing"), cells)
     assert trained == ["a", "b", "c", "a"]
-    (tmp_path / "rows.json").write_text("{")
-    with pytest.raises(InputError, match="not valid JSON"):
-        Sweep(tmp_path, Limits(), lambda text: None)
+    with pytest.raises(InputError, match="does not exist"):
+        run_sweep(options_of(tmp_path / "no"), cells)
 
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux tells the peak and lets it go")
@@ -96,48 +94,28 @@ def test_a_peak_of_memory_is_forgotten() -> None:
     assert status_mib("VmHWM") < before + 50  # the kernel's word; a page here and there is still in use
 
 
-def test_a_scene_keeps_the_photos_of_one_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "perception.pipeline.photos.load_all", lambda views, side, progress: [f"{v}-{side}" for v in views]
-    )
-    monkeypatch.setattr("perception.pipeline.photos.split_views", lambda views, every: (views[1:], views[:1]))
-    scene = SweepScene(tmp_path, tmp_path / "work", _scene=SimpleNamespace(views=["a", "b"]))
-    assert scene.photos(640) == (["b-640"], ["a-640"]) and scene.training(320, None) == ["b-320"]
-    assert list(scene._views) == [320]
-
-
 def test_a_table_shows_what_is_missing() -> None:
     text = table([{"group": "g", "name": "n", "psnr": 20.0}], (("PSNR", "psnr", ".2f"), ("AP", "ap", ".3f")))
     assert text.splitlines()[1].split() == ["g", "n", "20.00", "-"]
 
 
 @pytest.mark.slow
-def test_a_bench_trains_and_scores_a_scene(small_scene: Path, tmp_path: Path) -> None:
-    """The first row's figures are those of `perception map` and `export` with the same settings."""
+def test_a_bench_maps_and_scores_a_scene(small_scene: Path, tmp_path: Path) -> None:
+    """The AP of a row is that of `export` and `eval` on its map."""
     scene, out = tmp_path / "scene", tmp_path / "out"
     shutil.copytree(small_scene, scene)
-    shutil.copy(small_scene / "truth" / "gt_points.ply", scene / "gt_points.ply")
+    shutil.copytree(small_scene / "truth" / "masks_gt", scene / "masks_gt")
+    for name in ("gt_points.ply", "scene.json"):
+        shutil.copy(small_scene / "truth" / name, scene / name)
     small = ["train.iterations=120", "train.budget=3000", "densify.every=20", "instances.min_cluster_size=15"]
-    command = ["bench", "map", str(scene / "transforms.json"), "-o", str(out), "--only", "d 4"]
-    assert main([*command, *(f"--set={pair}" for pair in [*small, "instances.min_samples=5"])]) == 0
+    command = ["bench", "map", str(scene), "-o", str(out), "--only", "feature_dim 4"]
+    assert main([*command, *(f"--set={pair}" for pair in small)]) == 0
     rows = json.loads((out / "map.json").read_text())["rows"]
-    assert [(row["group"], row["name"]) for row in rows] == [("preset", "default"), ("d", "4")]
-    assert rows[0]["iterations"] == 120 and rows[0]["cpu_seconds"] > 0 and rows[0]["ap25"] is not None
-
-    config = load_config(None, [*(json_pairs(rows[0]["config"])), f"masks=labels:{scene / 'labels'}"])
-    build_map(scene / "transforms.json", tmp_path / "same.gsmap", config)
-    info = json.loads((tmp_path / "same.gsmap" / "map.json").read_text())
-    assert (info["num_gaussians"], info["quality"]["psnr"]) == (rows[0]["gaussians"], rows[0]["psnr"])
+    assert [(row["group"], row["name"]) for row in rows] == [("preset", "default"), ("feature_dim", "4")]
+    info = json.loads((Path(rows[1]["map"]) / "map.json").read_text())
+    assert (info["num_gaussians"], info["quality"]["psnr"]) == (rows[1]["gaussians"], rows[1]["psnr"])
+    assert info["config"]["losses"]["feature_dim"] == 4 and rows[1]["cpu_minutes"] > 0
     labelled = tmp_path / "labelled.ply"
     points = str(scene / "gt_points.ply")
-    assert main(["export", str(tmp_path / "same.gsmap"), "--points", points, "-o", str(labelled)]) == 0
+    assert main(["export", rows[0]["map"], "--points", points, "-o", str(labelled)]) == 0
     assert run_instances(labelled, points)[0]["ap25"] == pytest.approx(rows[0]["ap25"], abs=1e-6)
-
-
-def json_pairs(config: dict[str, Any]) -> list[str]:
-    """A kept config as KEY=VALUE."""
-    pairs = []
-    for key, value in config.items():
-        inner = value.items() if isinstance(value, dict) else [("", value)]
-        pairs += [f"{key}.{name}".rstrip(".") + f"={'none' if v is None else v}" for name, v in inner]
-    return pairs
