@@ -44,6 +44,8 @@ class PhotoConfig(Settings):
     )
     held_out: str | None = Field(None, description="text file of the photos kept for scoring instead, a name a line")
     camera: str | None = Field(None, description="ROS camera_info YAML: the intrinsics of all photos, kept fixed")
+    ignore_masks: str | None = Field(None, description="folder of PNG masks, same stem as the photo: black is ignored")
+    init_points: str | None = Field(None, description="cloud in the frame of the input's poses to start training from")
     strict: bool = Field(False, description="refuse a damaged photo instead of leaving it out")
 
 

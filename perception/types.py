@@ -43,7 +43,7 @@ class View:
     photo: path of the photo. lens: None when the photo is already a pinhole image of size width × height.
     K: [3, 3] float64, pixels. camera_from_world: [4, 4] float64, OpenCV axes (x right, y down, z forward).
     held_out: whether the view was used for evaluation of a finished map and not for training. depth: None without a
-    depth sensor.
+    depth sensor. mask: image of pixels to ignore (black), of the photo's shape at any resolution; None uses all.
     """
 
     name: str
@@ -55,6 +55,7 @@ class View:
     lens: Lens | None = None
     held_out: bool = False
     depth: DepthImage | None = None
+    mask: Path | None = None
 
 
 @dataclass

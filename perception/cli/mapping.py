@@ -38,6 +38,8 @@ def _add_map(commands: Any) -> None:
     p.add_argument(
         "--strict", action="store_const", const=True, help="refuse damaged photos instead of leaving them out"
     )
+    p.add_argument("--ignore-masks", metavar="DIR", help="PNG masks, same stem as the photo; black pixels are ignored")
+    p.add_argument("--init-points", metavar="CLOUD", help="start from these points, in the frame of the input's poses")
     p.add_argument("--max-side", metavar="PX", help="long side in pixels at which the map is trained")
     p.add_argument("--budget", metavar="N", help="most Gaussians the map may have")
     p.add_argument("--iterations", metavar="N")
@@ -61,6 +63,8 @@ _SHORTCUTS = {
     "masks": "masks",
     "camera": "photos.camera",
     "strict": "photos.strict",
+    "ignore_masks": "photos.ignore_masks",
+    "init_points": "photos.init_points",
     "max_side": "photos.max_side",
     "budget": "train.budget",
     "iterations": "train.iterations",

@@ -29,11 +29,12 @@ def psnr(prediction: np.ndarray, truth: np.ndarray) -> float:
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
-def ssim(prediction: np.ndarray, truth: np.ndarray) -> float:
+def ssim(prediction: np.ndarray, truth: np.ndarray, weight: np.ndarray | None = None) -> float:
     """Structural similarity of images [H, W, 3] in [0, 1] (Wang et al. 2004, equation 13), mean over channels.
 
     Equal to scikit-image's with the paper's parameters: Gaussian window of 11 × 11 pixels, σ = 1.5, K1 = 0.01, K2 =
-    0.03, biased covariances, mean over windows that lie completely inside the image. The training loss and its curve
+    0.03, biased covariances, mean over windows that lie completely inside the image, weighted by weight [H, W] of their
+    centres. The training loss and its curve
     differ: they pad with zeros, as 3DGS does. Raises InputError for images smaller than the window.
     """
     from skimage.metrics import structural_similarity
@@ -43,7 +44,11 @@ def ssim(prediction: np.ndarray, truth: np.ndarray) -> float:
         raise InputError(f"pictures are {width}x{height} pixels; SSIM needs at least {_WINDOW} a side")
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "K1": 0.01, "K2": 0.03}
     pictures64 = [np.asarray(image, np.float64) for image in (prediction, truth)]
-    return float(structural_similarity(*pictures64, data_range=1.0, channel_axis=2, **options))
+    mean, windows = structural_similarity(*pictures64, data_range=1.0, channel_axis=2, full=True, **options)
+    inside = slice(_WINDOW // 2, -(_WINDOW // 2))
+    if weight is None or not weight[inside, inside].any():
+        return float(mean)
+    return float(np.average(windows.mean(axis=2)[inside, inside], weights=weight[inside, inside]))
 
 
 def read_rgb(path: Path) -> np.ndarray:

@@ -37,10 +37,13 @@ def fill_holes(gaussians: Gaussians, views: list[TrainingView], room: int, seed:
     for view in views:
         alphas, depths = _blocks(Gaussians.concatenate([gaussians, born]), view)
         holes = alphas < EMPTY
+        covered = ~holes
+        if view.weight is not None:
+            holes &= _block_mean(view.weight[None])[0].numpy() > 0.999  # no colour of an ignored pixel
         empty, blocks = empty + int(holes.sum()), blocks + alphas.size
-        if not holes.any() or holes.all() or len(born) >= room:
+        if not holes.any() or not covered.any() or len(born) >= room:
             continue
-        found = _placed(view, holes, depths, gaussians, generator)
+        found = _placed(view, holes, covered, depths, gaussians, generator)
         born = Gaussians.concatenate([born, found.rows(torch.arange(min(len(found), room - len(born))))])
     return born, empty / max(1, blocks)
 
@@ -49,21 +52,30 @@ def _blocks(gaussians: Gaussians, view: TrainingView) -> tuple[np.ndarray, np.nd
     """Mean opacity of each block [h, w], and its opacity-weighted mean depth [h, w], 0 where the opacity is 0."""
     height, width = view.photo.shape[:2]
     out = render(gaussians, view.camera_from_world, view.K, width, height, eps2d=view.eps2d)
-    images = torch.stack([out.alphas[0], out.depths[0]])[None]
-    alpha, depth = torch.nn.functional.avg_pool2d(images, BLOCK, ceil_mode=True)[0].numpy()
+    images = torch.stack([out.alphas[0], out.depths[0]])
+    alpha, depth = _block_mean(images).numpy()
     return alpha, np.where(alpha > 0, depth / np.maximum(alpha, 1e-6), 0)
 
 
+def _block_mean(images: torch.Tensor) -> torch.Tensor:
+    return torch.nn.functional.avg_pool2d(images[None], BLOCK, ceil_mode=True)[0]
+
+
 def _placed(
-    view: TrainingView, holes: np.ndarray, depths: np.ndarray, like: Gaussians, generator: torch.Generator
+    view: TrainingView,
+    holes: np.ndarray,
+    covered: np.ndarray,
+    depths: np.ndarray,
+    like: Gaussians,
+    generator: torch.Generator,
 ) -> Gaussians:
-    """One Gaussian for each True block of holes [h, w]; depths [h, w] of the blocks; tensors shaped as in `like`."""
+    """One Gaussian for each True block of holes [h, w], by depths of the `covered` ones; tensors like `like`."""
     from scipy.spatial import cKDTree
 
-    covered, empty = np.argwhere(~holes), np.argwhere(holes)
-    count = min(NEIGHBOURS, len(covered))
-    _, near = cKDTree(covered).query(empty, k=count)
-    around = depths[~holes][near.reshape(len(empty), count)]
+    known, empty = np.argwhere(covered), np.argwhere(holes)
+    count = min(NEIGHBOURS, len(known))
+    _, near = cKDTree(known).query(empty, k=count)
+    around = depths[covered][near.reshape(len(empty), count)]
     depth = np.quantile(around, FAR, axis=1).astype(np.float32)
 
     height, width = view.photo.shape[:2]
@@ -75,7 +87,7 @@ def _placed(
     pose = view.camera_from_world.double().numpy()
     # Explicit sums: the rounding of a matrix product can depend on the number of threads.
     means = ((rays * depth[:, None] - pose[:3, 3])[:, :, None] * pose[:3, :3]).sum(axis=1)
-    colors = torch.nn.functional.avg_pool2d(view.photo.float().permute(2, 0, 1)[None], BLOCK, ceil_mode=True)[0]
+    colors = _block_mean(view.photo.float().permute(2, 0, 1))
     sh = torch.zeros(len(empty), *like.sh.shape[1:])
     sh[:, 0] = sh_from_rgb(colors[:, torch.from_numpy(holes)].T / 255)
     quats = torch.zeros(len(empty), 4)

@@ -201,8 +201,8 @@ class Schedule:
         with trainer.record.timed("evaluation"):
             for view in views:
                 image = render_view(shown, view)
-                ssim = [photometric(image, view.photo, beta=1.0).ssim] if with_ssim else []
-                figures.append([psnr(image, view.photo), *ssim])
+                ssim = [photometric(image, view.photo, 1.0, view.weight).ssim] if with_ssim else []
+                figures.append([psnr(image, view.photo, view.weight), *ssim])
         return dict(zip(("psnr", "ssim"), np.mean(figures, axis=0).tolist(), strict=False))
 
     def _note(self, progress: float) -> None:

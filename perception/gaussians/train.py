@@ -25,7 +25,7 @@ from perception.gaussians.rasterize import Rasterization, rasterize
 from perception.gaussians.rates import learning_rates
 from perception.gaussians.record import TrainRecord
 from perception.gaussians.schedule import Schedule
-from perception.gaussians.views import TrainingView, depth_image, psnr, render_view, scene_extent
+from perception.gaussians.views import TrainingView, depth_image, psnr, render_view, scene_extent, target_photo
 
 __all__ = ["TrainRecord", "Trainer", "TrainingView", "depth_image", "psnr", "render_view", "scene_extent"]
 
@@ -100,7 +100,8 @@ class Trainer:
         with self.record.timed("rasterizer forward"):
             out = self._render(params, view, with_features)  # I (eq. 3), F (eq. 5) and Var F (eq. 12)
         with self.record.timed("losses"):
-            loss = photometric_loss(out.colors[0], view.photo, SSIM_WEIGHT)  # L_RGB, eq. 4
+            photo = target_photo(view, out.colors[0])
+            loss = photometric_loss(out.colors[0], photo, SSIM_WEIGHT, view.weight)  # L_RGB, eq. 4
             if with_features:
                 loss = loss + self._feature_losses(view, out)
             images = [image for image in (out.colors, out.features, out.feature_variance) if image is not None]
@@ -145,7 +146,8 @@ class Trainer:
         """λ_var L_var (eq. 13) + λ_inst2d L_inst2d (eqs. 6 to 9)."""
         losses = self.config.losses
         assert out.features is not None and out.feature_variance is not None
-        total = losses.variance_weight * variance_loss(out.feature_variance[0])
+        variance = out.feature_variance[0] if view.weight is None else out.feature_variance[0] * view.weight[..., None]
+        total = losses.variance_weight * variance_loss(variance)
         if view.labels is None:
             return total
         instance = instance_loss(

@@ -18,7 +18,8 @@ BEST_PSNR = 100.0
 @dataclass(frozen=True)
 class TrainingView:
     """One photo as used in training. photo [H, W, 3] uint8; labels [H, W] int32 (0 = unlabelled) or None;
-    K [3, 3] and camera_from_world [4, 4] float32; eps2d: see `rasterize`."""
+    K [3, 3] and camera_from_world [4, 4] float32; eps2d: see `rasterize`; weight [H, W] float32: 0 = pixel is ignored,
+    None = all pixels count."""
 
     name: str
     photo: torch.Tensor
@@ -26,9 +27,11 @@ class TrainingView:
     K: torch.Tensor
     camera_from_world: torch.Tensor
     eps2d: float = 0.3
+    weight: torch.Tensor | None = None
 
     def halved(self) -> TrainingView:
-        """The same view at half the resolution: photo averaged 2 × 2, labels taken at every other pixel.
+        """The same view at half the resolution: photo averaged 2 × 2, labels taken at every other pixel. A pixel is
+        ignored if one of the four is.
 
         Averaging adds a blur of (2² − 1) / 12 px² at full resolution, so eps2d is changed. With an unchanged eps2d
         Gaussians become too thin for full resolution (−0.33 dB on tabletop_a at half length).
@@ -39,7 +42,19 @@ class TrainingView:
         labels = None if self.labels is None else self.labels[: 2 * height : 2, : 2 * width : 2].contiguous()
         K = self.K.clone()
         K[:2] *= 0.5
-        return TrainingView(self.name, photo.contiguous(), labels, K, self.camera_from_world, (self.eps2d + 0.25) / 4)
+        weight = self.weight
+        if weight is not None:
+            weight = weight[: 2 * height, : 2 * width].reshape(height, 2, width, 2).amin(dim=(1, 3))
+        eps2d = (self.eps2d + 0.25) / 4
+        return TrainingView(self.name, photo.contiguous(), labels, K, self.camera_from_world, eps2d, weight)
+
+
+def target_photo(view: TrainingView, image: torch.Tensor) -> torch.Tensor:
+    """The photo to compare `image` [H, W, 3] with; ignored pixels are the image's own, also for windows around them."""
+    if view.weight is None:
+        return view.photo
+    photo = view.photo.to(image.dtype) / 255
+    return torch.where(view.weight[..., None] > 0, photo, image.detach())
 
 
 def scene_extent(views: list[TrainingView]) -> float:
@@ -78,8 +93,9 @@ def depth_image(
     return torch.where(alpha > 0.5, out.depths[0] / alpha.clamp(min=1e-6), torch.zeros_like(alpha))
 
 
-def psnr(image: torch.Tensor, photo: torch.Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of image [H, W, 3] in [0, 1] against photo uint8."""
+def psnr(image: torch.Tensor, photo: torch.Tensor, weight: torch.Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB of image [H, W, 3] in [0, 1] against photo uint8, where weight [H, W] > 0."""
     # In numpy: the order of torch's sum depends on the number of threads, and growth decisions depend on the result.
-    error = float(np.square(image.detach().numpy() - photo.numpy() / np.float64(255)).mean())
+    squares = np.square(image.detach().numpy() - photo.numpy() / np.float64(255))
+    error = float(squares.mean() if weight is None else squares[weight.numpy() > 0].mean())
     return BEST_PSNR if error == 0 else min(BEST_PSNR, -10 * float(np.log10(error)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,11 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.colmap_check import check_binary_model
+from perception.io.ignore_masks import mask_of
 from perception.io.lens import lens_from_camera, load_pycolmap
 from perception.io.photos import why_left_out
 from perception.io.safe_names import safe_name
+from perception.io.start_points import Cloud
 from perception.io.triangulate import MIN_POINTS, cloud_of, posed_scene
 from perception.io.views import fit_lens, make_view
 from perception.progress import Progress
@@ -23,23 +26,32 @@ def is_workspace(folder: Path) -> bool:
     return (folder / "images").is_dir() and bool(_models(folder))
 
 
-def read_workspace(folder: Path, workdir: Path, seed: int, progress: Progress, strict: bool = False) -> Scene:
+def read_workspace(
+    folder: Path,
+    workdir: Path,
+    seed: int,
+    progress: Progress,
+    strict: bool = False,
+    masks: Path | None = None,
+    cloud: Cloud | None = None,
+) -> Scene:
     """The largest sparse model of a workspace as a Scene, in COLMAP's world.
 
     Photos that are missing or damaged are left out and reported; strict: damaged ones raise InputError. Image names
-    that point outside the photo folder raise InputError.
+    that point outside the photo folder raise InputError. masks: folder of masks. cloud: used instead of the points.
     """
     found = {path: _read_model(path) for path in _models(folder)}
     path, model = max(found.items(), key=lambda item: item[1].num_reg_images())
     if model.num_reg_images() == 0:
         raise InputError(f"{path}: the sparse model is empty (no registered photo); run structure from motion again")
     views, missing, notes = views_of_model(model, _located(model, folder / "images", path), path, strict)
+    views = [replace(view, mask=mask_of(masks, view.name)) for view in views]
     if not views:
         raise InputError(f"{folder / 'images'}: none of the {model.num_reg_images()} photos of {path} is there")
     if len(found) > 1:
         sizes = ", ".join(f"{p.name}: {m.num_reg_images()}" for p, m in found.items())
         notes.append(f"{folder}: {len(found)} sparse models (photos in {sizes}); the largest is used")
-    cloud = cloud_of(model)
+    cloud = cloud_of(model) if cloud is None else cloud
     if len(cloud[0]) < MIN_POINTS:
         notes.append(f"{path}: the sparse model holds {len(cloud[0])} points; new ones are triangulated")
     facts: dict[str, Any] = {"input": "colmap", "left_out": missing, "warnings": notes}

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from perception.io.atomic import atomic_directory, recover
+from perception.io.ignore_masks import stage_masks
 from perception.io.lens import load_pycolmap
 from perception.io.photos import exif_of, open_photo, photo_size
 from perception.io.staging import stage_photos
@@ -50,31 +51,44 @@ class FeatureStore:
 
 
 def build_features(
-    photos: list[Path], lenses: list[Lens | None], workdir: Path, seed: int, progress: Progress
+    photos: list[Path],
+    lenses: list[Lens | None],
+    workdir: Path,
+    seed: int,
+    progress: Progress,
+    masks: list[Path | None] | None = None,
 ) -> FeatureStore:
     """Extracts and matches features, unless `workdir` holds the result of the same photos, lenses, seed and options.
 
     lenses: known intrinsics per photo, or None to let structure from motion find them. Photos share one camera when
-    size, EXIF camera and known lens agree.
+    size, EXIF camera and known lens agree. masks: of pixels without features, per photo (see `ignore_masks`).
     """
-    folder = workdir / f"features-{_key(photos, lenses, seed)}"
+    masks = masks if masks and any(masks) else None
+    folder = workdir / f"features-{_key(photos, lenses, seed, masks)}"
     recover(folder)
     facts_file = folder / "facts.json"
     if not facts_file.exists():
         with atomic_directory(folder) as new:
-            facts = _build(new, photos, lenses, seed, progress)
+            facts = _build(new, photos, lenses, masks, seed, progress)
             (new / "facts.json").write_text(json.dumps(facts))
     facts = json.loads(facts_file.read_text())
     return FeatureStore(folder, facts.pop("names"), facts)
 
 
 def _build(
-    folder: Path, photos: list[Path], lenses: list[Lens | None], seed: int, progress: Progress
+    folder: Path,
+    photos: list[Path],
+    lenses: list[Lens | None],
+    masks: list[Path | None] | None,
+    seed: int,
+    progress: Progress,
 ) -> dict[str, Any]:
     pycolmap = load_pycolmap()
     pycolmap.set_random_seed(seed)
     started = time.perf_counter()
     names = stage_photos(folder / "photos", photos, progress)
+    if masks is not None:
+        stage_masks(folder / "masks", photos, names, masks)
     database = folder / "database.db"
     _extract(database, folder / "photos", photos, names, lenses, progress)
     extracted = time.perf_counter()
@@ -105,6 +119,8 @@ def _extract(
         options.sift.peak_threshold = PEAK_THRESHOLD
         options.sift.first_octave = 0
         reader = pycolmap.ImageReaderOptions()
+        if (root.parent / "masks").is_dir():
+            reader.mask_path = root.parent / "masks"
         if lens is not None:
             reader.camera_model = lens.model
             reader.camera_params = ", ".join(map(repr, lens.params))
@@ -211,8 +227,9 @@ def _mutual_matches(a: np.ndarray, b: np.ndarray, ratio: float = COARSE_RATIO) -
     return int((mutual & distinct).sum())
 
 
-def _key(photos: list[Path], lenses: list[Lens | None], seed: int) -> str:
-    files = [(str(photo.resolve()), photo.stat().st_size, photo.stat().st_mtime_ns) for photo in photos]
+def _key(photos: list[Path], lenses: list[Lens | None], seed: int, masks: list[Path | None] | None) -> str:
+    paths = [*photos, *(mask for mask in masks or () if mask is not None)]
+    files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
     extraction = (MAX_IMAGE_SIDE, MAX_FEATURES, MIN_FEATURES, PEAK_THRESHOLD)
     pairing = (EXHAUSTIVE_BELOW, NEIGHBORS, COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS, MIN_INLIERS)
     return hashlib.sha256(repr((files, lenses, extraction, pairing, seed)).encode()).hexdigest()[:12]

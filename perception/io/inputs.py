@@ -9,6 +9,8 @@ from pathlib import Path
 
 from perception.errors import InputError
 from perception.io.camera_file import read_camera
+from perception.io.ignore_masks import with_checked_masks
+from perception.io.start_points import check_seen, start_points
 from perception.progress import Progress
 from perception.types import Lens, Scene
 
@@ -24,6 +26,8 @@ def load_scene(
     seed: int = 0,
     strict: bool = False,
     frames: Path | None = None,
+    masks: Path | None = None,
+    init_points: Path | None = None,
 ) -> Scene:
     """Posed views of `source`, sorted by name, with a sparse cloud.
 
@@ -31,7 +35,8 @@ def load_scene(
     poses from structure from motion. `workdir` caches features and models for later calls. camera_file:
     ROS camera_info with the intrinsics of all photos, for photos and videos only. strict: a damaged photo is an
     InputError, else it is left out. frames: folder for the frames of a video (None: workdir/frames), which the map
-    needs later.
+    needs later. masks: folder of masks of pixels to ignore (see `ignore_masks`). init_points: cloud in the frame of the
+    input's poses, used instead of sparse points.
     """
     from perception.io.colmap import is_workspace, read_workspace
     from perception.io.photo_folder import VIDEO_SUFFIXES
@@ -49,18 +54,27 @@ def load_scene(
     unposed = is_video or (source.is_dir() and not workspace and not file.is_file())
     if camera_file is not None and not unposed:
         raise InputError(f"{camera_file}: a camera file goes with photos or a video; {source} brings its own cameras")
+    if init_points is not None and unposed:
+        raise InputError(f"{init_points}: a cloud to start from goes with an input that has poses; {source} has none")
+    if masks is not None and not masks.is_dir():
+        raise InputError(f"{masks}: no such folder of masks")
     lens = None if camera_file is None else read_camera(camera_file)
+    cloud = None if init_points is None else start_points(init_points)
     workdir.mkdir(parents=True, exist_ok=True)
     if is_video:
-        scene = _scene_of_video(source, frames or workdir / "frames", workdir, lens, seed, tell)
+        scene = _scene_of_video(source, frames or workdir / "frames", workdir, lens, seed, tell, masks)
     elif unposed:
-        scene = reconstruct(source, workdir, lens, seed, tell, strict)
+        scene = reconstruct(source, workdir, lens, seed, tell, strict, masks)
     elif workspace:
-        scene = read_workspace(source, workdir, seed, tell, strict)
+        scene = read_workspace(source, workdir, seed, tell, strict, masks, cloud)
     elif file.suffix.lower() == ".json":
-        scene = read_transforms(file, workdir, seed, tell, strict)
+        scene = read_transforms(file, workdir, seed, tell, strict, masks, cloud)
     else:
         raise InputError(f"{source}: expected {EXPECTED}")
+    if init_points is not None:
+        scene.report["points_from"] = str(init_points)
+        check_seen(scene, init_points)
+    scene = with_checked_masks(scene, masks)
     scene.report["seconds"]["total"] = time.perf_counter() - started
     return scene
 
@@ -108,7 +122,7 @@ def _size(photo: Path) -> tuple[int, int] | None:
 
 
 def _scene_of_video(
-    video: Path, folder: Path, workdir: Path, lens: Lens | None, seed: int, progress: Progress
+    video: Path, folder: Path, workdir: Path, lens: Lens | None, seed: int, progress: Progress, masks: Path | None
 ) -> Scene:
     from perception.io.sfm import reconstruct
     from perception.io.video import video_frames
@@ -116,7 +130,7 @@ def _scene_of_video(
     new = not folder.exists()
     record = video_frames(video, folder, progress)
     try:
-        scene = reconstruct(folder, workdir, lens, seed, progress)
+        scene = reconstruct(folder, workdir, lens, seed, progress, masks=masks)
     except InputError:
         if new:
             shutil.rmtree(folder, ignore_errors=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from perception.errors import InputError
 from perception.io.atomic import atomic_directory, recover
 from perception.io.colmap import views_of_model
 from perception.io.features import FeatureStore, build_features
+from perception.io.ignore_masks import mask_of
 from perception.io.incremental_sfm import map_photos
 from perception.io.lens import lens_from_camera, lens_text, load_pycolmap
 from perception.io.photo_folder import PhotoSet, choose_photos
@@ -28,13 +30,19 @@ MIN_PHOTOS = 3
 
 
 def reconstruct(
-    folder: Path, workdir: Path, lens: Lens | None, seed: int, progress: Progress, strict: bool = False
+    folder: Path,
+    workdir: Path,
+    lens: Lens | None,
+    seed: int,
+    progress: Progress,
+    strict: bool = False,
+    masks: Path | None = None,
 ) -> Scene:
     """Poses and a sparse cloud of the photos in `folder`, from the largest model; unit and orientation are arbitrary.
 
     lens: known intrinsics shared by all photos, kept fixed; None estimates focal length and radial distortion.
     Results in `workdir` are reused for unchanged photos, lens and seed. `choose_photos` decides which photos are left
-    out. strict: damaged photos raise InputError.
+    out. strict: damaged photos raise InputError. masks: folder of masks of pixels to ignore.
     """
     chosen = choose_photos(folder, strict, progress)
     photos = chosen.photos
@@ -44,12 +52,14 @@ def reconstruct(
         if lens and photo_size(photo) != (lens.width, lens.height):
             found = "×".join(map(str, photo_size(photo)))
             raise InputError(f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}")
-    store = build_features(photos, [lens] * len(photos), workdir, seed, progress)
+    ignored = [mask_of(masks, name) for name in chosen.names]
+    store = build_features(photos, [lens] * len(photos), workdir, seed, progress, ignored)
     model, report = _map(store, chosen, folder, lens is not None, seed, progress)
     number = {name: index for index, name in enumerate(store.names)}
     indices = {image_id: number[model.images[image_id].name] for image_id in model.reg_image_ids()}
     located = {image_id: (chosen.names[index], photos[index]) for image_id, index in indices.items()}
     views, _, _ = views_of_model(model, located, folder, strict)
+    views = [replace(view, mask=mask_of(masks, view.name)) for view in views]
     points, colors = cloud_of(model)
     report["left_out"] = sorted([*chosen.left_out, *report["left_out"]], key=lambda entry: entry["name"])
     return Scene(views, points, colors, report={**report, "notes": chosen.notes})

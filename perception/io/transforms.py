@@ -14,8 +14,10 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.documents import brief, read_json
+from perception.io.ignore_masks import mask_of
 from perception.io.photos import SUFFIXES, photo_size, why_left_out
 from perception.io.safe_names import safe_name
+from perception.io.start_points import Cloud, start_points
 from perception.io.triangulate import posed_scene
 from perception.io.views import fit_lens, make_view, rigid_pose
 from perception.progress import Progress
@@ -37,13 +39,22 @@ MILLIMETRE = 1e-3
 """Unit of depth images without `depth_unit_scale_factor` or `integer_depth_scale`, in metres: nerfstudio's default."""
 
 
-def read_transforms(file: Path, workdir: Path, seed: int, progress: Progress, strict: bool = False) -> Scene:
+def read_transforms(
+    file: Path,
+    workdir: Path,
+    seed: int,
+    progress: Progress,
+    strict: bool = False,
+    masks: Path | None = None,
+    cloud: Cloud | None = None,
+) -> Scene:
     """The frames of a transforms.json whose photos exist, as a Scene in the file's own world.
 
     Intrinsics of a frame override global ones. Without fl_x the focal length is computed from camera_angle_x; without w
     and h the size is that of the photo. Points are read from `ply_file_path`, else triangulated with the given poses.
     The unit is not assumed to be the metre. View names are paths below the common folder of all photos. Missing and
     damaged photos are left out and reported; strict: damaged ones raise InputError.
+    masks: folder whose masks precede `mask_path`. cloud: used instead of other points.
     """
     data = _load(file)
     frames = data["frames"]
@@ -54,17 +65,17 @@ def read_transforms(file: Path, workdir: Path, seed: int, progress: Progress, st
         first = f"{missing[0]['name']}: {missing[0]['why']}"
         raise InputError(f"{file}: none of the {len(frames)} photos it lists can be read (first: {first})")
     root = _common_root(list(photos.values()))
-    views, notes = _views(file, data, frames, photos, root)
-    cloud = _listed_cloud(file, data)
+    views, notes = _views(file, data, frames, photos, root, masks)
+    listed = _listed_cloud(file, data) if cloud is None else cloud
     facts: dict[str, Any] = {
         "input": "transforms",
         "left_out": missing,
         "warnings": notes,
         "mean_reprojection_error_px": None,
     }
-    if len(cloud[0]):
+    if cloud is None and len(listed[0]):
         facts["points_from"] = str(data["ply_file_path"])
-    return posed_scene(views, cloud, facts, workdir, seed, progress, least=1)
+    return posed_scene(views, listed, facts, workdir, seed, progress, least=1)
 
 
 def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:
@@ -82,7 +93,12 @@ def listed_photos(file: Path) -> list[Path]:
 
 
 def _views(
-    file: Path, data: dict[str, Any], frames: list[dict[str, Any]], photos: dict[int, Path], root: Path
+    file: Path,
+    data: dict[str, Any],
+    frames: list[dict[str, Any]],
+    photos: dict[int, Path],
+    root: Path,
+    masks: Path | None,
 ) -> tuple[list[View], list[str]]:
     views: dict[str, View] = {}
     notes: set[str] = set()
@@ -94,7 +110,7 @@ def _views(
             notes.add(f"{name} is listed more than once; the first pose is used")
             continue
         view = make_view(name, photo, lens, _pose(file, frame), file)
-        views[name] = replace(view, depth=_depth(file, data, frame))
+        views[name] = replace(view, depth=_depth(file, data, frame), mask=mask_of(masks, name) or _mask(file, frame))
         if note:
             notes.add(note)
     return [views[name] for name in sorted(views)], sorted(notes)
@@ -163,15 +179,24 @@ def _depth(file: Path, data: dict[str, Any], frame: dict[str, Any]) -> DepthImag
     listed = frame.get("depth_file_path", frame.get("depth_path"))
     if not listed:
         return None
-    path = _find(file.parent, str(listed))
-    if path is None:
-        raise InputError(f"{file}: depth image {brief(listed)} does not exist; remove the entry or add the file")
+    path = _listed(file, "depth image", listed)
     what = f"{file}: {frame['file_path']}"
     scales = (_number({**data, **frame}, key, what) for key in ("depth_unit_scale_factor", "integer_depth_scale"))
     scale = next((scale for scale in scales if scale is not None), MILLIMETRE)
     if scale <= 0:
         raise InputError(f"{what}: the scale of its depth must be above 0, found {scale:g}")
     return DepthImage(path, scale)
+
+
+def _mask(file: Path, frame: dict[str, Any]) -> Path | None:
+    return _listed(file, "mask", frame["mask_path"]) if frame.get("mask_path") else None
+
+
+def _listed(file: Path, what: str, listed: object) -> Path:
+    path = _find(file.parent, str(listed))
+    if path is None:
+        raise InputError(f"{file}: {what} {brief(listed)} does not exist; remove the entry or add the file")
+    return path
 
 
 def _lens(file: Path, values: dict[str, Any], photo: Path | None) -> Lens:
@@ -228,16 +253,11 @@ def _number(values: dict[str, Any], key: str, what: str) -> float | None:
     raise InputError(f"{what}: {key} must be a finite number, found {brief(value)}")
 
 
-def _listed_cloud(file: Path, data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    empty = np.empty((0, 3)), np.empty((0, 3), np.uint8)
+def _listed_cloud(file: Path, data: dict[str, Any]) -> Cloud:
     listed = data.get("ply_file_path")
     if not listed:
-        return empty
+        return np.empty((0, 3)), np.empty((0, 3), np.uint8)
     path = file.parent / str(listed)
     if not _is_file(path):
         raise InputError(f"{file}: ply_file_path {brief(listed)} does not exist; remove the entry or add the file")
-    from perception.io.cloud import read_cloud
-
-    cloud = read_cloud(path)
-    colors = np.full((len(cloud.points), 3), 128, np.uint8) if cloud.colors is None else cloud.colors
-    return np.asarray(cloud.points, dtype=np.float64), colors
+    return start_points(path)

@@ -51,7 +51,9 @@ def triangulated_cloud(
     With fewer than MIN_POINTS points, random points in the view frusta are returned, with a warning.
     """
     started = time.perf_counter()
-    store = build_features([v.photo for v in views], [view_lens(v) for v in views], workdir, seed, progress)
+    store = build_features(
+        [v.photo for v in views], [view_lens(v) for v in views], workdir, seed, progress, [v.mask for v in views]
+    )
     featured = time.perf_counter()
     points, colors, error = _triangulate(views, store, seed)
     facts: dict[str, Any] = {

@@ -160,6 +160,8 @@ def _scene(source: Path, output: Path, work: Path, config: MapConfig, progress: 
             seed=config.seed,
             strict=config.photos.strict,
             frames=frames_folder(output),
+            masks=Path(config.photos.ignore_masks) if config.photos.ignore_masks else None,
+            init_points=Path(config.photos.init_points) if config.photos.init_points else None,
         )
         save_scene(kept, scene := recentred(scene))
     return scene
@@ -198,14 +200,15 @@ def _masks(
 
 
 def score_views(gaussians: Gaussians, views: list[TrainingView]) -> dict[str, Any]:
-    """PSNR and SSIM of each view, and their means; empty without views."""
+    """PSNR and SSIM of each view without ignored pixels, and their means; empty without views."""
     from perception.evaluate.images import ssim
 
     per_view = {}
     for view in views:
         image = render_view(gaussians, view)
-        similarity = ssim(image.numpy().astype(np.float64), view.photo.numpy().astype(np.float64) / 255)
-        per_view[view.name] = {"psnr": psnr(image, view.photo), "ssim": float(similarity)}
+        weight = None if view.weight is None else view.weight.numpy()
+        similarity = ssim(image.numpy().astype(np.float64), view.photo.numpy().astype(np.float64) / 255, weight)
+        per_view[view.name] = {"psnr": psnr(image, view.photo, view.weight), "ssim": float(similarity)}
     if not per_view:
         return {"views": {}}
     means = {name: float(np.mean([entry[name] for entry in per_view.values()])) for name in ("psnr", "ssim")}

@@ -10,6 +10,7 @@ import torch
 
 from perception.errors import InputError
 from perception.gaussians.train import TrainingView
+from perception.io.ignore_masks import load_weight
 from perception.io.photos import load_photo, scaled_K
 from perception.masks.label_images import load_labels
 from perception.progress import Progress
@@ -43,21 +44,25 @@ def _names(listed: Path) -> set[str]:
 
 
 def training_view(view: View, max_side: int) -> TrainingView:
-    """Decodes one photo."""
+    """Decodes one photo, and its mask of pixels to ignore."""
     photo = load_photo(view, max_side)
     height, width = photo.shape[:2]
+    weight = load_weight(view, width, height)
     return TrainingView(
         view.name,
         torch.from_numpy(photo),
         None,
         torch.from_numpy(scaled_K(view, width, height).astype(np.float32)),
         torch.from_numpy(view.camera_from_world.astype(np.float32)),
+        weight=None if weight is None else torch.from_numpy(weight),
     )
 
 
 def with_labels(decoded: TrainingView, view: View, folder: Path) -> TrainingView:
-    """The decoded photo with its label image from `folder`."""
+    """The decoded photo with its label image from `folder`; ignored pixels are unlabelled."""
     labels = np.ascontiguousarray(load_labels(folder, view), dtype=np.int32)
+    if decoded.weight is not None:
+        labels[decoded.weight.numpy() == 0] = 0
     return replace(decoded, labels=torch.from_numpy(labels))
 
 

@@ -1,12 +1,15 @@
-"""Training views: what half the resolution shows."""
+"""Training views: what half the resolution shows, and what ignored pixels leave out."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 
-from perception.gaussians.model import Gaussians
+from perception.config import load_config
+from perception.gaussians.model import Gaussians, from_points
+from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView, render_view
 
 
@@ -38,3 +41,29 @@ def test_half_resolution_shows_the_average_of_the_full_picture() -> None:
     assert half.photo.shape == (48, 64, 3)
     assert error(half) < 0.5 * error(replace(half, eps2d=0.3))  # measured: 0.38
     assert error(half) < 0.02  # of 1; measured 0.013: eps2d adds width without taking height
+
+
+def test_ignored_pixels_do_not_change_the_map() -> None:
+    """Two sets of photos that differ in ignored pixels only train the same map, bit for bit."""
+    rng = np.random.default_rng(0)
+    points = np.stack([rng.uniform(-1, 1, 60), rng.uniform(-1, 1, 60), np.full(60, 2.0)], axis=1)
+    K = torch.tensor([[40.0, 0, 24], [0, 40.0, 20], [0, 0, 1]])
+    weight = torch.ones(40, 48)
+    weight[5:26, 9:30] = 0
+
+    def map_of(painted: int) -> dict[str, torch.Tensor]:
+        views = []
+        for shift in (-0.2, 0.0, 0.2):
+            photo = torch.from_numpy(np.random.default_rng(1).integers(0, 255, (40, 48, 3), np.uint8))
+            photo[weight == 0] = painted
+            pose = torch.eye(4)
+            pose[0, 3] = shift
+            views.append(TrainingView(str(shift), photo, None, K, pose, weight=weight))
+        pairs = ["train.iterations=60", "densify.every=6", "train.budget=500"]
+        start = from_points(points, np.full((60, 3), 90, np.uint8), feature_dim=1, seed=0)
+        trainer = Trainer(start, views, load_config(None, pairs), views[:1])
+        trainer.run()
+        return vars(trainer.gaussians)
+
+    dark, bright = map_of(0), map_of(255)
+    assert all(torch.equal(dark[name], bright[name]) for name in dark)
