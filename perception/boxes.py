@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from perception.geometry import scale_of
 from perception.types import OrientedBox
 
 SAMPLE = 4096
@@ -118,3 +119,11 @@ def _hull_directions(plane: np.ndarray, most: int = 64) -> np.ndarray:
     length = np.linalg.norm(sides, axis=1)
     longest = np.argsort(-length, kind="stable")[:most]
     return sides[longest] / length[longest, None]
+
+
+def move_box(a_from_b: np.ndarray, box: OrientedBox) -> OrientedBox:
+    """Transforms an oriented box from frame b to frame a."""
+    scale = scale_of(a_from_b)
+    rotation = np.asarray(box.rotation, np.float64) @ (a_from_b[:3, :3] / scale).T  # rows are axes
+    center = a_from_b[:3, :3] @ np.asarray(box.center, np.float64) + a_from_b[:3, 3]
+    return OrientedBox(center, rotation, np.asarray(box.extent, np.float64) * scale)

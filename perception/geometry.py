@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+
+from perception.errors import InputError
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes: OpenGL (x right, y up, z backward) to OpenCV (x right, y down, z forward). Its own inverse."""
+_TOLERANCE = 1e-4
+"""Largest deviation of R Rᵀ / s² from the identity: float32 poses pass, shears do not."""
 
 
 def rotation_from_quaternion(wxyz: np.ndarray) -> np.ndarray:
@@ -62,3 +68,33 @@ def align_similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, n
     rotation = u @ np.diag(sign) @ vt
     scale = float((singular * sign).sum() / ((b - mean_b) ** 2).sum(1).mean())
     return scale, rotation, mean_a - scale * rotation @ mean_b
+
+
+def check_similarity(a_from_b: Any, name: str = "a_from_b") -> np.ndarray:
+    """`a_from_b` as float64 [4, 4]; InputError unless it is a rotation times a positive scale, and a translation."""
+    try:
+        matrix = np.asarray(a_from_b, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected 4 × 4 numbers, found {str(a_from_b)[:60]!r}") from error
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError(f"{name}: expected a finite [4, 4] transform, found shape {list(matrix.shape)}")
+    scale = scale_of(matrix)
+    linear = matrix[:3, :3] / scale if scale > 0 else matrix[:3, :3]
+    straight = np.abs(linear @ linear.T - np.eye(3)).max() <= _TOLERANCE
+    if scale <= 0 or not straight or not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        raise InputError(
+            f"{name}: expected a rotation, a positive scale and a translation with last row 0 0 0 1; "
+            "found a shear, a mirror or another last row"
+        )
+    return matrix
+
+
+def scale_of(a_from_b: np.ndarray) -> float:
+    """The scale of a similarity [4, 4]: the cube root of the determinant, negative for a mirror."""
+    return float(np.cbrt(np.linalg.det(a_from_b[:3, :3])))
+
+
+def move_points(a_from_b: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Transforms points [..., 3] from frame b to a in float64; returns their own float dtype, else float64."""
+    moved = np.asarray(points, np.float64) @ a_from_b[:3, :3].T + a_from_b[:3, 3]
+    return moved.astype(points.dtype if np.issubdtype(np.asarray(points).dtype, np.floating) else np.float64)

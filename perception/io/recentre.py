@@ -1,4 +1,5 @@
-"""Moves georeferenced scenes near the origin, as float32 resolves coordinates of 1e6 m to 1/16 m only."""
+"""Moves scenes to another frame. Georeferenced scenes are moved near the origin, as float32 resolves coordinates of
+1e6 m to 1/16 m only."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.geometry import camera_centres
+from perception.geometry import camera_centres, check_similarity, move_points, scale_of
 from perception.types import Scene, View
 
 FAR = 100.0
@@ -18,34 +19,57 @@ error of float32, 2⁻²⁴ of the distance, is 6e-6 of the extent: a hundredth 
 
 
 def recentred(scene: Scene) -> Scene:
-    """The scene, moved to its centre if it is far from the origin; report["origin"] [3] is the subtracted offset."""
+    """The scene, moved to its centre if it is far from the origin."""
     centres = camera_centres(np.stack([view.camera_from_world for view in scene.views]))
     middle = np.median(centres, axis=0)
     extent = float(np.linalg.norm(centres - middle, axis=1).max())
     if extent == 0 or np.linalg.norm(middle) <= FAR * extent:
         return scene
-    origin = np.round(middle, -int(np.floor(np.log10(extent))))  # a round number, easy to remember
-    return replace(
-        scene,
-        views=[moved(view, origin) for view in scene.views],
-        points=scene.points - origin,
-        report={**scene.report, "origin": origin.tolist()},
-    )
+    shift = np.eye(4)
+    shift[:3, 3] = -np.round(middle, -int(np.floor(np.log10(extent))))  # a round number, easy to remember
+    return moved_scene(scene, shift)
 
 
-def moved(view: View, origin: np.ndarray) -> View:
-    """The view in coordinates with `origin` [3] subtracted."""
+def moved_scene(scene: Scene, b_from_a: np.ndarray) -> Scene:
+    """The scene in frame b, by a similarity [4, 4]; report["map_from_input"] leads there from the input's frame.
+
+    The down direction in report["gravity"] is rotated as well.
+    """
+    report = {**scene.report, "map_from_input": (b_from_a @ scene.report.get("map_from_input", np.eye(4))).tolist()}
+    if "gravity" in report:
+        down = b_from_a[:3, :3] @ report["gravity"]["direction"] / scale_of(b_from_a)
+        report["gravity"] = {**report["gravity"], "direction": down.tolist()}
+    views = [moved(view, b_from_a) for view in scene.views]
+    return replace(scene, views=views, points=move_points(b_from_a, scene.points), report=report)
+
+
+def moved(view: View, b_from_a: np.ndarray) -> View:
+    """The view in frame b, its depth in units of b; b_from_a [4, 4]: a similarity x_b = s R x_a + t.
+
+    A camera x_c = R_c x_a + t_c becomes x_c = R_c Rᵀ x_b + s t_c − R_c Rᵀ t.
+    """
+    scale = scale_of(b_from_a)
     pose = np.array(view.camera_from_world, np.float64)
-    pose[:3, 3] += pose[:3, :3] @ origin
-    return replace(view, camera_from_world=pose)
+    pose[:3, :3] = pose[:3, :3] @ (b_from_a[:3, :3] / scale).T
+    pose[:3, 3] = scale * pose[:3, 3] - pose[:3, :3] @ b_from_a[:3, 3]
+    depth = None if view.depth is None else replace(view.depth, scale=view.depth.scale * scale)
+    return replace(view, camera_from_world=pose, depth=depth)
 
 
-def map_origin(path: Path, info: dict[str, Any]) -> np.ndarray:
-    """Offset [3] float64 from map coordinates to those of the input (input = map + offset); info: map.json."""
+def map_from_input(path: Path, info: dict[str, Any]) -> np.ndarray:
+    """The similarity [4, 4] from the coordinates of a map's input to those of the map; info: map.json.
+
+    The identity for a map in its input's frame. Maps of earlier releases record the offset `scene.origin`.
+    """
+    matrix = info.get("map_from_input")
+    if matrix is not None:
+        return check_similarity(matrix, f"{path / 'map.json'}: map_from_input")
     try:
         origin = np.asarray(info.get("scene", {}).get("origin", (0, 0, 0)), np.float64)
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise ValueError(f"found {origin.tolist()}")
     except (AttributeError, TypeError, ValueError) as error:
         raise InputError(f"{path / 'map.json'}: scene.origin is no place ({error}); the map is damaged") from error
-    return origin
+    shift = np.eye(4)
+    shift[:3, 3] = -origin
+    return shift

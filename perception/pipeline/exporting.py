@@ -13,8 +13,9 @@ from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
 from perception.export.formats import sidecar_of, write_boxes, write_export, write_scannet, write_split
 from perception.export.transfer import ExportOptions, check_overlap, export_labels, resolved
+from perception.geometry import move_points, scale_of
 from perception.io.cloud import read_cloud
-from perception.io.recentre import map_origin
+from perception.io.recentre import map_from_input
 from perception.io.store import Map, read_map
 from perception.types import PointCloud
 
@@ -42,8 +43,9 @@ def export_map(
 ) -> tuple[dict[str, Any], str]:
     """Labels a cloud, writes it and the `outputs`, and returns (JSON-able facts, table).
 
-    Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids. Coordinates are those of
-    the input that the map was made from. .ply, .pcd, .npz: the cloud and its sidecar JSON. .mcap: a recording in the
+    Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids. `points` and the
+    result are in the coordinates of the map's input (`map_from_input`). Without `points` they are the map's, or the
+    input's if that was only shifted. .ply, .pcd, .npz: the cloud and its sidecar JSON. .mcap: a recording in the
     map's frame, the cloud together with the map's boxes, cameras and photos.
     """
     if output.suffix.lower() not in SUFFIXES:
@@ -51,8 +53,11 @@ def export_map(
     if outputs.color not in ("original", "instance"):
         raise InputError(f"color is '{outputs.color}'; expected original or instance")
     gmap = read_map(map_path)
-    origin = map_origin(map_path, gmap.info)
-    means = gmap.means + origin if origin.any() else gmap.means
+    placed = map_from_input(map_path, gmap.info)
+    if points is None and not np.array_equal(placed[:3, :3], np.eye(3)):
+        placed = np.eye(4)
+    moved = not np.array_equal(placed, np.eye(4))
+    means = move_points(np.linalg.inv(placed), gmap.means.astype(np.float64)) if moved else gmap.means
     began = time.perf_counter()
     if points is None:  # every point is its own nearest Gaussian
         cloud, options = surface_points(gmap, means), ExportOptions(drop_noise=False, smooth=False)
@@ -62,7 +67,7 @@ def export_map(
     labels = export_labels(means, gmap.instance_ids, cloud, options)
     if outputs.color == "instance":
         cloud = replace(cloud, colors=instance_palette(labels))
-    sidecar = _write(output, gmap, cloud, labels, origin, outputs)
+    sidecar = _write(output, gmap, cloud, labels, placed, outputs)
     result = {
         "points": len(labels),
         "labelled": int((labels >= 0).sum()),
@@ -82,14 +87,14 @@ def surface_points(gmap: Map, means: np.ndarray | None = None) -> PointCloud:
 
 
 def _write(
-    output: Path, gmap: Map, cloud: PointCloud, labels: np.ndarray, origin: np.ndarray, outputs: Outputs
+    output: Path, gmap: Map, cloud: PointCloud, labels: np.ndarray, placed: np.ndarray, outputs: Outputs
 ) -> dict[str, Any]:
     """Writes all files, `output` last, so that its existence means success. Returns the sidecar."""
     instances, frame = {entry["id"]: entry for entry in gmap.instances}, str(gmap.info.get("frame", "map"))
     if outputs.split is not None:
         write_split(outputs.split, cloud, labels)
     if outputs.boxes is not None:
-        metric = bool(gmap.info.get("metric"))
+        metric = gmap.metric and abs(scale_of(placed) - 1) < 1e-9
         write_boxes(outputs.boxes, cloud.points, labels, instances, frame=frame, metric=metric)
     if outputs.scannet is not None:
         write_scannet(outputs.scannet, output.stem, labels, instances)
@@ -97,7 +102,7 @@ def _write(
         return write_export(output, cloud, labels, instances)
     from perception.export.mcap import write_recording
 
-    local = replace(cloud, points=cloud.points - origin) if origin.any() else cloud
+    local = replace(cloud, points=move_points(placed, cloud.points.astype(np.float64)))
     write_recording(output, local, labels, gmap.instances, gmap.located_views(), frame)
     return sidecar_of(labels, instances)
 

@@ -31,12 +31,16 @@ from perception.pipeline.estimate import tell_estimate
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
 from perception.pipeline.photos import load_all, split_views, with_labels
 from perception.pipeline.record import Stages, finite, peak_memory_mib, versions
+from perception.pipeline.summary import frame_lines
 from perception.pipeline.work_folder import clear_work, frames_folder, working
 from perception.progress import Progress
 from perception.types import Scene, View
 
 GEOMETRY_START = 0.3
 """Training progress at which masks that use the depth of the map (the built-in ones) are made."""
+
+FRAME_FACTS = ("map_from_input", "scale", "gravity")
+"""Entries of a scene's report that map.json holds at its top level."""
 
 
 def build_map(
@@ -110,12 +114,13 @@ def build_map(
         record = {
             "frame": scene.frame,
             "metric": scene.metric,
+            **{key: scene.report[key] for key in FRAME_FACTS if key in scene.report},
             "source": str(source),
             "seed": config.seed,
             "fingerprint": fingerprint(source, config),
             "config": config.to_json(),
             "versions": versions(),
-            "scene": scene.report,
+            "scene": {key: fact for key, fact in scene.report.items() if key not in FRAME_FACTS},
             "masks": mask_report,
             "training": vars(trainer.record),
             "instances": found.report,
@@ -253,8 +258,8 @@ def _transfer_labels(old: Map, gmap: Map, progress: Progress) -> None:
 def _tell_scene(scene: Scene, progress: Progress) -> None:
     report = scene.report
     progress.log(f"{len(scene.views)} posed photos, {len(scene.points)} points")
-    if "origin" in report:
-        progress.log(f"far from the origin: the map's own lies at {report['origin']}; exports are in the input's frame")
+    for line in frame_lines({"metric": scene.metric, **report}):
+        progress.log(line)
     for note in report.get("notes", []):
         progress.log(note)
     for entry in report.get("left_out", []):

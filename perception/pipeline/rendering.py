@@ -15,7 +15,7 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
 from perception.gaussians.train import depth_image
 from perception.instances.silhouettes import render_silhouettes
-from perception.io.recentre import map_origin, moved
+from perception.io.recentre import map_from_input, moved
 from perception.io.safe_names import safe_name
 from perception.io.store import Map, read_map
 from perception.types import View
@@ -36,8 +36,11 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
         if kind not in KINDS:
             raise InputError(f"--what: found '{kind}', expected one of: {', '.join(KINDS)}")
     gmap = read_map(map_path)
-    origin = map_origin(map_path, gmap.info)
-    views = map_views(gmap) if cameras is None else [moved(view, origin) for view in _cameras(cameras)]
+    if cameras is None:
+        views = map_views(gmap)
+    else:
+        placed = map_from_input(map_path, gmap.info)
+        views = [moved(view, placed) for view in _cameras(cameras)]
     names = [safe_name(view.name, cameras or map_path) for view in views]  # no path outside `output`
     gaussians = as_gaussians(gmap)
     for kind in what:

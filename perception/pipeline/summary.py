@@ -76,8 +76,7 @@ def info_text(path: Path, info: dict[str, Any]) -> str:
         f"trained {training.get('iterations')} iterations ({_rates(training)}); "
         f"peak memory {info.get('peak_memory_mib')} MiB",
     ]
-    if "origin" in scene:
-        lines.append(f"the map's origin lies at {scene['origin']} of its input; exports are in the input's frame")
+    lines += frame_lines(info)
     if training.get("profile"):
         lines.append("of training: " + ", ".join(f"{name} {share:.0%}" for name, share in shares(training).items()))
     if quality.get("psnr") is not None:
@@ -88,6 +87,15 @@ def info_text(path: Path, info: dict[str, Any]) -> str:
     lines += [f"left out: {entry['name']} ({entry['why']})" for entry in scene.get("left_out", [])]
     lines += [f"warning: {text}" for text in scene.get("warnings", [])]
     return "\n".join(lines)
+
+
+def frame_lines(info: dict[str, Any]) -> list[str]:
+    """What is known of a map's frame, one line each: its place in the input's frame; info: map.json."""
+    lines = []
+    if "map_from_input" in info:
+        origin = np.linalg.inv(info["map_from_input"])[:3, 3]
+        lines.append(f"the map's origin lies at {origin.round(6).tolist()} of its input")
+    return lines
 
 
 def _rates(training: dict[str, Any]) -> str:

@@ -13,7 +13,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
 
 from perception.errors import InputError
-from perception.query.frames import Frame, scale_of
+from perception.geometry import scale_of
+from perception.query.frames import Frame
 from perception.query.regions import Prism, Region, axis_box
 from perception.query.requests import MAX_TEXT, MAX_TEXTS, MAX_TOP, Request
 from perception.query.where import Where

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from perception.query.frames import check_similarity, move_box, move_points
+from perception.boxes import move_box
+from perception.geometry import check_similarity, move_points
 from perception.types import OrientedBox
 
 _NO_SPREAD = np.zeros((3, 3))

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perception.errors import InputError
+from perception.geometry import move_points
 from perception.io.map import Map
-from perception.query.frames import Frame, move_points
+from perception.query.frames import Frame
 from perception.query.hit import Description, Hit, Neighbor
 from perception.query.requests import Request
 from perception.query.spatial_index import SpatialIndex

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from perception.boxes import move_box
 from perception.errors import InputError
-from perception.query.frames import check_similarity, move_box, move_points
+from perception.geometry import check_similarity, move_points
 from perception.types import OrientedBox
 
 

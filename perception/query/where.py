@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.query.frames import Frame, check_similarity, move_points, scale_of
+from perception.geometry import check_similarity, move_points, scale_of
+from perception.query.frames import Frame
 from perception.query.regions import Region, check_region, move_region
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,11 +13,12 @@ import pytest
 from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
+from perception.geometry import look_at
 from perception.io.cloud import read_cloud, write_cloud
-from perception.io.recentre import FAR, map_origin, recentred
+from perception.io.recentre import FAR, map_from_input, moved_scene, recentred
 from perception.io.store import read_map
 from perception.pipeline.mapping import build_map
-from perception.types import Scene, View
+from perception.types import DepthImage, Scene, View
 
 pytestmark = pytest.mark.slow
 
@@ -42,8 +44,8 @@ def test_only_what_is_far_is_moved() -> None:
     assert recentred(near) is near
     far = scene_at(ORIGIN)
     scene = recentred(far)
-    origin = np.array(scene.report["origin"])
-    assert np.linalg.norm(origin - ORIGIN) < 1 and "origin" not in far.report
+    origin = -np.array(scene.report["map_from_input"])[:3, 3]
+    assert np.linalg.norm(origin - ORIGIN) < 1 and "map_from_input" not in far.report
     np.testing.assert_allclose(scene.points + origin, far.points, rtol=0, atol=1e-9)
     for old, new in zip(far.views, scene.views, strict=True):  # a place is seen where it was
         place = np.append(far.points[0], 1)
@@ -60,7 +62,31 @@ def test_one_camera_or_many_in_one_place_stay() -> None:
 @pytest.mark.parametrize("origin", [[1, 2], "x", [1, 2, float("nan")], None, {}])
 def test_an_origin_that_is_none_is_told(origin: object) -> None:
     with pytest.raises(InputError, match=r"scene\.origin is no place"):
-        map_origin(Path("m.gsmap"), {"scene": {"origin": origin}})
+        map_from_input(Path("m.gsmap"), {"scene": {"origin": origin}})
+
+
+def test_an_offset_of_an_earlier_release_and_a_matrix_that_is_none() -> None:
+    old = map_from_input(Path("m.gsmap"), {"scene": {"origin": [1.0, 2.0, 3.0]}})
+    assert np.array_equal(old @ [1, 2, 3, 1], [0, 0, 0, 1])
+    with pytest.raises(InputError, match=r"map\.json: map_from_input: expected a rotation"):
+        map_from_input(Path("m.gsmap"), {"map_from_input": np.diag([1.0, 2, 3, 1]).tolist()})
+
+
+def test_a_scene_in_another_frame_is_the_same_scene() -> None:
+    """Pixels stay, depths along the optical axis grow with the unit; two moves are one, and gravity turns along."""
+    scene = scene_at(np.zeros(3))
+    scene.views[0] = replace(scene.views[0], depth=DepthImage(Path("d.png"), 0.001))
+    scene.report["gravity"] = {"direction": [0.0, 0.6, 0.8], "source": "x", "standard_error_deg": 1.0}
+    turn = look_at(np.array([1.0, 2, 3]), np.zeros(3), np.array([0, 0, 1.0]))[:3, :3]
+    b_from_a = np.eye(4)
+    b_from_a[:3, :3], b_from_a[:3, 3] = 2.5 * turn, [4, 5, 6]
+    twice = moved_scene(moved_scene(scene, b_from_a), b_from_a)
+    for old, new in zip(scene.views, twice.views, strict=True):
+        seen = [v.camera_from_world @ np.append(s.points[0], 1) for v, s in ((old, scene), (new, twice))]
+        np.testing.assert_allclose(seen[1][:3], 2.5**2 * seen[0][:3], atol=1e-9)
+    assert twice.views[0].depth is not None and twice.views[0].depth.scale == pytest.approx(0.001 * 2.5**2)
+    np.testing.assert_allclose(twice.report["gravity"]["direction"], turn @ turn @ [0, 0.6, 0.8], atol=1e-12)
+    np.testing.assert_allclose(twice.report["map_from_input"], b_from_a @ b_from_a, atol=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +114,7 @@ def both(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[st
 def test_a_georeferenced_scene_maps_as_well_as_one_at_home(both: dict[str, Path]) -> None:
     """The rounding of the moved coordinates differs, 1e-9 m in double, so bits do; the quality may not."""
     near, far = (read_map(both[name] / "m.gsmap") for name in ("near", "far"))
-    assert "origin" not in near.info["scene"] and np.abs(far.means).max() < 100
+    assert "map_from_input" not in near.info and np.abs(far.means).max() < 100
     assert far.info["quality"]["psnr"] == pytest.approx(near.info["quality"]["psnr"], abs=0.3)
     assert len(far.instances) > 3
 
@@ -102,7 +128,7 @@ def test_exports_and_cameras_are_in_the_inputs_coordinates(both: dict[str, Path]
     assert np.array_equal(given.points, result.points) and (result.labels["instance_id"] >= 0).mean() > 0.3
     assert main(["export", str(far / "m.gsmap"), "-o", str(own)]) == 0
     gmap = read_map(far / "m.gsmap")
-    shown = gmap.means[gmap.opacities >= 0.5] + map_origin(far, gmap.info)
+    shown = gmap.means[gmap.opacities >= 0.5] - map_from_input(far, gmap.info)[:3, 3]
     np.testing.assert_allclose(read_cloud(own).points, shown, rtol=0, atol=1e-9)
     for given in ([], ["--cameras", str(far / "transforms.json")]):
         assert main(["render", str(far / "m.gsmap"), *given, "-o", str(tmp_path / str(len(given)))]) == 0
