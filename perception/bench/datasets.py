@@ -1,12 +1,12 @@
-"""Shared by the dataset benchmarks: a map of each scene, built or reused, and instance masks in given views."""
+"""The runner of the dataset benchmarks: a map of each scene, predictions from it, and the table of the scores."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -23,22 +23,83 @@ from perception.progress import Progress
 from perception.query import QueryMap
 from perception.types import View
 
-Masks = Mapping[tuple[str, str], np.ndarray]
+HELD_OUT = "held out of training, unless the map was brought along"
 
 
-@dataclass(frozen=True)
-class Workplace:
-    """Folders and settings of one benchmark run. maps: folder of <scene>.gsmap files; existing ones are reused.
+class DatasetBench(ABC):
+    """One dataset benchmark, `perception bench NAME DIR -o WORK`: a subclass says how the download is read.
 
-    config: returns the settings for a scene's name and additional KEY=VALUE pairs.
+    What is finished is kept in WORK, so that a second run goes on. args: the parsed arguments.
     """
 
-    work: Path
-    maps: Path
-    config: Callable[..., MapConfig]
-    progress: Progress
+    name: str
+    expected: str
+    """The layout of a scene in DIR, for the message when there is none."""
 
-    def map(self, scene: str, source: Path, held_out: list[str] | None = None) -> Map:
+    def __init__(self, args: argparse.Namespace) -> None:
+        self.args, self.work = args, args.output
+        self.maps = args.maps or args.output / "maps"
+        self.progress = Progress(quiet=args.json)
+        self.config("scene")  # invalid settings raise before the first scene
+
+    @classmethod
+    @abstractmethod
+    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
+        """Adds the options of this benchmark alone."""
+
+    @abstractmethod
+    def scenes(self) -> dict[str, Path]:
+        """The folder of each scene of the download; empty when it is not this dataset."""
+
+    def listed(self) -> list[str] | None:
+        """The scenes to run when --scenes is not given; None = all."""
+        return None
+
+    @abstractmethod
+    def predict(self, name: str, scene: Path, target: Path) -> None:
+        """Writes the predictions of a scene into the empty folder `target`. InputError: the scene scores 0."""
+
+    @abstractmethod
+    def score(self, scenes: Mapping[str, Path]) -> tuple[dict[str, Any], str]:
+        """The scores of WORK/predictions and their table."""
+
+    @classmethod
+    def main(cls, arguments: Sequence[str] | None = None) -> None:
+        """Command line entry point; prints the table or JSON, and writes WORK/NAME.json."""
+        parser = argparse.ArgumentParser(prog=f"perception bench {cls.name}", description=cls.__doc__)
+        parser.add_argument("dataset", type=Path, metavar="DIR", help="the dataset as downloaded")
+        parser.add_argument(
+            "-o", "--output", type=Path, required=True, metavar="WORK", help="maps, predictions, result"
+        )
+        parser.add_argument("--maps", type=Path, metavar="DIR", help="finished maps <scene>.gsmap (default WORK/maps)")
+        parser.add_argument("--scenes", type=lambda text: text.split(","), metavar="A,B", help="only these")
+        parser.add_argument(
+            "--masks", default="auto", metavar="SOURCE", help="of the mapper; {scene} is the scene's name"
+        )
+        parser.add_argument("--preset", default="default")
+        parser.add_argument("--config", type=Path, metavar="FILE.toml")
+        parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
+        parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
+        cls.add_arguments(parser)
+        bench = cls(parser.parse_args(arguments))
+        found = bench.scenes()
+        if not found:
+            raise InputError(f"{bench.args.dataset}: holds no scenes; expected {cls.expected}")
+        wanted = bench.args.scenes or bench.listed() or list(found)
+        for name in wanted:
+            if name not in found:
+                raise InputError(f"{bench.args.dataset}: holds no scene '{name}'; found {', '.join(found)}")
+        scenes = {name: folder for name, folder in found.items() if name in wanted}
+        failed = bench._predict_all(scenes)
+        (bench.work / "predictions").mkdir(parents=True, exist_ok=True)
+        bench._report(*bench.score(scenes), failed, scenes)
+
+    def config(self, scene: str, more: Sequence[str] = ()) -> MapConfig:
+        """The settings of a scene's map."""
+        pairs = [*self.args.pairs, f"masks={self.args.masks.replace('{scene}', scene)}", *more]
+        return load_config(self.args.config, pairs, self.args.preset)
+
+    def map(self, scene: str, source: Path, held_out: Sequence[str] | None = None) -> Map:
         """The scene's map: read from `maps` if it is there, else built. An interrupted build is resumed.
 
         held_out: names of photos excluded from training. They have no effect on a map that already exists.
@@ -57,62 +118,48 @@ class Workplace:
         self.progress.log(f"{scene}: mapping {source}")
         return build_map(source, path, self.config(scene, more), resume=True, progress=self.progress)
 
+    def _predict_all(self, scenes: Mapping[str, Path]) -> dict[str, str]:
+        """Predicts each scene that has no predictions yet; returns the reason of failure by scene name."""
+        failed = {}
+        for name, folder in scenes.items():
+            target = self.work / "predictions" / name
+            if target.exists():
+                self.progress.log(f"{name}: predictions are there already")
+                continue
+            try:
+                with atomic_directory(target) as aside:
+                    self.predict(name, folder, aside)
+            except InputError as error:
+                failed[name] = str(error)
+                self.progress.log(f"warning: {name} failed and scores 0: {error}")
+        return failed
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the options that all dataset benchmarks share."""
-    parser.add_argument("dataset", type=Path, metavar="DIR", help="the dataset as downloaded")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="WORK", help="maps, predictions, result")
-    parser.add_argument("--maps", type=Path, metavar="DIR", help="finished maps <scene>.gsmap (default WORK/maps)")
-    parser.add_argument("--scenes", type=lambda text: text.split(","), metavar="A,B", help="only these")
-    parser.add_argument("--masks", default="auto", metavar="SOURCE", help="of the mapper; {scene} is the scene's name")
-    parser.add_argument("--preset", default="default")
-    parser.add_argument("--config", type=Path, metavar="FILE.toml")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
-    parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
+    def _report(self, result: dict[str, Any], table: str, failed: dict[str, str], scenes: Mapping[str, Path]) -> None:
+        name = self.name.replace("-", "_")
+        facts = {
+            "bench": name,
+            "arguments": {key: str(value) for key, value in vars(self.args).items()},
+            "versions": versions(),
+            "failed": failed,
+            "maps": {scene: _map_facts(self.maps / f"{scene}.gsmap") for scene in scenes},
+            "result": result,
+        }
+        with atomic_file(self.work / f"{name}.json") as aside:
+            aside.write_text(json.dumps(facts, indent=1, default=str) + "\n", encoding="utf-8")
+        lines = [table] + [f"{scene} failed and scores 0: {why}" for scene, why in failed.items()]
+        print(json.dumps(facts, default=str) if self.args.json else "\n".join(lines))
 
-
-def workplace(args: argparse.Namespace) -> Workplace:
-    """Folders and settings from the parsed arguments."""
-
-    def config(scene: str, more: Sequence[str] = ()) -> MapConfig:
-        pairs = [*args.pairs, f"masks={args.masks.replace('{scene}', scene)}", *more]
-        return load_config(args.config, pairs, args.preset)
-
-    config("scene")  # invalid settings raise before the first scene
-    return Workplace(args.output, args.maps or args.output / "maps", config, Progress(quiet=args.json))
-
-
-def chosen_scenes(scenes: Mapping[str, Path], wanted: list[str] | None, dataset: Path) -> dict[str, Path]:
-    """The scenes to run. InputError when there are none or a wanted one is missing."""
-    for name in wanted or []:
-        if name not in scenes:
-            raise InputError(f"{dataset}: holds no scene '{name}'; found {', '.join(scenes) or 'none'}")
-    return {name: path for name, path in scenes.items() if not wanted or name in wanted}
-
-
-def run_scenes(
-    scenes: Mapping[str, Path], place: Workplace, predict: Callable[[str, Path, Path], None]
-) -> dict[str, str]:
-    """Calls predict(name, scene folder, empty output folder) for each scene that has no predictions yet.
-
-    Returns the reason of failure by scene name. A scene that cannot be mapped has no predictions and scores 0.
-    """
-    failed = {}
-    for name, folder in scenes.items():
-        target = place.work / "predictions" / name
-        if target.exists():
-            place.progress.log(f"{name}: predictions are there already")
-            continue
-        try:
-            with atomic_directory(target) as aside:
-                predict(name, folder, aside)
-        except InputError as error:
-            failed[name] = str(error)
-            place.progress.log(f"warning: {name} failed and scores 0: {error}")
-    return failed
+    def chosen_truth(self, folders: Mapping[str, Path]) -> Path:
+        """The download, or with --scenes a folder of links to the truth of these: `folders`, {path in it: folder}."""
+        if not self.args.scenes:
+            return Path(self.args.dataset)
+        root: Path = self.work / "truth" / "+".join(self.args.scenes)
+        for path, folder in folders.items():
+            link(folder, root / path)
+        return root
 
 
-def write_masks(folder: Path, masks: Masks) -> None:
+def write_masks(folder: Path, masks: Mapping[tuple[str, str], np.ndarray]) -> None:
     """<folder>/<view>/<prompt>.png, 255 × the mask or silhouette."""
     import cv2
 
@@ -122,31 +169,6 @@ def write_masks(folder: Path, masks: Masks) -> None:
         values = np.clip(np.round(np.asarray(mask, np.float32) * 255), 0, 255).astype(np.uint8)
         if not cv2.imwrite(str(path), values):
             raise InputError(f"{path}: cannot be written; choose a writable -o")
-
-
-def report(
-    name: str,
-    args: argparse.Namespace,
-    result: dict[str, Any],
-    table: str,
-    failed: Mapping[str, str],
-    scenes: Mapping[str, Path],
-) -> None:
-    """Writes WORK/<name>.json and prints the table (or the JSON)."""
-    maps = args.maps or args.output / "maps"
-    infos = {scene: _map_facts(maps / f"{scene}.gsmap") for scene in scenes}
-    facts = {
-        "bench": name,
-        "arguments": {key: str(value) for key, value in vars(args).items()},
-        "versions": versions(),
-        "failed": dict(failed),
-        "maps": infos,
-        "result": result,
-    }
-    with atomic_file(args.output / f"{name}.json") as aside:
-        aside.write_text(json.dumps(facts, indent=1, default=str) + "\n", encoding="utf-8")
-    lines = [table] + [f"{scene} failed and scores 0: {why}" for scene, why in failed.items()]
-    print(json.dumps(facts, default=str) if args.json else "\n".join(lines))
 
 
 def _map_facts(path: Path) -> dict[str, Any] | None:

@@ -1,31 +1,15 @@
-"""LERF-mask (Gaussian Grouping) from the downloaded folder to the table: `perception bench lerf-mask DIR -o WORK`.
-
-DIR/<scene>: images/, sparse/0, images_train/ (photos that may be trained on), test_mask/<view>/<prompt>.png, where
-<view> is a photo's name or the number of a test view (sorted by name). Every scene is mapped without its test views,
-the instances a prompt selects are rendered with occlusion, and the masks are scored; what is finished is kept in
-WORK, so that a second run goes on. A scene that fails scores 0.
-"""
+"""LERF-mask (Gaussian Grouping): `perception bench lerf-mask DIR -o WORK`."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-import numpy as np
+import cv2
 
-from perception.bench.datasets import (
-    InstanceViews,
-    Workplace,
-    add_arguments,
-    by_reference,
-    by_words,
-    chosen_scenes,
-    report,
-    run_scenes,
-    workplace,
-    write_masks,
-)
+from perception.bench.datasets import HELD_OUT, DatasetBench, InstanceViews, by_reference, by_words, write_masks
 from perception.errors import InputError
 from perception.evaluate.layouts import read_mask_folder, run_lerf_mask
 
@@ -37,75 +21,64 @@ SELECTION = {
 }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line entry point; see the module docstring."""
-    parser = argparse.ArgumentParser(prog="perception bench lerf-mask", description=__doc__)
-    add_arguments(parser)
-    parser.add_argument(
-        "--select", default="query", metavar="HOW", help="query, truth, or reference:DIR with <scene>/<prompt>.png"
-    )
-    parser.add_argument("--missing", choices=("zero", "skip"), default="zero")
-    args = parser.parse_args(arguments)
-    kind, _, folder = args.select.partition(":")
-    if kind not in SELECTION or (kind == "reference") != bool(folder):
-        raise InputError(f"--select is '{args.select}'; expected query, truth or reference:DIR")
-    found = {path.parent.name: path.parent for path in sorted(args.dataset.glob("*/test_mask"))}
-    if (args.dataset / "test_mask").is_dir():
-        found = {args.dataset.name: args.dataset}
-    if not found:
-        raise InputError(f"{args.dataset}: holds no scenes; expected <scene>/test_mask/<view>/<prompt>.png")
-    scenes = chosen_scenes(found, args.scenes, args.dataset)
-    place = workplace(args)
-    references = Path(folder) if folder else None
+class LerfMask(DatasetBench):
+    """DIR/<scene>: images/, sparse/0, images_train/ (photos that may be trained on), test_mask/<view>/<prompt>.png,
+    where <view> is a photo's name or the number of a test view (sorted by name). Every scene is mapped without its test
+    views, the instances a prompt selects are rendered with occlusion, and the masks are scored. A scene that fails
+    scores 0."""
 
-    def predict(name: str, scene: Path, target: Path) -> None:
-        write_masks(target, predict_scene(place, name, scene, kind, references))
+    name, expected = "lerf-mask", "<scene>/test_mask/<view>/<prompt>.png"
 
-    failed = run_scenes(scenes, place, predict)
-    (args.output / "predictions").mkdir(parents=True, exist_ok=True)
-    switches = {
-        "selection": SELECTION[kind],
-        "rendered": f"with occlusion, > {RENDERED}",
-        "test_views": "held out of training, unless the map was brought along",
-    }
-    truth = args.dataset if not args.scenes else _only(args, scenes)
-    result, table = run_lerf_mask(args.output / "predictions", truth, missing=args.missing, **switches)
-    report("lerf_mask", args, result, table, failed, scenes)
+    @classmethod
+    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
+        how = "query, truth, or reference:DIR with <scene>/<prompt>.png"
+        parser.add_argument("--select", default="query", metavar="HOW", help=how)
+        parser.add_argument("--missing", choices=("zero", "skip"), default="zero")
 
+    def __init__(self, args: argparse.Namespace) -> None:
+        super().__init__(args)
+        self.select, _, self.references = args.select.partition(":")
+        if self.select not in SELECTION or (self.select == "reference") != bool(self.references):
+            raise InputError(f"--select is '{args.select}'; expected query, truth or reference:DIR")
 
-def _only(args: argparse.Namespace, scenes: dict[str, Path]) -> Path:
-    """A folder of links to the ground truth of the given scenes."""
-    from perception.bench.datasets import link
+    def scenes(self) -> dict[str, Path]:
+        dataset = self.args.dataset
+        if (dataset / "test_mask").is_dir():
+            return {dataset.name: dataset}
+        return {path.parent.name: path.parent for path in sorted(dataset.glob("*/test_mask"))}
 
-    folder: Path = args.output / "truth" / "+".join(scenes)
-    for name, scene in scenes.items():
-        link(scene / "test_mask", folder / name / "test_mask")
-    return folder
+    def predict(self, name: str, scene: Path, target: Path) -> None:
+        """A bool mask of each prompt in each test view that has a registered pose."""
+        truths = read_mask_folder(scene / "test_mask")
+        tests = test_photos(scene, sorted({view for view, _ in truths}))
+        shown = InstanceViews(self.map(name, scene, sorted(tests.values())))
+        views = {label: shown.find(photo) for label, photo in tests.items()}
+        first = next(((label, view) for label, view in sorted(views.items()) if view is not None), None)
+        if first is None:
+            raise InputError(f"{scene}: none of its test views {sorted(tests.values())} is registered in the map")
+        ids = shown.ids(first[1]) if self.select != "query" else None
+        masks = {}
+        for prompt in sorted({prompt for _, prompt in truths}):
+            if ids is None:
+                chosen = by_words(shown.gmap, prompt, "top-1")
+            else:
+                reference: Any = truths.get((first[0], prompt))
+                if self.references:
+                    reference = cv2.imread(str(Path(self.references) / name / f"{prompt}.png"), cv2.IMREAD_GRAYSCALE)
+                chosen = [] if reference is None else by_reference(ids, reference > 128, SHARE)
+            for label, view in views.items():
+                if view is not None and (label, prompt) in truths:
+                    masks[label, prompt] = shown.silhouette(chosen, view, occlusion=True) > RENDERED
+        write_masks(target, masks)
 
-
-def predict_scene(
-    place: Workplace, name: str, scene: Path, select: str, references: Path | None
-) -> dict[tuple[str, str], np.ndarray]:
-    """{(view, prompt): bool mask [H, W]} of one scene. Views without a registered pose are absent."""
-    truths = read_mask_folder(scene / "test_mask")
-    tests = test_photos(scene, sorted({view for view, _ in truths}))
-    shown = InstanceViews(place.map(name, scene, sorted(tests.values())))
-    views = {label: shown.find(photo) for label, photo in tests.items()}
-    first = next(((label, view) for label, view in sorted(views.items()) if view is not None), None)
-    if first is None:
-        raise InputError(f"{scene}: none of its test views {sorted(tests.values())} is registered in the map")
-    ids = shown.ids(first[1]) if select != "query" else None
-    masks = {}
-    for prompt in sorted({prompt for _, prompt in truths}):
-        if ids is None:
-            chosen = by_words(shown.gmap, prompt, "top-1")
-        else:
-            reference = truths.get((first[0], prompt)) if references is None else _reference(references, name, prompt)
-            chosen = [] if reference is None else by_reference(ids, reference > 128, SHARE)
-        for label, view in views.items():
-            if view is not None and (label, prompt) in truths:
-                masks[label, prompt] = shown.silhouette(chosen, view, occlusion=True) > RENDERED
-    return masks
+    def score(self, scenes: Mapping[str, Path]) -> tuple[dict[str, Any], str]:
+        switches = {
+            "selection": SELECTION[self.select],
+            "rendered": f"with occlusion, > {RENDERED}",
+            "test_views": HELD_OUT,
+        }
+        truth = self.chosen_truth({f"{name}/test_mask": scene / "test_mask" for name, scene in scenes.items()})
+        return run_lerf_mask(self.work / "predictions", truth, missing=self.args.missing, **switches)
 
 
 def test_photos(scene: Path, labels: Sequence[str]) -> dict[str, str]:
@@ -128,8 +101,4 @@ def test_photos(scene: Path, labels: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def _reference(folder: Path, scene: str, prompt: str) -> np.ndarray | None:
-    import cv2
-
-    image = cv2.imread(str(folder / scene / f"{prompt}.png"), cv2.IMREAD_GRAYSCALE)
-    return None if image is None else np.asarray(image)
+main = LerfMask.main

@@ -1,31 +1,13 @@
-"""LERF-OVS, 3D selection (OpenGaussian's protocol), from the downloaded folder to the table:
-`perception bench lerf-ovs DIR -o WORK`.
-
-DIR/<scene>: images/ and sparse/0; DIR/label/<scene>/frame_*.json: polygons by category. Every scene is mapped
-without its labelled frames, the Gaussians a category selects are rendered, and the silhouettes are scored; what is
-finished is kept in WORK, so that a second run goes on. A scene that fails scores 0.
-"""
+"""LERF-OVS, 3D selection (OpenGaussian's protocol): `perception bench lerf-ovs DIR -o WORK`."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-
-from perception.bench.datasets import (
-    InstanceViews,
-    Workplace,
-    add_arguments,
-    by_words,
-    chosen_scenes,
-    link,
-    report,
-    run_scenes,
-    workplace,
-    write_masks,
-)
+from perception.bench.datasets import HELD_OUT, DatasetBench, InstanceViews, by_words, write_masks
 from perception.errors import InputError
 from perception.evaluate.layouts import read_lerf_polygons, run_lerf_ovs
 
@@ -35,55 +17,46 @@ SELECTION = {
 }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line entry point; see the module docstring."""
-    parser = argparse.ArgumentParser(prog="perception bench lerf-ovs", description=__doc__)
-    add_arguments(parser)
-    parser.add_argument("--select", choices=tuple(SELECTION), default="top-1")
-    parser.add_argument("--occlusion", action="store_true", help="render with the other Gaussians in front")
-    parser.add_argument("--train-on-test", action="store_true", help="labelled frames are trained on, as LangSplat")
-    args = parser.parse_args(arguments)
-    labels = args.dataset / "label"
-    found = {path.name: path for path in sorted(labels.iterdir()) if path.is_dir()} if labels.is_dir() else {}
-    if not found:
-        raise InputError(f"{args.dataset}: holds no labels; expected label/<scene>/frame_*.json")
-    scenes = chosen_scenes(found, args.scenes, args.dataset)
-    place = workplace(args)
+class LerfOvs(DatasetBench):
+    """DIR/<scene>: images/ and sparse/0; DIR/label/<scene>/frame_*.json: polygons by category. Every scene is mapped
+    without its labelled frames, the Gaussians a category selects are rendered, and the silhouettes are scored. A scene
+    that fails scores 0."""
 
-    def predict(name: str, label: Path, target: Path) -> None:
-        source = args.dataset / name
-        held = not args.train_on_test
-        write_masks(target, predict_scene(place, name, source, label, args.select, args.occlusion, held))
+    name, expected = "lerf-ovs", "label/<scene>/frame_*.json"
 
-    failed = run_scenes(scenes, place, predict)
-    (args.output / "predictions").mkdir(parents=True, exist_ok=True)
-    truth = args.dataset
-    if args.scenes:
-        truth = args.output / "truth" / "+".join(scenes)
-        for name, label in scenes.items():
-            link(label, truth / "label" / name)
-    switches = {
-        "selection": SELECTION[args.select],
-        "occlusion": "on" if args.occlusion else "off",
-        "test_views": "trained on" if args.train_on_test else "held out of training, unless the map was brought along",
-    }
-    result, table = run_lerf_ovs(args.output / "predictions", truth, **switches)
-    report("lerf_ovs", args, result, table, failed, scenes)
+    @classmethod
+    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--select", choices=tuple(SELECTION), default="top-1")
+        parser.add_argument("--occlusion", action="store_true", help="render with the other Gaussians in front")
+        parser.add_argument("--train-on-test", action="store_true", help="labelled frames are trained on, as LangSplat")
+
+    def scenes(self) -> dict[str, Path]:
+        return {path.name: path for path in sorted(self.args.dataset.glob("label/*")) if path.is_dir()}
+
+    def predict(self, name: str, scene: Path, target: Path) -> None:
+        """Silhouettes in [0, 1] of each category in each labelled frame that has a registered pose."""
+        source = self.args.dataset / name
+        if not source.is_dir():
+            raise InputError(f"{source}: no such folder; expected the scene's images/ and sparse/ there")
+        truths = read_lerf_polygons(scene)
+        frames = sorted({frame for frame, _ in truths})
+        shown = InstanceViews(self.map(name, source, [] if self.args.train_on_test else frames))
+        selected = {text: by_words(shown.gmap, text, self.args.select) for text in sorted({text for _, text in truths})}
+        masks = {}
+        for frame, text in truths:
+            view = shown.find(frame)
+            if view is not None:
+                masks[frame, text] = shown.silhouette(selected[text], view, self.args.occlusion)
+        write_masks(target, masks)
+
+    def score(self, scenes: Mapping[str, Path]) -> tuple[dict[str, Any], str]:
+        switches = {
+            "selection": SELECTION[self.args.select],
+            "occlusion": "on" if self.args.occlusion else "off",
+            "test_views": "trained on" if self.args.train_on_test else HELD_OUT,
+        }
+        truth = self.chosen_truth({f"label/{name}": label for name, label in scenes.items()})
+        return run_lerf_ovs(self.work / "predictions", truth, **switches)
 
 
-def predict_scene(
-    place: Workplace, name: str, source: Path, label: Path, select: str, occlusion: bool, held_out: bool
-) -> dict[tuple[str, str], np.ndarray]:
-    """{(frame, category): silhouette [H, W] in [0, 1]} of one scene. Frames without a registered pose are absent."""
-    if not source.is_dir():
-        raise InputError(f"{source}: no such folder; expected the scene's images/ and sparse/ there")
-    truths = read_lerf_polygons(label)
-    frames = sorted({frame for frame, _ in truths})
-    shown = InstanceViews(place.map(name, source, frames if held_out else []))
-    selected = {prompt: by_words(shown.gmap, prompt, select) for prompt in sorted({prompt for _, prompt in truths})}
-    masks = {}
-    for frame, prompt in truths:
-        view = shown.find(frame)
-        if view is not None:
-            masks[frame, prompt] = shown.silhouette(selected[prompt], view, occlusion)
-    return masks
+main = LerfOvs.main

@@ -93,7 +93,7 @@ def run_sweep(options: argparse.Namespace, variants: Sequence[Variant]) -> list[
     return rows
 
 
-def map_variant(scene: Path, variant: Variant, pairs: Sequence[str], row: Path) -> dict[str, Any]:
+def map_variant(scene: Path, variant: Variant, pairs: list[str], row: Path) -> dict[str, Any]:
     """Maps the scene beside `row` and scores the map. Minutes are of the whole run, CPU seconds of all its threads."""
     path, settings = row.with_suffix(".gsmap"), (word for pair in pairs for word in ("--set", pair))
     before = os.times()
