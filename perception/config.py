@@ -46,6 +46,9 @@ class PhotoConfig(Settings):
     camera: str | None = Field(None, description="ROS camera_info YAML: the intrinsics of all photos, kept fixed")
     ignore_masks: str | None = Field(None, description="folder of PNG masks, same stem as the photo: black is ignored")
     init_points: str | None = Field(None, description="cloud in the frame of the input's poses to start training from")
+    poses: Literal["auto", "keep", "refine"] = Field(
+        "auto", description="given poses: refined where matched features show that they are wrong, kept, or refined"
+    )
     strict: bool = Field(False, description="refuse a damaged photo instead of leaving it out")
 
 

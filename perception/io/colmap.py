@@ -34,11 +34,13 @@ def read_workspace(
     strict: bool = False,
     masks: Path | None = None,
     cloud: Cloud | None = None,
+    poses: str = "auto",
 ) -> Scene:
     """The largest sparse model of a workspace as a Scene, in COLMAP's world.
 
     Photos that are missing or damaged are left out and reported; strict: damaged ones raise InputError. Image names
     that point outside the photo folder raise InputError. masks: folder of masks. cloud: used instead of the points.
+    poses: see `posed_scene`.
     """
     found = {path: _read_model(path) for path in _models(folder)}
     path, model = max(found.items(), key=lambda item: item[1].num_reg_images())
@@ -56,7 +58,7 @@ def read_workspace(
         notes.append(f"{path}: the sparse model holds {len(cloud[0])} points; new ones are triangulated")
     facts: dict[str, Any] = {"input": "colmap", "left_out": missing, "warnings": notes}
     facts |= {"model": path.relative_to(folder).as_posix(), "mean_reprojection_error_px": _reprojection_error(model)}
-    return posed_scene(views, cloud, facts, workdir, seed, progress, least=MIN_POINTS)
+    return posed_scene(views, cloud, facts, workdir, seed, progress, MIN_POINTS, poses)
 
 
 def _located(model: Any, images: Path, source: Path) -> dict[int, tuple[str, Path]]:

@@ -28,6 +28,7 @@ def load_scene(
     frames: Path | None = None,
     masks: Path | None = None,
     init_points: Path | None = None,
+    poses: str = "auto",
 ) -> Scene:
     """Posed views of `source`, sorted by name, with a sparse cloud.
 
@@ -36,7 +37,8 @@ def load_scene(
     ROS camera_info with the intrinsics of all photos, for photos and videos only. strict: a damaged photo is an
     InputError, else it is left out. frames: folder for the frames of a video (None: workdir/frames), which the map
     needs later. masks: folder of masks of pixels to ignore (see `ignore_masks`). init_points: cloud in the frame of the
-    input's poses, used instead of sparse points.
+    input's poses, used instead of sparse points. poses: "auto", "keep" or "refine" the given
+    ones (see io.pose_refinement).
     """
     from perception.io.colmap import is_workspace, read_workspace
     from perception.io.photo_folder import VIDEO_SUFFIXES
@@ -66,9 +68,9 @@ def load_scene(
     elif unposed:
         scene = reconstruct(source, workdir, lens, seed, tell, strict, masks)
     elif workspace:
-        scene = read_workspace(source, workdir, seed, tell, strict, masks, cloud)
+        scene = read_workspace(source, workdir, seed, tell, strict, masks, cloud, poses)
     elif file.suffix.lower() == ".json":
-        scene = read_transforms(file, workdir, seed, tell, strict, masks, cloud)
+        scene = read_transforms(file, workdir, seed, tell, strict, masks, cloud, poses)
     else:
         raise InputError(f"{source}: expected {EXPECTED}")
     if init_points is not None:

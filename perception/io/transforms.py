@@ -47,6 +47,7 @@ def read_transforms(
     strict: bool = False,
     masks: Path | None = None,
     cloud: Cloud | None = None,
+    poses: str = "auto",
 ) -> Scene:
     """The frames of a transforms.json whose photos exist, as a Scene in the file's own world.
 
@@ -54,7 +55,7 @@ def read_transforms(
     and h the size is that of the photo. Points are read from `ply_file_path`, else triangulated with the given poses.
     The unit is not assumed to be the metre. View names are paths below the common folder of all photos. Missing and
     damaged photos are left out and reported; strict: damaged ones raise InputError.
-    masks: folder whose masks precede `mask_path`. cloud: used instead of other points.
+    masks: folder whose masks precede `mask_path`. cloud: used instead of other points. poses: see `posed_scene`.
     """
     data = _load(file)
     frames = data["frames"]
@@ -75,7 +76,7 @@ def read_transforms(
     }
     if cloud is None and len(listed[0]):
         facts["points_from"] = str(data["ply_file_path"])
-    return posed_scene(views, listed, facts, workdir, seed, progress, least=1)
+    return posed_scene(views, listed, facts, workdir, seed, progress, 1, poses)
 
 
 def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:

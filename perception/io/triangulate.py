@@ -1,4 +1,4 @@
-"""Triangulates a sparse cloud for photos with known poses: features are matched, poses are kept fixed."""
+"""The scene of photos with known poses: poses are checked against matched features, a sparse cloud is triangulated."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from perception.geometry import inverse_se3
 from perception.io.features import build_features
 from perception.io.lens import camera_from_lens, lens_text, load_pycolmap
+from perception.io.pose_refinement import checked_poses
 from perception.io.views import view_lens
 from perception.progress import Progress
 from perception.types import Scene, View
@@ -28,41 +29,46 @@ def posed_scene(
     seed: int,
     progress: Progress,
     least: int,
+    poses: str = "auto",
 ) -> Scene:
     """The Scene of views with known poses. cloud: points [P, 3] and colors [P, 3] from the input.
 
     With fewer than `least` points, triangulated points are used instead. facts: report entries, with "warnings".
+    poses: "keep", "refine", or "auto": checked where features are matched anyway or views have depth, refined where
+    they are wrong (see io.pose_refinement).
     """
     cameras = sorted({lens_text(view_lens(view)) for view in views})
     report = {**facts, "registered": len(views), "cameras": cameras, "seconds": {}}
     points, colors = cloud
-    if len(points) < least:
-        points, colors, found = triangulated_cloud(views, workdir, seed, progress)
-        report |= {**found, "warnings": [*facts["warnings"], *found["warnings"]]}
+    few = len(points) < least
+    check = poses == "refine" or (poses == "auto" and (few or any(view.depth is not None for view in views)))
+    if few or check:
+        masks = [v.mask for v in views]
+        store = build_features([v.photo for v in views], [view_lens(v) for v in views], workdir, seed, progress, masks)
+        report["seconds"] = store.facts["seconds"]
+        if check:
+            started = time.perf_counter()
+            views, found = checked_poses(views, store, poses)
+            report |= {**found, "warnings": [*report["warnings"], *found["warnings"]]}
+            report["seconds"]["refinement"] = time.perf_counter() - started
+        if few:
+            points, colors, found = triangulated_cloud(views, store, seed)
+            report |= {**found, "warnings": [*report["warnings"], *found["warnings"]]}
     report["points"] = len(points)
     return Scene(views, points, colors, report=report)
 
 
-def triangulated_cloud(
-    views: list[View], workdir: Path, seed: int, progress: Progress
-) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+def triangulated_cloud(views: list[View], store: Any, seed: int) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """points [P, 3] float64 in the world of the views, colors [P, 3] uint8, facts for the report.
 
-    With fewer than MIN_POINTS points, random points in the view frusta are returned, with a warning.
+    store: the matched features of the views (see io.features). With fewer than MIN_POINTS points, random points in the
+    view frusta are returned, with a warning.
     """
-    started = time.perf_counter()
-    store = build_features(
-        [v.photo for v in views], [view_lens(v) for v in views], workdir, seed, progress, [v.mask for v in views]
-    )
-    featured = time.perf_counter()
     points, colors, error = _triangulate(views, store, seed)
     facts: dict[str, Any] = {
-        "points_from": "triangulated with the given poses",
-        "points": len(points),
+        "points_from": "triangulated",
         "mean_reprojection_error_px": error,
-        "seconds": {**store.facts["seconds"], "triangulation": time.perf_counter() - featured},
         "warnings": [],
-        "features_cached": featured - started < 0.5 * sum(store.facts["seconds"].values()),
     }
     if len(points) < MIN_POINTS:
         facts["warnings"].append(
@@ -70,7 +76,7 @@ def triangulated_cloud(
             f"{FALLBACK_POINTS} random points in the cameras' view are used instead"
         )
         points, colors = random_cloud(views, seed)
-        facts.update(points_from="random", points=len(points))
+        facts["points_from"] = "random"
     return points, colors, facts
 
 

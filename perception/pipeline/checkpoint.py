@@ -1,7 +1,8 @@
 """Checkpoints of a run, and the dependencies of each stage, by which `--resume` repeats only what has changed.
 
     stage      depends on                                                 kept in the work folder as
-    poses      input, photos.camera, strict, ignore_masks, init_points, seed   poses-MARK/
+    poses      input, photos.camera, strict, poses, ignore_masks and
+               init_points, seed                                          poses-MARK/
     masks      source of masks, photo, size (and the map's depth)         masks/, a key in each PNG
     optimise   poses, photos.*, train.*, densify.*, losses.*; and masks   before_masks.pt, checkpoint.pt
     group      optimise, instances.*                                      nothing: it takes seconds
@@ -49,9 +50,8 @@ def fingerprint(source: Path, config: MapConfig) -> str:
 def poses_mark(source: Path, config: MapConfig) -> str:
     """Hash of the input path and the settings that change the poses and the sparse cloud."""
     photos = config.photos
-    return _digest(
-        str(source.resolve()), photos.camera, photos.strict, photos.ignore_masks, photos.init_points, config.seed
-    )
+    chosen = (photos.camera, photos.strict, photos.poses, photos.ignore_masks, photos.init_points)
+    return _digest(str(source.resolve()), *chosen, config.seed)
 
 
 def training_mark(source: Path, config: MapConfig) -> str:

@@ -167,6 +167,7 @@ def _scene(source: Path, output: Path, work: Path, config: MapConfig, progress: 
             frames=frames_folder(output),
             masks=Path(config.photos.ignore_masks) if config.photos.ignore_masks else None,
             init_points=Path(config.photos.init_points) if config.photos.init_points else None,
+            poses=config.photos.poses,
         )
         save_scene(kept, scene := recentred(scene))
     return scene

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -235,13 +236,15 @@ def _colmap_binary() -> dict[str, bytes]:
 
 
 def _without_photos() -> None:
-    """Points that a file lacks are found in its photos, which is no reading: random ones take their place here."""
+    """Photos are not matched, which is no reading: random points take the place of those that a file lacks."""
     from perception.io import triangulate
 
-    def random(views: list[Any], work: Path, seed: int, progress: Any) -> tuple[Any, Any, dict[str, Any]]:
+    def random(views: list[Any], store: Any, seed: int) -> tuple[Any, Any, dict[str, Any]]:
         return (*triangulate.random_cloud(views, seed), {"warnings": []})
 
-    triangulate.triangulated_cloud = random  # type: ignore[assignment]
+    triangulate.triangulated_cloud = random
+    triangulate.build_features = lambda *_: SimpleNamespace(facts={"seconds": {}})  # type: ignore[assignment, return-value]
+    triangulate.checked_poses = lambda views, *_: (views, {"warnings": []})
 
 
 def _png(width: int = 8, height: int = 6, mode: str = "RGB") -> bytes:

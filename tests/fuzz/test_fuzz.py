@@ -21,10 +21,10 @@ target_of = cache(load)
 
 @pytest.fixture(scope="module", autouse=True)
 def as_it_was() -> Iterator[None]:
-    """The targets put random points in place of triangulation; the tests of other files want it back."""
-    before = triangulate.triangulated_cloud
+    """The targets put random points in place of matching and triangulation; the tests of other files want them back."""
+    before = dict(vars(triangulate))
     yield
-    triangulate.triangulated_cloud = before
+    vars(triangulate).update(before)
 
 
 def edits(size: int, words: list[str]) -> st.SearchStrategy[list[tuple[int, int, bytes]]]:
