@@ -45,6 +45,26 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
 
+def interpolated_pose(times: np.ndarray, poses: np.ndarray, time: float, gap: float) -> np.ndarray | None:
+    """Pose [4, 4] at `time` between the samples poses [N, 4, 4] at ascending times [N]; rotations by slerp.
+
+    None before the first sample, after the last, and between samples more than `gap` apart.
+    """
+    after = int(np.searchsorted(times, time))
+    if after < len(times) and times[after] == time:
+        return np.asarray(poses[after])
+    if after == 0 or after == len(times) or times[after] - times[after - 1] > gap:
+        return None
+    from scipy.spatial.transform import Rotation, Slerp
+
+    share = (time - times[after - 1]) / (times[after] - times[after - 1])
+    pose = np.eye(4)
+    pair = Rotation.from_matrix(poses[after - 1 : after + 1, :3, :3])
+    pose[:3, :3] = Slerp([0.0, 1.0], pair)(share).as_matrix()
+    pose[:3, 3] = (1 - share) * poses[after - 1, :3, 3] + share * poses[after, :3, 3]
+    return pose
+
+
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     """camera_from_world [4, 4], OpenCV axes, of a camera at `eye` looking at `target`; `up` not parallel to it."""
     forward = np.asarray(target, dtype=np.float64) - eye

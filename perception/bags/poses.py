@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from perception.bags.read import ODOMETRY, TRANSFORMS, Bag
-from perception.geometry import inverse_se3
+from perception.geometry import interpolated_pose, inverse_se3
 
 FIXED_FRAMES = ("map", "odom", "world")
 MAX_GAP = 0.5
@@ -70,17 +70,7 @@ class Poses:
         times, matrices = self._arrays[child]
         if child in self._static:
             return np.asarray(matrices[-1])
-        after = int(np.searchsorted(times, time))
-        if after < len(times) and times[after] == time:
-            return np.asarray(matrices[after])
-        if after == 0 or after == len(times) or times[after] - times[after - 1] > MAX_GAP * 1e9:
-            return None
-        share = (time - times[after - 1]) / (times[after] - times[after - 1])
-        pair = Rotation.from_matrix(matrices[after - 1 : after + 1, :3, :3])
-        result = np.eye(4)
-        result[:3, :3] = Slerp([0.0, 1.0], pair)(share).as_matrix()
-        result[:3, 3] = (1 - share) * matrices[after - 1, :3, 3] + share * matrices[after, :3, 3]
-        return result
+        return interpolated_pose(times, matrices, time, MAX_GAP * 1e9)
 
 
 def read_poses(bag: Bag, odometry: str | None = None) -> Poses:

@@ -34,8 +34,8 @@ def ssim(prediction: np.ndarray, truth: np.ndarray, weight: np.ndarray | None = 
 
     Equal to scikit-image's with the paper's parameters: Gaussian window of 11 × 11 pixels, σ = 1.5, K1 = 0.01, K2 =
     0.03, biased covariances, mean over windows that lie completely inside the image, weighted by weight [H, W] of their
-    centres. The training loss and its curve
-    differ: they pad with zeros, as 3DGS does. Raises InputError for images smaller than the window.
+    centres. The training loss and its curve differ: they pad with zeros, as 3DGS does. Raises InputError for images
+    smaller than the window.
     """
     from skimage.metrics import structural_similarity
 

@@ -25,13 +25,15 @@ class Chooser:
     sharpness: list[float] = field(default_factory=list)
     _last: np.ndarray | None = None
 
-    def show(self, picture: np.ndarray) -> None:
-        """Adds the next frame [H, W, 3] uint8 BGR."""
+    def show(self, picture: np.ndarray, motion: float | None = None) -> None:
+        """Adds the next frame [H, W, 3] uint8 BGR. motion: since the frame before; None measures it."""
         scale = THUMBNAIL / max(picture.shape[:2])
         small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else picture
         grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY))
         self.sharpness.append(float(cv2.Laplacian(grey, cv2.CV_64F).var()))
-        self.motion.append(0.0 if self._last is None else motion_between(self._last, grey))
+        if motion is None:
+            motion = 0.0 if self._last is None else motion_between(self._last, grey)
+        self.motion.append(motion)
         self._last = grey
 
     def chosen(self, most: int) -> list[int]:

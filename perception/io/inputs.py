@@ -1,10 +1,10 @@
-"""Reads any input as a Scene: a transforms.json, a COLMAP workspace, a folder of photos or a video."""
+"""Reads any input as a Scene: a transforms.json, a COLMAP workspace, an RGB-D recording, photos or a video."""
 
 from __future__ import annotations
 
 import shutil
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from perception.errors import InputError
@@ -14,7 +14,10 @@ from perception.io.start_points import check_seen, start_points
 from perception.progress import Progress
 from perception.types import Lens, Scene
 
-EXPECTED = "a folder of photos, a video, a COLMAP workspace or a transforms.json"
+EXPECTED = (
+    "a folder of photos, a video, a COLMAP workspace, a transforms.json or an RGB-D recording (TUM, ScanNet, 7-Scenes, "
+    "3DMatch, Redwood)"
+)
 
 
 def load_scene(
@@ -32,16 +35,18 @@ def load_scene(
 ) -> Scene:
     """Posed views of `source`, sorted by name, with a sparse cloud.
 
-    A folder is read as a COLMAP workspace if it is one, else by its transforms.json if it has one, else as photos, with
-    poses from structure from motion. `workdir` caches features and models for later calls. camera_file:
-    ROS camera_info with the intrinsics of all photos, for photos and videos only. strict: a damaged photo is an
-    InputError, else it is left out. frames: folder for the frames of a video (None: workdir/frames), which the map
-    needs later. masks: folder of masks of pixels to ignore (see `ignore_masks`). init_points: cloud in the frame of the
-    input's poses, used instead of sparse points. poses: "auto", "keep" or "refine" the given
-    ones (see io.pose_refinement).
+    A folder is read as a COLMAP workspace if it is one, else by its transforms.json if it has one, else as an RGB-D
+    recording if it has the layout of one, else as photos, with poses from structure from motion. `workdir` caches
+    features and models for later calls. camera_file: ROS camera_info with the intrinsics of all photos, for photos,
+    videos and recordings. strict: a damaged photo is an InputError, else it is left out. frames: folder for the frames
+    of a video (None: workdir/frames), which the map needs later. masks: folder of masks of pixels to ignore (see
+    `ignore_masks`). init_points: cloud in the frame of the input's poses, used instead of sparse points. poses: "auto",
+    "keep" or "refine" the given ones (see io.pose_refinement).
     """
     from perception.io.colmap import is_workspace, read_workspace
     from perception.io.photo_folder import VIDEO_SUFFIXES
+    from perception.io.recording_layouts import find_recording, refuse_depth_without_poses
+    from perception.io.recordings import recorded_scene
     from perception.io.sfm import reconstruct
     from perception.io.transforms import read_transforms
 
@@ -53,8 +58,9 @@ def load_scene(
     file = source / "transforms.json" if source.is_dir() else source
     workspace = source.is_dir() and is_workspace(source)
     is_video = file.suffix.lower() in VIDEO_SUFFIXES
-    unposed = is_video or (source.is_dir() and not workspace and not file.is_file())
-    if camera_file is not None and not unposed:
+    recording = None if workspace or file.is_file() else find_recording(source)
+    unposed = is_video or (source.is_dir() and not workspace and not file.is_file() and recording is None)
+    if camera_file is not None and not unposed and recording is None:
         raise InputError(f"{camera_file}: a camera file goes with photos or a video; {source} brings its own cameras")
     if init_points is not None and unposed:
         raise InputError(f"{init_points}: a cloud to start from goes with an input that has poses; {source} has none")
@@ -65,7 +71,11 @@ def load_scene(
     workdir.mkdir(parents=True, exist_ok=True)
     if is_video:
         scene = _scene_of_video(source, frames or workdir / "frames", workdir, lens, seed, tell, masks)
+    elif recording is not None:
+        recording = replace(recording, lens=lens or recording.lens)
+        scene = recorded_scene(recording, workdir, seed, tell, strict, masks, cloud, poses)
     elif unposed:
+        refuse_depth_without_poses(source)
         scene = reconstruct(source, workdir, lens, seed, tell, strict, masks)
     elif workspace:
         scene = read_workspace(source, workdir, seed, tell, strict, masks, cloud, poses)
@@ -97,6 +107,8 @@ def photo_sizes(source: Path) -> PhotoSizes:
     """
     from perception.io.colmap import is_workspace
     from perception.io.photo_folder import VIDEO_SUFFIXES, list_photos
+    from perception.io.recording_layouts import find_recording
+    from perception.io.recordings import MOST_FRAMES as MOST_RECORDED
     from perception.io.transforms import listed_photos
     from perception.io.video import MOST_FRAMES, frame_size
 
@@ -104,6 +116,12 @@ def photo_sizes(source: Path) -> PhotoSizes:
     if file.suffix.lower() in VIDEO_SUFFIXES:
         return PhotoSizes([frame_size(source)] * MOST_FRAMES, False, f"at most {MOST_FRAMES} frames")
     workspace = source.is_dir() and is_workspace(source)
+    recording = None if workspace or file.is_file() else find_recording(source)
+    if recording is not None and recording.frames:
+        count = len(recording.frames)
+        size = _size(recording.frames[0].photo) or (640, 480)
+        taken = min(count, MOST_RECORDED)
+        return PhotoSizes([size] * taken, True, f"at most {taken} of {count} frames")
     if workspace:
         photos = list_photos(source / "images")
     elif file.is_file():

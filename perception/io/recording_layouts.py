@@ -1,0 +1,284 @@
+"""Folders of RGB-D data sets: TUM RGB-D, ScanNet, 7-Scenes, 3DMatch, and Redwood / Open3D, recognised by content.
+
+All write pixel centres at whole numbers, so 0.5 is added to their principal points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.geometry import interpolated_pose, rotation_from_quaternion
+from perception.io.documents import brief, read_json
+from perception.io.photos import open_photo, photo_size
+from perception.io.recordings import Frame, Recording
+from perception.types import Lens
+
+TUM_APART, TUM_GAP = 0.02, 0.1
+"""Greatest time in seconds between a photo and its depth image, and between two poses that are interpolated."""
+_TUM_LENSES = {  # fx fy cx cy k1 k2 p1 p2 k3, from the data set's page on calibration
+    "freiburg1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    "freiburg2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6, 0.0, 0.0, 0.0, 0.0, 0.0),
+}
+_PRIMESENSE = (525.0, 525.0, 319.5, 239.5)  # the intrinsics that Redwood and Open3D assume for 640 × 480 pixels
+_KINECT_DEPTH, _KINECT_COLOR = (585.0, 585.0, 320.0, 240.0), (525.0, 525.0, 320.0, 240.0)
+_SIZE = (640, 480)
+_COLOR_FOLDERS = ("color", "image", "rgb")
+
+
+def find_recording(source: Path) -> Recording | None:
+    """The recording in folder `source`, or None when it has none of the layouts. InputError for one that is damaged."""
+    reader = _reader(source) if source.is_dir() else None
+    return None if reader is None else reader(source)
+
+
+def _reader(source: Path) -> Callable[[Path], Recording] | None:
+    if (source / "rgb.txt").is_file() and (source / "depth.txt").is_file():
+        return _tum
+    if (source / "color").is_dir() and (source / "pose").is_dir():
+        return _scannet
+    if any(source.glob("frame-*.color.*")) or any(source.glob("seq*/frame-*.color.*")):
+        return _seven_scenes
+    if _color_folder(source) and (source / "depth").is_dir() and any(source.glob("*.log")):
+        return _redwood
+    return None
+
+
+def refuse_depth_without_poses(source: Path) -> None:
+    """InputError for a folder of photos that holds 16-bit depth images, which would be taken for photos."""
+    first = next(iter(sorted((source / "depth").glob("*.png"))), None)
+    if first is None:
+        return
+    with open_photo(first) as image:
+        is_depth = image.mode.startswith("I")
+    if is_depth:
+        raise InputError(
+            f"{source}: has depth images but no poses; expected transforms.json with depth_file_path, groundtruth.txt "
+            "(TUM), pose/*.txt (ScanNet) or a trajectory *.log (Redwood); to map the photos alone, give their folder"
+        )
+
+
+# ---------------------------------------------------------------------- TUM RGB-D
+
+
+def _tum(source: Path) -> Recording:
+    """Lists of "time file" for photos and depth, "time tx ty tz qx qy qz qw" for poses; 5000 units of depth a metre."""
+    truth = source / "groundtruth.txt"
+    if not truth.is_file():
+        raise InputError(f"{truth}: missing, so depth has no poses; expected lines 'time tx ty tz qx qy qz qw'")
+    (at, photos), (depth_at, depths) = (_listed(source / name) for name in ("rgb.txt", "depth.txt"))
+    times, poses = _tum_poses(truth)
+    nearest = np.abs(depth_at[None] - at[:, None]).argmin(axis=1)
+    apart = np.abs(depth_at[nearest] - at)
+    if apart.min() > TUM_APART:
+        raise InputError(
+            f"{source}: photos and depth are at least {apart.min():.3g} s apart, at most {TUM_APART} are allowed; do "
+            "rgb.txt and depth.txt use one clock?"
+        )
+    frames = []
+    for time, photo, depth, near in zip(at, photos, nearest, apart <= TUM_APART, strict=True):
+        pose = interpolated_pose(times, poses, time, TUM_GAP)
+        if pose is not None and (source / photo).is_file():
+            frames.append(Frame(photo, source / photo, source / depths[depth] if near else None, pose))
+    if not frames:
+        raise InputError(
+            f"{source}: no photo lies between two poses; photos are from {at.min():.3f} to {at.max():.3f} s, poses "
+            f"from {times.min():.3f} to {times.max():.3f} s"
+        )
+    name = next((name for name in _TUM_LENSES if name in source.resolve().name), None)
+    lens = None if name is None else _lens(_TUM_LENSES[name], _SIZE)
+    notes = _missing(len(photos) - len(frames), len(photos), "a pose")
+    notes += _missing(sum(frame.depth is None for frame in frames), len(frames), f"depth within {TUM_APART} s")
+    return Recording(source, "TUM RGB-D", frames, lens, 5000.0, None, notes)
+
+
+def _listed(file: Path) -> tuple[np.ndarray, list[str]]:
+    rows = [line.split() for line in _lines(file)]
+    try:
+        rows.sort(key=lambda row: float(row[0]))
+        return np.array([float(row[0]) for row in rows]), [row[1] for row in rows]
+    except (ValueError, IndexError) as error:
+        raise InputError(f"{file}: expected lines 'time file' ({error})") from error
+
+
+def _tum_poses(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    rows = _numbers(file, 8)
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    if (np.linalg.norm(rows[:, 4:], axis=1) < 1e-6).any():
+        raise InputError(f"{file}: a quaternion is zero; expected lines 'time tx ty tz qx qy qz qw'")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = [rotation_from_quaternion(row[[7, 4, 5, 6]]) for row in rows]
+    poses[:, :3, 3] = rows[:, 1:4]
+    return rows[:, 0], poses
+
+
+# ------------------------------------------------------- folders of numbered files
+
+
+def _scannet(source: Path) -> Recording:
+    """Exported frames: color/, depth/ in mm, pose/ world_from_camera, infinite where tracking was lost."""
+    photos = _images(source / "color")
+    frames = []
+    for photo in photos:
+        depth, pose = source / "depth" / f"{photo.stem}.png", source / "pose" / f"{photo.stem}.txt"
+        matrix = _matrix(pose) if pose.is_file() else None
+        if matrix is not None:
+            frames.append(Frame(f"color/{photo.name}", photo, depth if depth.is_file() else None, matrix))
+    size = photo_size(photos[0])
+    lens = _matrix_lens(source / "intrinsic" / "intrinsic_color.txt", size)
+    depths = [frame.depth for frame in frames if frame.depth is not None]
+    own = _matrix_lens(source / "intrinsic" / "intrinsic_depth.txt", photo_size(depths[0])) if depths else None
+    notes = _missing(len(photos) - len(frames), len(photos), "a pose (tracking was lost)")
+    return Recording(source, "ScanNet", frames, lens, 1000.0, own, notes)
+
+
+def _seven_scenes(source: Path) -> Recording:
+    """frame-*.color.png, .depth.png in mm and .pose.txt, in the folder or in seq-*; 3DMatch adds the intrinsics."""
+    photos = sorted(source.glob("frame-*.color.*")) or sorted(source.glob("seq*/frame-*.color.*"))
+    frames = []
+    for photo in photos:
+        stem = photo.name.partition(".")[0]
+        depth, pose = photo.with_name(f"{stem}.depth.png"), photo.with_name(f"{stem}.pose.txt")
+        matrix = _matrix(pose) if pose.is_file() else None
+        if matrix is not None:
+            name = photo.relative_to(source).as_posix()
+            frames.append(Frame(name, photo, depth if depth.is_file() else None, matrix))
+    notes = _missing(len(photos) - len(frames), len(photos), "a pose")
+    size = photo_size(photos[0])
+    for file in (source / "camera-intrinsics.txt", source.parent / "camera-intrinsics.txt"):
+        if file.is_file():
+            folders = {photo.parent for photo in photos}
+            if len(folders) > 1:
+                raise InputError(f"{source}: {len(folders)} sequences, each with a world of its own; give one of them")
+            return Recording(source, "3DMatch", frames, _matrix_lens(file, size), 1000.0, None, notes)
+    warning = (
+        f"{source}: 7-Scenes does not register depth to the photos; the nominal lenses are used (focal length "
+        f"{_KINECT_COLOR[0]:g} and {_KINECT_DEPTH[0]:g} pixels), and the 2 to 3 cm between the cameras are neglected"
+    )
+    color, depth_lens = _lens(_KINECT_COLOR, _SIZE), _lens(_KINECT_DEPTH, _SIZE)
+    return Recording(source, "7-Scenes", frames, color, 1000.0, depth_lens, notes, [warning])
+
+
+def _redwood(source: Path) -> Recording:
+    """color/ (or image/, rgb/) and depth/ in mm in equal order, and a .log of world_from_camera matrices."""
+    folder = _color_folder(source)
+    assert folder is not None
+    photos, depths = _images(folder), _images(source / "depth")
+    if len(photos) != len(depths):
+        raise InputError(
+            f"{source}: {len(photos)} photos in {folder.name}/, {len(depths)} images in depth/; expected pairs"
+        )
+    logs = sorted(source.glob("*.log"))
+    named = [log for log in logs if log.name == "trajectory.log"] or logs
+    if len(named) > 1:
+        raise InputError(f"{source}: several trajectories ({', '.join(log.name for log in logs)}); keep one of them")
+    poses = _trajectory(named[0], len(photos))
+    frames = [Frame(f"{folder.name}/{photos[i].name}", photos[i], depths[i], pose) for i, pose in poses.items()]
+    size, lens, notes = photo_size(photos[0]), None, _missing(len(photos) - len(poses), len(photos), "a pose")
+    cameras = sorted(source.glob("*intrinsic*.json")) + sorted(source.glob("camera*.json"))
+    if cameras:
+        lens = _open3d_lens(cameras[0])
+    elif size == _SIZE:
+        lens = _lens(_PRIMESENSE, _SIZE)
+        notes.append(f"{source}: no intrinsics, those of PrimeSense are used ({_PRIMESENSE[0]:g} pixels)")
+    return Recording(source, "Redwood / Open3D", frames, lens, 1000.0, None, notes)
+
+
+def _trajectory(file: Path, photos: int) -> dict[int, np.ndarray]:
+    """Blocks of a line of three whole numbers, the first the number of the photo from 0, and four rows of a matrix."""
+    lines = _lines(file)
+    try:
+        numbers = [int(line.split()[0]) for line in lines[::5]]
+        rows = [line for index, line in enumerate(lines) if index % 5]
+        matrices = np.array([line.split() for line in rows], np.float64).reshape(-1, 4, 4)
+    except (ValueError, IndexError) as error:
+        raise InputError(f"{file}: expected blocks of a line 'i i i+1' and four rows of four numbers") from error
+    if len(matrices) != len(numbers):
+        raise InputError(f"{file}: ends within a block; expected a line 'i i i+1' and four rows of four numbers")
+    places = list(range(photos)) if len(numbers) == photos else numbers
+    if min(places) < 0 or max(places) >= photos:
+        raise InputError(f"{file}: tells the pose of photo {max(places)} (counted from 0), there are {photos} photos")
+    return dict(zip(places, matrices, strict=True))
+
+
+# ------------------------------------------------------------------------ helpers
+
+
+def _color_folder(source: Path) -> Path | None:
+    return next((source / name for name in _COLOR_FOLDERS if (source / name).is_dir()), None)
+
+
+def _images(folder: Path) -> list[Path]:
+    """PNG and JPEG files in order of their numbers, which need not be padded with zeros."""
+    found = [path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
+    if not found:
+        raise InputError(f"{folder}: holds no PNG or JPEG images")
+    return sorted(found, key=lambda path: (len(path.stem), path.name))
+
+
+def _matrix(file: Path) -> np.ndarray | None:
+    """world_from_camera [4, 4]; None where tracking was lost: not finite, or all zero."""
+    matrix = _numbers(file, 4)
+    if matrix.shape != (4, 4):
+        raise InputError(f"{file}: {len(matrix)} rows, expected a 4×4 matrix world_from_camera")
+    return matrix if np.isfinite(matrix).all() and matrix[:3, :3].any() else None
+
+
+def _numbers(file: Path, columns: int) -> np.ndarray:
+    rows = [line.split() for line in _lines(file)]
+    try:
+        table = np.array(rows, np.float64)
+    except ValueError as error:
+        raise InputError(f"{file}: expected lines of {columns} numbers ({brief(str(error))})") from error
+    if table.ndim != 2 or table.shape[1] < columns:
+        raise InputError(f"{file}: expected lines of {columns} numbers")
+    return table
+
+
+def _lines(file: Path) -> list[str]:
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: cannot be read as text") from error
+    lines = [line.replace(",", " ") for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    if not lines:
+        raise InputError(f"{file}: is empty")
+    return lines
+
+
+def _matrix_lens(file: Path, size: tuple[int, int]) -> Lens | None:
+    if not file.is_file():
+        return None
+    K = _numbers(file, 3)
+    if len(K) < 3:
+        raise InputError(f"{file}: {len(K)} rows, expected a matrix of intrinsics, 3×3 or 4×4")
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    if not (min(fx, fy) > 0 and abs(cx / size[0] - 0.5) < 0.25 and abs(cy / size[1] - 0.5) < 0.25):
+        raise InputError(
+            f"{file}: focal length {fx:g} and centre ({cx:g}, {cy:g}) are not those of images of {size[0]}×{size[1]}; "
+            "were they resized? give --camera FILE, or the original images"
+        )
+    return _lens((fx, fy, cx, cy), size)
+
+
+def _open3d_lens(file: Path) -> Lens:
+    data = read_json(file)
+    try:
+        K = np.array(data["intrinsic_matrix"], np.float64).reshape(3, 3).T  # stored by columns
+        return _lens((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), (int(data["width"]), int(data["height"])))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{file}: expected Open3D's camera intrinsics: width, height, intrinsic_matrix") from error
+
+
+def _lens(values: tuple[float, ...], size: tuple[int, int]) -> Lens:
+    fx, fy, cx, cy, *k = (float(value) for value in values)
+    centred = (fx, fy, cx + 0.5, cy + 0.5)
+    return Lens("FULL_OPENCV", (*centred, *k, 0.0, 0.0, 0.0), *size) if any(k) else Lens("PINHOLE", centred, *size)
+
+
+def _missing(count: int, total: int, what: str) -> list[str]:
+    return [f"{count} of {total} photos have not {what}"] if count else []
