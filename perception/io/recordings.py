@@ -68,8 +68,8 @@ def recorded_scene(
 ) -> Scene:
     """The chosen frames of a recording as a Scene in its own world, whose unit is the metre.
 
-    masks, cloud, poses: as for `read_transforms`. InputError for poses that are not rigid, a missing lens, and depth whose
-    unit cannot be right. strict: damaged photos raise InputError, else they are left out.
+    masks, cloud, poses: as for `read_transforms`. strict: damaged photos raise InputError, else they are left out.
+    InputError for poses that are not rigid, a missing lens, and depth whose unit cannot be right.
     """
     source, kind, lens = recording.source, recording.kind, recording.lens
     if not recording.frames:

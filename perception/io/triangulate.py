@@ -49,7 +49,8 @@ def posed_scene(
         if check:
             started = time.perf_counter()
             views, found = checked_poses(views, store, poses)
-            report |= {**found, "warnings": [*report["warnings"], *found["warnings"]]}
+            report |= {key: [*report.get(key, []), *found[key]] for key in ("notes", "warnings")}
+            report["poses"] = found["poses"]
             report["seconds"]["refinement"] = time.perf_counter() - started
         if few:
             points, colors, found = triangulated_cloud(views, store, seed)
