@@ -83,6 +83,9 @@ class LossConfig(Settings):
     negative: Literal["squared", "unsquared"] = Field(
         "squared", description="distance in L_neg: squared as in the paper, unsquared as in the authors' code"
     )
+    depth_weight: float = Field(
+        0.5, ge=0, le=1000, description="weight of the depth loss of photos with depth images; 0: depth is not used"
+    )
     start: float = Field(0.3, ge=0, le=1, description="share of the training after which features are trained")
     every: int = Field(2, ge=1, le=10**8, description="features are trained in every N-th iteration")
     half_resolution: bool = Field(True, description="features are trained at half the resolution of the photos")

@@ -114,6 +114,46 @@ def photometric_loss(
     return photometric(render, target, beta, weight).value
 
 
+# ---------- depth
+
+_DEPTH_NOISE = 0.01
+"""Relative error of depth below which the loss is quadratic: the noise of a Kinect at 2 m is 0.7 cm."""
+
+
+class _Depth(Function):
+    @staticmethod
+    def forward(ctx: Any, depths: Tensor, alphas: Tensor, measured: Tensor) -> Tensor:
+        known = measured > 0
+        count = max(1, int(known.sum()))
+        target = torch.where(known, measured, torch.ones_like(measured))
+        expected = depths / alphas.clamp(min=1e-6)
+        error = expected / target - 1
+        length = (error * error + _DEPTH_NOISE**2).sqrt()
+        pull = torch.where(known, error / (length * target * count), torch.zeros_like(depths))
+        ctx.save_for_backward(pull, torch.where(known, -pull * expected - 1 / count, torch.zeros_like(pull)))
+        value = torch.where(known, alphas * (length - _DEPTH_NOISE) + 1 - alphas, torch.zeros_like(pull))
+        return depths.new_tensor(_kernels.sum(value.reshape(-1), False) / count)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+        of_depths, of_alphas = ctx.saved_tensors
+        return of_depths * grad, of_alphas * grad, None
+
+
+def depth_loss(depths: Tensor, alphas: Tensor, measured: Tensor) -> Tensor:
+    """L_depth = 1/|M| Σ_{p ∈ M} [α̅ ρ(D / (α d) − 1) + 1 − α], ρ(e) = sqrt(e² + σ²) − σ, over the measured pixels M.
+
+    depths, alphas: [H, W] D = Σ z w and α = Σ w as rendered. measured: [H, W] d, 0 = none, of the same dtype. D / α is
+    the expected depth. Charbonnier's ρ of the relative error bounds the pull of wrong measurements. α̅ is α taken as
+    constant, so that nearly empty pixels have no large gradients. 1 − α: what a sensor measured is opaque.
+    """
+    if not depths.shape == alphas.shape == measured.shape or depths.ndim != 2:
+        found = ", ".join(str(list(t.shape)) for t in (depths, alphas, measured))
+        raise InputError(f"depth loss: found {found}, expected one shape [H, W]")
+    return _Depth.apply(depths.contiguous(), alphas.contiguous(), _ready("measured", measured))
+
+
 # ---------- instance
 
 

@@ -2,6 +2,8 @@
 
     L = L_RGB + λ_inst2d L_inst2d + λ_var L_var                                                                (eq. 14)
 
+and λ_depth L_depth where a sensor measured depth.
+
 All schedules are functions of progress in [0, 1], the larger of the shares of iterations done and of time spent. A time
 limit thus shortens every phase instead of cutting off the end. Random numbers depend on (seed, iteration) only, so a
 run resumed from a checkpoint takes the same steps as one without interruption.
@@ -18,7 +20,7 @@ import torch
 
 from perception.config import MapConfig
 from perception.gaussians.densify import Statistics
-from perception.gaussians.losses import instance_loss, photometric_loss, variance_loss
+from perception.gaussians.losses import depth_loss, instance_loss, photometric_loss, variance_loss
 from perception.gaussians.model import Gaussians, sigmoid
 from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.rasterize import Rasterization, rasterize
@@ -105,6 +107,9 @@ class Trainer:
             if with_features:
                 loss = loss + self._feature_losses(view, out)
             images = [image for image in (out.colors, out.features, out.feature_variance) if image is not None]
+            if view.depth is not None:
+                loss = loss + self.config.losses.depth_weight * depth_loss(out.depths[0], out.alphas[0], view.depth)
+                images += [out.depths, out.alphas]
             cotangents = torch.autograd.grad(loss, images, allow_unused=True)
         with self.record.timed("rasterizer backward"):
             used = [(image, grad) for image, grad in zip(images, cotangents, strict=True) if grad is not None]
@@ -138,7 +143,7 @@ class Trainer:
             sh_degree=self.gaussians.sh_degree,
             features=params["features"] if with_features else None,
             background=torch.from_numpy(colors),
-            depth=False,
+            depth=view.depth is not None,
             eps2d=view.eps2d,
         )
 
@@ -210,9 +215,13 @@ class Trainer:
 
     @torch.no_grad()
     def depth(self, name: str) -> np.ndarray:
-        """Rendered depth [H, W] float32 along the optical axis of training view `name`, 0 = no surface."""
+        """Depth [H, W] float32 along the optical axis of training view `name`, 0 = no surface.
+
+        It is what a sensor measured, and rendered where nothing was.
+        """
         view = next(view for view in self.views if view.name == name)
-        return depth_image(self.gaussians, view.camera_from_world, view.K, *view.photo.shape[1::-1]).numpy()
+        rendered = depth_image(self.gaussians, view.camera_from_world, view.K, *view.photo.shape[1::-1])
+        return (rendered if view.depth is None else torch.where(view.depth > 0, view.depth, rendered)).numpy()
 
     def _restart_optimiser(self, state: dict[str, Any]) -> None:
         self.gaussians = Gaussians(**state["params"])

@@ -16,6 +16,8 @@ from perception.types import DepthImage, Lens, View
 
 SATURATED = 65535
 """Value of 16-bit depth images that means "too far to measure"."""
+_EDGE = 0.05
+"""Relative step of depth between neighbouring pixels that belong to two surfaces."""
 _ASPECT = 0.02
 """Largest relative difference between the aspect ratios of a depth image and its photo: sizes are whole pixels."""
 
@@ -60,6 +62,16 @@ def load_depth(view: View, width: int, height: int) -> np.ndarray:
     depth = np.zeros((height, width), np.float32)
     depth[inside] = image[y[inside].astype(np.int64), x[inside].astype(np.int64)] * np.float32(view.depth.scale)
     return depth
+
+
+def without_edges(depth: np.ndarray) -> np.ndarray:
+    """depth [h, w], 0 = none, with 0 at every pixel that has a depth edge in its 3 × 3 neighbourhood.
+
+    At edges sensors measure mixtures of both surfaces, and the shift between colour and depth camera is not exact.
+    """
+    kernel = np.ones((3, 3), np.uint8)
+    near = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), kernel)
+    return np.where(cv2.dilate(depth, kernel) - near <= _EDGE * depth, depth, np.float32(0))
 
 
 def _depth_lens(view: View, depth: DepthImage, width: int, height: int) -> Lens:

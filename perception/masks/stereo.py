@@ -1,9 +1,9 @@
 """Depth of every photo by multi-view stereo: plane sweep (Collins 1996) and semi-global matching (Hirschmüller 2008).
 
-The depth rendered from a partly trained map fits colours and not surfaces, so it is only a prior. Planes perpendicular
-to the optical axis, evenly spaced in inverse depth, warp neighbouring photos into this one. The matching cost comes
-from zero-mean normalised cross-correlation. Semi-global aggregation along four directions selects a smooth depth.
-Depths that no neighbour confirms are dropped.
+What a sensor measured is the depth. Depth rendered from a partly trained map fits colours and not surfaces, so it is
+only a prior. Planes perpendicular to the optical axis, evenly spaced in inverse depth, warp neighbouring photos into
+this one. The matching cost comes from zero-mean normalised cross-correlation. Semi-global aggregation along four
+directions selects a smooth depth. Depths that no neighbour confirms are dropped.
 """
 
 from __future__ import annotations
@@ -27,11 +27,15 @@ _AGREE = 0.03  # largest relative difference of depths that confirm each other
 
 
 def measure_depths(views: list[StereoView], progress: Progress | None = None) -> None:
-    """Replaces the depths of all views by stereo depths, and marks the pixels confirmed by other views."""
+    """Replaces the depths of all views by stereo depths, and marks the pixels confirmed by other views.
+
+    Depths that a sensor measured are kept, averaged with those of the views that agree.
+    """
     chosen = choose_neighbours(views)
 
     def depth_of(i: int) -> np.ndarray:
-        return sweep(views[i], [views[j] for j in chosen[i]]) if chosen[i] else views[i].depth
+        swept = chosen[i] and not views[i].measured
+        return sweep(views[i], [views[j] for j in chosen[i]]) if swept else views[i].depth
 
     depths = []
     pool = ThreadPoolExecutor(os.cpu_count())

@@ -18,7 +18,7 @@ class StereoView:
     """One photo. photo: [h, w, 3] uint8 RGB; grey: [h, w] float32; K: [3, 3]; camera_from_world: [4, 4] float64.
 
     prior: [h, w] depth known before stereo, 0 = none. depth: [h, w] current best depth. confirmed: [h, w] bool, pixels
-    whose depth other photos agree with.
+    whose depth other photos agree with. measured: the prior comes from a sensor.
     """
 
     name: str
@@ -29,6 +29,7 @@ class StereoView:
     prior: np.ndarray
     depth: np.ndarray
     confirmed: np.ndarray
+    measured: bool = False
 
     @property
     def center(self) -> np.ndarray:
@@ -60,4 +61,5 @@ def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray) -> Stereo
     K = np.diag([size[0] / view.width, size[1] / view.height, 1.0]) @ view.K
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
     pose = np.asarray(view.camera_from_world, np.float64)
-    return StereoView(view.name, small, grey, K, pose, prior, filled_depth(prior), prior > 0)
+    measured = view.depth is not None
+    return StereoView(view.name, small, grey, K, pose, prior, filled_depth(prior), prior > 0, measured)

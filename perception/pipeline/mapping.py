@@ -6,7 +6,8 @@ Section (§) and equation numbers are the paper's (Piekenbrinck et al. 2025).
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from perception.config import MapConfig
 from perception.errors import InputError
+from perception.gaussians.depth_start import start_on_surface
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
 from perception.instances.label_transfer import transfer_labels, transfer_text
@@ -31,7 +33,8 @@ from perception.pipeline.estimate import tell_estimate
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
 from perception.pipeline.photos import load_all, split_views, with_labels
 from perception.pipeline.record import Stages, finite, peak_memory_mib, versions
-from perception.pipeline.summary import frame_lines
+from perception.pipeline.sensor_depth import depth_errors, depth_used
+from perception.pipeline.summary import depth_text, frame_lines
 from perception.pipeline.work_folder import clear_work, frames_folder, working
 from perception.progress import Progress
 from perception.types import Scene, View
@@ -82,7 +85,7 @@ def build_map(
             views = load_all(training, config.photos.max_side, progress)
             held = load_all(held_out, config.photos.max_side, progress)
 
-        trainer = Trainer(initial_gaussians(scene, config), views, config, held)
+        trainer = Trainer(initial_gaussians(scene, config, views), views, config, held)
         from_geometry = isinstance(mask_source, GeometryMaskSource)
         masks_enter = GEOMETRY_START if from_geometry else config.losses.start
         mark = training_mark(source, config)
@@ -110,7 +113,7 @@ def build_map(
             found = describe(gaussians, grouped, views, config.language, encoder, progress)
 
         with stages("score"):
-            quality = score_views(gaussians, held)
+            quality = score_views(gaussians, held, scene.metric)
         record = {
             "frame": scene.frame,
             "metric": scene.metric,
@@ -122,6 +125,7 @@ def build_map(
             "versions": versions(),
             "scene": {key: fact for key, fact in scene.report.items() if key not in FRAME_FACTS},
             "masks": mask_report,
+            "depth": depth_used(views),
             "training": vars(trainer.record),
             "instances": found.report,
             "quality": quality,
@@ -170,16 +174,24 @@ def _scene(source: Path, output: Path, work: Path, config: MapConfig, progress: 
             poses=config.photos.poses,
         )
         save_scene(kept, scene := recentred(scene))
+    if config.losses.depth_weight == 0:
+        return replace(scene, views=[replace(view, depth=None) for view in scene.views])
     return scene
 
 
-def initial_gaussians(scene: Scene, config: MapConfig) -> Gaussians:
-    """One Gaussian per point of the sparse cloud; a random subset if there are more points than the budget."""
+def initial_gaussians(scene: Scene, config: MapConfig, views: Sequence[TrainingView] = ()) -> Gaussians:
+    """One Gaussian per voxel of the surface that depth sensors measured in `views`, and per point of the sparse cloud
+    elsewhere; a random subset if there are more points than the budget."""
     points, colors = scene.points, scene.point_colors
-    if len(points) > config.train.budget:
-        keep = np.random.default_rng(config.seed).choice(len(points), config.train.budget, replace=False)
+    feature_dim, budget, seed = config.losses.feature_dim, config.train.budget, config.seed
+    real = slice(0) if scene.report.get("points_from") == "random" else slice(None)
+    surface = start_on_surface(views, points[real], colors[real], budget, feature_dim, seed)
+    if surface is not None:
+        return surface
+    if len(points) > budget:
+        keep = np.random.default_rng(seed).choice(len(points), budget, replace=False)
         points, colors = points[np.sort(keep)], colors[np.sort(keep)]
-    return from_points(points, colors, feature_dim=config.losses.feature_dim, seed=config.seed)
+    return from_points(points, colors, feature_dim=feature_dim, seed=seed)
 
 
 def _masks(
@@ -205,8 +217,11 @@ def _masks(
     return report
 
 
-def score_views(gaussians: Gaussians, views: list[TrainingView]) -> dict[str, Any]:
-    """PSNR and SSIM of each view without ignored pixels, and their means; empty without views."""
+def score_views(gaussians: Gaussians, views: list[TrainingView], metric: bool = False) -> dict[str, Any]:
+    """PSNR and SSIM of each view without ignored pixels, and their means; empty without views.
+
+    Depth is compared where it was measured; metric: the unit is the metre.
+    """
     from perception.evaluate.images import ssim
 
     per_view = {}
@@ -218,7 +233,8 @@ def score_views(gaussians: Gaussians, views: list[TrainingView]) -> dict[str, An
     if not per_view:
         return {"views": {}}
     means = {name: float(np.mean([entry[name] for entry in per_view.values()])) for name in ("psnr", "ssim")}
-    return {**means, "views": per_view}
+    depth = depth_errors(gaussians, views, metric)
+    return {**means, **({"depth": depth} if depth else {}), "views": per_view}
 
 
 def _assemble(
@@ -258,7 +274,9 @@ def _transfer_labels(old: Map, gmap: Map, progress: Progress) -> None:
 
 def _tell_scene(scene: Scene, progress: Progress) -> None:
     report = scene.report
-    progress.log(f"{len(scene.views)} posed photos, {len(scene.points)} points")
+    with_depth = sum(view.depth is not None for view in scene.views)
+    depth = f", {with_depth} with depth" if with_depth else ""
+    progress.log(f"{len(scene.views)} posed photos{depth}, {len(scene.points)} points")
     for line in frame_lines({"metric": scene.metric, **report}):
         progress.log(line)
     for note in report.get("notes", []):
@@ -272,6 +290,7 @@ def _tell_scene(scene: Scene, progress: Progress) -> None:
 def _tell_result(gmap: Map, output: Path, progress: Progress) -> None:
     info, quality = gmap.info, gmap.info["quality"]
     scored = f", held-out PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.3f}" if quality.get("psnr") else ""
+    scored += f", {depth_text(quality['depth'])}" if "depth" in quality else ""
     progress.log(
         f"{output}: {len(gmap)} Gaussians, {len(gmap.instances)} instances{scored}, "
         f"{info['seconds']['total']:.0f} s, peak {info['peak_memory_mib']:.0f} MiB"

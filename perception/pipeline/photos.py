@@ -10,6 +10,7 @@ import torch
 
 from perception.errors import InputError
 from perception.gaussians.train import TrainingView
+from perception.io.depth import load_depth, without_edges
 from perception.io.ignore_masks import load_weight
 from perception.io.photos import load_photo, scaled_K
 from perception.masks.label_images import load_labels
@@ -44,10 +45,13 @@ def _names(listed: Path) -> set[str]:
 
 
 def training_view(view: View, max_side: int) -> TrainingView:
-    """Decodes one photo, and its mask of pixels to ignore."""
+    """Decodes one photo, its mask of pixels to ignore, and its depth image without ignored pixels."""
     photo = load_photo(view, max_side)
     height, width = photo.shape[:2]
     weight = load_weight(view, width, height)
+    depth = None
+    if view.depth is not None:
+        depth = without_edges(load_depth(view, width, height)) * (1 if weight is None else weight > 0)
     return TrainingView(
         view.name,
         torch.from_numpy(photo),
@@ -55,6 +59,7 @@ def training_view(view: View, max_side: int) -> TrainingView:
         torch.from_numpy(scaled_K(view, width, height).astype(np.float32)),
         torch.from_numpy(view.camera_from_world.astype(np.float32)),
         weight=None if weight is None else torch.from_numpy(weight),
+        depth=None if depth is None else torch.from_numpy(depth),
     )
 
 
@@ -67,7 +72,7 @@ def with_labels(decoded: TrainingView, view: View, folder: Path) -> TrainingView
 
 
 def load_all(views: list[View], max_side: int, progress: Progress) -> list[TrainingView]:
-    """Decodes all `views`; takes 3 bytes of memory per pixel."""
+    """Decodes all `views`; takes 3 bytes of memory per pixel, and 4 more with depth."""
     loaded = []
     for done, view in enumerate(views, start=1):
         loaded.append(training_view(view, max_side))

@@ -21,6 +21,7 @@ from perception.io.photos import load_photo, scaled_K
 from perception.io.store import Map
 from perception.pictures import features_to_rgb, montage, outline, overlay
 from perception.pipeline.rendering import as_gaussians
+from perception.pipeline.summary import depth_text
 from perception.pipeline.top_view import instances_top_view
 from perception.pipeline.view_coverage import weak_coverage
 from perception.query import QueryMap
@@ -170,6 +171,8 @@ def _figures(gmap: Map) -> dict[str, str]:
             "Held-out PSNR": f"{info['quality']['psnr']:.2f} dB",
             "SSIM": f"{info['quality']['ssim']:.3f}",
         }
+    if info["quality"].get("depth"):
+        figures["Held-out depth"] = depth_text(info["quality"]["depth"])
     figures["Time"] = f"{info['seconds']['total']:.0f} s"
     figures["Peak memory"] = f"{info['peak_memory_mib']:.0f} MiB"
     return figures

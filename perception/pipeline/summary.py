@@ -83,6 +83,12 @@ def info_text(path: Path, info: dict[str, Any]) -> str:
         lines.append(
             f"held-out views: PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.4f} over {len(quality['views'])}"
         )
+    if info.get("depth"):
+        lines.append(
+            f"depth images: {info['depth']['views']}, measured in {info['depth']['measured']:.0%} of their pixels"
+        )
+    if quality.get("depth"):
+        lines.append(f"held-out views: {depth_text(quality['depth'])}")
     lines += [f"decision: {text}" for text in training.get("decisions", [])]
     lines += [f"left out: {entry['name']} ({entry['why']})" for entry in scene.get("left_out", [])]
     lines += [f"warning: {text}" for text in scene.get("warnings", [])]
@@ -96,6 +102,13 @@ def frame_lines(info: dict[str, Any]) -> list[str]:
         origin = np.linalg.inv(info["map_from_input"])[:3, 3]
         lines.append(f"the map's origin lies at {origin.round(6).tolist()} of its input")
     return lines
+
+
+def depth_text(errors: dict[str, Any]) -> str:
+    """`depth_errors` as a phrase."""
+    in_metres = errors["unit"] == "m"
+    median, tolerance = ((f"{100 * errors[key]:.2g} {'cm' if in_metres else '%'}") for key in ("median", "tolerance"))
+    return f"depth error {median} in the median, {errors['close']:.0%} within {tolerance}"
 
 
 def _rates(training: dict[str, Any]) -> str:

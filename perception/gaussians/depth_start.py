@@ -1,0 +1,159 @@
+"""Starts Gaussians on the surface that depth sensors measured: the depth images of all views, fused into voxels.
+
+The noise of a triangulating sensor grows with the square of the distance, so a pixel counts z⁻⁴, the inverse of its
+variance. Voxels that other cameras look through are noise, reflections or moving things, and are dropped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from perception.gaussians.model import Gaussians, from_points
+from perception.gaussians.views import TrainingView
+from perception.masks.surface import voxel_keys
+
+SAMPLES = 1_500_000
+"""Most pixels that are fused; an even grid of pixels is taken from more."""
+FINEST = 2.0
+"""Least voxel side in pixel footprints at the median depth."""
+LEAST_PIXELS = 2
+AGREE = 0.04
+"""Relative difference of depths up to which a view sees a voxel. If its depth is larger, it looks through the voxel."""
+STEEPEST = 0.2
+"""Least cosine between a pixel's ray and the surface normal: steeper surfaces are measured badly."""
+OPACITY, WIDTH, THICKNESS, NEIGHBOURS = 0.9, 0.7, 0.1, 9
+"""The first Gaussians are nearly opaque discs: WIDTH of the voxels' spacing, THICKNESS of that along the normal of
+their nearest NEIGHBOURS. Balls hide what lies behind slanted surfaces: their depth is 5 cm too short in the median, and
+that of discs 3 cm (kitchen_rgbd, voxels of 6 cm, before training)."""
+SHARE = 0.5
+"""Share of the budget for the surface; the rest grows where the photos need it."""
+
+
+@dataclass(frozen=True)
+class DepthCloud:
+    """side: of the voxels; points [P, 3] float64 in the world frame, one per voxel; colors [P, 3] uint8."""
+
+    side: float
+    points: np.ndarray
+    colors: np.ndarray
+
+
+def start_on_surface(
+    views: Sequence[TrainingView], points: np.ndarray, colors: np.ndarray, budget: int, feature_dim: int, seed: int
+) -> Gaussians | None:
+    """One Gaussian per voxel of the fused depth of `views`, and per sparse point where no depth was measured.
+
+    points [P, 3], colors [P, 3] uint8: sparse points. None when no depth was measured. At most SHARE of the budget is
+    used.
+    """
+    from scipy.spatial import cKDTree
+
+    most = max(1, int(SHARE * budget))
+    cloud = fuse_depth(views, most)
+    if cloud is None:
+        return None
+    balls = from_points(cloud.points, cloud.colors, feature_dim=feature_dim, seed=seed, opacity=OPACITY)
+    surface = _discs(balls)
+    away = cKDTree(cloud.points).query(points)[0] > 4 * cloud.side if len(points) else np.zeros(0, bool)
+    rest = np.flatnonzero(away)[: most - len(surface)]
+    if len(rest) == 0:
+        return surface
+    return Gaussians.concatenate([surface, from_points(points[rest], colors[rest], feature_dim=feature_dim, seed=seed)])
+
+
+def _discs(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians as discs in the planes of their nearest neighbours, sizes as WIDTH and THICKNESS say."""
+    from scipy.spatial import cKDTree
+    from scipy.spatial.transform import Rotation
+
+    means = gaussians.means.double().numpy()
+    near = means[cKDTree(means).query(means, k=min(NEIGHBOURS, len(means)))[1].reshape(len(means), -1)]
+    offset = near - near.mean(axis=1, keepdims=True)
+    covariance = np.stack([(offset * offset[..., i : i + 1]).sum(axis=1) for i in range(3)], axis=1)
+    axes = np.linalg.eigh(covariance)[1]  # columns, by ascending variance: the first is the normal
+    axes *= np.linalg.det(axes)[:, None, None]
+    quats = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]
+    log_scales = gaussians.log_scales + math.log(WIDTH) + torch.tensor([math.log(THICKNESS), 0, 0])
+    return replace(gaussians, quats=torch.from_numpy(np.ascontiguousarray(quats, np.float32)), log_scales=log_scales)
+
+
+def fuse_depth(views: Sequence[TrainingView], most: int) -> DepthCloud | None:
+    """At most `most` points of the surface that the depth images of `views` show; None when nothing was measured."""
+    measured = [view for view in views if view.depth is not None and bool((view.depth > 0).any())]
+    if not measured:
+        return None
+    pixels = sum(view.photo.shape[0] * view.photo.shape[1] for view in measured)
+    every = max(1, int(np.ceil(np.sqrt(pixels / SAMPLES))))
+    samples = [_samples(view, every) for view in measured]
+    points, colors, weights, footprints = (np.concatenate(parts) for parts in zip(*samples, strict=True))
+    if len(points) == 0:
+        return None
+    side = FINEST * float(np.median(footprints))
+    while True:
+        cloud = _voxels(points, colors, weights, side, measured)
+        if len(cloud.points) <= most:
+            return cloud
+        side *= max(1.05, float(np.sqrt(len(cloud.points) / most)))
+
+
+def _samples(view: TrainingView, every: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """World points [P, 3], colours [P, 3], weights [P] and pixel footprints [P] of every `every`-th measured pixel."""
+    assert view.depth is not None
+    z, K = view.depth.double().numpy(), view.K.double().numpy()
+    row, column = np.mgrid[every // 2 : z.shape[0] : every, every // 2 : z.shape[1] : every].reshape(2, -1)
+    known = (z[row, column] > 0) & (_facing(z, K)[row, column] > STEEPEST)
+    row, column = row[known], column[known]
+    depth = z[row, column]
+    local = np.stack([(column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(depth))], axis=1)
+    pose = view.camera_from_world.double().numpy()
+    # Explicit sums: the rounding of a matrix product can depend on the number of threads.
+    points = ((local * depth[:, None] - pose[:3, 3])[:, :, None] * pose[:3, :3]).sum(axis=1)
+    return points, view.photo.numpy()[row, column], depth**-4.0, depth / K[0, 0]
+
+
+def _facing(z: np.ndarray, K: np.ndarray, reach: int = 4) -> np.ndarray:
+    """[h, w] cosine between ray and surface normal, from differences over `reach` pixels; 1 where one is missing."""
+    slopes = []
+    for axis, focal in ((0, K[1, 1]), (1, K[0, 0])):
+        ahead, behind = np.roll(z, -reach, axis), np.roll(z, reach, axis)
+        known = (ahead > 0) & (behind > 0)
+        for image, edge in ((known, slice(None, reach)), (known, slice(-reach, None))):
+            np.moveaxis(image, axis, 0)[edge] = False
+        slopes.append(np.where(known, (ahead - behind) * focal / (2 * reach * np.where(z > 0, z, 1)), 0))
+    return 1 / np.sqrt(1 + slopes[0] ** 2 + slopes[1] ** 2)
+
+
+def _voxels(
+    points: np.ndarray, colors: np.ndarray, weights: np.ndarray, side: float, views: list[TrainingView]
+) -> DepthCloud:
+    """Weighted means of the samples in each voxel of LEAST_PIXELS or more that no majority of views looks through."""
+    _, index, count = np.unique(voxel_keys(points, side), return_inverse=True, return_counts=True)
+    total = np.bincount(index, weights)
+    values = np.concatenate([points, colors], axis=1)
+    means = np.stack([np.bincount(index, weights * column) for column in values.T], axis=1) / total[:, None]
+    means = means[count >= LEAST_PIXELS]
+    means = means[_consistent(means[:, :3], side, views)]
+    return DepthCloud(side, means[:, :3], np.rint(means[:, 3:]).astype(np.uint8))
+
+
+def _consistent(points: np.ndarray, side: float, views: list[TrainingView]) -> np.ndarray:
+    """[P] bool: whether at least as many views measured each point as measured something behind it."""
+    seen, through = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    for view in views:
+        assert view.depth is not None
+        depth, K, pose = view.depth.numpy(), view.K.double().numpy(), view.camera_from_world.double().numpy()
+        x, y, z = ((points * pose[i, :3]).sum(axis=1) + pose[i, 3] for i in range(3))
+        ahead = z > 0
+        column, row = (np.floor(K[i, i] * c / np.where(ahead, z, 1) + K[i, 2]) for i, c in ((0, x), (1, y)))
+        inside = ahead & (column >= 0) & (row >= 0) & (column < depth.shape[1]) & (row < depth.shape[0])
+        theirs = np.zeros(len(points))
+        theirs[inside] = depth[row[inside].astype(np.int64), column[inside].astype(np.int64)]
+        slack = AGREE * theirs + side / 2
+        seen += (theirs > 0) & (np.abs(theirs - z) <= slack)
+        through += (theirs > 0) & (theirs - z > slack)
+    return seen >= np.maximum(through, 1)
