@@ -104,6 +104,9 @@ class LanguageConfig(Settings):
     encoder: str = Field("auto", description="auto, none, conse or clip:FOLDER: what describes the instances")
     views: int = Field(5, ge=1, le=1000, description="best views K that describe an instance (paper: 5)")
     zooms: int = Field(0, ge=0, le=20, description="crops L of each view (paper: 3); 0: as suits the encoder")
+    texts: Literal["auto", "on", "off"] = Field(
+        "auto", description="reading of printed texts; auto: if the extra ocr is installed"
+    )
 
 
 class MapConfig(Settings):

@@ -132,20 +132,25 @@ def _add_info(commands: Any) -> None:
 
 
 def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.io.map import Map
     from perception.io.store import read_info, verify_map
     from perception.pipeline.summary import info_text
 
     info = read_info(args.map)
+    entries = Map.open(args.map).instances
+    texts = {entry["id"]: entry["texts"] for entry in entries if entry.get("texts")}
+    told = info_text(args.map, info, texts)
+    info = {**info, "texts": texts} if texts else info
     if args.sheet is not None:
         from perception.pipeline.reporting import write_sheet
         from perception.query import load_map
 
         write_sheet(load_map(args.map), args.sheet)
     if not args.verify:
-        return info, info_text(args.map, info)
+        return info, told
     states = verify_map(args.map)
     lines = [f"{name}: {state}" for name, state in states.items()]
-    return {**info, "verified": states}, "\n".join([info_text(args.map, info), *lines])
+    return {**info, "verified": states}, "\n".join([told, *lines])
 
 
 def _add_report(commands: Any) -> None:

@@ -193,6 +193,8 @@ class Editor:
         label = next((entry["label"] for entry in entries if entry.get("label")), None)
         merged = self._entry(new, ids, label, float(weights @ [e["score"] for e in entries] / weights.sum()))
         merged["views"] = max(int(entry.get("views", 0)) for entry in entries)
+        if texts := [text for entry in entries for text in entry.get("texts", [])]:
+            merged["texts"] = texts
         self._replace(f"merged {', '.join(map(str, chosen))} into {new}", places, ids, [merged], joined)
         return new
 

@@ -15,6 +15,7 @@ from perception.instances.crops import choose_views, view_scores
 from perception.instances.describe import describe_instances
 from perception.instances.group import Grouping, group
 from perception.instances.silhouettes import Silhouettes, render_silhouettes
+from perception.instances.texts import Reader, read_texts, store_texts
 from perception.instances.votes import mask_votes
 from perception.language.base import Encoder, reading_of
 from perception.language.description import to_arrays
@@ -64,8 +65,10 @@ def describe(
     words: LanguageConfig,
     encoder: Encoder | None,
     progress: Progress,
+    reader: Reader | None = None,
 ) -> FoundInstances:
-    """Geometry, score and views of each instance and, with an encoder, its language embeddings (§3.2.2)."""
+    """Geometry, score and views of each instance; with an encoder its language embeddings (§3.2.2), with a reader its
+    printed texts."""
     count = len(gaussians)
     if grouped is None:
         report = {"warnings": ["no photo has masks"]}
@@ -74,6 +77,10 @@ def describe(
     found = FoundInstances(grouped.ids, grouped.membership, _entries(grouped, gaussians, seen))
     if encoder is not None and grouped.count:
         found.language = _embed(encoder, grouped.ids, seen, views, words.views, words.zooms, progress)
+    if reader is not None and grouped.count:
+        choices = _best_views(grouped.ids, seen, views, words.views)
+        texts = read_texts(reader, choices, lambda n: (views[n].photo.numpy(), seen[n].ids), progress)
+        store_texts(found.instances, texts)
     if grouped.parents:
         local = np.where(grouped.part_ids >= 0, grouped.part_ids - grouped.count, -1).astype(np.int32)
         language: dict[str, np.ndarray] = {}
@@ -87,6 +94,8 @@ def describe(
         "noise_share": float(np.mean(grouped.ids < 0)) if count else 0.0,
         "encoder": str(found.language["encoder"]) if found.language else None,
     }
+    if reader is not None:
+        found.report["texts"] = reader.identity
     return found
 
 
@@ -144,16 +153,21 @@ def _embed(
 
     zooms 0: the default number of the encoder.
     """
-    pixels = np.stack([view.pixels for view in seen], axis=1)
-    total = np.maximum(np.bincount(ids[ids >= 0], minlength=len(pixels)), 1)
-    visible = np.stack([view.visible for view in seen], axis=1) / total[:, None]
-    sizes = np.array([view.photo.shape[0] * view.photo.shape[1] for view in views])
     descriptions = describe_instances(
         encoder,
-        choose_views(view_scores(pixels, sizes, visible), best),
+        _best_views(ids, seen, views, best),
         lambda index: (views[index].photo.numpy(), seen[index].ids),
         [view.name for view in views],
         levels=zooms or reading_of(encoder).zooms,
         progress=progress,
     )
     return to_arrays(descriptions, encoder.identity)
+
+
+def _best_views(ids: np.ndarray, seen: list[Silhouettes], views: list[TrainingView], best: int) -> list[np.ndarray]:
+    """The `best` views of each instance (eq. 10), see `crops.choose_views`."""
+    pixels = np.stack([view.pixels for view in seen], axis=1)
+    total = np.maximum(np.bincount(ids[ids >= 0], minlength=len(pixels)), 1)
+    visible = np.stack([view.visible for view in seen], axis=1) / total[:, None]
+    sizes = np.array([view.photo.shape[0] * view.photo.shape[1] for view in views])
+    return choose_views(view_scores(pixels, sizes, visible), best)

@@ -26,6 +26,7 @@ from perception.io.recentre import recentred
 from perception.io.scene_cache import load_saved_scene, save_scene
 from perception.io.store import Map, read_info, read_map, write_map
 from perception.language.base import Encoder
+from perception.language.ocr import make_reader
 from perception.masks import MaskSource, compute_masks, make_source
 from perception.masks.source import GeometryMaskSource
 from perception.pipeline.checkpoint import TrainingObserver, fingerprint, poses_mark, training_mark
@@ -75,6 +76,7 @@ def build_map(
         # Files and models are opened first, so that errors appear before hours of work.
         mask_source = make_source(config.masks)
         encoder = _encoder(config.language.encoder, progress)
+        reader = make_reader(config.language.texts)
 
         # Posed images I_v (§3.2) and a sparse cloud.
         with stages("poses"):
@@ -110,7 +112,7 @@ def build_map(
         # Group the Gaussians by their features into instances (§3.2.1), describe these from their best views (§3.2.2).
         with stages("instances"):
             grouped = group_gaussians(gaussians, views, config, progress)
-            found = describe(gaussians, grouped, views, config.language, encoder, progress)
+            found = describe(gaussians, grouped, views, config.language, encoder, progress, reader)
 
         with stages("score"):
             quality = score_views(gaussians, held, scene.metric)

@@ -25,6 +25,7 @@ from perception.pipeline.summary import depth_text
 from perception.pipeline.top_view import instances_top_view
 from perception.pipeline.view_coverage import weak_coverage
 from perception.query import QueryMap
+from perception.query.hit import printed_texts
 from perception.report import InstanceRow, QueryRow, ReportData, ViewRow, write_report
 from perception.types import View
 
@@ -228,10 +229,10 @@ def _best_crop(opened: QueryMap, index: int, album: _Album, whole: bool) -> np.n
 
 
 def _rows(opened: QueryMap, album: _Album) -> Iterator[tuple[dict[str, Any], np.ndarray | None, list[str]]]:
-    """(entry of instances.json, best crop, most likely names) of each instance; no names without language data."""
+    """(entry of instances.json, best crop, printed texts and likely names) of each instance; names need an encoder."""
     names = opened.likely_names() if opened.problem is None else [[] for _ in opened.instances]
     for i, entry in enumerate(opened.instances):
-        yield entry, _best_crop(opened, i, album, whole=False), names[i]
+        yield entry, _best_crop(opened, i, album, whole=False), printed_texts(entry)[:2] + names[i]
 
 
 def write_sheet(opened: QueryMap, path: Path) -> None:

@@ -64,8 +64,8 @@ def profile_text(info: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def info_text(path: Path, info: dict[str, Any]) -> str:
-    """Summary of map.json as text, for `perception info`."""
+def info_text(path: Path, info: dict[str, Any], texts: dict[int, list[dict[str, Any]]] | None = None) -> str:
+    """Summary of map.json as text, for `perception info`; texts: those printed on each instance, by its id."""
     quality, training, scene = info.get("quality", {}), info.get("training", {}), info.get("scene", {})
     seconds = info.get("seconds", {})
     lines = [
@@ -89,6 +89,7 @@ def info_text(path: Path, info: dict[str, Any]) -> str:
         )
     if quality.get("depth"):
         lines.append(f"held-out views: {depth_text(quality['depth'])}")
+    lines += [f"printed on {i}: " + ", ".join(f'"{e["text"]}"' for e in found) for i, found in (texts or {}).items()]
     lines += [f"decision: {text}" for text in training.get("decisions", [])]
     lines += [f"left out: {entry['name']} ({entry['why']})" for entry in scene.get("left_out", [])]
     lines += [f"warning: {text}" for text in scene.get("warnings", [])]

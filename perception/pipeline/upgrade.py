@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.instances.describe import describe_instances
+from perception.instances.describe import Load, describe_instances
 from perception.instances.silhouettes import render_silhouettes
+from perception.instances.texts import Reader, read_texts, store_texts
 from perception.io.map import PART, Map
 from perception.io.map_lock import writing
 from perception.io.map_views import StoredView, locate_photo, stored_view
@@ -19,6 +20,7 @@ from perception.io.store import FORMAT_VERSION, read_info, read_map, write_map
 from perception.language.base import Encoder, reading_of
 from perception.language.description import from_arrays, to_arrays
 from perception.language.encoders import make_encoder
+from perception.language.ocr import make_reader
 from perception.pipeline.photos import training_view
 from perception.pipeline.rendering import as_gaussians
 from perception.progress import Progress
@@ -34,7 +36,8 @@ def upgrade_map(
     """Writes the map at `path` in the newest format, to `output` or in place; Gaussians, instances, labels are kept.
 
     If the embeddings are from another encoder than the one its settings now select, all instances are embedded again,
-    from their recorded photos and rendered silhouettes; InputError names the first missing photo.
+    from their recorded photos and rendered silhouettes; InputError names the first missing photo. Printed texts are
+    read if the extra ocr is installed, the map has none from this reader, and its photos are there.
     Returns {"map", "format_version": [before, after], "encoder": [before, after]}.
     """
     target, progress = output or path, progress or Progress(quiet=True)
@@ -47,6 +50,7 @@ def upgrade_map(
         encoder = _encoder(gmap, encoders) if gmap.language else None
         if encoder is not None and encoder.identity != old:
             _embed_again(gmap, encoder, progress)
+        _read_again(gmap, make_reader(gmap.info.get("config", {}).get("language", {}).get("texts", "auto")), progress)
         gmap.views = [  # version 1 has neither photo sizes nor relative paths
             view
             if isinstance(view, StoredView) and view.photo_bytes is not None
@@ -75,6 +79,20 @@ def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:
         gmap.parts = {"ids": owners, **{PART + name: array for name, array in anew.items()}}
 
 
+def _read_again(gmap: Map, reader: Reader | None, progress: Progress) -> None:
+    """Replaces `texts` of the instances if another reader, or none, has looked for them."""
+    report = gmap.info.get("instances", {})
+    if reader is None or not gmap.language or report.get("texts") == reader.identity:
+        return
+    try:
+        choices, load = _shown(gmap, gmap.language, gmap.instance_ids, [entry["id"] for entry in gmap.instances])
+    except InputError as error:
+        progress.log(f"warning: printed texts are not read: {error}")
+        return
+    store_texts(gmap.instances, read_texts(reader, choices, load, progress))
+    gmap.info["instances"] = {**report, "texts": reader.identity}
+
+
 def _described(
     gmap: Map,
     encoder: Encoder,
@@ -84,9 +102,18 @@ def _described(
     zooms: int,
     progress: Progress,
 ) -> dict[str, np.ndarray]:
-    """Language arrays of the instances `ids`, each from the views that `stored` lists for it.
+    """Language arrays of the instances `ids`; see `_shown`."""
+    choices, load = _shown(gmap, stored, owners, ids)
+    names = [view.name for view in gmap.views]
+    return to_arrays(describe_instances(encoder, choices, load, names, zooms, progress), encoder.identity)
 
-    owners: [N] instance id of each Gaussian, −1 = none.
+
+def _shown(
+    gmap: Map, stored: dict[str, np.ndarray], owners: np.ndarray, ids: list[int]
+) -> tuple[list[np.ndarray], Load]:
+    """The views that `stored` lists for each of the instances `ids`, and what loads them (see `describe_instances`).
+
+    owners: [N] instance id of each Gaussian, −1 = none. Raises InputError for a missing photo, before any is loaded.
     """
     descriptions, _ = from_arrays(stored)
     number = {view.name: n for n, view in enumerate(gmap.views)}
@@ -96,7 +123,6 @@ def _described(
             f"{gmap.path}: lists the photo {unknown[0]!a}, which is none of its views; build the map again"
         )
     wanted = sorted({number[name] for d in descriptions for name in d.views})
-    # All photos are located before any is embedded.
     located = {n: replace(gmap.views[n], photo=locate_photo(gmap.views[n], gmap.path)) for n in wanted}
     gaussians, side = as_gaussians(gmap), int(gmap.info["config"]["photos"]["max_side"])
     rank = {instance: n for n, instance in enumerate(ids)}
@@ -108,12 +134,4 @@ def _described(
         seen = render_silhouettes(gaussians, positions, view.camera_from_world, view.K, width, height)
         return view.photo.numpy(), seen.ids
 
-    again = describe_instances(
-        encoder,
-        [np.array([number[name] for name in d.views], np.int64) for d in descriptions],
-        load,
-        [view.name for view in gmap.views],
-        levels=zooms,
-        progress=progress,
-    )
-    return to_arrays(again, encoder.identity)
+    return [np.array([number[name] for name in d.views], np.int64) for d in descriptions], load

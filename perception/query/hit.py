@@ -82,6 +82,11 @@ class Neighbor:
     gap: float
 
 
+def printed_texts(entry: dict[str, Any]) -> list[str]:
+    """The texts printed on the instance of this entry of instances.json, in quotation marks, best supported first."""
+    return [f'"{text["text"]}"' for text in entry.get("texts", [])]
+
+
 @dataclass(frozen=True)
 class Description:
     """All properties of one instance. confidence: the mapper's score in [0, 1]; aabb: [2, 3] lowest and highest corner

@@ -15,6 +15,7 @@ from perception.errors import InputError
 from perception.io.map import Map
 from perception.language.base import Encoder
 from perception.language.encoders import make_encoder
+from perception.language.printed import Printed
 from perception.query.where import tidy
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ class TextRanking:
             raise InputError(f"{self._gmap.path}: was mapped without an encoder; map again with language.encoder=conse")
         check_encoder(identity, encoder.identity)
         labels = [entry.get("label") for entry in self._gmap.instances]
-        return Ranker(descriptions, encoder, labels, self._shapes)
+        return Ranker(descriptions, encoder, labels, self._shapes, printed_on(self._gmap))
 
     def _shapes(self) -> np.ndarray:
         from perception.instances.shapes import shape_scores
@@ -112,6 +113,12 @@ class TextRanking:
         owners = np.repeat(index.ids, np.diff(index.starts))
         poses = self._gmap.poses
         return shape_scores(index.points, owners, [entry["id"] for entry in self._gmap.instances], poses)
+
+
+def printed_on(gmap: Map) -> Printed | None:
+    """The texts printed on the map's instances; None if nobody looked for any."""
+    read = gmap.info.get("instances", {}).get("texts") is not None
+    return Printed([entry.get("texts", []) for entry in gmap.instances]) if read else None
 
 
 @contextmanager

@@ -7,6 +7,7 @@ import string
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from perception.query.hit import printed_texts
 from perception.viewer.paint import MODES
 from perception.viewer.session import Session
 
@@ -177,6 +178,7 @@ class Panel:
                 f"**{escaped(session.name(entry))}** (id {entry['id']})  \nconfidence {entry['score']:.2f} · "
                 f"{entry['num_gaussians']} Gaussians  \nbox {sides} {unit}"
                 + (f"  \n{len(entry['parts'])} parts; Split takes it apart" if entry.get("parts") else "")
+                + (f"  \nprinted: {escaped(', '.join(printed_texts(entry)[:5]))}" if entry.get("texts") else "")
             )
             named = (entry["id"], entry.get("label"))
             if named != self._named:  # else keep what a user is typing there

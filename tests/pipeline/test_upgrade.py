@@ -13,6 +13,8 @@ import perception
 from perception.cli import main
 from perception.errors import InputError
 from perception.io.store import FORMAT_VERSION, read_info, read_map, verify_map
+from perception.language.ocr import Line
+from perception.pipeline import upgrade
 from perception.pipeline.upgrade import upgrade_map
 from support.color_encoder import THINGS, ColorEncoder, encoders
 from support.paths import MAPS
@@ -108,6 +110,37 @@ def test_upgrade_of_the_same_encoder_needs_no_photos(old: Path, monkeypatch: pyt
     assert upgrade_map(old, encoders=encoders)["format_version"] == [1, FORMAT_VERSION]
     after = read_map(old).language
     assert all(np.array_equal(after[name], before[name]) for name in before)
+
+
+class Reader:
+    """Reads STRAWBERRY wherever a photo is red."""
+
+    identity = "red"
+
+    def read(self, photo: np.ndarray) -> list[Line]:
+        rows, columns = np.nonzero((photo[..., 0] > 150) & (photo[..., 1:].max(axis=2) < 100))
+        x0, y0, x1, y1 = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+        return [Line("STRAWBERRY", 0.9, np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], np.float32))]
+
+
+def test_upgrade_reads_texts_and_prompts_use_them(
+    old: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(upgrade, "make_reader", lambda setting: None)
+    upgrade_map(old, encoders=encoders)
+    assert b"texts" not in (old / "instances.json").read_bytes() and "instances" not in read_info(old)
+    monkeypatch.setattr(upgrade, "make_reader", lambda setting: Reader())
+    upgrade_map(old, encoders=encoders)
+    opened = perception.load_map(old, encoders)
+    assert [entry.get("texts") for entry in opened.instances] == [[{"text": "STRAWBERRY", "score": 0.99}], None, None]
+    assert [hit.instance_id for hit in opened.query("the box that says strawberry", top_k=1)] == [0]
+    assert opened.query("the box that says lime") == []
+    assert main(["info", str(old)]) == 0 and 'printed on 0: "STRAWBERRY"' in capsys.readouterr().out
+    shutil.rmtree("photos")
+    upgrade_map(old, encoders=encoders)  # nothing is left to read
+    monkeypatch.setattr(Reader, "identity", "newer")
+    upgrade_map(old, encoders=encoders)  # cannot be read; what is known stays
+    assert read_info(old)["instances"]["texts"] == "red" and read_map(old).instances[0]["texts"]
 
 
 def test_upgrade_on_the_command_line(old: Path, capsys: pytest.CaptureFixture[str]) -> None:

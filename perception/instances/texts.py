@@ -1,0 +1,119 @@
+"""Printed texts of instances: lines of text read in their best views, assigned by silhouette and fused over the views.
+
+A line belongs to the instance that covers most of its rectangle. Views read a text in part or with errors. Of all reads
+of an instance, the text with the largest support is kept, then those that agree with it are set aside, and so on:
+    s_v(t) = max over reads r in view v that agree with t of s_r · (1 − d(r, t) / max length),   d: edit distance
+    support(t) = Σ_v s_v(t)   score(t) = 1 − Π_v (1 − s_v(t))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from perception.language.ocr import Line
+from perception.language.printed import edit_distance
+from perception.progress import Progress
+
+VIEWS = 3  # best views of an instance that are read
+MOST_VIEWS = 120  # most photos read for a map, those that are best for an instance first: bounds the time
+MOST_TEXTS = 20  # kept per instance, best supported first
+LEAST = 0.6  # score of a read, and of a text
+SINGLE = 0.8  # score of a text of under FEW characters, or read in one view only
+FEW = 4
+AGREE = 0.6  # share of the shorter of two texts that the longer must hold to be the same
+COVER = 0.5  # share of a line's rectangle that its instance must cover
+
+Read = tuple[int, str, float]  # view, text, score
+
+
+class Reader(Protocol):
+    """What `ocr.TextReader` is."""
+
+    @property
+    def identity(self) -> str: ...
+
+    def read(self, photo: np.ndarray) -> list[Line]: ...
+
+
+def read_texts(
+    reader: Reader,
+    choices: Sequence[np.ndarray],
+    load: Callable[[int], tuple[np.ndarray, np.ndarray]],
+    progress: Progress | None = None,
+) -> list[list[dict[str, Any]]]:
+    """Texts of the I instances, best supported first: entries {"text": str, "score": in [0, 1]}.
+
+    choices and load: as for `describe.describe_instances`. Only the first VIEWS views of an instance are read.
+    """
+    rank: dict[int, int] = {}
+    for views in choices:
+        for place, view in enumerate(views[:VIEWS]):
+            rank[int(view)] = min(place, rank.get(int(view), VIEWS))
+    wanted = sorted(sorted(rank, key=lambda view: (rank[view], view))[:MOST_VIEWS])
+    reads: list[list[Read]] = [[] for _ in choices]
+    for done, view in enumerate(wanted, start=1):
+        photo, ids = load(view)
+        for line in reader.read(photo):
+            owner = owner_of(line.corners, ids)
+            if owner is not None and line.score >= LEAST and sum(c.isalnum() for c in line.text) > 1:
+                reads[owner].append((view, line.text, line.score))
+        if progress:
+            progress.update("texts", done, len(wanted))
+    return [fuse(found) for found in reads]
+
+
+def store_texts(entries: Sequence[dict[str, Any]], texts: Sequence[list[dict[str, Any]]]) -> None:
+    """Sets `texts` of the entries of instances.json; the key is absent where nothing was read."""
+    for entry, found in zip(entries, texts, strict=True):
+        entry.pop("texts", None)
+        if found:
+            entry["texts"] = found
+
+
+def owner_of(corners: np.ndarray, ids: np.ndarray) -> int | None:
+    """The instance that covers most of a rectangle [4, 2] in the instance image [H, W]; None below the share COVER."""
+    s, t = (np.arange(n)[..., None] / n + 0.5 / n for n in (24, 6))
+    top, bottom = corners[0] + s * (corners[1] - corners[0]), corners[3] + s * (corners[2] - corners[3])
+    points = np.floor(top[:, None] + t[None] * (bottom - top)[:, None]).astype(np.int64).reshape(-1, 2)
+    inside = ((points >= 0) & (points < ids.shape[::-1])).all(axis=1)
+    found = ids[points[inside, 1], points[inside, 0]]
+    counts = np.bincount(found[found >= 0]) if (found >= 0).any() else np.zeros(1, int)
+    return int(counts.argmax()) if counts.max() >= COVER * len(points) else None
+
+
+def fuse(reads: Sequence[Read]) -> list[dict[str, Any]]:
+    """The texts that reads of several views agree on; see the module docstring."""
+    texts: list[dict[str, Any]] = []
+    left = list(reads)
+    while left and len(texts) < MOST_TEXTS:
+        candidates = sorted({text for _, text, _ in left})
+        found = [_by_view([read for read in left if _agree(read[1], text)], text) for text in candidates]
+        chosen = int(np.argmax([sum(views.values()) for views in found]))
+        best, views = candidates[chosen], found[chosen]
+        score = 1.0 - float(np.prod([1.0 - value for value in views.values()]))
+        if score >= (SINGLE if len(views) == 1 or len(best) < FEW else LEAST):
+            texts.append({"text": best, "score": round(min(score, 0.99), 2)})
+        left = [read for read in left if not _agree(read[1], best)]
+    return texts
+
+
+def _by_view(reads: Sequence[Read], text: str) -> dict[int, float]:
+    """Of each view, its best read's score times its similarity with `text`."""
+    best: dict[int, float] = {}
+    for view, other, score in reads:
+        a, b = _plain(text), _plain(other)
+        value = score * (1.0 - edit_distance(a, b) / max(len(a), len(b), 1))
+        best[view] = max(best.get(view, 0.0), value)
+    return best
+
+
+def _agree(a: str, b: str) -> bool:
+    short, long = sorted((_plain(a), _plain(b)), key=len)
+    return edit_distance(short, long, inside=True) <= (1 - AGREE) * len(short)
+
+
+def _plain(text: str) -> str:
+    return "".join(c for c in text.casefold() if c.isalnum())

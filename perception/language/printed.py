@@ -1,0 +1,129 @@
+"""Matches prompts with the texts printed on instances, despite errors of OCR.
+
+A prompt may quote a text ("the book that says BIRDS", 'box labelled "oat milk"'), which an instance must then bear. In
+any other prompt a printed word is evidence: "cereal box" for a thing with CEREAL on it. A word of the prompt matches a
+text with quality 1 − d / length, where d is the edit distance to a word of the text, or for LONG words to any stretch
+of it (Sellers 1980); characters that OCR confuses (0 and O, 1 and l) are equal. English grammar, words of any language.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from perception.language.colors import color_words
+from perception.language.shape_words import head_noun
+
+QUALITY = 0.75  # least quality of a match: one wrong character in four
+PART = 0.6  # least share of a word that a text cut off at either end must hold
+SHORT = 3  # up to so many characters a word must be equal
+LONG = 5  # from so many on, spaces missing in the text do not matter
+RIVAL = 4  # a match counts by (its quality / that of the map's best)^RIVAL: where BUTTER is, BATTERY is not it
+_SAYS = re.compile(
+    r"^(?P<thing>.*?\w.*?)[,\s]+(?:(?:that|which)\s+)?(?:(?:says?|saying|titled|labell?ed)(?:\s+(?:as|with))?|"
+    r"(?:reads?|reading|marked)(?=\s+[\"'“«A-Z0-9])|"
+    r"(?:with|bears?|has|bearing|having)\s+(?:the\s+)?(?:words?|texts?|titles?|labels?|letters|names?|print|inscription))"
+    r"\s+(?P<text>.*\w.*)$"
+)
+_QUOTED = re.compile(r"[\"“”«»]([^\"“”«»]*\w[^\"“”«»]*)[\"“”«»]")
+_WORDS = {
+    "article": "a an the some any this that my our your",
+    "stop": "of on in with and or for to at by from near next left right under over above below behind front top "
+    "bottom big small large little tiny one two it its is there",
+    # things known by what is printed on them: in "cereal box" only "cereal" tells which box
+    "carrier": "box book package packet pack bag can bottle carton tin jar sign poster magazine brochure leaflet flyer "
+    "label sticker container thing object item something cover bar tube pot tub pouch sachet newspaper paper card menu "
+    "placard plate board binder folder drink food product",
+}
+_KIND = {word: kind for kind, words in _WORDS.items() for word in words.split()}
+_SAME = str.maketrans({"0": "o", "1": "l", "i": "l", "|": "l", "5": "s", "8": "b", "2": "z"})
+_WORD = re.compile(r"\w+")
+
+
+def quoted_text(prompt: str) -> tuple[str, str] | None:
+    """(thing, text) of a prompt that quotes what is printed: "the book that says BIRDS" → ("the book", "BIRDS")."""
+    said = _SAYS.match(prompt)
+    thing, text = (said["thing"], said["text"]) if said else (prompt, "")
+    if quote := _QUOTED.search(prompt):
+        thing, text = (thing if said else _QUOTED.sub(" ", prompt)), quote[1]
+    words = [word for word in _WORD.findall(thing.lower()) if _KIND.get(word) != "article"]
+    if not text or (said and not quote and not words):
+        return None
+    return " ".join(thing.split()) if words else "thing", text.strip(" .,;:!?'")
+
+
+class Printed:
+    """The texts of a map's instances, prepared for prompts. texts: of each instance, entries {"text", "score"}."""
+
+    def __init__(self, texts: Sequence[Sequence[dict[str, Any]]]) -> None:
+        self.count = len(texts)
+        self._lines = [(i, _folded(e["text"]), float(e["score"])) for i, es in enumerate(texts) for e in es]
+
+    def __bool__(self) -> bool:
+        return bool(self._lines)
+
+    def quoted(self, text: str) -> np.ndarray:
+        """[I] in [0, 1]: how well each instance bears all words of `text`, weighted by their lengths."""
+        words = _folded(text)
+        return self._borne(words, [len(word) for word in words])
+
+    def evidence(self, prompt: str) -> np.ndarray:
+        """[I] in [0, 1]: share of the prompt's telling words that each instance bears; squared unless the prompt names
+        a thing known by its print, because COFFEE may be on a poster as well as on a coffee mug."""
+        words = [word for word in _WORD.findall(prompt.lower()) if not color_words(f"{word} thing")]
+        telling = [_folded(word)[0] for word in words if _singular(word) not in _KIND]
+        share = self._borne(telling, [1] * len(telling))
+        return share if len(telling) == 1 == len(words) or _KIND.get(head_noun(prompt)) == "carrier" else share**2
+
+    def _borne(self, words: Sequence[str], weights: Sequence[float]) -> np.ndarray:
+        best = np.zeros((len(words), self.count))
+        for n, word in enumerate(words):
+            for i, line, score in self._lines:
+                best[n, i] = max(best[n, i], score * match_quality(word, line))
+        most = best.max(axis=1, initial=1e-9, keepdims=True)
+        best *= (best / most) ** RIVAL
+        return np.asarray(weights, np.float64) @ best / max(sum(weights), 1)
+
+
+def match_quality(word: str, line: Sequence[str]) -> float:
+    """Quality in {0} ∪ [PART, 1] of the best match of a folded word with the folded words of a line."""
+    best = 0.0
+    for other in line:
+        if word == other:
+            return 1.0
+        if SHORT < len(other) < len(word) and other in word:
+            best = max(best, len(other) / len(word) * (len(other) >= PART * len(word)))
+        elif min(len(word), len(other)) > SHORT:
+            best = max(best, _quality(edit_distance(word, other), len(word)))
+    if len(word) >= LONG:
+        best = max(best, _quality(edit_distance(word, "".join(line), inside=True), len(word)))
+    return best
+
+
+def edit_distance(a: str, b: str, inside: bool = False) -> int:
+    """Levenshtein's distance of a and b; with `inside`, of a and the stretch of b nearest to it."""
+    row = [0] * (len(b) + 1) if inside else list(range(len(b) + 1))
+    for n, x in enumerate(a, start=1):
+        last, row[0] = row[0], n
+        for m, y in enumerate(b, start=1):
+            last, row[m] = row[m], min(last + (x != y), row[m] + 1, row[m - 1] + 1)
+    return min(row) if inside else row[-1]
+
+
+def _quality(distance: int, length: int) -> float:
+    quality = 1.0 - distance / length
+    return quality if quality >= QUALITY else 0.0
+
+
+def _folded(text: str) -> list[str]:
+    """Its words in lower case, singular, with characters that OCR confuses made equal."""
+    return [_singular(word).translate(_SAME) for word in _WORD.findall(text.lower())]
+
+
+def _singular(word: str) -> str:
+    if word.endswith("xes"):
+        return word[:-2]
+    return word[:-1] if len(word) > SHORT and word.endswith("s") and not word.endswith("ss") else word

