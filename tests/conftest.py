@@ -32,7 +32,6 @@ def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cameras = json.loads((root / "truth" / "transforms.json").read_text())
     for frame in cameras["frames"]:
         frame["file_path"] = f"images/{Path(frame['file_path']).name}"
-        del frame["depth_file_path"]  # truth is for scoring
     # Points from the surface stand in for structure from motion, which these tests are not about.
     (root / "transforms.json").write_text(json.dumps({**cameras, "ply_file_path": "truth/gt_points.ply"}))
     return root

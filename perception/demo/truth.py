@@ -134,7 +134,6 @@ def _transforms(photos: str, names: list[str], cameras: list[Camera]) -> dict[st
         {
             "file_path": f"{photos}/{name}",
             "transform_matrix": (np.linalg.inv(camera.camera_from_world) @ FLIP).tolist(),
-            "depth_file_path": f"depth/{Path(name).stem}.png",
             "instance_file_path": f"masks_gt/{Path(name).stem}.png",
         }
         for name, camera in zip(names, cameras, strict=True)

@@ -124,15 +124,15 @@ class _Depth(Function):
     @staticmethod
     def forward(ctx: Any, depths: Tensor, alphas: Tensor, measured: Tensor) -> Tensor:
         known = measured > 0
-        count = max(1, int(known.sum()))
+        share = known.to(depths.dtype).div_(max(1, int(known.sum())))  # 1 / |M| at measured pixels
         target = torch.where(known, measured, torch.ones_like(measured))
         expected = depths / alphas.clamp(min=1e-6)
-        error = expected / target - 1
-        length = (error * error + _DEPTH_NOISE**2).sqrt()
-        pull = torch.where(known, error / (length * target * count), torch.zeros_like(depths))
-        ctx.save_for_backward(pull, torch.where(known, -pull * expected - 1 / count, torch.zeros_like(pull)))
-        value = torch.where(known, alphas * (length - _DEPTH_NOISE) + 1 - alphas, torch.zeros_like(pull))
-        return depths.new_tensor(_kernels.sum(value.reshape(-1), False) / count)
+        error = (expected / target).sub_(1)
+        length = (error * error).add_(_DEPTH_NOISE**2).sqrt_()
+        pull = error.div_(length).div_(target).mul_(share)
+        ctx.save_for_backward(pull, expected.mul_(pull).add_(share).neg_())
+        value = length.sub_(_DEPTH_NOISE + 1).mul_(alphas).add_(1).mul_(share)
+        return depths.new_tensor(_kernels.sum(value.reshape(-1), False))
 
     @staticmethod
     @once_differentiable

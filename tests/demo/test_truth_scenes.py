@@ -54,7 +54,7 @@ def test_truth_points_land_on_their_own_mask_and_depth(scene: Path) -> None:
         y = np.floor(transforms["fl_y"] * p[:, 1] / z + transforms["cy"])
         inside = (x >= 0) & (x < 160) & (y >= 0) & (y < 120)
         rows, columns, z, owner = y[inside].astype(int), x[inside].astype(int), z[inside], ids[inside]
-        depth = image(scene / frame["depth_file_path"])[rows, columns] / 1000
+        depth = image(scene / "depth" / Path(frame["instance_file_path"]).name)[rows, columns] / 1000
         near = np.abs(depth - z) < 0.004
         same += int((image(scene / frame["instance_file_path"])[rows, columns] == owner)[near].sum())
         total += int(near.sum())
