@@ -19,9 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from perception.bench.memory import fresh_peak, status_mib
 from perception.bench.output import Column, bench_parser, finish, table
-from perception.bench.processes import run_python
+from perception.bench.processes import fresh_peak, run_python, status_mib
 
 TREES = ("perception", "scipy", "open3d")
 LISTS = 12
@@ -149,8 +148,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     turns: dict[tuple[str, str], list[dict[str, Any]]] = {job: [] for job in jobs}
     for _ in range(options.turns):
         for job in jobs:
-            told = run_python("-m", "perception.bench.clouds", *sizes, "--one", *job)
-            turns[job].append(json.loads(told.splitlines()[-1]))
+            output = run_python("-m", "perception.bench.clouds", *sizes, "--one", *job)
+            turns[job].append(json.loads(output.splitlines()[-1]))
     rows = [
         {"task": task, "by": tree, **{key: min(turn[key] for turn in found) for _, key, _ in COLUMNS}}
         for (task, tree), found in turns.items()

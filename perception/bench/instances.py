@@ -5,6 +5,7 @@ AP with the map's scores and with constant ones, things and stuff together and a
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,30 @@ from typing import Any
 import numpy as np
 
 from perception.bench.output import Column, bench_parser, finish, table
-from perception.bench.truth import read_scene, read_truth_cloud
+from perception.errors import InputError
+from perception.types import PointCloud
+
+
+def read_scene(scene: Path) -> dict[str, Any]:
+    """The content of scene.json. Raises InputError when the file is missing."""
+    file = scene / "scene.json"
+    if not file.is_file():
+        raise InputError(f"{scene}: no scene.json there; expected the folder of a scene with truth")
+    about: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return about
+
+
+def read_truth_cloud(scene: Path, means: np.ndarray) -> PointCloud:
+    """gt_points.ply. Raises InputError without the label `instance_id`, or with most points off `means` [N, 3]."""
+    from perception.export.transfer import check_overlap
+    from perception.io.cloud import read_cloud
+
+    cloud = read_cloud(scene / "gt_points.ply")
+    if "instance_id" not in cloud.labels:
+        raise InputError(f"{scene / 'gt_points.ply'}: expected a property instance_id, found none")
+    if check_overlap(means, cloud.points) < 0.5:
+        raise InputError(f"{scene}: most of its points lie outside the map; map the scene with its transforms.json")
+    return cloud
 
 
 def score_map(scene: Path, map_path: Path) -> dict[str, Any]:

@@ -1,13 +1,14 @@
-"""Subprocesses of a benchmark. They import this installed package, whatever the current directory is."""
+"""Subprocesses of a benchmark, which import this package whatever the current directory is, and memory of processes."""
 
 from __future__ import annotations
 
+import ctypes
 import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,3 +46,28 @@ def served(*arguments: str) -> Iterator[tuple[str, int]]:
     finally:
         server.terminate()
         server.wait()
+
+
+def fresh_peak() -> None:
+    """Resets the peak resident memory of this process, so that one benchmark case does not affect the next.
+
+    Frees memory kept for reuse, then resets VmHWM. Unsupported steps are skipped (all need Linux with glibc).
+    """
+    core = sys.modules.get("perception._core")
+    if core is not None:
+        core.rasterizer_release_memory()
+    with suppress(OSError, AttributeError, TypeError):  # malloc_trim exists only in glibc; CDLL(None) fails on Windows
+        ctypes.CDLL(None).malloc_trim(0)
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # proc(5)
+
+
+def status_mib(key: str, process: int | str = "self") -> float:
+    """A value of /proc/PROCESS/status (VmRSS, VmHWM) in MiB; NaN where it is not available."""
+    try:
+        for line in Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines():
+            if line.startswith(f"{key}:"):
+                return int(line.split()[1]) / 1024
+    except OSError:
+        pass
+    return float("nan")

@@ -19,15 +19,14 @@ from typing import Any
 import numpy as np
 
 from perception.bench.clients import WAYS, Best
-from perception.bench.memory import status_mib
 from perception.bench.output import bench_parser, finish
-from perception.bench.processes import run_python
+from perception.bench.processes import run_python, status_mib
 from perception.bench.synthetic_map import write_synthetic_map
 from perception.errors import InputError
 
 _COLD = """
 import sys, time
-from perception.bench.memory import status_mib
+from perception.bench.processes import status_mib
 from perception.query import load_map
 gmap = load_map(sys.argv[1])
 opened = time.process_time()

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from perception.bench.memory import fresh_peak, status_mib
 from perception.bench.output import Column, bench_parser, finish, save_plot, table
+from perception.bench.processes import fresh_peak, status_mib
 from perception.bench.splats import SPLAT_KEYS, load_scene, synthetic_scene
 from perception.errors import InputError
 

@@ -88,8 +88,8 @@ def run_sweep(options: argparse.Namespace, variants: Sequence[Variant]) -> list[
                 aside.write_text(json.dumps(map_variant(options.scene, variant, pairs, kept)), encoding="utf-8")
         row = {**asdict(variant), **json.loads(kept.read_text(encoding="utf-8"))}
         rows.append(row)
-        told = f"{number}/{len(chosen)} {variant.group} {variant.name}: {60 * row['minutes']:.0f} s"
-        print(told + (" (kept)" if known else ""), file=sys.stderr, flush=True)
+        line = f"{number}/{len(chosen)} {variant.group} {variant.name}: {60 * row['minutes']:.0f} s"
+        print(line + (" (kept)" if known else ""), file=sys.stderr, flush=True)
     return rows
 
 
@@ -97,13 +97,13 @@ def map_variant(scene: Path, variant: Variant, pairs: list[str], row: Path) -> d
     """Maps the scene beside `row` and scores the map. Minutes are of the whole run, CPU seconds of all its threads."""
     path, settings = row.with_suffix(".gsmap"), (word for pair in pairs for word in ("--set", pair))
     before = os.times()
-    told = run_python(
+    output = run_python(
         *("-m", "perception.cli", "map", str(scene.resolve()), "-o", str(path.resolve()), "--json", "--resume"),
         *("--preset", variant.preset, *settings),
         threads=variant.threads or os.cpu_count() or 1,
     )
     after = os.times()
-    facts = json.loads(told)
+    facts = json.loads(output)
     train, iterations = facts["seconds"]["train"], max(1, facts["iterations"])
     cpu = after.children_user + after.children_system - before.children_user - before.children_system
     found = {

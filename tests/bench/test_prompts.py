@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from perception.bench.prompts import ABSENT, HOUSEHOLD, accuracy, chance, singular
+from perception.bench.queries import ABSENT, HOUSEHOLD, accuracy, chance, singular
 from perception.language.ranking import probes
 
 

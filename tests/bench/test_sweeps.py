@@ -14,8 +14,8 @@ import pytest
 from perception.bench import map as bench_map
 from perception.bench import scaling, sweep
 from perception.bench.map import pareto
-from perception.bench.memory import fresh_peak, status_mib
 from perception.bench.output import table
+from perception.bench.processes import fresh_peak, status_mib
 from perception.bench.sweep import Variant, run_sweep, settings_of, sweep_parser
 from perception.cli import main
 from perception.config import MapConfig, load_config
