@@ -15,19 +15,7 @@ from perception import __version__
 from perception.cli.parser import Parser
 from perception.errors import InputError
 
-_MODULES = (
-    "mapping",
-    "asking",
-    "labels",
-    "maps",
-    "clouds",
-    "scoring",
-    "serving",
-    "node",
-    "viewing",
-    "models",
-    "robot_inputs",
-)
+_MODULES = ("mapping", "asking", "maps", "clouds", "scoring", "serving", "models", "robot_inputs")
 """Files of this package that add subcommands, in the order of --help."""
 
 
@@ -69,8 +57,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        told = f"interrupted; what was done is kept, go on with: {_resume(argv)}"
-        print(getattr(args, "interrupted", told), file=sys.stderr)
+        message = f"interrupted; what was done is kept, go on with: {_resume(argv)}"
+        print(getattr(args, "interrupted", message), file=sys.stderr)
         return 130
     except BrokenPipeError:
         return 0

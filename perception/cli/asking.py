@@ -12,10 +12,6 @@ from perception.errors import InputError
 
 def register(commands: Any) -> None:
     """Adds this module's subcommands."""
-    _add_query(commands)
-
-
-def _add_query(commands: Any) -> None:
     p = command(commands, "query", _query, 'ranked 3D instances for each text, or "not present"')
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("text", nargs="+", metavar="TEXT")

@@ -49,7 +49,6 @@ def _add_map(commands: Any) -> None:
     p.add_argument("--seed", metavar="S")
     p.add_argument("--device", help="auto, cpu or cuda")
     p.add_argument("--labels-from", type=Path, metavar="OLD.gsmap", help="carry over the names given to its instances")
-    p.add_argument("--profile", action="store_true", help="print where the time went")
     p.add_argument("--resume", action="store_true", help="go on with an interrupted run")
 
 
@@ -82,7 +81,7 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     given = [f"{key}={getattr(args, name)}" for name, key in _SHORTCUTS.items() if getattr(args, name) is not None]
     config = load_config(args.config, args.pairs + given, args.preset)
     from perception.pipeline.mapping import build_map
-    from perception.pipeline.summary import map_facts, profile_text
+    from perception.pipeline.summary import map_facts
     from perception.progress import Progress
 
     with sigterm_as_interrupt(), Progress() as progress:
@@ -91,8 +90,7 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         )
         _write_own_report(args.output, progress)
 
-    facts = map_facts(args.output, gmap.info, len(gmap), len(gmap.instances))
-    return facts, profile_text(gmap.info) if args.profile else ""
+    return map_facts(args.output, gmap.info, len(gmap), len(gmap.instances)), ""
 
 
 def _write_own_report(path: Path, progress: Progress) -> None:

@@ -1,4 +1,4 @@
-"""`perception relink` and `perception upgrade`: new photo paths for moved maps, the new format for older maps."""
+"""`perception label`, `relink` and `upgrade`: names of instances, new photo paths, the new format for older maps."""
 
 from __future__ import annotations
 
@@ -7,16 +7,60 @@ from pathlib import Path
 from typing import Any
 
 from perception.cli.parser import command
+from perception.errors import InputError
 
 
 def register(commands: Any) -> None:
     """Adds this module's subcommands."""
+    p = command(commands, "label", _label, "name an instance; queries know the name from then on")
+    p.add_argument("map", type=Path, metavar="MAP")
+    p.add_argument("id", type=int, nargs="?", metavar="ID", help="without one, the labels are listed")
+    p.add_argument("text", nargs="?", metavar="NAME", help='such as "grandma\'s cup"')
+    p.add_argument("--clear", action="store_true", help="take the name away")
+    p.add_argument("--from", type=Path, metavar="OLD.gsmap", dest="old", help="carry over the names of an older map")
     p = command(commands, "relink", _relink, "tell a map where its photos lie now")
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("folder", type=Path, metavar="DIR", help="the folder that holds the photos")
     p = command(commands, "upgrade", _upgrade, "bring an older map to the newest format and encoder")
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("-o", "--output", type=Path, metavar="OUT.gsmap", help="default: in place")
+
+
+def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    if sum((args.text is not None, args.clear, args.old is not None)) > 1:
+        raise InputError("label: give a NAME, --clear or --from, only one of them")
+    if args.old is not None:
+        return _transfer(args)
+    if args.id is not None:
+        return _set(args)
+    if args.clear:
+        raise InputError("label: --clear needs the ID whose name is taken away")
+    from perception.io.map import Map
+
+    named = {entry["id"]: entry["label"] for entry in Map.open(args.map).instances if entry.get("label")}
+    return {"labels": named}, "\n".join(f"{i:>5}  {name}" for i, name in named.items()) or "no instance has a name"
+
+
+def _set(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.io.store import set_labels
+
+    if args.text is None and not args.clear:
+        raise InputError("label: no NAME given; write one, or --clear to take it away")
+    label = set_labels(args.map, {args.id: args.text})[args.id]
+    said = f"instance {args.id} is called “{label}” now" if label else f"instance {args.id} has no name any more"
+    return {"id": args.id, "label": label}, said
+
+
+def _transfer(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.instances.label_transfer import transfer_labels, transfer_text
+    from perception.io.store import read_map, set_labels
+
+    if args.id is not None:
+        raise InputError("label: --from carries all names over and takes no ID")
+    transfer = transfer_labels(read_map(args.old), read_map(args.map))
+    if transfer.labels:
+        set_labels(args.map, dict(transfer.labels))
+    return {"labels": transfer.labels, "dropped": [name for _, name in transfer.dropped]}, transfer_text(transfer)
 
 
 def _relink(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

@@ -1,4 +1,4 @@
-"""`perception serve`."""
+"""`perception serve`, `node` and `view`: one map over HTTP, on a robot's middleware, and in a browser."""
 
 from __future__ import annotations
 
@@ -11,6 +11,12 @@ from perception.cli.parser import command
 
 def register(commands: Any) -> None:
     """Adds this module's subcommands."""
+    _add_serve(commands)
+    _add_node(commands)
+    _add_view(commands)
+
+
+def _add_serve(commands: Any) -> None:
     p = command(commands, "serve", _serve, "a map over HTTP: JSON, binary points and a page")
     p.set_defaults(interrupted="stopped")
     p.add_argument("map", type=Path, metavar="MAP")
@@ -51,3 +57,62 @@ def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     serve(args.map, settings)
     return {}, ""
+
+
+def _add_node(commands: Any) -> None:
+    p = command(commands, "node", _node, "serve a map on DDS or ROS 2: prompts in; points, boxes and markers out")
+    p.add_argument("map", type=Path, metavar="MAP")
+    p.add_argument("--transport", help="dds, rclpy or auto: rclpy where ROS 2 is, else dds")
+    p.add_argument("--namespace", metavar="NAME", help="before all topics; default: perception")
+    p.add_argument("--domain", metavar="N", help="DDS domain; default: ROS_DOMAIN_ID or 0")
+    p.add_argument("--network", metavar="NET", help="localhost, or an interface such as eth0 (dds only)")
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs", help="further settings")
+
+
+def _node(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.config import read_pairs
+    from perception.node.config import node_config
+
+    values = read_pairs(args.pairs)
+    for name in ("transport", "namespace", "domain", "network"):
+        if getattr(args, name) is not None:
+            values[name] = getattr(args, name)
+    config = node_config(values)
+    from perception.node.serving import serve_node, stop_on_signals
+    from perception.progress import Progress
+
+    with stop_on_signals() as stop:
+        figures = serve_node(args.map, config, stop, Progress().log)
+    return figures, f"{figures['answered']} questions answered"
+
+
+def _add_view(commands: Any) -> None:
+    p = command(commands, "view", _view, "walk through a map in the browser: ask, pick, correct, save")
+    p.add_argument("map", type=Path, metavar="MAP")
+    p.add_argument("--host", default="127.0.0.1", help="other than this machine only with a token")
+    p.add_argument("--port", type=int, default=8090, help="0: any free one")
+    p.add_argument("--token-file", type=Path, metavar="FILE", help="its content opens the page; default: a new token")
+
+
+def _view(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    import sys
+    import threading
+
+    from perception.listening import check_address, read_token
+
+    token = None if args.token_file is None else read_token(args.token_file)
+    check_address(args.host, args.port, token)
+    from perception.viewer import start_viewer
+
+    viewer = start_viewer(args.map, args.host, args.port, token)
+    port = viewer.address.rpartition(":")[2]
+    shown = viewer.url if token is None else f"{viewer.address}/?token=CONTENT-OF-{args.token_file.name}"
+    hint = f"; over SSH: ssh -L {port}:localhost:{port} THIS-MACHINE, then open it there"
+    print(f"{args.map}: open {shown} in a browser{hint}. Ctrl-C ends.", file=sys.stderr, flush=True)
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        viewer.stop()
+        if viewer.session.editor.dirty:
+            print("warning: the last corrections were not saved", file=sys.stderr)
+    return {"url": viewer.address}, ""

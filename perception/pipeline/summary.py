@@ -46,24 +46,6 @@ def shares(training: dict[str, Any]) -> dict[str, float]:
     return {name: round(parts[name] / total, 4) for name in sorted(parts, key=lambda name: -parts[name])}
 
 
-def profile_text(info: dict[str, Any]) -> str:
-    """Seconds and share of each stage of the run, then of each part of training, one per line."""
-    training, seconds = info["training"], info["seconds"]
-    total = max(seconds["total"], 1e-9)
-    lines = [f"{name:24}{value:9.1f} s {value / total:7.1%}" for name, value in seconds.items() if name != "total"]
-    lines.append(f"{'total':24}{total:9.1f} s")
-    lines.append("of training:")
-    lines += [
-        f"  {name:22}{share * training['seconds']:9.1f} s {share:7.1%}" for name, share in shares(training).items()
-    ]
-    rates = speed(training)
-    lines.append(
-        f"{rates['iterations_per_second']:.1f} iterations/s, {rates['pairs_per_second'] / 1e6:.1f} M contributing "
-        f"pairs/s, peak memory {info['peak_memory_mib']:.0f} MiB"
-    )
-    return "\n".join(lines)
-
-
 def info_text(path: Path, info: dict[str, Any], texts: dict[int, list[dict[str, Any]]] | None = None) -> str:
     """Summary of map.json as text, for `perception info`; texts: those printed on each instance, by its id."""
     quality, training, scene = info.get("quality", {}), info.get("training", {}), info.get("scene", {})
