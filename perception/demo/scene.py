@@ -16,10 +16,10 @@ from perception.demo.light import WORKERS, Scene
 from perception.demo.render import Picture, cast
 from perception.demo.segmenter import erring_labels, perfect_labels
 from perception.demo.shapes import Box, Ellipsoid, Shape, to_world
-from perception.demo.truth import DemoTruth, Truth, load_truth
+from perception.demo.truth import DemoTruth, Truth
 from perception.errors import InputError
 
-__all__ = ["SCENES", "DemoTruth", "load_truth", "make_photos"]
+__all__ = ["SCENES", "DemoTruth", "make_photos"]
 
 SCENES = {"tabletop": tabletop, "room": room}
 LEAST_POINTS = 1200  # minimum per object, before points that fewer than two photos see are dropped

@@ -7,12 +7,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from perception.demo.cameras import Camera
-from perception.errors import InputError
-from perception.io.cloud import read_cloud, write_cloud
+from perception.io.cloud import write_cloud
 from perception.types import PointCloud
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes <-> the OpenGL axes of transforms.json
@@ -54,11 +52,6 @@ class DemoTruth:
     photos: str = "images"
 
     @property
-    def things(self) -> list[Truth]:
-        """The instances that are not background."""
-        return [instance for instance in self.instances if not instance.is_stuff]
-
-    @property
     def queries(self) -> list[tuple[str, list[int]]]:
         """Every prompt with the ids of the visible instances that it names."""
         found: dict[str, list[int]] = {}
@@ -67,14 +60,6 @@ class DemoTruth:
                 if instance.gt_points:
                     found.setdefault(text, []).append(instance.id)
         return sorted(found.items())
-
-    def labels(self, name: str) -> np.ndarray:
-        """Instance ids [H, W] uint16 of a photo, 0 = none. Ids are consistent across photos."""
-        path = self.folder / "masks_gt" / f"{Path(name).stem}.png"
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if image is None:
-            raise InputError(f"{path}: no readable label image; make the demo's photos again")
-        return image
 
     def save(self) -> None:
         """Writes scene.json, transforms.json and gt_points.ply into the folder."""
@@ -98,35 +83,6 @@ class DemoTruth:
         labels = {"instance_id": self.instance_ids, "semantic_id": semantic[self.instance_ids]}
         cloud = PointCloud(self.points, self.colors, self.normals, labels=labels)
         write_cloud(self.folder / "gt_points.ply", cloud)
-
-
-def load_truth(folder: Path | str) -> DemoTruth:
-    """Reads what `DemoTruth.save` wrote."""
-    folder = Path(folder)
-    if not (folder / "scene.json").is_file():
-        raise InputError(f"{folder}: holds no scene.json; expected the truth folder of `perception demo`")
-    scene = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
-    views = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
-    K = np.array([[views["fl_x"], 0, views["cx"]], [0, views["fl_y"], views["cy"]], [0, 0, 1.0]])
-    cameras = [
-        Camera(K, np.linalg.inv(np.array(frame["transform_matrix"]) @ FLIP), views["w"], views["h"])
-        for frame in views["frames"]
-    ]
-    cloud = read_cloud(folder / "gt_points.ply")
-    assert cloud.normals is not None and cloud.colors is not None
-    photos = [Path(frame["file_path"]) for frame in views["frames"]]
-    return DemoTruth(
-        [Truth(**instance) for instance in scene["instances"]],
-        scene["asked"],
-        [photo.name for photo in photos],
-        cameras,
-        cloud.points,
-        cloud.normals,
-        cloud.colors,
-        cloud.labels["instance_id"],
-        folder,
-        photos[0].parent.as_posix(),
-    )
 
 
 def _transforms(photos: str, names: list[str], cameras: list[Camera]) -> dict[str, Any]:

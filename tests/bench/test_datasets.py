@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from perception.bench import instances, lerf_mask, lerf_ovs, queries, scannetpp
 from perception.bench.datasets import by_reference
 from perception.cli import main
-from perception.demo import load_truth
 from perception.errors import InputError
 from perception.io.cloud import write_cloud
 from perception.io.store import read_info
 from perception.types import PointCloud
+from support.demo_truth import labels_of, load_truth, things
 
 pytestmark = pytest.mark.slow
 
@@ -58,8 +58,8 @@ def truth(small_scene: Path):
 def downloads(small_scene: Path, truth, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """LERF-mask and LERF-OVS side by side: one scene that can be mapped, and one whose poses were not downloaded."""
     root = tmp_path_factory.mktemp("downloads")
-    ball = next(thing for thing in truth.things if "ball" in thing.name)
-    others = [thing for thing in truth.things if thing.id != ball.id][:2]
+    ball = next(thing for thing in things(truth) if "ball" in thing.name)
+    others = [thing for thing in things(truth) if thing.id != ball.id][:2]
     scene = root / "lerf_mask" / "table"
     shutil.copytree(small_scene / "images", scene / "images")
     write_colmap(scene / "sparse" / "0", truth, truth.names)
@@ -70,7 +70,7 @@ def downloads(small_scene: Path, truth, tmp_path_factory: pytest.TempPathFactory
     for number, name in enumerate(TESTS):
         (scene / "test_mask" / str(number)).mkdir(parents=True)
         for thing in [ball, *others]:
-            mask = np.where(truth.labels(name) == thing.id, 255, 0).astype(np.uint8)
+            mask = np.where(labels_of(truth, name) == thing.id, 255, 0).astype(np.uint8)
             cv2.imwrite(str(scene / "test_mask" / str(number) / f"{thing.name}.png"), mask)
     (root / "lerf_mask" / "broken").mkdir()
     shutil.copytree(scene / "images", root / "lerf_mask" / "broken" / "images")
@@ -82,7 +82,7 @@ def downloads(small_scene: Path, truth, tmp_path_factory: pytest.TempPathFactory
     shutil.copytree(scene / "sparse", ovs / "table" / "sparse")
     (ovs / "label" / "table").mkdir(parents=True)
     for name in TESTS:
-        mask = truth.labels(name) == ball.id
+        mask = labels_of(truth, name) == ball.id
         outline, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         polygon = max(outline, key=len)[:, 0].tolist()
         label = {"info": {"height": 96, "width": 128}, "objects": [{"category": "ball", "segmentation": polygon}]}
@@ -99,7 +99,7 @@ def ovs_run(downloads: Path, small_scene: Path, truth, tmp_path_factory: pytest.
     lerf_ovs.main([str(downloads / "lerf_ovs"), "-o", str(work), "--masks", masks, *QUICK, *brief])
     path = work / "maps" / "table.gsmap" / "instances.json"
     found = json.loads(path.read_text())
-    ball = next(thing for thing in truth.things if "ball" in thing.name)
+    ball = next(thing for thing in things(truth) if "ball" in thing.name)
     middle = truth.points[truth.instance_ids == ball.id].mean(axis=0)
     nearest = min(found["instances"], key=lambda entry: float(np.linalg.norm(entry["centroid"] - middle)))
     nearest["label"] = "ball"

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from perception.demo import DemoTruth, load_truth, make_photos
+from perception.demo import DemoTruth, make_photos
 from perception.errors import InputError
+from support.demo_truth import labels_of, load_truth, things
 
 pytestmark = pytest.mark.slow
 
@@ -37,7 +38,7 @@ def test_projected_points_fall_on_the_mask_of_their_object(made: tuple[Path, Dem
     """An independent projection of truth points with the saved poses meets the id images."""
     _, truth = made
     for name, camera in zip(truth.names, truth.cameras, strict=True):
-        labels = truth.labels(name)
+        labels = labels_of(truth, name)
         ball = truth.points[truth.instance_ids == 4]  # the basketball: convex and in the open
         center = ball.mean(0) * [1, 1, 0] + [0, 0, 0.088]
         x, y, z = camera.K @ (camera.camera_from_world[:3, :3] @ center + camera.camera_from_world[:3, 3])
@@ -51,7 +52,7 @@ def test_the_table_is_the_plane_it_says(made: tuple[Path, DemoTruth]) -> None:
     """Pixels labelled table, cast back onto z = 0 by hand, land inside the table's rectangle (or see its
     edge, legs)."""
     _, truth = made
-    camera, labels = truth.cameras[3], truth.labels(truth.names[3])
+    camera, labels = truth.cameras[3], labels_of(truth, truth.names[3])
     rows, columns = np.nonzero(labels == 11)
     pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
     rays = camera.camera_from_world[:3, :3].T @ np.linalg.inv(camera.K) @ pixels
@@ -75,7 +76,7 @@ def test_every_thing_is_seen_and_every_query_has_its_answer(made: tuple[Path, De
     _, truth = made
     names = {instance.id: instance.name for instance in truth.instances}
     assert sorted(names) == list(range(1, len(names) + 1))
-    assert set(np.unique(truth.instance_ids)) >= {thing.id for thing in truth.things}
+    assert set(np.unique(truth.instance_ids)) >= {thing.id for thing in things(truth)}
     answers = {text: [names[i] for i in ids] for text, ids in truth.queries}
     assert [answers.get(text) for text in truth.asked] == [["red mug"], ["basketball"], ["banana"], None]
     assert answers["mug"] == ["red mug", "blue mug"] and answers["poster"] == [
@@ -105,5 +106,3 @@ def test_photos_tell_their_focal_length(made: tuple[Path, DemoTruth]) -> None:
 def test_bad_arguments_are_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at least 3"):
         make_photos(tmp_path / "p", views=2)
-    with pytest.raises(InputError, match=r"scene\.json"):
-        load_truth(tmp_path)

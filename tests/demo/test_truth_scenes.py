@@ -15,6 +15,7 @@ from perception.bench.queries import read_queries
 from perception.cli import main
 from perception.demo import make_photos
 from perception.io.cloud import read_cloud
+from support.demo_truth import things
 
 pytestmark = pytest.mark.slow
 
@@ -128,6 +129,6 @@ def test_another_seed_is_another_scene(tmp_path: Path) -> None:
     names = []
     for seed in (1, 2):
         made = make_photos(tmp_path / f"{seed}/photos", views=3, width=64, height=48, seed=seed, light_samples=1)
-        names.append([thing.name for thing in made.things])
+        names.append([thing.name for thing in things(made)])
         assert len(set(names[-1])) == len(names[-1]) > 12
     assert names[0] != names[1]

@@ -17,7 +17,6 @@ import pytest
 import perception
 from perception.cli import main
 from perception.config import load_config
-from perception.demo import load_truth
 from perception.errors import InputError
 from perception.io.cloud import read_cloud
 from perception.io.map_lock import lock_file
@@ -27,6 +26,7 @@ from perception.pipeline.demo import truth_in_map_frame
 from perception.pipeline.mapping import build_map
 from perception.pipeline.reporting import write_map_report
 from perception.pipeline.work_folder import work_folder
+from support.demo_truth import load_truth
 from support.interrupts import interrupt_at
 
 pytestmark = pytest.mark.slow
