@@ -11,7 +11,8 @@ from urllib.parse import unquote, urlparse
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory
-from perception.io.download import download, is_url, sha256_of
+from perception.io.checksums import facts_of, sha256
+from perception.io.download import download, is_url
 from perception.io.model_store import (
     StoredModel,
     check_name,
@@ -170,8 +171,8 @@ def _local(source: str, expected: str | None, parts: Path, progress: Progress | 
         file_name = Path(unquote(urlparse(source).path)).name.lstrip(".") or "model.onnx"
         part = _part(parts, source)
         download(source, part, progress, file_name)
-        if expected is not None and sha256_of(part) != expected:
-            found = sha256_of(part)
+        if expected is not None and sha256(part) != expected:
+            found = sha256(part)
             part.unlink()
             raise InputError(f"{source}: sha256 is {found}, expected {expected}; what was fetched is thrown away")
         return [(file_name, part, source)]
@@ -181,8 +182,8 @@ def _local(source: str, expected: str | None, parts: Path, progress: Progress | 
         return [(str(f.relative_to(path)), f, str(f)) for f in files]
     if not path.is_file():
         raise InputError(f"{source}: no such file or folder, and no http(s) address")
-    if expected is not None and sha256_of(path) != expected:
-        raise InputError(f"{source}: sha256 is {sha256_of(path)}, expected {expected}; is it the right file?")
+    if expected is not None and sha256(path) != expected:
+        raise InputError(f"{source}: sha256 is {sha256(path)}, expected {expected}; is it the right file?")
     beside = [path.with_name(path.name + suffix) for suffix in ("_data", ".data")]
     return [(p.name, p, str(p)) for p in [path, *beside] if p.is_file()]
 
@@ -200,8 +201,7 @@ def _install(name: str, files: Sequence[tuple[str, Path, str]], expected: dict[s
             target = folder / file_name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target)
-            size, digest = target.stat().st_size, sha256_of(target)
-            entries.append({"name": file_name, "source": source, "bytes": size, "sha256": digest})
+            entries.append({"name": file_name, "source": source, **facts_of(target)})
         family, purpose, _ = judge([describe_graph(graph) for graph in sorted(folder.rglob("*.onnx"))])
         write_record(folder, family, purpose, entries)
 
