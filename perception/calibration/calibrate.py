@@ -29,7 +29,7 @@ def run_calibration(
     board: Board,
     model: str = "auto",
     pictures: Path | None = None,
-    tell: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, Any], str]:
     """Calibrates a camera from a folder of photos or a video of a board: (JSON-serialisable result, table).
 
@@ -39,9 +39,9 @@ def run_calibration(
     """
     if model not in MODELS:
         raise InputError(f"--model is '{model}'; expected one of {', '.join(MODELS)}")
-    tell = tell or (lambda line: None)
+    log = log or (lambda line: None)
     found, size, looked_at = _detect(source, board)
-    tell(f"{board} seen in {len(found)} of {looked_at} pictures")
+    log(f"{board} seen in {len(found)} of {looked_at} pictures")
     views = distinct_views(found, size[0])
     check_count(views, len(found), looked_at, str(board), str(source))
     views = [views[i] for i in np.linspace(0, len(views) - 1, min(len(views), MAX_VIEWS)).round().astype(int)]

@@ -88,5 +88,5 @@ class EarlyStopping:
         kept = degree
         while kept and worth[kept] - worth[kept - 1] < HARMONICS_GAIN:
             kept -= 1
-        told = ", ".join(f"{psnr:.2f}" for psnr in worth)
-        return kept, f"harmonics: degree {kept} kept; cut to 0 to {degree}, held-out PSNR is {told} dB"
+        figures = ", ".join(f"{psnr:.2f}" for psnr in worth)
+        return kept, f"harmonics: degree {kept} kept; cut to 0 to {degree}, held-out PSNR is {figures} dB"

@@ -81,7 +81,7 @@ def atomic_directory(path: Path) -> Iterator[Path]:
             path.parent.mkdir(parents=True, exist_ok=True)
             recover(path)
             held.enter_context(_locked(temporary, temporary.mkdir))
-            with _told_of(path, temporary):
+            with _errors_naming(path, temporary):
                 yield temporary
             for file in temporary.rglob("*"):
                 _sync(file)
@@ -197,7 +197,7 @@ def _sync(path: Path) -> None:
 
 
 @contextmanager
-def _told_of(path: Path, temporary: Path) -> Iterator[None]:
+def _errors_naming(path: Path, temporary: Path) -> Iterator[None]:
     """Replaces the temporary folder by `path` in InputError messages."""
     try:
         yield

@@ -11,7 +11,6 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.arrays import read_npz
 from perception.io.atomic import replacing
-from perception.io.cloud_las import read_las
 from perception.io.cloud_memory import require_memory
 from perception.io.cloud_pcd import read_pcd, write_pcd
 from perception.io.cloud_text import read_obj, read_xyz, write_xyz
@@ -101,6 +100,28 @@ def _read_ply_cloud(path: Path) -> PointCloud:
     return cloud
 
 
+def _read_las(path: Path) -> PointCloud:
+    """points [P, 3] float64 (scale and offset applied); 16-bit colours become 8-bit; `classification` is a label."""
+    try:
+        import laspy
+    except ImportError as error:
+        raise InputError(f"{path}: LAS and LAZ need the package 'laspy'; run: pip install 'laspy[lazrs]'") from error
+    try:
+        las = laspy.read(path)
+    except (laspy.errors.LaspyException, ValueError, OSError) as error:
+        raise InputError(f"{path}: is not a readable LAS/LAZ file ({error})") from error
+    cloud = PointCloud(np.ascontiguousarray(las.xyz, dtype=np.float64))
+    names = set(las.point_format.dimension_names)
+    if {"red", "green", "blue"} <= names:
+        wide = np.stack([np.asarray(las.red), np.asarray(las.green), np.asarray(las.blue)], axis=1)
+        # The standard asks for 16 bits, but many writers leave 8-bit values unscaled.
+        cloud.colors = (wide >> 8 if wide.max(initial=0) > 255 else wide).astype(np.uint8)
+    for name in ("classification", "instance_id", "semantic_id"):
+        if name in names:
+            cloud.labels[name] = np.asarray(las[name]).astype(np.int32)
+    return cloud
+
+
 def to_uint8(colors: np.ndarray) -> np.ndarray:
     """Colours [P, 3] as uint8: floats in [0, 1] are scaled by 255, 16-bit values by 1/257, bytes are kept."""
     if colors.dtype == np.uint8:
@@ -175,8 +196,8 @@ _READERS: dict[str, Callable[[Path], PointCloud]] = {
     ".xyz": read_xyz,
     ".txt": read_xyz,
     ".pts": read_xyz,
-    ".las": read_las,
-    ".laz": read_las,
+    ".las": _read_las,
+    ".laz": _read_las,
 }
 # Memory to read a file as a multiple of its size, for compressed and text formats.
 _BYTES_PER_BYTE = {".laz": 40, ".obj": 12, ".xyz": 4, ".txt": 4, ".pts": 4}

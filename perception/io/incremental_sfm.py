@@ -43,7 +43,7 @@ class _Mapping:
     ) -> None:
         self.database, self.image_root, self.folder = store.database, store.image_root, folder
         self.fixed, self.seed, self.count, self.progress = fixed, seed, count, progress
-        self.told, self.runs = 0.0, 0
+        self.shown, self.runs = 0.0, 0
 
     def run(self) -> Found:
         """The first model that contradicts at most MAX_CONTRADICTED of the pairs, else the one with most agreeing."""
@@ -123,8 +123,8 @@ class _Mapping:
         def next_image() -> None:
             nonlocal registered
             registered += 1
-            self.told = max(self.told, min(1.0, registered / self.count))
-            self.progress.update("poses: mapping", round(100 * self.told), 100)
+            self.shown = max(self.shown, min(1.0, registered / self.count))
+            self.progress.update("poses: mapping", round(100 * self.shown), 100)
 
         found = pycolmap.incremental_mapping(
             database,

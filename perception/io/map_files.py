@@ -221,9 +221,9 @@ def _read_instances(file: Path) -> tuple[list[dict[str, Any]], bytes]:
         if len({entry["id"] for entry in instances}) != len(instances):
             raise ValueError("an id occurs twice")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        told = f"no {error}" if isinstance(error, KeyError) else str(error)
+        problem = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(
-            f"{file}: cannot be read as instances ({told}); the map is damaged, build it again or copy it anew"
+            f"{file}: cannot be read as instances ({problem}); the map is damaged, build it again or copy it anew"
         ) from error
     return instances, raw
 

@@ -120,8 +120,8 @@ class NodeClient:
                 for data, _ in reader.take():
                     message = deserialize(topic.kind, data)
                     if topic is channels.ANSWER:
-                        told = json.loads(message["data"])
-                        facts.update(told if told["id"] == identity else {})
+                        received = json.loads(message["data"])
+                        facts.update(received if received["id"] == identity else {})
                     else:
                         seen[topic][_stamp(message)] = message
             if "error" in facts:

@@ -78,9 +78,9 @@ class Core:
         self._send_json({**answers.answer_json(reply, question.identity), "stamp": answers.stamp_json(stamp)})
 
     def _send_error(self, error: BaseException, text: str, identity: str | None) -> None:
-        told = error_json(error, text, identity)
-        self._refused[told["error"]["kind"]] += 1
-        self._send_json({**told, "stamp": answers.stamp_json(self._stamps.next())})
+        body = error_json(error, text, identity)
+        self._refused[body["error"]["kind"]] += 1
+        self._send_json({**body, "stamp": answers.stamp_json(self._stamps.next())})
 
     def _send_json(self, value: Message) -> None:
         self._transport.publish(channels.ANSWER, {"data": json.dumps(value, allow_nan=False)})
@@ -124,9 +124,9 @@ class Core:
         return answers.text_value(json.dumps(answers.answer_json(reply, asked.identity), allow_nan=False))
 
     def _error_value(self, error: BaseException, name: str) -> Message:
-        told = error_json(error, name, identity_of(name))
-        self._refused[told["error"]["kind"]] += 1
-        return answers.text_value(json.dumps(told))
+        body = error_json(error, name, identity_of(name))
+        self._refused[body["error"]["kind"]] += 1
+        return answers.text_value(json.dumps(body))
 
     def reload(self) -> Message:
         """The reload service (std_srvs/Trigger): loads the map now at the path; on failure the current one stays."""
@@ -143,8 +143,8 @@ class Core:
         """Publishes the health message: figures of the engine, counts of rejected prompts, transport warnings."""
         refused = {f"refused_{kind}": count for kind, count in self._refused.items()}
         facts = {**self._engine.health(), **refused, **self._transport.figures()}
-        told = answers.diagnostics(self._config.namespace, facts, self._transport.warnings(), self._stamps.next())
-        self._transport.publish(channels.HEALTH, told)
+        body = answers.diagnostics(self._config.namespace, facts, self._transport.warnings(), self._stamps.next())
+        self._transport.publish(channels.HEALTH, body)
 
     def _send_map(self, gmap: QueryMap) -> None:
         if not self._config.map_points:

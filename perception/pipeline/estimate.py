@@ -80,12 +80,12 @@ def _sfm_seconds(sizes: list[tuple[int, int]]) -> float:
     return features + pairs * SFM_SECONDS_PER_PAIR + count * SFM_SECONDS_PER_PHOTO
 
 
-def tell_estimate(source: Path, config: MapConfig, tell: Callable[[str], None]) -> None:
-    """Passes the estimate for the input `source` to `tell` as one line; InputError if memory is not sufficient."""
+def log_estimate(source: Path, config: MapConfig, log: Callable[[str], None]) -> None:
+    """Passes the estimate for the input `source` to `log` as one line; InputError if memory is not sufficient."""
     photos = photo_sizes(source)
     if photos.sizes:
         check_memory(photos, config)
-        tell(estimate(photos, config).text())
+        log(estimate(photos, config).text())
 
 
 def check_memory(photos: PhotoSizes, config: MapConfig, limit: int | None = None) -> None:

@@ -30,7 +30,7 @@ from perception.language.ocr import make_reader
 from perception.masks import MaskSource, compute_masks, make_source
 from perception.masks.source import GeometryMaskSource
 from perception.pipeline.checkpoint import TrainingObserver, fingerprint, poses_mark, training_mark
-from perception.pipeline.estimate import tell_estimate
+from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
 from perception.pipeline.photos import load_all, split_views, with_labels
 from perception.pipeline.record import Stages, finite, peak_memory_mib, versions
@@ -162,7 +162,7 @@ def _scene(source: Path, output: Path, work: Path, config: MapConfig, progress: 
     kept = work / f"poses-{poses_mark(source, config)}"
     scene = load_saved_scene(kept)
     if scene is None:
-        tell_estimate(source, config, progress.log)
+        log_estimate(source, config, progress.log)
         scene = load_scene(
             source,
             work / "sfm",

@@ -82,13 +82,13 @@ def _warnings(info: dict[str, Any], gaussians: Gaussians, views: list[View]) -> 
     scored = info["quality"].get("views", {})
     mean = info["quality"].get("psnr")
     bad = [f"{name} ({figures['psnr']:.1f} dB)" for name, figures in scored.items() if mean - figures["psnr"] > 6]
-    told = [*_left_out(info["scene"]), *info["scene"].get("warnings", []), *info["masks"].get("warnings", [])]
+    lines = [*_left_out(info["scene"]), *info["scene"].get("warnings", []), *info["masks"].get("warnings", [])]
     if skipped := info["training"].get("skipped_gradients"):
-        told.append(f"{skipped} gradients were not finite and were skipped")
+        lines.append(f"{skipped} gradients were not finite and were skipped")
     if bad:
-        told.append(f"held-out views far below the mean of {mean:.1f} dB: {', '.join(bad)}")
+        lines.append(f"held-out views far below the mean of {mean:.1f} dB: {', '.join(bad)}")
     weak = weak_coverage(gaussians, views)
-    return told if weak is None else [*told, weak]
+    return lines if weak is None else [*lines, weak]
 
 
 def _left_out(scene: dict[str, Any], most: int = 12) -> list[str]:
@@ -96,12 +96,12 @@ def _left_out(scene: dict[str, Any], most: int = 12) -> list[str]:
     reasons: dict[str, list[str]] = {}
     for entry in scene.get("left_out", []):
         reasons.setdefault(entry["why"], []).append(entry["name"])
-    told = []
+    lines = []
     for why, names in reasons.items():
         more = f" and {len(names) - most} more" if len(names) > most else ""
         count = "1 photo" if len(names) == 1 else f"{len(names)} photos"
-        told.append(f"{count} not in the map, {why}: {', '.join(names[:most])}{more}")
-    return told
+        lines.append(f"{count} not in the map, {why}: {', '.join(names[:most])}{more}")
+    return lines
 
 
 class _Album:

@@ -15,7 +15,7 @@ SOLID = 0.5
 """Least opacity of Gaussians that count as surface."""
 SIDE = 240
 """Long side in pixels of the images in which visibility is tested."""
-TOLD = 0.02
+WEAK_SHARE = 0.02
 """Least share of weakly covered surface for a warning."""
 
 
@@ -46,7 +46,7 @@ def weak_coverage(gaussians: Gaussians, views: list[View]) -> str | None:
     solid = gaussians.opacities.detach().numpy() > SOLID
     weak = solid & (views_of_each(gaussians, views) < ENOUGH)
     share = weak.sum() / max(1, solid.sum())
-    if share < TOLD:
+    if share < WEAK_SHARE:
         return None
     middle = np.median(gaussians.means.detach().numpy()[weak], axis=0)
     nearest = min(views, key=lambda view: _off_axis(view, middle))

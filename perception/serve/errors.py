@@ -25,11 +25,11 @@ class OtherMap(Exception):
 
 def problem(status: int, line: str, headers: Mapping[str, str] | None = None) -> JSONResponse:
     """An error response as JSON."""
-    told = " ".join(line.encode("utf-8", "backslashreplace").decode().split())
-    return JSONResponse({"error": told, "status": status}, status, headers)
+    text = " ".join(line.encode("utf-8", "backslashreplace").decode().split())
+    return JSONResponse({"error": text, "status": status}, status, headers)
 
 
-async def told(request: Request, error: Exception) -> JSONResponse:
+async def answer_error(request: Request, error: Exception) -> JSONResponse:
     """The response to an exception that a handler raised."""
     if isinstance(error, UnknownInstance):
         return problem(404, str(error))
@@ -67,4 +67,4 @@ def _bad_request(error: RequestValidationError) -> JSONResponse:
 
 
 _OURS = (InputError, OtherMap, EngineBusy, EngineClosed, AnswerTimeout)
-HANDLERS: dict[Any, Any] = dict.fromkeys((RequestValidationError, *_OURS, HTTPException, Exception), told)
+HANDLERS: dict[Any, Any] = dict.fromkeys((RequestValidationError, *_OURS, HTTPException, Exception), answer_error)

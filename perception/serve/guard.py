@@ -66,8 +66,8 @@ class Guard:
                 return problem(403, f"Host '{name[:80]}' is not this machine; ask for 127.0.0.1 or localhost")
         wait = self._wait(scope["client"][0] if scope.get("client") else "")
         if wait > 0:
-            told = f"more than {settings.rate:g} requests a second; ask again in {wait:.1f} s"
-            return problem(429, told, {"Retry-After": str(max(1, round(wait)))})
+            reason = f"more than {settings.rate:g} requests a second; ask again in {wait:.1f} s"
+            return problem(429, reason, {"Retry-After": str(max(1, round(wait)))})
         if not trusted and scope["path"] not in OPEN:
             why = "the token is wrong" if "authorization" in headers else "a token is needed"
             return problem(401, f"{why}; send it as 'Authorization: Bearer TOKEN'", {"WWW-Authenticate": "Bearer"})
@@ -109,8 +109,8 @@ class Guard:
             try:
                 message = await asyncio.wait_for(receive(), max(0.01, deadline - time.monotonic()))
             except (TimeoutError, asyncio.TimeoutError):
-                told = f"the request did not arrive within {self.settings.timeout:g} s"
-                return problem(408, told, {"Connection": "close"}), receive
+                reason = f"the request did not arrive within {self.settings.timeout:g} s"
+                return problem(408, reason, {"Connection": "close"}), receive
             if message["type"] == "http.disconnect":
                 return problem(400, "the request was cut short"), receive
             part = message.get("body", b"")
@@ -119,8 +119,8 @@ class Guard:
                 kept += part
             more = bool(message.get("more_body"))
         if size > most:
-            told = f"the request has more than {most} bytes, the most that is read"
-            return problem(413, told, {"Connection": "close"}), receive
+            reason = f"the request has more than {most} bytes, the most that is read"
+            return problem(413, reason, {"Connection": "close"}), receive
         return None, _replay(bytes(kept), receive)
 
 

@@ -214,7 +214,7 @@ class Viewer:
             try:
                 action()
             except InputError as error:
-                self.panel.tell(client, str(error))
+                self.panel.notify(client, str(error))
                 return
             if edited:
                 self.session.edited()
@@ -232,7 +232,7 @@ class Viewer:
                 problem = self._follow()
             self.panel.offer_renewal(outdated and bool(problem))
             if problem and problem != self._problem:
-                self.panel.tell(None, problem)
+                self.panel.notify(None, problem)
             self._problem = problem
 
     def _follow(self) -> str:
@@ -244,7 +244,7 @@ class Viewer:
                 self.session.reopen()
             except InputError as error:
                 return str(error)
-            self.panel.tell(None, "the map was changed by another program; this is the new one")
+            self.panel.notify(None, "the map was changed by another program; this is the new one")
             self.panel.refresh()
             self.redraw()
         return ""

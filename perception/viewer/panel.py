@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from perception.query.hit import printed_texts
 from perception.viewer.paint import MODES
-from perception.viewer.session import Session
+from perception.viewer.session import Session, selection_ply
 
 
 class Page(Protocol):
@@ -142,13 +142,11 @@ class Panel:
                 self.session.editor.hide(entry["id"], False)
 
     def _export(self, client: Any) -> None:
-        from perception.viewer.download import selection_ply
-
         client.send_file_download("selection.ply", selection_ply(self.session.editor.current(), self.session.selected))
 
     # ------------------------------------------------------------------- texts
 
-    def tell(self, client: Any, text: str) -> None:
+    def notify(self, client: Any, text: str) -> None:
         """Shows a notification in one browser, or in all when `client` is None."""
         receivers = [client] if client is not None else list(self.viewer.server.get_clients().values())
         for receiver in receivers:

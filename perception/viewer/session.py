@@ -11,10 +11,12 @@ import numpy as np
 
 from perception.editing import Editor
 from perception.errors import InputError
+from perception.io.map import Map
+from perception.io.ply import ply_bytes
 from perception.query import Hit, PartsMap, QueryMap
 from perception.query.crops import best_crop
 from perception.types import View
-from perception.viewer.paint import highlight, paint
+from perception.viewer.paint import base_colors, highlight, paint
 from perception.viewer.picking import pick
 
 CROP_SIDE = 320
@@ -150,6 +152,17 @@ class Session:
             return best_crop(self._loaded(), instance, CROP_SIDE, self.folders)
         except InputError:
             return None
+
+
+def selection_ply(gmap: Map, chosen: list[int]) -> bytes:
+    """A binary PLY of the chosen instances' means: x y z, red green blue, instance_id. InputError for no instance."""
+    if not chosen:
+        raise InputError("nothing is selected; click a thing first")
+    rows = np.isin(gmap.instance_ids, chosen)
+    points, colors = gmap.means[rows].astype(np.float32), base_colors(gmap)[rows]
+    columns = {axis: points[:, i] for i, axis in enumerate("xyz")}
+    columns |= {name: colors[:, i] for i, name in enumerate(("red", "green", "blue"))}
+    return ply_bytes({"vertex": {**columns, "instance_id": gmap.instance_ids[rows].astype(np.int32)}})
 
 
 def _whole(hit: Hit) -> int:

@@ -11,7 +11,7 @@ from perception.config import load_config
 from perception.errors import InputError
 from perception.io.inputs import PhotoSizes, photo_sizes
 from perception.pipeline import estimate as module
-from perception.pipeline.estimate import check_memory, estimate, tell_estimate
+from perception.pipeline.estimate import check_memory, estimate, log_estimate
 
 GIB = 2**30
 CASES = {  # photos, size, settings, seconds and GiB read on two cores
@@ -67,12 +67,12 @@ def test_the_line_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     (tmp_path / "3.png").write_bytes(b"broken")
     assert photo_sizes(tmp_path) == PhotoSizes([(64, 48)] * 3, False, "3 photos")
     lines: list[str] = []
-    tell_estimate(tmp_path, load_config(None, []), lines.append)
+    log_estimate(tmp_path, load_config(None, []), lines.append)
     (line,) = lines
     assert line.startswith("3 photos, trained at up to 64 pixels: about 1.1 GiB and") and "two cores" in line
     monkeypatch.setattr(module, "memory_limit", lambda: GIB // 2)
     with pytest.raises(InputError, match=r"there are 0\.5"):
-        tell_estimate(tmp_path, load_config(None, []), lines.append)
+        log_estimate(tmp_path, load_config(None, []), lines.append)
 
 
 def test_sizes_of_posed_inputs(small_scene: Path) -> None:
