@@ -17,10 +17,10 @@ from fuzz.core import Dice
 from fuzz.targets import Target, in_memory, map_store
 from perception.errors import InputError
 
-
 _NASTY = (
-    1e308, -1e308, 1e200, 5e-324, -0.0, 10**400, 2**63, -1, 0, 1e39, "\ud800", "", "mug", "\x00", "a" * 1001, None, True,
-    [], {}, [[]], [0, 0, 0], [1e308] * 3, [1e-200] * 3, np.eye(4).tolist(), (1e200 * np.eye(3)).tolist(), [[0, 0]] * 70,
+    1e308, -1e308, 1e200, 5e-324, -0.0, 10**400, 2**63, -1, 0, 1e39, None, True,
+    "\ud800", "", "mug", "\x00", "a" * 1001, [], {}, [[]], [0, 0, 0], [1e308] * 3, [1e-200] * 3,
+    np.eye(4).tolist(), (1e200 * np.eye(3)).tolist(), [[0, 0]] * 70,
 )  # fmt: skip
 """Values that replace those of a sound request."""
 
