@@ -167,13 +167,18 @@ def _match(database: Path, pair_file: Path, names: list[str], seed: int, progres
     progress.update("poses: matching", 0, 1)
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
+    # The index of descriptors is trained with OpenBLAS, in pycolmap's wheel one without threads or locks. With several
+    # threads it differed now and then, and with it the matches. The verification uses all threads.
+    matching.num_threads = 1
+    matching.skip_geometric_verification = True
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     verification.ransac.max_num_trials = 2000
     verification.min_num_inliers = MIN_INLIERS
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = pair_file
-    pycolmap.match_image_pairs(database, matching, pairing, verification)
+    pycolmap.match_image_pairs(database, matching, pairing)
+    pycolmap.verify_matches(database, pair_file, verification)
     progress.update("poses: matching", 1, 1)
     return len(pairs), len(names) * (len(names) - 1) // 2
 

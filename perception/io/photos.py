@@ -6,6 +6,7 @@ import struct
 import threading
 import zlib
 from pathlib import Path
+from stat import S_ISREG
 
 import cv2
 import numpy as np
@@ -212,6 +213,8 @@ def _shrink(photo: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 _OPENING = threading.Lock()
+_HEADER = 1 << 16
+"""Bytes of a file's beginning."""
 
 
 def open_photo(path: Path) -> Image.Image:
@@ -219,6 +222,10 @@ def open_photo(path: Path) -> Image.Image:
     if path.suffix.lower() in HEIF_SUFFIXES:
         register_heif()
     try:
+        if not S_ISREG(path.stat().st_mode):
+            raise ValueError("no file")  # to open a FIFO would mean to wait for its writer
+        with path.open("rb") as file:
+            file.read(_HEADER)  # on a disk that hangs, this waits, without the lock that other photos need
         with _OPENING:  # Pillow's limit is global and lies below LARGE_PIXELS; MOST_DECODED is checked instead
             limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
             try:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import builtins
+import io
 import json
 import os
+import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -273,3 +277,32 @@ def test_damaged_photos_with_given_poses_are_left_out(tmp_path: Path) -> None:
     assert [entry["name"] for entry in scene.report["left_out"]] == ["1.png"]
     with pytest.raises(InputError, match=r"1\.png: the photo is truncated"):
         load_scene(tmp_path, tmp_path / "strict", strict=True)
+
+
+def test_a_fifo_is_no_photo(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.jpg")
+    with pytest.raises(InputError, match="not a readable image"):
+        read_photo(tmp_path / "pipe.jpg")
+
+
+def test_a_photo_that_hangs_holds_up_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a mount whose server is gone: the file is there, and opening it waits."""
+    hung, sound = save(tmp_path / "hung.png", 1), save(tmp_path / "sound.png", 2)
+    begun, end, opened = threading.Event(), threading.Event(), builtins.open
+
+    def hanging(file: Any, *rest: Any, **named: Any) -> Any:
+        if os.fspath(file) == str(hung):
+            begun.set()
+            end.wait(60)
+        return opened(file, *rest, **named)
+
+    monkeypatch.setattr(builtins, "open", hanging)
+    monkeypatch.setattr(io, "open", hanging)
+    readers = [threading.Thread(target=read_photo, args=(path,), daemon=True) for path in (hung, sound)]
+    readers[0].start()
+    assert begun.wait(60)
+    readers[1].start()
+    readers[1].join(10)
+    assert not readers[1].is_alive()
+    end.set()
+    readers[0].join(60)

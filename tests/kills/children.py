@@ -31,6 +31,7 @@ class Moment:
 
     seconds: float
     write: int | None = None
+    signal: int = signal.SIGKILL
 
 
 @dataclass(frozen=True)
@@ -44,9 +45,10 @@ class End:
 
 
 def run(work: Callable[[], Any], folder: Path, moment: Moment | None = None) -> End:
-    """Runs `work` in a process group of its own; with a `moment`, SIGKILL falls then, unless it ended before.
+    """Runs `work` in a process group of its own; with a `moment`, its signal falls then, unless it ended before.
 
-    The return value of `work` is its exit code. `folder`: changes below it are counted; its sibling log keeps stderr.
+    Killed is what ended by it, or with 130, as a command does that treats SIGTERM like Ctrl-C. The return value of
+    `work` is its exit code. `folder`: changes below it are counted; its sibling log keeps stderr.
     """
     log = folder.with_suffix(".log")
     log.touch()  # a kill may come before the child has opened it
@@ -63,7 +65,7 @@ def run(work: Callable[[], Any], folder: Path, moment: Moment | None = None) -> 
         limit = started + moment.seconds
     elif moment is not None and select.select([reading], [], [], DEADLINE)[0] and os.read(reading, 1):
         limit = time.monotonic() + moment.seconds
-    killed, status = _wait_until(child, limit)
+    killed, status = _wait_until(child, limit, signal.SIGKILL if moment is None else moment.signal)
     os.close(reading)
     seconds = time.monotonic() - started
     said = log.read_text(encoding="utf-8", errors="replace")
@@ -137,7 +139,7 @@ class _Trap:
         self.left -= 1
         if self.left == 0:
             if self.moment.seconds == 0:
-                os.kill(os.getpid(), signal.SIGKILL)
+                os.kill(os.getpid(), self.moment.signal)
             os.write(self.pipe, b"!")
 
 
@@ -177,14 +179,20 @@ def _set_group(child: int) -> None:
         os.setpgid(child, child)  # here too: whoever comes first
 
 
-def _wait_until(child: int, limit: float) -> tuple[bool, int]:
-    """(whether it had to be killed, wait status)."""
+def _wait_until(child: int, limit: float, number: int) -> tuple[bool, int]:
+    """(whether a signal ended it, wait status). `number` is sent when it has not ended at `limit`."""
     handle = os.pidfd_open(child)
     try:
-        ended = select.select([handle], [], [], max(0.0, limit - time.monotonic()))[0]
+        if not _ended(handle, limit):
+            os.killpg(child, number)
+            if not _ended(handle, time.monotonic() + DEADLINE):
+                os.killpg(child, signal.SIGKILL)
+                raise AssertionError(f"a child went on for {DEADLINE:.0f} s after signal {number}")
     finally:
         os.close(handle)
-    if not ended:
-        os.killpg(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
-    return os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL, status
+    return os.waitstatus_to_exitcode(status) in (-number, 130), status
+
+
+def _ended(handle: int, limit: float) -> bool:
+    return bool(select.select([handle], [], [], max(0.0, limit - time.monotonic()))[0])

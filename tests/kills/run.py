@@ -1,7 +1,8 @@
-"""SIGKILL at random moments of mapping, exporting and label editing; afterwards nothing may be lost.
+"""SIGKILL (or SIGTERM) at random moments of mapping, exporting and label editing; afterwards nothing may be lost.
 
     python tests/kills/run.py                     # 100 kills of each, about 20 minutes on two cores
     python tests/kills/run.py editing --kills 1000 --seed 7
+    python tests/kills/run.py --signal TERM
 
 After every kill the map from before must open with all its checksums, no half-written file may lie under a final name,
 and the same command again (`perception map --resume`) must end with, bit for bit, what the undisturbed run ended with,
@@ -16,6 +17,7 @@ import collections
 import json
 import platform
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -63,6 +65,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("what", nargs="*", default=list(NAMES), help=f"of {', '.join(NAMES)}; all by default")
     parser.add_argument("--kills", type=int, default=100, metavar="N", help="at uniformly drawn times")
     parser.add_argument("--writes", type=int, default=30, metavar="N", help="around changes to the file system")
+    parser.add_argument("--signal", choices=("KILL", "TERM"), default="KILL")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--scene", type=Path, help="a small scene that lies ready (tests/conftest.py's)")
     parser.add_argument(
@@ -81,7 +84,6 @@ def _arguments() -> argparse.Namespace:
 def _warm() -> None:
     """Everything imported that the commands import, and nothing of it run."""
     import cv2  # noqa: F401
-    import pycolmap  # noqa: F401
     import scipy.sparse.csgraph
     import scipy.spatial  # noqa: F401
     import torch  # noqa: F401
@@ -91,6 +93,9 @@ def _warm() -> None:
     import perception.io.sfm
     import perception.pipeline.exporting
     import perception.pipeline.mapping  # noqa: F401
+    from perception.io.lens import load_pycolmap
+
+    load_pycolmap()
 
 
 def _cases(folder: Path, args: argparse.Namespace) -> dict[str, Case]:
@@ -143,9 +148,10 @@ def _kill(case: Case, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
         if row["kills"] == args.kills + args.writes:
             break
         uniform = row["kills"] < args.kills
-        moment = _moment(rng, lengths[trial % case.variants], writes[trial % case.variants], uniform)
+        number = signal.Signals[f"SIG{args.signal}"]
+        moment = _moment(rng, lengths[trial % case.variants], writes[trial % case.variants], uniform, number)
         twice = rng.random() < RESUME_KILLED
-        second = Moment(rng.uniform(0, lengths[trial % case.variants])) if twice else None
+        second = Moment(rng.uniform(0, lengths[trial % case.variants]), signal=number) if twice else None
         place = folder / f"{case.name}-{trial}"
         try:
             _one(case, place, trial, moment, second, row)
@@ -184,11 +190,12 @@ def _check_forking(case: Mapping, folder: Path) -> None:
     shutil.rmtree(place)
 
 
-def _moment(rng: np.random.Generator, length: float, writes: list[str], uniform: bool) -> Moment:
+def _moment(rng: np.random.Generator, length: float, writes: list[str], uniform: bool, number: int) -> Moment:
     if uniform:
-        return Moment(rng.uniform(0, length))
+        return Moment(rng.uniform(0, length), None, number)
     first = max(1, len(writes) - FINAL) if rng.random() < 0.5 else 1
-    return Moment(float(rng.choice([0.0, rng.uniform(0, 0.003)])), int(rng.integers(first, len(writes) + 1)))
+    seconds = float(rng.choice([0.0, rng.uniform(0, 0.003)]))
+    return Moment(seconds, int(rng.integers(first, len(writes) + 1)), number)
 
 
 def _one(case: Case, place: Path, trial: int, moment: Moment, second: Moment | None, row: dict[str, Any]) -> None:
