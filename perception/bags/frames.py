@@ -1,8 +1,10 @@
-"""`perception frames`: extracts sharp, well-spaced photos from a bag, with intrinsics and, if available, poses."""
+"""`perception frames`: extracts sharp, well-spaced photos from a bag, with intrinsics and what there is of poses, depth
+and gravity."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from perception.bags.decode import decode_image, encoded
+from perception.bags.depth import MILLIMETRES, choose_depth, depth_topics, write_depth
+from perception.bags.gravity import gravity
 from perception.bags.poses import FIXED_FRAMES, Poses, read_poses
 from perception.bags.read import CAMERA_INFO, IMAGES, Bag, open_bag, stamp_of
 from perception.errors import InputError
@@ -26,7 +30,8 @@ class FrameOptions:
     """topic: of the images (None: the only one in the bag). camera_info: its topic (None: the one next to the images).
 
     camera: file that replaces camera_info. poses: use tf and odometry if available. fixed_frame: the world frame
-    (None: map, odom, world, or the root of the tree). odometry: topic (None: all). max_frames, spacing: see Chooser.
+    (None: map, odom, world, or the root of the tree). odometry: topic (None: all). depth: topic, or
+    "none" (None: the one registered to the images, else the only one). max_frames, spacing: see Chooser.
     """
 
     topic: str | None = None
@@ -35,6 +40,7 @@ class FrameOptions:
     poses: bool = True
     fixed_frame: str | None = None
     odometry: str | None = None
+    depth: str | None = None
     max_frames: int = 200
     spacing: float = 0.08
 
@@ -42,7 +48,7 @@ class FrameOptions:
 def run_frames(
     source: Path, output: Path, options: FrameOptions | None = None, tell: Callable[[str], None] | None = None
 ) -> tuple[dict[str, Any], str]:
-    """Writes `output`/images, camera.yaml and, with poses, transforms.json: (JSON-serialisable result, text).
+    """Writes `output`/images, camera.yaml, depth of the images, and, with poses, transforms.json: (JSON result, text).
 
     Map `output` if there are poses. Otherwise map `output`/images with --camera `output`/camera.yaml.
     """
@@ -52,7 +58,8 @@ def run_frames(
     if options.max_frames < 2 or not options.spacing > 0:
         raise InputError(f"--max-frames {options.max_frames}, --spacing {options.spacing}: expected 2 or more, above 0")
     with open_bag(source) as bag:
-        topic = _image_topic(bag, options.topic)
+        depths = depth_topics(bag)
+        topic = _image_topic(bag, options.topic, depths)
         info = None if options.camera is not None else _camera_info(bag, topic, options.camera_info)
         chooser = Chooser(options.spacing)
         size = None
@@ -64,13 +71,15 @@ def run_frames(
             raise InputError(f"{source}: {topic} holds no images")
         chosen = chooser.chosen(options.max_frames)
         tell(f"{topic}: {len(chosen)} of {len(chooser.motion)} images chosen")
-        poses = read_poses(bag, options.odometry) if options.poses else Poses()
+        poses = read_poses(bag, options.odometry)
         with atomic_directory(output) as aside:
             lens = _write_camera(aside / "camera.yaml", options.camera, info, topic, size, source)
             stamps, frame = _write_images(bag, topic, chosen, aside / "images")
-            placed = _place(poses, stamps, frame, options.fixed_frame)
+            depth, told = _depth(bag, depths, options.depth, stamps, lens, frame, poses, aside / "depth")
+            placed = _place(poses if options.poses else Poses(), stamps, frame, options.fixed_frame)
+            down = gravity(bag, poses, placed.fixed) if placed.known and placed.fixed is not None else None
             if placed.known:
-                _write_transforms(aside / "transforms.json", placed, lens)
+                _write_transforms(aside / "transforms.json", placed, lens, depth, down)
     facts = {
         "output": str(output),
         "topic": topic,
@@ -81,6 +90,10 @@ def run_frames(
         "camera_frame": placed.frame,
         "size": list(size),
         "camera_model": lens.model,
+        "depth": told,
+        "with_depth": len(depth),
+        "gravity": None if down is None else down[0].tolist(),
+        "gravity_std_deg": None if down is None else down[1],
     }
     return facts, _text(facts)
 
@@ -95,8 +108,9 @@ class Placed:
     frame: str
 
 
-def _image_topic(bag: Bag, wanted: str | None) -> str:
+def _image_topic(bag: Bag, wanted: str | None, depths: list[str]) -> str:
     topics = bag.of_type(*IMAGES)
+    topics = [topic for topic in topics if topic not in depths] or topics
     if wanted is not None:
         if wanted not in topics:
             raise InputError(f"{bag.path}: has no image topic '{wanted}'; found {', '.join(topics) or 'none'}")
@@ -154,6 +168,27 @@ def _write_images(bag: Bag, topic: str, chosen: list[int], folder: Path) -> tupl
     return stamps, frame
 
 
+def _depth(
+    bag: Bag,
+    topics: list[str],
+    wanted: str | None,
+    stamps: dict[str, int],
+    lens: Lens,
+    frame: str,
+    poses: Poses,
+    folder: Path,
+) -> tuple[dict[str, str], str | None]:
+    """Depth file by photo, and one line for the user; depth that was not asked for and cannot be used is left out."""
+    try:
+        topic = choose_depth(bag, topics, wanted, frame)
+        return ({}, None) if topic is None else write_depth(bag, topic, stamps, lens, frame, poses, folder)
+    except InputError as error:
+        if wanted is not None:
+            raise
+        shutil.rmtree(folder, ignore_errors=True)
+        return {}, f"left out: {error}"
+
+
 def _place(poses: Poses, stamps: dict[str, int], frame: str, fixed: str | None) -> Placed:
     """Poses in the first of FIXED_FRAMES (or the tree's root) with poses for 80 % of the images, else with the most."""
     best = Placed({}, stamps, fixed, frame)
@@ -167,13 +202,19 @@ def _place(poses: Poses, stamps: dict[str, int], frame: str, fixed: str | None) 
     return best
 
 
-def _write_transforms(path: Path, placed: Placed, lens: Lens) -> None:
-    """nerfstudio's format: only frames with a pose, OpenGL camera axes, pixel centres at +0.5."""
+def _write_transforms(
+    path: Path, placed: Placed, lens: Lens, depth: dict[str, str], down: tuple[np.ndarray, float] | None
+) -> None:
+    """nerfstudio's format: only frames with a pose, OpenGL camera axes, pixel centres at +0.5, depth in millimetres.
+
+    "gravity" points down in the world; "gravity_std_deg" is its standard error in degrees.
+    """
     frames = [
         {
             "file_path": f"images/{name}",
             "transform_matrix": (inverse_se3(placed.known[name]) @ OPENCV_FROM_OPENGL).tolist(),
             "stamp_ns": placed.stamps[name],
+            **({"depth_file_path": depth[name]} if name in depth else {}),
         }
         for name in placed.known
     ]
@@ -186,6 +227,10 @@ def _write_transforms(path: Path, placed: Placed, lens: Lens) -> None:
         "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     }.get(lens.model, ())
     data |= dict(zip(order, extra, strict=True))
+    if depth:
+        data["depth_unit_scale_factor"] = 1 / MILLIMETRES
+    if down is not None:
+        data |= {"gravity": down[0].tolist(), "gravity_std_deg": down[1]}
     path.write_text(json.dumps({**data, "world_frame": placed.fixed, "frames": frames}, indent=1), encoding="utf-8")
 
 
@@ -194,5 +239,10 @@ def _text(facts: dict[str, Any]) -> str:
     line = f"{folder}: {facts['chosen']} of {facts['images']} images of {facts['topic']}, {facts['camera_model']}"
     if facts["with_pose"]:
         line += f"; {facts['with_pose']} with a pose in '{facts['fixed_frame']}'"
+    if facts["depth"]:
+        line += f"\ndepth: {facts['depth']}"
+    if facts["gravity"]:
+        line += f"\ngravity: from the IMU, ±{facts['gravity_std_deg']:.1f}°"
+    if facts["with_pose"]:
         return f"{line}\nnext: perception map {folder} -o MAP"
-    return f"{line}; no poses\nnext: perception map {folder}/images --camera {folder}/camera.yaml -o MAP"
+    return f"{line}\nno poses\nnext: perception map {folder}/images --camera {folder}/camera.yaml -o MAP"

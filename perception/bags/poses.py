@@ -35,10 +35,7 @@ class Poses:
 
     def root(self, frame: str) -> str:
         """The topmost ancestor of a frame."""
-        seen = [frame.lstrip("/")]
-        while seen[-1] in self.parents and self.parents[seen[-1]] not in seen:
-            seen.append(self.parents[seen[-1]])
-        return seen[-1]
+        return [frame.lstrip("/"), *self._ancestors(frame)][-1]
 
     def chain(self, fixed: str, frame: str) -> list[str] | None:
         """Frames from `frame` up to just below `fixed`; None if `fixed` is not an ancestor of `frame`."""
@@ -62,6 +59,23 @@ class Poses:
                 return None
             fixed_from_frame = step @ fixed_from_frame
         return inverse_se3(fixed_from_frame)
+
+    def between(self, a: str, b: str, time: int) -> np.ndarray | None:
+        """a_from_b [4, 4] at a time in ns, by their nearest common ancestor; None as in `camera_from_world`."""
+        above = [[frame.lstrip("/"), *self._ancestors(frame)] for frame in (a, b)]
+        common = next((frame for frame in above[0] if frame in above[1]), None)
+        if common is None:
+            return None
+        ends = [
+            np.eye(4) if frames[0] == common else self.camera_from_world(common, frames[0], time) for frames in above
+        ]
+        return None if ends[0] is None or ends[1] is None else ends[0] @ inverse_se3(ends[1])
+
+    def _ancestors(self, frame: str) -> list[str]:
+        found: list[str] = []
+        while (parent := self.parents.get(found[-1] if found else frame.lstrip("/"))) and parent not in found:
+            found.append(parent)
+        return found
 
     def _at(self, child: str, time: int) -> np.ndarray | None:
         if child not in self._arrays:

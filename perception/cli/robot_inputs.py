@@ -51,6 +51,9 @@ def _add_frames(commands: Any) -> None:
     p.add_argument("--poses", action=argparse.BooleanOptionalAction, default=True, help="from tf and odometry")
     p.add_argument("--fixed-frame", metavar="FRAME", help="the world (default: map, odom, world, or the tree's root)")
     p.add_argument("--odometry", metavar="TOPIC")
+    p.add_argument(
+        "--depth", metavar="TOPIC", help="none, or a topic (default: registered to the images, or the only one)"
+    )
     p.add_argument("--max-frames", type=int, default=200, metavar="N")
     p.add_argument("--spacing", type=float, default=0.08, metavar="S", help="least motion, as share of the width")
 
@@ -58,5 +61,5 @@ def _add_frames(commands: Any) -> None:
 def _frames(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.bags import FrameOptions, run_frames
 
-    names = ("topic", "camera_info", "camera", "poses", "fixed_frame", "odometry", "max_frames", "spacing")
+    names = ("topic", "camera_info", "camera", "poses", "fixed_frame", "odometry", "depth", "max_frames", "spacing")
     return run_frames(args.bag, args.output, FrameOptions(**{name: getattr(args, name) for name in names}))

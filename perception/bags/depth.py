@@ -1,0 +1,226 @@
+"""Depth images of a bag: decoded to metres, registered to the photos, and paired with them by time."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cv2
+import numpy as np
+
+from perception.bags.poses import Poses
+from perception.bags.read import CAMERA_INFO, IMAGES, Bag, stamp_of
+from perception.errors import InputError
+from perception.io.camera_file import read_camera, write_camera_info
+from perception.io.lens import camera_from_lens, rescale_lens
+from perception.types import Lens
+
+APART = 0.03
+"""Greatest time in seconds between a photo and its depth image: one frame at 30 Hz."""
+MILLIMETRES, LARGEST = 1000.0, 65534
+"""Stored units per metre, and the largest: 65535 means saturated to many programs."""
+_SAME_LENS = 0.01
+"""Largest relative difference between focal lengths for which depth in the photos' frame counts as registered."""
+_COMPRESSED, _HEADER = "compressedDepth", 12
+_NAMED = ("aligned", "registered")
+_TYPES = {"16UC1": "u2", "32FC1": "f4"}
+
+
+def depth_topics(bag: Bag) -> list[str]:
+    """Topics whose first message is a depth image: 16UC1 or 32FC1, raw or by the transport compressedDepth."""
+    found = []
+    for topic in bag.of_type(*IMAGES):
+        first = next(bag.messages([topic]), None)
+        kind = "" if first is None else str(getattr(first[2], "encoding", None) or first[2].format)
+        if _COMPRESSED in kind or kind.startswith(("16UC1", "32FC1")):
+            found.append(topic)
+    return found
+
+
+def choose_depth(bag: Bag, topics: list[str], wanted: str | None, frame: str) -> str | None:
+    """The depth topic to use for photos in tf frame `frame`; None when there is none, or `wanted` is "none".
+
+    Preferred: in the photos' frame, then named aligned or registered, then not compressed.
+    """
+    if wanted == "none" or not (topics or wanted):
+        return None
+    if wanted is not None:
+        if wanted not in topics:
+            raise InputError(f"{bag.path}: has no depth topic '{wanted}'; found {', '.join(topics) or 'none'}")
+        return wanted
+
+    def rank(topic: str) -> tuple[bool, bool, bool]:
+        other = _frame_of(next(bag.messages([topic]))[2]) != frame.lstrip("/")
+        return other, not any(word in topic for word in _NAMED), topic.endswith(_COMPRESSED)
+
+    ranked = sorted((rank(topic), topic) for topic in topics)
+    if len(ranked) > 1 and ranked[0][0] == ranked[1][0]:
+        raise InputError(f"{bag.path}: holds several depth topics, choose one with --depth: {', '.join(topics)}")
+    return ranked[0][1]
+
+
+def decode_depth(message: Any, where: str) -> np.ndarray:
+    """Depth [h, w] float32 in metres, 0 = nothing measured. 16UC1 holds millimetres, 32FC1 metres (ROS REP 118)."""
+    kind = str(getattr(message, "encoding", None) or message.format)
+    image: np.ndarray | None
+    if hasattr(message, "encoding"):
+        image = _raw(message, kind, where)
+    elif _COMPRESSED in kind:
+        image = _compressed(bytes(message.data), kind, where)
+    else:
+        image = cv2.imdecode(np.frombuffer(bytes(message.data) or b"\0", np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 2:
+        raise InputError(f"{where}: a depth image of format '{kind}' cannot be decoded; expected png or rvl")
+    metres = image.astype(np.float32) / (np.float32(1) if image.dtype.kind == "f" else np.float32(MILLIMETRES))
+    metres[~np.isfinite(metres) | (metres < 0) | ((image == 65535) & (image.dtype == np.uint16))] = 0
+    return metres
+
+
+def _raw(message: Any, kind: str, where: str) -> np.ndarray:
+    if kind not in _TYPES:
+        raise InputError(f"{where}: depth is encoded as '{kind}'; expected 16UC1 (mm) or 32FC1 (m)")
+    dtype = np.dtype(_TYPES[kind]).newbyteorder(">" if message.is_bigendian else "<")
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    if min(height, width) < 1 or step < width * dtype.itemsize or data.size < step * height:
+        raise InputError(f"{where}: a depth image of {width}x{height} (rows of {step} bytes) holds {data.size} bytes")
+    rows = np.ascontiguousarray(data[: step * height].reshape(height, step)[:, : width * dtype.itemsize])
+    return np.asarray(rows.view(dtype))
+
+
+def _compressed(data: bytes, kind: str, where: str) -> np.ndarray | None:
+    """ROS's compressedDepth: a header (int32, float a, float b), then PNG or RVL; 32FC1 stores v = a / depth + b."""
+    if len(data) <= _HEADER:
+        return None
+    _, a, b = struct.unpack("<iff", data[:_HEADER])
+    image: np.ndarray | None
+    if "rvl" in kind.lower():
+        image = _rvl(data[_HEADER:], where)
+    else:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8, offset=_HEADER), cv2.IMREAD_UNCHANGED)
+    if image is None or not kind.startswith("32FC1"):
+        return image
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(image > 0, a / (image.astype(np.float32) - b), 0).astype(np.float32)
+
+
+def _rvl(data: bytes, where: str) -> np.ndarray:
+    """Wilson 2017, "Fast Lossless Depth Image Compression": runs of zeros and of differences, in nibbles of 3 bits."""
+    width, height = struct.unpack("<ii", data[:8])
+    if not 0 < width * height <= 1 << 26:
+        raise InputError(f"{where}: an RVL image of {width}x{height} pixels")
+    words = np.frombuffer(data[8 : 8 + (len(data) - 8) // 4 * 4], "<u4")
+    nibbles = iter(((words[:, None] >> np.arange(28, -1, -4)) & 15).ravel().tolist())
+
+    def number() -> int:
+        value = shift = 0
+        for nibble in nibbles:
+            value |= (nibble & 7) << shift
+            shift += 3
+            if nibble < 8:
+                return value
+        raise InputError(f"{where}: an RVL image ends early")
+
+    image, at, last = np.zeros(width * height, np.int64), 0, 0
+    while at < len(image):
+        at += number()
+        for _ in range(number()):
+            delta = number()
+            last += (delta >> 1) ^ -(delta & 1)
+            if at >= len(image):
+                raise InputError(f"{where}: an RVL image holds more than {width}x{height} pixels")
+            image[at], at = last, at + 1
+    return image.astype(np.uint16).reshape(height, width)
+
+
+def registered(depth: np.ndarray, own: Lens, color: Lens, color_from_depth: np.ndarray) -> np.ndarray:
+    """Depth [h, w] of lens `own` as lens `color` sees it, at a resolution at which pixels of `own` leave no gaps.
+
+    Each measured point is moved by color_from_depth [4, 4]; where several fall on a pixel, the nearest counts.
+    """
+    height, width = depth.shape
+    own = rescale_lens(own, width, height)
+    scale = min(1.0, own.params[0] / color.params[0])
+    color = rescale_lens(color, max(1, int(color.width * scale)), max(1, int(color.height * scale)))
+    rows, columns = np.nonzero(depth)
+    rays = np.asarray(camera_from_lens(own).cam_from_img(np.stack([columns + 0.5, rows + 0.5], axis=1)))[:, :2]
+    z = depth[rows, columns].astype(np.float64)
+    points = np.column_stack([rays * z[:, None], z]) @ color_from_depth[:3, :3].T + color_from_depth[:3, 3]
+    points = points[points[:, 2] > 0]
+    at = np.floor(np.asarray(camera_from_lens(color).img_from_cam(points))).astype(np.int64)
+    inside = (at >= 0).all(axis=1) & (at[:, 0] < color.width) & (at[:, 1] < color.height)
+    image = np.full(color.width * color.height, np.inf)
+    np.minimum.at(image, at[inside, 1] * color.width + at[inside, 0], points[inside, 2])
+    return np.where(np.isfinite(image), image, 0).astype(np.float32).reshape(color.height, color.width)
+
+
+def write_depth(
+    bag: Bag, topic: str, stamps: dict[str, int], lens: Lens, frame: str, poses: Poses, folder: Path
+) -> tuple[dict[str, str], str]:
+    """Writes the depth image nearest in time to each photo, 16-bit PNG in millimetres: file by photo, and a text.
+
+    stamps: times of the photos in ns. lens, frame: of the photos. Depth of another frame or lens is registered by its
+    camera_info and tf; InputError where these are missing.
+    """
+    own = _depth_lens(bag, topic)
+    times = np.array([stamp_of(message) or recorded for _, recorded, message in bag.messages([topic])])
+    nearest = {name: int(np.abs(times - stamp).argmin()) for name, stamp in stamps.items()}
+    apart = {name: abs(int(times[index]) - stamps[name]) / 1e9 for name, index in nearest.items()}
+    wanted: dict[int, list[str]] = {}
+    for name, index in nearest.items():
+        if apart[name] <= APART:
+            wanted.setdefault(index, []).append(name)
+    if not wanted:
+        raise InputError(
+            f"{bag.path}: no image of {topic} lies within {APART} s of a photo (the nearest: "
+            f"{min(apart.values()):.3g} s); give another --depth, or --depth none"
+        )
+    folder.mkdir()
+    for index, (_, recorded, message) in enumerate(bag.messages([topic])):
+        if index not in wanted:
+            continue
+        depth, there = decode_depth(message, f"{bag.path}: {topic}"), _frame_of(message)
+        if there != frame.lstrip("/") or (own is not None and not _same(own, lens)):
+            moved = poses.between(frame, there, stamp_of(message) or recorded)
+            if own is None or moved is None:
+                lacks = "a camera_info" if own is None else f"tf from '{there}' to '{frame}'"
+                raise InputError(f"{bag.path}: {topic} is not registered to the photos and lacks {lacks}")
+            depth = registered(depth, own, lens, moved)
+        for name in wanted[index]:
+            (folder / f"{Path(name).stem}.png").write_bytes(_png(depth))
+    written = {name: f"{folder.name}/{Path(name).stem}.png" for names in wanted.values() for name in names}
+    most = max(apart[name] for name in written)
+    return written, f"{topic}, {len(written)} of {len(stamps)} photos, at most {1000 * most:.0f} ms apart"
+
+
+def _png(depth: np.ndarray) -> bytes:
+    stored = np.round(depth * MILLIMETRES)
+    image = np.where(stored <= LARGEST, stored, 0).astype(np.uint16)
+    return bytes(cv2.imencode(".png", image)[1].tobytes())
+
+
+def _frame_of(message: Any) -> str:
+    return str(message.header.frame_id).lstrip("/")
+
+
+def _depth_lens(bag: Bag, topic: str) -> Lens | None:
+    base = topic.removesuffix(f"/{_COMPRESSED}").removesuffix("/compressed").rpartition("/")
+    name = f"{base[0]}/camera_info"
+    if name not in bag.of_type(CAMERA_INFO):
+        return None
+    message = next((message for _, _, message in bag.messages([name])), None)
+    if message is None:
+        return None
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "camera_info.yaml"
+        write_camera_info(file, message, rectified="rect" in base[2].partition("_")[2])
+        return read_camera(file)
+
+
+def _same(a: Lens, b: Lens) -> bool:
+    """Whether two lenses see the same, at any resolution."""
+    ratio = np.array([a.width / b.width, a.height / b.height] * 2)
+    size = np.array([a.width, a.height] * 2)
+    return bool((np.abs(np.array(a.params[:4]) - ratio * b.params[:4]) < _SAME_LENS * size).all())
