@@ -44,6 +44,7 @@ class View:
     K: [3, 3] float64, pixels. camera_from_world: [4, 4] float64, OpenCV axes (x right, y down, z forward).
     held_out: whether the view was used for evaluation of a finished map and not for training. depth: None without a
     depth sensor. mask: image of pixels to ignore (black), of the photo's shape at any resolution; None uses all.
+    gain: colours of the photo over those of the scene, RGB, where exposure or white balance vary; None = 1.
     """
 
     name: str
@@ -56,6 +57,7 @@ class View:
     held_out: bool = False
     depth: DepthImage | None = None
     mask: Path | None = None
+    gain: tuple[float, float, float] | None = None
 
 
 @dataclass

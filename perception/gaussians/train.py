@@ -102,8 +102,9 @@ class Trainer:
         with self.record.timed("rasterizer forward"):
             out = self._render(params, view, with_features)  # I (eq. 3), F (eq. 5) and Var F (eq. 12)
         with self.record.timed("losses"):
-            photo = target_photo(view, out.colors[0])
-            loss = photometric_loss(out.colors[0], photo, SSIM_WEIGHT, view.weight)  # L_RGB, eq. 4
+            image = view.exposed(out.colors[0])
+            photo = target_photo(view, image)
+            loss = photometric_loss(image, photo, SSIM_WEIGHT, view.weight)  # L_RGB, eq. 4
             if with_features:
                 loss = loss + self._feature_losses(view, out)
             images = [image for image in (out.colors, out.features, out.feature_variance) if image is not None]

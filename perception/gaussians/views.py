@@ -20,7 +20,8 @@ class TrainingView:
     """One photo as used in training. photo [H, W, 3] uint8; labels [H, W] int32 (0 = unlabelled) or None;
     K [3, 3] and camera_from_world [4, 4] float32; eps2d: see `rasterize`; weight [H, W] float32: 0 = pixel is ignored,
     None = all pixels count; depth [H, W] float32, what a sensor measured along the optical axis without its edges
-    (`io.depth.without_edges`), in scene units, 0 = none; or None."""
+    (`io.depth.without_edges`), in scene units, 0 = none; or None; gain [3] float32: colours of the
+    photo over those of the scene, None = 1."""
 
     name: str
     photo: torch.Tensor
@@ -30,6 +31,7 @@ class TrainingView:
     eps2d: float = 0.3
     weight: torch.Tensor | None = None
     depth: torch.Tensor | None = None
+    gain: torch.Tensor | None = None
 
     def halved(self) -> TrainingView:
         """The same view at half the resolution: photo averaged 2 × 2, labels taken at every other pixel. A pixel is
@@ -54,7 +56,12 @@ class TrainingView:
         if weight is not None:
             weight = weight[: 2 * height, : 2 * width].reshape(height, 2, width, 2).amin(dim=(1, 3))
         eps2d = (self.eps2d + 0.25) / 4
-        return TrainingView(self.name, photo.contiguous(), labels, K, self.camera_from_world, eps2d, weight, depth)
+        photo, pose = photo.contiguous(), self.camera_from_world
+        return TrainingView(self.name, photo, labels, K, pose, eps2d, weight, depth, self.gain)
+
+    def exposed(self, image: torch.Tensor) -> torch.Tensor:
+        """`image` [H, W, 3] of the scene as this photo is exposed."""
+        return image if self.gain is None else image * self.gain
 
 
 def target_photo(view: TrainingView, image: torch.Tensor) -> torch.Tensor:
@@ -74,8 +81,8 @@ def scene_extent(views: list[TrainingView]) -> float:
 
 @torch.no_grad()
 def render_view(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
-    """The Gaussians rendered from the view, [H, W, 3] float32 in [0, 1], on a black background."""
-    return _render(gaussians, view).colors[0].clamp(0, 1)
+    """The Gaussians rendered and exposed as the view, [H, W, 3] float32 in [0, 1], on a black background."""
+    return view.exposed(_render(gaussians, view).colors[0]).clamp(0, 1)
 
 
 @torch.no_grad()

@@ -7,6 +7,7 @@ reduced system is solved by preconditioned conjugate gradients (Agarwal et al. 2
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -175,7 +176,7 @@ def _step(problem: _Problem, poses: Poses, points: np.ndarray, damping: float) -
     U = bsr_matrix((U, np.arange(count), np.arange(count + 1)), shape=(6 * count, 6 * count))
     reduced = (U + prior_H - eliminate @ W.T).tocsr()
     reduced.setdiag(reduced.diagonal() * (1 + damping))
-    delta = _conjugate_gradients(reduced, g_pose.ravel() + prior_g - eliminate @ g_point.ravel(), count)
+    delta = conjugate_gradients(reduced, g_pose.ravel() + prior_g - eliminate @ g_point.ravel(), 6)
     shift = np.einsum("pij,pj->pi", V_inverse, g_point - (W.T @ delta).reshape(size, 3))
     return delta.reshape(count, 6), shift
 
@@ -203,7 +204,7 @@ def _linearised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np
     return root * residual, J_pose, J_point
 
 
-def _prior_system(delta: np.ndarray, prior: tuple[float, float]) -> tuple[object, np.ndarray]:
+def _prior_system(delta: np.ndarray, prior: tuple[float, float]) -> tuple[Any, np.ndarray]:
     """Matrix [6N, 6N] and right side [6N] of the normal equations of the priors."""
     from scipy.sparse import diags, identity, kron, vstack
 
@@ -214,21 +215,21 @@ def _prior_system(delta: np.ndarray, prior: tuple[float, float]) -> tuple[object
     return A.T @ diags(weight.ravel()) @ A, -(A.T @ (weight * rows).ravel())
 
 
-def _conjugate_gradients(A: object, b: np.ndarray, count: int) -> np.ndarray:
-    """x of A x = b, A sparse, symmetric and positive; the inverse of its 6 × 6 diagonal blocks preconditions."""
-    blocks = np.stack([A[i : i + 6, i : i + 6].toarray() for i in range(0, 6 * count, 6)])  # type: ignore[index]
+def conjugate_gradients(A: Any, b: np.ndarray, size: int) -> np.ndarray:
+    """x of A x = b, A sparse, symmetric and positive; the inverses of its diagonal blocks [size, size] precondition."""
+    blocks = np.stack([A[i : i + size, i : i + size].toarray() for i in range(0, len(b), size)])
     inverse = np.linalg.inv(blocks)
     x, r = np.zeros_like(b), b.copy()
-    z = np.einsum("nij,nj->ni", inverse, r.reshape(count, 6)).ravel()
+    z = np.einsum("nij,nj->ni", inverse, r.reshape(-1, size)).ravel()
     p, rz = z, (r * z).sum()
     first = rz
     for _ in range(10 * len(b)):
         if rz <= 1e-10 * first:
             break
-        Ap = A @ p  # type: ignore[operator]
+        Ap = A @ p
         step = rz / (p * Ap).sum()
         x, r = x + step * p, r - step * Ap
-        z = np.einsum("nij,nj->ni", inverse, r.reshape(count, 6)).ravel()
+        z = np.einsum("nij,nj->ni", inverse, r.reshape(-1, size)).ravel()
         before, rz = rz, (r * z).sum()
         p = z + rz / before * p
     return x

@@ -36,7 +36,9 @@ def stored_view(view: View, folder: Path, held_out: bool = False) -> StoredView:
         size = None
     K, pose = np.asarray(view.K, np.float64), np.asarray(view.camera_from_world, np.float64)
     beside = _relative(photo, folder)
-    return StoredView(view.name, photo, K, view.width, view.height, pose, view.lens, held_out, None, None, beside, size)
+    return StoredView(
+        view.name, photo, K, view.width, view.height, pose, view.lens, held_out, None, None, view.gain, beside, size
+    )
 
 
 def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
@@ -87,7 +89,7 @@ def _relative(photo: Path, folder: Path) -> str | None:
 
 
 def view_json(view: View) -> dict[str, Any]:
-    """A view as JSON, with the photo record if `view` is a `StoredView`, and its depth and mask if it has any."""
+    """A view as JSON, with the photo record if `view` is a `StoredView`, and its depth, mask and gain if it has any."""
     entry = {
         "name": view.name,
         "photo": str(absolute(view.photo)),
@@ -101,6 +103,8 @@ def view_json(view: View) -> dict[str, Any]:
         entry |= {name: getattr(view, name) for name in ("held_out", "photo_beside", "photo_bytes")}
     if view.depth is not None:
         entry["depth"] = [str(absolute(view.depth.path)), view.depth.scale, _lens_json(view.depth.lens)]
+    if view.gain is not None:
+        entry["gain"] = list(view.gain)
     if view.mask is not None:
         entry["mask"] = str(absolute(view.mask))
     return entry
@@ -108,7 +112,7 @@ def view_json(view: View) -> dict[str, Any]:
 
 def view_from_json(entry: dict[str, Any]) -> StoredView:
     """The inverse of `view_json`. ValueError, TypeError or KeyError for an invalid entry."""
-    beside, size, depth, mask = (entry.get(key) for key in ("photo_beside", "photo_bytes", "depth", "mask"))
+    beside, size, depth, mask, gain = map(entry.get, ("photo_beside", "photo_bytes", "depth", "mask", "gain"))
     K, pose = (np.array(entry[name], np.float64) for name in ("K", "camera_from_world"))
     if K.shape != (3, 3) or pose.shape != (4, 4) or not (np.isfinite(K).all() and np.isfinite(pose).all()):
         raise ValueError(f"{entry['name']}: K or camera_from_world is no finite matrix")
@@ -126,6 +130,7 @@ def view_from_json(entry: dict[str, Any]) -> StoredView:
         bool(entry.get("held_out", False)),
         None if depth is None else DepthImage(Path(depth[0]), float(depth[1]), _lens_of(depth[2])),
         None if mask is None else Path(mask),
+        None if gain is None else (float(gain[0]), float(gain[1]), float(gain[2])),
         None if beside is None else str(beside),
         None if size is None else int(size),
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from perception.geometry import camera_centres
 from perception.io.bundle_adjustment import Poses, adjust, residuals, starting_points
-from perception.io.tracks import Features, features_of, tracks_of
+from perception.io.tracks import Features, tracks_of
 from perception.io.views import view_lens
 from perception.types import View
 
@@ -50,13 +50,13 @@ def match_errors(features: Features, poses: Poses) -> tuple[np.ndarray, np.ndarr
     return np.concatenate(lines), np.concatenate(carried)
 
 
-def checked_poses(views: list[View], store: Any, how: str) -> tuple[list[View], dict[str, Any]]:
+def checked_poses(views: list[View], features: Features, how: str) -> tuple[list[View], dict[str, Any]]:
     """`views` as given or with refined poses, and the report's entries: "poses", "notes", "warnings".
 
-    store: the matched features of the views (see io.features). how: "auto" refines poses that are worse than TOLERANCE,
+    how: "auto" refines poses that are worse than TOLERANCE,
     "refine" any. Views that are held out for scoring are refined as well, by features and depth alone.
     """
-    features, given = features_of(views, store), poses_of(views)
+    given = poses_of(views)
     if len(features.pairs) < LEAST_MATCHES:
         note = f"given poses not checked: {len(features.pairs)} matched features, {LEAST_MATCHES} are needed"
         return views, {"poses": {}, "notes": [note], "warnings": []}

@@ -15,6 +15,7 @@ from typing import Any
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory, recover
 from perception.io.colmap import views_of_model
+from perception.io.exposure import with_gains
 from perception.io.features import FeatureStore, build_features
 from perception.io.ignore_masks import mask_of
 from perception.io.incremental_sfm import map_photos
@@ -22,6 +23,7 @@ from perception.io.lens import lens_from_camera, lens_text, load_pycolmap
 from perception.io.photo_folder import PhotoSet, choose_photos
 from perception.io.photos import photo_size
 from perception.io.sfm_checks import model_warnings
+from perception.io.tracks import features_of
 from perception.io.triangulate import cloud_of
 from perception.progress import Progress
 from perception.types import Lens, Scene
@@ -60,9 +62,11 @@ def reconstruct(
     located = {image_id: (chosen.names[index], photos[index]) for image_id, index in indices.items()}
     views, _, _ = views_of_model(model, located, folder, strict)
     views = [replace(view, mask=mask_of(masks, view.name)) for view in views]
+    staged = dict(zip(chosen.names, store.names, strict=True))
+    views, exposure = with_gains(views, features_of(views, store, [staged[view.name] for view in views]))
     points, colors = cloud_of(model)
     report["left_out"] = sorted([*chosen.left_out, *report["left_out"]], key=lambda entry: entry["name"])
-    return Scene(views, points, colors, report={**report, "notes": chosen.notes})
+    return Scene(views, points, colors, report={**report, **exposure, "notes": chosen.notes})
 
 
 def _too_few(folder: Path, chosen: PhotoSet) -> InputError:

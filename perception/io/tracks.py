@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from perception.io.depth import load_depth
+from perception.io.features import FeatureStore
 from perception.io.lens import camera_from_lens, load_pycolmap
 from perception.io.views import view_lens
 from perception.types import View
@@ -47,15 +48,16 @@ class Tracks:
         return int(self.point[-1]) + 1 if len(self.point) else 0
 
 
-def features_of(views: list[View], store: Any) -> Features:
-    """The matched features of `views` in `store` (see io.features), which was made of the same photos."""
+def features_of(views: list[View], store: FeatureStore, names: list[str] | None = None) -> Features:
+    """The matched features of `views`, which have these `names` in `store`; None: they are all its photos in order."""
     db = load_pycolmap().Database.open(store.database)
-    images = [db.read_image_with_name(name).image_id for name in store.names]
+    images = [db.read_image_with_name(name).image_id for name in names or store.names]
     keypoints = [np.asarray(db.read_keypoints(image), np.float64)[:, :2] for image in images]
     starts = dict(zip(images, np.cumsum([0, *map(len, keypoints)]), strict=False))
     matches = [np.empty((0, 2), np.int64)]
     for (a, b), geometry in _geometries(db):
-        matches.append(np.add(geometry.inlier_matches, (starts[a], starts[b]), dtype=np.int64).reshape(-1, 2))
+        if a in starts and b in starts:
+            matches.append(np.add(geometry.inlier_matches, (starts[a], starts[b]), dtype=np.int64).reshape(-1, 2))
     db.close()
     pairs = np.concatenate(matches)
     view = np.repeat(np.arange(len(views)), [len(found) for found in keypoints])

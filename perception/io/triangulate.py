@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 
 from perception.geometry import inverse_se3
+from perception.io.exposure import with_gains
 from perception.io.features import build_features
 from perception.io.lens import camera_from_lens, lens_text, load_pycolmap
 from perception.io.pose_refinement import checked_poses
+from perception.io.tracks import features_of
 from perception.io.views import view_lens
 from perception.progress import Progress
 from perception.types import Scene, View
@@ -46,12 +48,15 @@ def posed_scene(
         masks = [v.mask for v in views]
         store = build_features([v.photo for v in views], [view_lens(v) for v in views], workdir, seed, progress, masks)
         report["seconds"] = store.facts["seconds"]
+        features = features_of(views, store)
         if check:
             started = time.perf_counter()
-            views, found = checked_poses(views, store, poses)
+            views, found = checked_poses(views, features, poses)
             report |= {key: [*report.get(key, []), *found[key]] for key in ("notes", "warnings")}
             report["poses"] = found["poses"]
             report["seconds"]["refinement"] = time.perf_counter() - started
+        views, found = with_gains(views, features)
+        report |= found
         if few:
             points, colors, found = triangulated_cloud(views, store, seed)
             report |= {**found, "warnings": [*report["warnings"], *found["warnings"]]}

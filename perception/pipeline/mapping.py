@@ -32,7 +32,7 @@ from perception.masks.source import GeometryMaskSource
 from perception.pipeline.checkpoint import TrainingObserver, fingerprint, poses_mark, training_mark
 from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
-from perception.pipeline.photos import load_all, split_views, with_labels
+from perception.pipeline.photos import exposed_as_neighbours, load_all, split_views, with_labels
 from perception.pipeline.record import Stages, finite, peak_memory_mib, versions
 from perception.pipeline.sensor_depth import depth_errors, depth_used
 from perception.pipeline.summary import depth_text, frame_lines
@@ -83,6 +83,7 @@ def build_map(
             scene = _scene(source, output, work, config, progress)
         _tell_scene(scene, progress)
         training, held_out = split_views(scene.views, config.photos.holdout, config.photos.held_out)
+        held_out = exposed_as_neighbours(held_out, training)
         with stages("photos"):
             views = load_all(training, config.photos.max_side, progress)
             held = load_all(held_out, config.photos.max_side, progress)
@@ -248,7 +249,7 @@ def _assemble(
     output: Path,
 ) -> Map:
     """The map to write; in JSON values, None replaces NaN and infinity."""
-    held = {view.name for view in held_out}
+    held = {view.name: view for view in held_out}
     arrays = {name: tensor.detach().numpy() for name, tensor in vars(gaussians).items()}
     arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)
     return Map(
@@ -257,7 +258,7 @@ def _assemble(
         membership=found.membership,
         instances=finite(found.instances),
         info=finite(record),
-        views=[stored_view(view, output, view.name in held) for view in scene.views],
+        views=[stored_view(held.get(view.name, view), output, view.name in held) for view in scene.views],
         language=found.language,
         parts=found.parts,
     )
@@ -281,6 +282,8 @@ def _tell_scene(scene: Scene, progress: Progress) -> None:
     progress.log(f"{len(scene.views)} posed photos{depth}, {len(scene.points)} points")
     for line in frame_lines({"metric": scene.metric, **report}):
         progress.log(line)
+    if report.get("exposure", {}).get("varies"):
+        progress.log(f"exposure varies by {report['exposure']['spread']:.0%} between photos: each has its gains")
     for note in report.get("notes", []):
         progress.log(note)
     for entry in report.get("left_out", []):

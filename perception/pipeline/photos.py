@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -44,6 +45,21 @@ def _names(listed: Path) -> set[str]:
         raise InputError(f"{listed}: cannot be read; expected a text file of photo names, one a line") from error
 
 
+def exposed_as_neighbours(held_out: list[View], training: list[View]) -> list[View]:
+    """Held-out views, each with the geometric mean of the gains of the training views before and after it by name.
+
+    Their own gains come from the photos that they are to be compared with.
+    """
+    names = [view.name for view in training]
+    exposed = []
+    for view in held_out:
+        place = bisect(names, view.name)
+        near = [other.gain for other in training[max(place - 1, 0) : place + 1] if other.gain is not None]
+        gain = None if view.gain is None or not near else tuple(np.exp(np.log(near).mean(axis=0)).tolist())
+        exposed.append(replace(view, gain=gain))
+    return exposed
+
+
 def training_view(view: View, max_side: int) -> TrainingView:
     """Decodes one photo, its mask of pixels to ignore, and its depth image without ignored pixels."""
     photo = load_photo(view, max_side)
@@ -60,6 +76,7 @@ def training_view(view: View, max_side: int) -> TrainingView:
         torch.from_numpy(view.camera_from_world.astype(np.float32)),
         weight=None if weight is None else torch.from_numpy(weight),
         depth=None if depth is None else torch.from_numpy(depth),
+        gain=None if view.gain is None else torch.tensor(view.gain),
     )
 
 

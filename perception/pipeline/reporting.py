@@ -135,7 +135,9 @@ class _Album:
     def render(self, name: str) -> np.ndarray:
         """[h, w, 3] uint8: the map rendered from the camera of the photo."""
         pose, K, _, _ = self._camera(name)
-        view = TrainingView(name, torch.from_numpy(self.photo(name)), None, K, pose)
+        gain = self.views[name].gain
+        exposure = None if gain is None else torch.tensor(gain)
+        view = TrainingView(name, torch.from_numpy(self.photo(name)), None, K, pose, gain=exposure)
         return (render_view(self.gaussians, view) * 255 + 0.5).to(torch.uint8).numpy()
 
     def _ids(self, name: str) -> np.ndarray:

@@ -10,7 +10,7 @@ import torch
 from perception.config import load_config
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import Trainer
-from perception.gaussians.views import TrainingView, render_view
+from perception.gaussians.views import TrainingView, psnr, render_view
 
 
 def small_gaussians(n: int = 400) -> Gaussians:
@@ -67,3 +67,26 @@ def test_ignored_pixels_do_not_change_the_map() -> None:
 
     dark, bright = map_of(0), map_of(255)
     assert all(torch.equal(dark[name], bright[name]) for name in dark)
+
+
+def test_photos_of_changing_exposure_are_trained_as_one_scene() -> None:
+    """Renders of one scene, darkened and tinted by known gains: with these, the scene itself is learnt."""
+    truth = small_gaussians()
+    K = torch.tensor([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
+    gains = [torch.tensor(gain) for gain in ([0.5, 0.6, 0.7], [0.8, 0.6, 0.4])]
+    blank = TrainingView("", torch.zeros(48, 64, 3, dtype=torch.uint8), None, K, torch.eye(4))
+    views = []
+    for i, gain in enumerate(gains):
+        photo = render_view(truth, replace(blank, gain=gain))
+        torch.testing.assert_close(photo, (render_view(truth, blank) * gain).clamp(0, 1), atol=1e-6, rtol=0)
+        views.append(replace(blank, name=str(i), photo=(255 * photo).round().to(torch.uint8), gain=gain))
+    assert all(view.halved().gain is view.gain for view in views)
+    config, expected = load_config(None, ["train.iterations=60", "train.exchange_db=0"]), render_view(truth, blank)
+
+    def trained(shown: list[TrainingView]) -> float:
+        start = small_gaussians()
+        trainer = Trainer(replace(start, sh=torch.full_like(start.sh, 0.3)), shown, config, [])
+        trainer.run()
+        return psnr(render_view(trainer.gaussians, blank), (255 * expected).round().to(torch.uint8))
+
+    assert trained(views) > trained([replace(view, gain=None) for view in views]) + 3

@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perception.geometry import align_similarity, look_at
-from perception.io import pose_refinement
 from perception.io.bundle_adjustment import Poses, _linearised, _Problem, starting_points
 from perception.io.pose_refinement import checked_poses, match_errors, poses_of, refine
 from perception.io.tracks import Features, Tracks, tracks_of
@@ -166,22 +165,21 @@ def test_a_view_with_two_features_of_a_track_is_left_out_of_it():
 # ------------------------------------------------------------------ what is done with them
 
 
-def check(monkeypatch, features, poses, how="auto"):
+def check(features, poses, how="auto"):
     views = views_at(poses.matrices())
-    monkeypatch.setattr(pose_refinement, "features_of", lambda *_: features)
-    return views, *checked_poses(views, None, how)
+    return views, *checked_poses(views, features, how)
 
 
-def test_exact_poses_are_used_as_they_are(made, monkeypatch):
+def test_exact_poses_are_used_as_they_are(made):
     _, right, features = made
-    given, views, report = check(monkeypatch, features, right)
+    given, views, report = check(features, right)
     assert views is given and not report["poses"]["refined"] and not report["warnings"]
     assert report["poses"]["given_error_px"]["epipolar"] < 2 * NOISE
 
 
-def test_drifting_poses_are_refined_and_told(made, monkeypatch):
+def test_drifting_poses_are_refined_and_told(made):
     rng, right, features = made
-    given, views, report = check(monkeypatch, features, drifted(rng, right, 0.5, 0.02))
+    given, views, report = check(features, drifted(rng, right, 0.5, 0.02))
     facts = report["poses"]
     assert facts["refined"] and facts["error_px"]["epipolar"] < 2 * NOISE < 1 < facts["given_error_px"]["epipolar"]
     moved = np.linalg.norm(poses_of(views).center - poses_of(given).center, axis=1)
@@ -192,25 +190,25 @@ def test_drifting_poses_are_refined_and_told(made, monkeypatch):
     assert all(view.name == old.name and view.K is old.K for view, old in zip(views, given, strict=True))
 
 
-def test_depth_in_another_unit_is_left_out_with_a_warning(made, monkeypatch):
+def test_depth_in_another_unit_is_left_out_with_a_warning(made):
     rng, right, features = made
     millimetres = replace(features, depth=1000 * features.depth)
-    _, views, report = check(monkeypatch, millimetres, drifted(rng, right, 0.5, 0.02))
+    _, views, report = check(millimetres, drifted(rng, right, 0.5, 0.02))
     assert report["poses"]["refined"] and "another unit" in report["warnings"][0]
     assert errors(poses_of(views), right)[0] < 0.004
-    given, views, report = check(monkeypatch, millimetres, right)
+    given, views, report = check(millimetres, right)
     assert "another unit" in report["warnings"][0]
     assert all(view.camera_from_world is old.camera_from_world for view, old in zip(views, given, strict=True))
 
 
-def test_poses_that_no_match_agrees_with_are_kept_with_a_warning(monkeypatch):
+def test_poses_that_no_match_agrees_with_are_kept_with_a_warning():
     rng = np.random.default_rng(0)
     matrices = truth(rng)
-    given, views, report = check(monkeypatch, seen(rng, matrices, wrong=1), poses_of(views_at(matrices)))
+    given, views, report = check(seen(rng, matrices, wrong=1), poses_of(views_at(matrices)))
     assert views is given and "do not fit the photos" in report["warnings"][0]
 
 
-def test_few_matches_are_no_check(made, monkeypatch):
+def test_few_matches_are_no_check(made):
     _, right, features = made
-    given, views, report = check(monkeypatch, replace(features, pairs=features.pairs[:20]), right)
+    given, views, report = check(replace(features, pairs=features.pairs[:20]), right)
     assert views is given and "not checked: 20" in report["notes"][0]

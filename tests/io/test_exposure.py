@@ -1,0 +1,59 @@
+"""Gains of photos: made tracks with known gains, and plain photos of known brightness."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from perception.io.exposure import VARIES, photo_gains, with_gains
+from perception.io.tracks import Features, Tracks
+from perception.types import View
+
+PHOTOS, POINTS = 30, 400
+
+
+def test_gains_are_found_among_wrong_matches_and_shadows():
+    """A walk: each point is seen in five photos of the row, so that gains are tied in a chain only."""
+    rng = np.random.default_rng(0)
+    right = np.cumsum(rng.normal(0, 0.05, (PHOTOS, 3)), axis=0)
+    right -= right.mean(axis=0)
+    first = rng.integers(0, PHOTOS - 4, POINTS)
+    view, point = (first[:, None] + np.arange(5)).ravel(), np.repeat(np.arange(POINTS), 5)
+    logs = rng.normal(-1, 0.4, (POINTS, 3))[point] + right[view] + rng.normal(0, 0.02, (len(view), 3))
+    wrong = rng.random(len(view)) < 0.15
+    logs[wrong] += rng.normal(-0.3, 0.5, (wrong.sum(), 3))
+    tracks = Tracks(view, point, np.zeros((len(view), 2)), np.ones(len(view)), np.zeros(len(view)))
+    found = photo_gains(logs, np.ones(len(view), bool), tracks, PHOTOS)
+    # About 60 points of 0.02 tie one photo to the next, 0.003 a step; a chain of 30 steps is off by a hundredth or two.
+    assert np.abs(found - right).max() < 0.03 < np.abs(right).max()
+    assert np.abs(found.mean(axis=0)).max() < 1e-12
+
+
+def photos(folder, levels):
+    K = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
+    views = []
+    for i, level in enumerate(levels):
+        Image.fromarray(np.full((48, 64, 3), level, np.uint8)).save(folder / f"{i}.png")
+        views.append(View(f"{i}.png", folder / f"{i}.png", K, 64, 48, np.eye(4)))
+    return views
+
+
+def matched(count):
+    """Twenty features a photo, each seen in all of them."""
+    rays = np.tile(np.random.default_rng(1).uniform(-0.4, 0.4, (20, 2)), (count, 1))
+    pairs = np.stack([np.arange(20 * (count - 1)), np.arange(20, 20 * count)], axis=1)
+    return Features(np.repeat(np.arange(count), 20), rays, np.full(len(rays), 50.0), np.zeros(len(rays)), pairs)
+
+
+def test_photos_of_changing_exposure_and_white_balance_get_gains(tmp_path):
+    levels = np.array([[100, 100, 100], [120, 120, 120], [100, 100, 150], [60, 90, 100]])
+    views, report = with_gains(photos(tmp_path, levels), matched(4))
+    geometric = levels / np.exp(np.log(levels).mean(axis=0))
+    np.testing.assert_allclose([view.gain for view in views], geometric, rtol=0.02)
+    assert report["exposure"]["varies"] and report["exposure"]["spread"] > VARIES
+
+
+@pytest.mark.parametrize("levels", [[100, 100, 101, 100], [255, 255, 255, 3]])
+def test_photos_of_equal_exposure_and_clipped_ones_are_left_as_they_are(tmp_path, levels):
+    given = photos(tmp_path, levels)
+    views, report = with_gains(given, matched(4))
+    assert views is given and not report["exposure"]["varies"]
