@@ -23,8 +23,8 @@ TIED = 0.02
 """Weight of each photo's gain of 1, in observations: (noise of a colour 0.03 / usual spread of gains 0.2)²."""
 VARIES, REMAINS = 0.03, 0.7
 """Gains are used if the standard deviation of their logarithms is above VARIES, and if they leave at most the share
-REMAINS of the differences between colours of the same point. Read: 0.2 and 0.45 in an RGB-D camera's walk; 0.1 and 0.8
-with a phone that also maps tones by place (gains are worth 0.1 dB there, 0.8 dB in the walk); 0.005 and 0.99 with fixed exposure."""
+REMAINS of the differences between colours of the same point. Read: 0.2 and 0.45 in an RGB-D camera's walk, where gains
+are worth 0.8 dB; 0.1 and 0.8 with a phone that also maps tones by place, 0.1 dB; 0.005 and 0.99 with fixed exposure."""
 
 
 def with_gains(views: list[View], features: Features) -> tuple[list[View], dict[str, Any]]:
