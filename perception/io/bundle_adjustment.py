@@ -66,7 +66,8 @@ def starting_points(tracks: Tracks, poses: Poses) -> np.ndarray:
     """Points [P, 3]: the least-squares intersection of the rays, each ended at its measured depth if there is one."""
     rays = np.concatenate([tracks.rays, np.ones((len(tracks.rays), 1))], axis=1)
     world = np.einsum("oji,oj->oi", poses.rotation[tracks.view], rays)
-    ends = poses.center[tracks.view] + world * tracks.depth[:, None]
+    origin = poses.center.mean(axis=0)  # the world's may be far away
+    ends = (poses.center - origin)[tracks.view] + world * tracks.depth[:, None]
     along = world / np.linalg.norm(world, axis=1, keepdims=True)
     across = np.eye(3) - along[:, :, None] * along[:, None, :]
     # Σ A_o (x − e_o) = 0, where A_o is the projection across the ray, or with depth nearly the identity.
@@ -74,7 +75,7 @@ def starting_points(tracks: Tracks, poses: Poses) -> np.ndarray:
     system = _sums(weight, tracks.point, tracks.size)
     right = _sums(np.einsum("oij,oj->oi", weight, ends), tracks.point, tracks.size)
     system += 1e-9 * np.trace(system, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    return np.asarray(np.linalg.solve(system, right[..., None])[..., 0])
+    return np.asarray(np.linalg.solve(system, right[..., None])[..., 0] + origin)
 
 
 def residuals(tracks: Tracks, poses: Poses, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

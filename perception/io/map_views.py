@@ -116,6 +116,8 @@ def view_from_json(entry: dict[str, Any]) -> StoredView:
     K, pose = (np.array(entry[name], np.float64) for name in ("K", "camera_from_world"))
     if K.shape != (3, 3) or pose.shape != (4, 4) or not (np.isfinite(K).all() and np.isfinite(pose).all()):
         raise ValueError(f"{entry['name']}: K or camera_from_world is no finite matrix")
+    if gain is not None and not (len(gain) == 3 and all(0 < value < 1e3 for value in gain)):
+        raise ValueError(f"{entry['name']}: gain is not three numbers above 0")
     width, height = int(entry["width"]), int(entry["height"])
     if min(width, height) < 1:
         raise ValueError(f"{entry['name']}: {width}×{height} pixels")

@@ -80,7 +80,8 @@ def checked_poses(views: list[View], features: Features, how: str) -> tuple[list
         facts |= {"refined": True, "error_px": after, **_changes(refined.since(given))}
         report["notes"].append(f"refined poses: {_text(after)}; {_changes_text(facts)}")
         return [replace(v, camera_from_world=m) for v, m in zip(usable, refined.matrices(), strict=True)], report
-    if before["epipolar"] <= good:
+    if before["epipolar"] <= HOPELESS * good:
+        report["notes"].append(f"refining them gains little ({_text(after)}); they are used as they are")
         return usable, report
     warning = "the given poses do not fit the photos, and refining them did not help; they are used as they are"
     return views, {**report, "warnings": [warning]}

@@ -1,10 +1,14 @@
 """Gains of photos: made tracks with known gains, and plain photos of known brightness."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from perception.io.exposure import VARIES, photo_gains, with_gains
+from perception.io.map_views import view_from_json, view_json
 from perception.io.tracks import Features, Tracks
 from perception.types import View
 
@@ -57,3 +61,12 @@ def test_photos_of_equal_exposure_and_clipped_ones_are_left_as_they_are(tmp_path
     given = photos(tmp_path, levels)
     views, report = with_gains(given, matched(4))
     assert views is given and not report["exposure"]["varies"]
+
+
+def test_gains_are_kept_and_wrong_ones_refused(tmp_path):
+    (view,) = photos(tmp_path, [100])
+    entry = json.loads(json.dumps(view_json(replace(view, gain=(0.5, 1.0, 1.5)))))
+    assert view_from_json(entry).gain == (0.5, 1.0, 1.5) and view_from_json(view_json(view)).gain is None
+    for wrong in ([1, 2], [1, 1, float("nan")], [0, 1, 1]):
+        with pytest.raises(ValueError, match="gain"):
+            view_from_json({**entry, "gain": wrong})

@@ -87,6 +87,13 @@ def test_the_world_frame_is_kept(made):
     assert align_similarity(found.center, given.center)[0] == pytest.approx(1, abs=0.02)
 
 
+def test_a_world_far_from_its_origin_makes_no_difference(made):
+    rng, right, features = made
+    given, far = drifted(rng, right), np.array([5e5, -4e6, 100.0])  # as in UTM coordinates
+    near, moved = refine(features, given), refine(features, Poses(given.rotation, given.center + far))
+    np.testing.assert_allclose(moved.center - far, near.center, atol=1e-4)
+
+
 def test_depth_gives_the_scale(made):
     _, right, features = made
     wide = Poses(right.rotation, 1.04 * right.center)  # odometry that counts its wheels 4 % too large
