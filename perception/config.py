@@ -52,6 +52,15 @@ class PhotoConfig(Settings):
     strict: bool = Field(False, description="refuse a damaged photo instead of leaving it out")
 
 
+class FrameConfig(Settings):
+    keep_world: bool | None = Field(None, description="keep the input's frame and unit; none: if the input has poses")
+    known_length: str | None = Field(None, description="METRES: PHOTO X,Y X,Y; PHOTO X,Y X,Y: a length, by its pixels")
+    tag_size: float | None = Field(
+        None, gt=0, le=1000, description="metres: black square of the AprilTags or ArUco markers in the photos"
+    )
+    board: str | None = Field(None, description="KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]]: a board in the photos")
+
+
 class TrainConfig(Settings):
     iterations: int = Field(3000, ge=1, le=10**8, description="iterations of training; all schedules scale with them")
     time_limit: float | None = Field(None, gt=0, description="seconds of training; all schedules shrink to fit")
@@ -116,6 +125,7 @@ class MapConfig(Settings):
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="what computes; there is no CUDA build yet")
     masks: str = Field("auto", description="auto, builtin, sam:PATH or labels:DIR: where object masks come from")
     photos: PhotoConfig = PhotoConfig()
+    frame: FrameConfig = FrameConfig()
     train: TrainConfig = TrainConfig()
     densify: DensifyConfig = DensifyConfig()
     losses: LossConfig = LossConfig()

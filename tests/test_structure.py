@@ -15,7 +15,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "perception"
 LAYERS = [
     {"errors", "types", "config", "boxes", "geometry", "progress", "listening", "_core", "pictures", "colors"},
     {"io"},
-    {"masks", "demo", "calibration", "bags"},
+    {"masks", "demo", "calibration", "bags", "frame"},
     {"gaussians"},
     {"language", "instances"},
     {

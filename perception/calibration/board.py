@@ -51,6 +51,19 @@ class Board:
                 f"--dictionary '{self.dictionary}' is not known; expected one of OpenCV's, such as 5X5_100"
             )
 
+    @classmethod
+    def from_text(cls, text: str) -> Board:
+        """The board of "KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]]"; the marker is 3/4 of the square by default."""
+        kind, squares, square, marker, dictionary = (*text.split(":"), *[""] * 5)[:5]
+        try:
+            columns, rows = (int(word) for word in squares.lower().split("x"))
+            side = float(square)
+            return cls(kind, (columns, rows), side, float(marker or 0.75 * side), dictionary or "5X5_100")
+        except ValueError as error:
+            raise InputError(
+                f"board: found '{text}', expected KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]] such as charuco:8x11:0.02"
+            ) from error
+
     def __str__(self) -> str:
         markers = f", markers {self.dictionary}" if self.kind == "charuco" else ""
         return f"{self.kind} of {self.squares[0]}x{self.squares[1]} squares{markers}"

@@ -40,6 +40,12 @@ def _add_map(commands: Any) -> None:
     )
     p.add_argument("--ignore-masks", metavar="DIR", help="PNG masks, same stem as the photo; black pixels are ignored")
     p.add_argument("--init-points", metavar="CLOUD", help="start from these points, in the frame of the input's poses")
+    p.add_argument(
+        "--keep-world", action=argparse.BooleanOptionalAction, help="keep the input's frame (default: if it has poses)"
+    )
+    p.add_argument("--known-length", metavar="TEXT", help='"0.297: a.jpg 100,200 300,220; b.jpg 110,190 310,215"')
+    p.add_argument("--tag-size", metavar="M", help="side of the AprilTags or ArUco markers in the photos")
+    p.add_argument("--board", metavar="TEXT", help="a calibration board in the photos, such as charuco:8x11:0.02")
     p.add_argument("--max-side", metavar="PX", help="long side in pixels at which the map is trained")
     p.add_argument("--budget", metavar="N", help="most Gaussians the map may have")
     p.add_argument("--iterations", metavar="N")
@@ -64,6 +70,10 @@ _SHORTCUTS = {
     "strict": "photos.strict",
     "ignore_masks": "photos.ignore_masks",
     "init_points": "photos.init_points",
+    "keep_world": "frame.keep_world",
+    "known_length": "frame.known_length",
+    "tag_size": "frame.tag_size",
+    "board": "frame.board",
     "max_side": "photos.max_side",
     "budget": "train.budget",
     "iterations": "train.iterations",

@@ -36,10 +36,10 @@ from typing import Any
 
 import numpy as np
 
+from perception.frame.gravity import Gravity, up_from_cameras
 from perception.geometry import camera_centres
 from perception.language.shape_words import KINDS
 
-LEVEL = 0.12  # largest mean square of the sine of the cameras' roll at which they count as level
 SAMPLES = 1000  # points used per instance
 LEAST = 20  # points; instances with fewer get no scores
 
@@ -60,33 +60,21 @@ class Body:
     footprint: np.ndarray  # low and high corner [2, 2] of the slab's bounding rectangle
 
 
-def up_from_cameras(camera_from_world: np.ndarray) -> np.ndarray | None:
-    """The up direction [3] in the world frame, from poses [C, 4, 4]; None when the cameras were not held level.
-
-    The x axes of level cameras are horizontal, so up is the direction of their smallest mean squared component.
-    """
-    if len(camera_from_world) < 3:
-        return None
-    right, down = camera_from_world[:, 0, :3], camera_from_world[:, 1, :3]
-    values, vectors = np.linalg.eigh(right.T @ right / len(right))
-    up = vectors[:, 0]
-    if values[1] < 2 * values[0] + 1e-3:  # a path without turns: all x axes are parallel
-        up = -down.mean(axis=0)
-        up /= max(float(np.linalg.norm(up)), 1e-9)
-    if float(((right @ up) ** 2).mean()) > LEVEL or abs(float((down @ up).mean())) < 0.3:
-        return None
-    return up if (down @ up).mean() < 0 else -up
-
-
 def shape_scores(
-    means: np.ndarray, instance_ids: np.ndarray, wanted: list[int], camera_from_world: np.ndarray
+    means: np.ndarray,
+    instance_ids: np.ndarray,
+    wanted: list[int],
+    camera_from_world: np.ndarray,
+    gravity: Gravity | None = None,
 ) -> np.ndarray:
     """Shape scores of the instances `wanted` for each of shape_words.KINDS: [I, K] in [0, 1].
 
-    means [N, 3], instance_ids [N]; camera_from_world [C, 4, 4]. If the up direction is unknown, only "ball" is scored.
+    means [N, 3], instance_ids [N]; camera_from_world [C, 4, 4]. gravity: of the map, if recorded. If the
+    up direction is unknown, only "ball" is scored.
     """
     scores = np.zeros((len(wanted), len(KINDS)))
-    up = up_from_cameras(camera_from_world)
+    known = gravity is not None and gravity.confident
+    up = -gravity.direction if gravity is not None and known else up_from_cameras(camera_from_world)
     frame = level_frame(np.array([0.0, 0.0, 1.0]) if up is None else up)
     measured = [measure(means[instance_ids == i] @ frame.T) for i in wanted]
     rows = [n for n, body in enumerate(measured) if body is not None]

@@ -38,6 +38,9 @@ _PERSPECTIVE = (
 MILLIMETRE = 1e-3
 """Unit of depth images without `depth_unit_scale_factor` or `integer_depth_scale`, in metres: nerfstudio's default."""
 
+GRAVITY_ERROR = 1.0
+"""Standard error in degrees of a `gravity` without `gravity_std_deg`, as of a phone's motion sensors."""
+
 
 def read_transforms(
     file: Path,
@@ -53,7 +56,7 @@ def read_transforms(
 
     Intrinsics of a frame override global ones. Without fl_x the focal length is computed from camera_angle_x; without w
     and h the size is that of the photo. Points are read from `ply_file_path`, else triangulated with the given poses.
-    The unit is not assumed to be the metre. View names are paths below the common folder of all photos. Missing and
+    The unit is the metre if `metric` is true. View names are paths below the common folder of all photos. Missing and
     damaged photos are left out and reported; strict: damaged ones raise InputError.
     masks: folder whose masks precede `mask_path`. cloud: used instead of other points. poses: see `posed_scene`.
     """
@@ -76,7 +79,10 @@ def read_transforms(
     }
     if cloud is None and len(listed[0]):
         facts["points_from"] = str(data["ply_file_path"])
-    return posed_scene(views, listed, facts, workdir, seed, progress, 1, poses)
+    facts |= _gravity(file, data)
+    scene = posed_scene(views, listed, facts, workdir, seed, progress, 1, poses)
+    scene.metric = data.get("metric") is True
+    return scene
 
 
 def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:
@@ -198,6 +204,22 @@ def _listed(file: Path, what: str, listed: object) -> Path:
     if path is None:
         raise InputError(f"{file}: {what} {brief(listed)} does not exist; remove the entry or add the file")
     return path
+
+
+def _gravity(file: Path, data: dict[str, Any]) -> dict[str, Any]:
+    """The report's entry of `gravity` [3], down in the file's world, whose error in degrees is `gravity_std_deg`."""
+    if data.get("gravity") is None:
+        return {}
+    try:
+        down = np.array(data["gravity"], np.float64)
+    except (TypeError, ValueError, OverflowError):
+        down = np.zeros(3)
+    length = float(np.linalg.norm(down)) if down.shape == (3,) else 0.0
+    error = _number(data, "gravity_std_deg", str(file))
+    if not 0 < length < np.inf or (error is not None and error <= 0):
+        raise InputError(f"{file}: gravity must be three numbers, not all 0, and gravity_std_deg above 0")
+    error = GRAVITY_ERROR if error is None else error
+    return {"gravity": {"direction": (down / length).tolist(), "source": file.name, "standard_error_deg": error}}
 
 
 def _lens(file: Path, values: dict[str, Any], photo: Path | None) -> Lens:

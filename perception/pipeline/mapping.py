@@ -15,6 +15,7 @@ import numpy as np
 
 from perception.config import MapConfig
 from perception.errors import InputError
+from perception.frame.place import placed_scene
 from perception.gaussians.depth_start import start_on_surface
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
@@ -176,7 +177,7 @@ def _scene(source: Path, output: Path, work: Path, config: MapConfig, progress: 
             init_points=Path(config.photos.init_points) if config.photos.init_points else None,
             poses=config.photos.poses,
         )
-        save_scene(kept, scene := recentred(scene))
+        save_scene(kept, scene := placed_scene(recentred(scene), config.frame, config.seed))
     if config.losses.depth_weight == 0:
         return replace(scene, views=[replace(view, depth=None) for view in scene.views])
     return scene

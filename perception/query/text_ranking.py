@@ -107,12 +107,15 @@ class TextRanking:
         return Ranker(descriptions, encoder, labels, self._shapes, printed_on(self._gmap))
 
     def _shapes(self) -> np.ndarray:
+        from perception.frame.gravity import Gravity
         from perception.instances.shapes import shape_scores
 
         index = self._gmap.index
         owners = np.repeat(index.ids, np.diff(index.starts))
         poses = self._gmap.poses
-        return shape_scores(index.points, owners, [entry["id"] for entry in self._gmap.instances], poses)
+        gravity = self._gmap.info.get("gravity")
+        down = None if gravity is None else Gravity.from_json(gravity)
+        return shape_scores(index.points, owners, [entry["id"] for entry in self._gmap.instances], poses, down)
 
 
 def printed_on(gmap: Map) -> Printed | None:

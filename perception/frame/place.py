@@ -1,0 +1,142 @@
+"""Puts a scene into the frame of its map: z up, metres, the origin on the floor below the first camera, x ahead."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from perception.calibration.board import Board
+from perception.config import FrameConfig
+from perception.errors import InputError
+from perception.frame.gps import scale_of_gps
+from perception.frame.gravity import Gravity, floor_height, gravity_of_scene
+from perception.frame.known_size import scale_of_board, scale_of_pixels, scale_of_tags
+from perception.frame.scale import Measurement, combined, known_length, scale_of_depth
+from perception.geometry import camera_centres
+from perception.io.recentre import moved_scene
+from perception.types import Scene, View
+
+UNIT_IS_METRE = 0.03
+"""Largest deviation from 1, and largest standard error, at which a measured unit is taken as the metre as it is."""
+
+
+def placed_scene(scene: Scene, options: FrameConfig, seed: int = 0) -> Scene:
+    """The scene in the map's frame; report["scale"], ["gravity"] and ["map_from_input"] tell how it was found.
+
+    A scene whose input has poses keeps its world unless `options.keep_world` is False: only the unit becomes the metre
+    when `options` give a known size. Photos without poses get the map's frame as far as it is known: turned if the
+    standard error of gravity allows (`Gravity.confident`), in metres if something tells the scale. InputError for a
+    known size that is not seen.
+    """
+    posed = scene.report.get("input") != "photos"
+    asked = any((options.known_length, options.tag_size, options.board))
+    metric, scale, notes = _unit(scene, options, seed)
+    gravity, more = _gravity(scene, seed)
+    scene = replace(scene, metric=metric, report=_with(scene.report, scale, gravity, [*notes, *more]))
+    scene = _depth_in_units(scene, scale, posed)
+    keep = posed if options.keep_world is None else options.keep_world
+    unit = 1.0 if metric or scale is None else scale.metres
+    if keep and not (posed and asked and options.keep_world is None):
+        return scene
+    if gravity is None or not gravity.confident or keep:
+        map_from_world = np.diag([unit, unit, unit, 1.0])
+    else:
+        map_from_world = _upright(scene, gravity, unit)
+    if scale is not None and not metric:
+        measured = Measurement(1.0, scale.standard_error / scale.metres, scale.source)
+        scene = replace(scene, metric=True, report={**scene.report, "scale": measured.to_json()})
+    if not np.array_equal(map_from_world, np.eye(4)):
+        scene = moved_scene(scene, map_from_world)
+    if not posed:
+        scene.report.pop("map_from_input", None)  # the frame of structure from motion is nobody's
+    return scene
+
+
+def measured_scale(
+    views: Sequence[View], points: np.ndarray, options: FrameConfig, seed: int = 0
+) -> tuple[Measurement | None, list[str]]:
+    """Metres per unit from all sources that posed views offer, and notes. InputError as `placed_scene`."""
+    found = [scale_of_depth(views, points, seed)]
+    gps, notes = scale_of_gps(views, seed)
+    found.append(gps)
+    if options.known_length is not None:
+        length = known_length(options.known_length)
+        if length.pixels is None:
+            raise InputError(
+                "known length: before the map exists it is given by pixels of photos, 'METRES: PHOTO X,Y X,Y; PHOTO "
+                "X,Y X,Y'; by instances or points of a finished map with `perception scale`"
+            )
+        found.append(scale_of_pixels(views, length))
+    if options.tag_size is not None:
+        found.append(scale_of_tags(views, options.tag_size))
+    if options.board is not None:
+        found.append(scale_of_board(views, Board.from_text(options.board)))
+    scale, warnings = combined([each for each in found if each is not None])
+    return scale, [*notes, *warnings]
+
+
+def _unit(scene: Scene, options: FrameConfig, seed: int) -> tuple[bool, Measurement | None, list[str]]:
+    """Whether the unit is the metre, its measurement, notes."""
+    scale, notes = measured_scale(scene.views, scene.points, options, seed)
+    if scale is None:
+        return scene.metric, None, notes
+    off, error = abs(np.log(scale.metres)), scale.standard_error / scale.metres
+    if scene.metric:
+        if off > 3 * error + UNIT_IS_METRE:
+            notes.append(f"the input says its unit is the metre, but it is {scale}")
+        return True, scale, notes
+    posed = scene.report.get("input") != "photos"
+    return posed and bool(max(off, error) <= UNIT_IS_METRE), scale, notes
+
+
+def _gravity(scene: Scene, seed: int) -> tuple[Gravity | None, list[str]]:
+    """The input's gravity or that of the scene, whichever is more certain, and notes."""
+    found = gravity_of_scene(np.stack([view.camera_from_world for view in scene.views]), scene.points, seed)
+    if "gravity" not in scene.report:
+        return found, []
+    given = Gravity.from_json(scene.report["gravity"])
+    if found is None:
+        return given, []
+    angle = float(np.degrees(np.arccos(np.clip(given.direction @ found.direction, -1, 1))))
+    notes = []
+    if angle > 3 * np.hypot(given.standard_error, found.standard_error) + 2:
+        notes.append(f"the input's gravity and that of the scene ({found.source}) differ by {angle:.0f}°")
+    return given if given.standard_error <= found.standard_error else found, notes
+
+
+def _with(report: dict, scale: Measurement | None, gravity: Gravity | None, notes: list[str]) -> dict:  # type: ignore[type-arg]
+    facts = {} if scale is None else {"scale": scale.to_json()}
+    facts |= {} if gravity is None else {"gravity": gravity.to_json()}
+    return {**report, **facts, "warnings": [*report.get("warnings", []), *notes]}
+
+
+def _depth_in_units(scene: Scene, scale: Measurement | None, posed: bool) -> Scene:
+    """The scene with depth images in its own unit, where sensor and poses measure in different units."""
+    if scale is None or scene.metric or not any(view.depth for view in scene.views):
+        return scene
+    if posed and abs(np.log(scale.metres)) <= 3 * scale.standard_error / scale.metres + UNIT_IS_METRE:
+        return scene
+    views = [
+        view if view.depth is None else replace(view, depth=replace(view.depth, scale=view.depth.scale / scale.metres))
+        for view in scene.views
+    ]
+    if posed:
+        scene.report["warnings"].append(f"depth images are converted to the unit of the poses: {scale}")
+    return replace(scene, views=views)
+
+
+def _upright(scene: Scene, gravity: Gravity, unit: float) -> np.ndarray:
+    """map_from_world [4, 4]: z up, x along the first camera's view, the origin on the floor below it."""
+    up = -gravity.direction
+    pose = scene.views[0].camera_from_world
+    eye, ahead = camera_centres(pose[None])[0], pose[2, :3] - (pose[2, :3] @ up) * up
+    if np.linalg.norm(ahead) < 0.3:  # it looks down or up: what is up in its photo lies ahead
+        ahead = -pose[1, :3] * np.sign(pose[2, :3] @ -up) + (pose[1, :3] @ up) * up * np.sign(pose[2, :3] @ -up)
+    x = ahead / np.linalg.norm(ahead)
+    axes = np.stack([x, np.cross(up, x), up])
+    origin = eye + (floor_height(up, scene.points, eye) - eye @ up) * up
+    map_from_world = np.eye(4)
+    map_from_world[:3, :3], map_from_world[:3, 3] = unit * axes, -unit * axes @ origin
+    return map_from_world
