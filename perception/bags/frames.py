@@ -231,7 +231,8 @@ def _write_transforms(
         data["depth_unit_scale_factor"] = 1 / MILLIMETRES
     if down is not None:
         data |= {"gravity": down[0].tolist(), "gravity_std_deg": down[1]}
-    path.write_text(json.dumps({**data, "world_frame": placed.fixed, "frames": frames}, indent=1), encoding="utf-8")
+    facts = {"metric": True, "world_frame": placed.fixed}  # ROS measures in metres (REP 103)
+    path.write_text(json.dumps({**data, **facts, "frames": frames}, indent=1), encoding="utf-8")
 
 
 def _text(facts: dict[str, Any]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from perception.types import Scene, View
 UNIT_IS_METRE = 0.03
 """Largest deviation from 1, and largest standard error, at which a measured unit is taken as the metre as it is."""
 
+STATED = {"metres_per_unit": 1.0, "source": "the input, which states it", "standard_error": None}
+
 
 def placed_scene(scene: Scene, options: FrameConfig, seed: int = 0) -> Scene:
     """The scene in the map's frame; report["scale"], ["gravity"] and ["map_from_input"] tell how it was found.
@@ -34,7 +37,7 @@ def placed_scene(scene: Scene, options: FrameConfig, seed: int = 0) -> Scene:
     asked = any((options.known_length, options.tag_size, options.board))
     metric, scale, notes = _unit(scene, options, seed)
     gravity, more = _gravity(scene, seed)
-    scene = replace(scene, metric=metric, report=_with(scene.report, scale, gravity, [*notes, *more]))
+    scene = replace(scene, metric=metric, report=_with(scene.report, metric, scale, gravity, [*notes, *more]))
     scene = _depth_in_units(scene, scale, posed)
     keep = posed if options.keep_world is None else options.keep_world
     unit = 1.0 if metric or scale is None else scale.metres
@@ -79,7 +82,7 @@ def measured_scale(
 
 def _unit(scene: Scene, options: FrameConfig, seed: int) -> tuple[bool, Measurement | None, list[str]]:
     """Whether the unit is the metre, its measurement, notes."""
-    scale, notes = measured_scale(scene.views, scene.points, options, seed)
+    scale, notes = measured_scale(scene.views, _real_points(scene), options, seed)
     if scale is None:
         return scene.metric, None, notes
     off, error = abs(np.log(scale.metres)), scale.standard_error / scale.metres
@@ -93,7 +96,7 @@ def _unit(scene: Scene, options: FrameConfig, seed: int) -> tuple[bool, Measurem
 
 def _gravity(scene: Scene, seed: int) -> tuple[Gravity | None, list[str]]:
     """The input's gravity or that of the scene, whichever is more certain, and notes."""
-    found = gravity_of_scene(np.stack([view.camera_from_world for view in scene.views]), scene.points, seed)
+    found = gravity_of_scene(np.stack([view.camera_from_world for view in scene.views]), _real_points(scene), seed)
     if "gravity" not in scene.report:
         return found, []
     given = Gravity.from_json(scene.report["gravity"])
@@ -106,8 +109,14 @@ def _gravity(scene: Scene, seed: int) -> tuple[Gravity | None, list[str]]:
     return given if given.standard_error <= found.standard_error else found, notes
 
 
-def _with(report: dict, scale: Measurement | None, gravity: Gravity | None, notes: list[str]) -> dict:  # type: ignore[type-arg]
-    facts = {} if scale is None else {"scale": scale.to_json()}
+def _real_points(scene: Scene) -> np.ndarray:
+    return scene.points[:0] if scene.report.get("points_from") == "random" else scene.points
+
+
+def _with(
+    report: dict[str, Any], metric: bool, scale: Measurement | None, gravity: Gravity | None, notes: list[str]
+) -> dict[str, Any]:
+    facts: dict[str, Any] = {"scale": scale.to_json()} if scale is not None else {"scale": STATED} if metric else {}
     facts |= {} if gravity is None else {"gravity": gravity.to_json()}
     return {**report, **facts, "warnings": [*report.get("warnings", []), *notes]}
 
@@ -136,7 +145,7 @@ def _upright(scene: Scene, gravity: Gravity, unit: float) -> np.ndarray:
         ahead = -pose[1, :3] * np.sign(pose[2, :3] @ -up) + (pose[1, :3] @ up) * up * np.sign(pose[2, :3] @ -up)
     x = ahead / np.linalg.norm(ahead)
     axes = np.stack([x, np.cross(up, x), up])
-    origin = eye + (floor_height(up, scene.points, eye) - eye @ up) * up
+    origin = eye + (floor_height(up, _real_points(scene), eye) - eye @ up) * up
     map_from_world = np.eye(4)
     map_from_world[:3, :3], map_from_world[:3, 3] = unit * axes, -unit * axes @ origin
     return map_from_world

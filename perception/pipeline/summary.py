@@ -83,14 +83,11 @@ def frame_lines(info: dict[str, Any]) -> list[str]:
     lines, scale, gravity = [], info.get("scale"), info.get("gravity")
     if scale:
         unit = "1" if info.get("metric") else f"{scale['metres_per_unit']:.4g}"
-        lines.append(
-            f"scale: a unit is {unit} m, by {scale['source']} (standard error {scale['standard_error']:.2g} m)"
-        )
+        error = "" if scale["standard_error"] is None else f" ± {scale['standard_error']:.2g} m"
+        lines.append(f"scale: a unit is {unit} m{error}, by {scale['source']}")
     if gravity:
         down = ", ".join(f"{x:.3f}" for x in gravity["direction"])
-        lines.append(
-            f"gravity: down is {down}, by {gravity['source']} (standard error {gravity['standard_error_deg']:.1f}°)"
-        )
+        lines.append(f"gravity: down is {down} ± {gravity['standard_error_deg']:.1f}°, by {gravity['source']}")
     if "map_from_input" in info:
         origin = np.linalg.inv(info["map_from_input"])[:3, 3]
         lines.append(f"the map's origin lies at {origin.round(6).tolist()} of its input")
