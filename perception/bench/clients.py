@@ -1,7 +1,8 @@
-"""Clients of a served map for the load test of `bench query`: direct calls of the engine, HTTP, and the DDS node.
+"""Clients of a served map for the load test of `bench query`: direct calls of the engine, and HTTP.
 
 Each of WAYS takes the path of a map and is a context manager of a `Served`. A client takes a prompt and returns the
-best hit, (instance id, number of points), or None; it raises RuntimeError for an answer to another prompt.
+best hit, (instance id, number of points), or None; it raises RuntimeError for an answer to another prompt. Another
+server, such as the DDS node, needs one more function here.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,41 +67,6 @@ def by_http(path: Path) -> Iterator[Served]:
         yield Served(client, process)
 
 
-@contextmanager
-def by_dds(path: Path, topics: bool = False) -> Iterator[Served]:
-    """Clients of `perception node` on the loopback interface; each is a DDS participant that calls the query service.
-
-    topics: each publishes its prompt and waits for the four messages of the answer instead. There every client receives
-    all answers; one that is more than 64 behind loses some and repeats its prompt, which then counts as late.
-    """
-    from perception.node.client import NodeClient, cloud_rows
-    from perception.node.config import NodeConfig
-
-    domain = 20 + os.getpid() % 200  # hardly anything else is there
-    config = NodeConfig(namespace=f"bench{os.getpid()}", transport="dds", domain=domain, network="localhost")
-    place = ["--namespace", config.namespace, "--domain", str(domain), "--network", "localhost", "--transport", "dds"]
-    more = ["--set", f"timeout={_SECONDS}", "--set", "watch=3600", "--set", "discovery_seconds=0.2"]
-    with served("node", str(path.resolve()), *place, *more) as (_, process):
-
-        def client() -> Client:
-            node = NodeClient(config) if topics else NodeClient(config, retry=_SECONDS)
-            node.wait_for_node(_SECONDS)
-
-            def call(text: str) -> Best:
-                (answer,) = node.query([{"text": text, "top_k": 1}], _SECONDS)
-                return _best(text, answer)
-
-            def publish(text: str) -> Best:
-                answer = node.ask({"text": text, "top_k": 1}, _SECONDS)
-                best = _best(text, answer.facts)
-                rows = cloud_rows(answer.points or {})
-                return best and (int(rows["instance_id"][0]), len(rows))
-
-            return publish if topics else call
-
-        yield Served(client, process)
-
-
 def _best(text: str, answer: Any) -> Best:
     if not isinstance(answer, dict) or answer.get("text") != text:
         raise RuntimeError(f"asked for {text!r}, answered {str(answer)[:80]}")
@@ -109,9 +74,4 @@ def _best(text: str, answer: Any) -> Best:
     return (hits[0]["instance_id"], hits[0]["num_points"]) if hits else None
 
 
-WAYS: dict[str, Callable[[Path], AbstractContextManager[Served]]] = {
-    "engine": by_engine,
-    "http": by_http,
-    "dds": by_dds,
-    "dds-topics": partial(by_dds, topics=True),
-}
+WAYS: dict[str, Callable[[Path], AbstractContextManager[Served]]] = {"engine": by_engine, "http": by_http}

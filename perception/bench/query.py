@@ -2,8 +2,8 @@
 
 Synthetic maps whose answers are known by construction. Cold: a fresh process until its first answer. Load: load_map
 alone. Warm: prompts never asked before, and prompts asked again (their ranking is remembered). Clients: many at once
-through the engine, HTTP, and DDS by service and by topics; each answer is compared with the one a single thread got, a
-difference is a crossed answer and an exception a lost one. Memory: resident before and after the queries.
+through the engine and HTTP; each answer is compared with the one a single thread got, a difference is a crossed answer
+and an exception a lost one. Memory: resident before and after the queries.
 """
 
 from __future__ import annotations
