@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from perception.bench.synthetic_map import write_synthetic_map
 from perception.language.encoders import make_encoder
 from support.paths import REPOSITORY
 from support.query_maps import write_map_of
+from support.synthetic_map import write_synthetic_map
 
 
 def run(name: str, *arguments: object, folder: Path) -> str:

@@ -12,6 +12,7 @@ from perception.calibration.board import Detection
 from perception.calibration.solve import Solution
 from perception.errors import InputError
 from perception.io.photos import SUFFIXES
+from perception.io.video import frames
 
 MAX_FRAMES = 240
 """Maximum number of video frames that are read, evenly spaced."""
@@ -35,22 +36,11 @@ def read_pictures(source: Path) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _video(source: Path) -> Iterator[tuple[str, np.ndarray]]:
-    video = cv2.VideoCapture(str(source))
-    try:
-        if not video.isOpened():
-            raise InputError(f"{source}: is not a readable video (nor a folder of photos)")
-        step = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)) // MAX_FRAMES, 1)
-        number = 0
-        while video.grab():
-            if number % step == 0:
-                seen, frame = video.retrieve()
-                if seen:
-                    yield f"frame_{number:06d}", cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-            number += 1
-        if number == 0:
-            raise InputError(f"{source}: holds no frame that can be decoded")
-    finally:
-        video.release()
+    number = None
+    for number, _, frame in frames(source, most=MAX_FRAMES):
+        yield f"frame_{number:06d}", cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+    if number is None:
+        raise InputError(f"{source}: is not a readable video (nor a folder of photos)")
 
 
 def draw_detection(picture: np.ndarray, view: Detection, residuals: np.ndarray, magnify: float = 50) -> np.ndarray:

@@ -36,7 +36,7 @@ def video_frames(video: Path, folder: Path, progress: Progress) -> dict[str, obj
             return known
         raise InputError(f"{folder}: exists already, and holds no frames of {video}; remove or rename it")
     chooser, numbers = Chooser(), []
-    for number, share, frame in _frames(video, None):
+    for number, share, frame in frames(video):
         chooser.show(frame)
         numbers.append(number)
         progress.update("poses: choosing frames", round(100 * share), 100)
@@ -45,7 +45,7 @@ def video_frames(video: Path, folder: Path, progress: Progress) -> dict[str, obj
         raise InputError(f"{video}: not a readable video; expected .mp4, .mov or another that OpenCV's FFmpeg decodes")
     record |= {"frames": numbers[-1] + 1, "chosen": len(chosen)}
     with atomic_directory(folder) as aside:
-        for number, share, frame in _frames(video, set(chosen)):
+        for number, share, frame in frames(video, set(chosen)):
             cv2.imwrite(str(aside / f"{number:06d}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
             progress.update("poses: writing frames", round(100 * share), 100)
         (aside / FRAMES_RECORD).write_text(json.dumps(record), encoding="utf-8")
@@ -60,13 +60,19 @@ def _known(folder: Path) -> dict[str, object]:
         return {}
 
 
-def _frames(video: Path, wanted: set[int] | None) -> Iterator[tuple[int, float, np.ndarray]]:
-    """(number, share of the video, BGR [h, w, 3] uint8) of the `wanted` frames; None: LOOKS_PER_SECOND frames."""
+def frames(
+    video: Path, wanted: set[int] | None = None, most: int | None = None
+) -> Iterator[tuple[int, float, np.ndarray]]:
+    """(number, share of the video, BGR [h, w, 3] uint8) of the `wanted` frames, upright.
+
+    Without `wanted`, every n-th frame: LOOKS_PER_SECOND, or about `most` in all. None where the video is unreadable.
+    """
     capture = cv2.VideoCapture(str(video))
     try:
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         rate, total = capture.get(cv2.CAP_PROP_FPS), max(1.0, capture.get(cv2.CAP_PROP_FRAME_COUNT))
         step = max(1, round(rate / LOOKS_PER_SECOND)) if np.isfinite(rate) else 1
+        step = step if most is None else max(1, int(total) // most)
         number = 0
         while capture.grab():
             if number in wanted if wanted is not None else number % step == 0:
@@ -80,6 +86,6 @@ def _frames(video: Path, wanted: set[int] | None) -> Iterator[tuple[int, float, 
 
 def frame_size(video: Path) -> tuple[int, int]:
     """(width, height) of the video's frames, upright. InputError where there are none."""
-    for _, _, frame in _frames(video, {0}):
+    for _, _, frame in frames(video, {0}):
         return frame.shape[1], frame.shape[0]
     raise InputError(f"{video}: not a readable video; expected .mp4, .mov or another that OpenCV's FFmpeg decodes")

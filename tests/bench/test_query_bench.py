@@ -20,7 +20,7 @@ def test_the_bench_finds_every_answer_right(tmp_path: Path, monkeypatch: pytest.
         monkeypatch.setattr(f"perception.query.{module}.make_encoder", encoders)
     path = write_map_of(tmp_path / "a.gsmap", gaussians=600)
     facts, answers = warm(path, NAMES, 30)
-    assert facts["right_by_construction"] == f"{len(NAMES)} of {len(NAMES)}"
+    assert facts["present"] == f"{len(NAMES)} of {len(NAMES)}"
     ids = read_map(path).instance_ids
     assert answers == {name: (n, int((ids == n).sum())) for n, name in enumerate(NAMES)}
     row = clients_at_once(by_engine, path, answers, shares_of(NAMES, 80, 4))

@@ -18,11 +18,11 @@ from support.paths import REPOSITORY
 from support.query_maps import encoders, write_map_of
 
 pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
-from perception.bench.synthetic_map import SIGMA, grid
 from perception.cli import build_parser
 from perception.io.cloud import read_cloud
 from perception.io.store import read_map
 from support.processes import served
+from support.synthetic_map import SIGMA, grid
 
 PAGE = (REPOSITORY / "docs" / "recipes.md").read_text(encoding="utf-8")
 NAMES = ["red mug", "banana", "laptop", "teapot", "kettle", "lamp", "violin", "anchor", "drum"]

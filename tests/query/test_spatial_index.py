@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import perception
-from perception.bench.synthetic_map import SIGMA, grid
 from perception.errors import InputError
 from perception.geometry import rotation_from_quaternion
 from perception.io.store import Map, read_map, set_labels
 from perception.query import Frame, Prism, QueryMap, Where, axis_box, load_map
 from perception.types import OrientedBox
 from support.query_maps import NAMES, encoders, write_map_of
+from support.synthetic_map import SIGMA, grid
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +247,7 @@ def test_bad_questions_are_told_in_one_line(gmap: QueryMap, ask) -> None:
 
 
 def test_a_map_without_words_still_knows_places(tmp_path: Path) -> None:
-    from perception.bench.synthetic_map import write_synthetic_map
+    from support.synthetic_map import write_synthetic_map
 
     write_synthetic_map(tmp_path / "a.gsmap", NAMES, None, gaussians=500, sh_degree=0)
     silent = perception.load_map(tmp_path / "a.gsmap")

@@ -20,9 +20,9 @@ from typing import Any
 
 import pytest
 
-from perception.bench.synthetic_map import write_synthetic_map
 from support.processes import served, server
 from support.query_maps import NAMES, write_map_of
+from support.synthetic_map import write_synthetic_map
 
 pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
 pytest.importorskip("uvicorn", reason="the extra 'serve' is not installed")

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.bench.synthetic_map import write_synthetic_map
 from perception.language.colors import without_color_words
+from support.synthetic_map import write_synthetic_map
 
 NAMES = ["mug", "banana", "laptop", "teapot", "kettle", "lamp", "violin", "anchor", "drum"]
 
