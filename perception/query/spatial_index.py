@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -34,21 +34,11 @@ class SpatialIndex:
         return float(np.sqrt(_squared(points, point).min())) if len(points) else float("inf")
 
     def nearest(self, point: np.ndarray, count: int, ids: Iterable[int]) -> list[tuple[float, int]]:
-        """The `count` instances of `ids` with the nearest points: (distance, id), nearest first, ties by id.
-
-        Instances are visited by increasing distance to their bounding box, a lower bound of the distance to their
-        points. The search stops once this bound exceeds the largest distance that is kept.
-        """
+        """The `count` instances of `ids` with the nearest points: (distance, id), nearest first, ties by id."""
         known = [i for i in ids if i in self._place]
         bounds = self.bounds[[self._place[i] for i in known]].reshape(-1, 2, 3)
-        outside = np.maximum(bounds[:, 0] - point, point - bounds[:, 1]).clip(min=0)
-        least = np.sqrt((outside**2).sum(axis=1)) * (1 - 1e-9)  # rounding must not hide a tie
-        kept: list[tuple[float, int]] = []
-        for n in np.argsort(least, kind="stable"):
-            if len(kept) >= count and least[n] > kept[-1][0]:
-                break
-            kept = heapq.nsmallest(count, [*kept, (self.distance(known[n], point), known[n])])
-        return kept
+        apart = np.maximum(bounds[:, 0] - point, point - bounds[:, 1])
+        return _closest(known, apart, count, lambda i, _: self.distance(i, point))
 
     def share_inside(self, instance_id: int, region: Region) -> float:
         """The share of the instance's points that lies in `region`, in [0, 1]; 0 without points."""
@@ -67,16 +57,6 @@ class SpatialIndex:
         radius = np.partition(around, min(_NEIGHBORS, len(around) - 1))[min(_NEIGHBORS, len(around) - 1)]
         return bool(squared[nearest] <= radius)
 
-    def gap(self, a: int, b: int) -> float:
-        """The least distance between the points of two instances; infinite when one has none."""
-        from scipy.spatial import cKDTree
-
-        first, second = self.index.of(a), self.index.of(b)
-        if not len(first) or not len(second):
-            return float("inf")
-        distances, _ = cKDTree(first).query(second)
-        return float(distances.min())
-
     def neighbors(self, instance_id: int, count: int) -> list[tuple[float, int]]:
         """The `count` other instances whose points come nearest: (gap, id), nearest first."""
         from scipy.spatial import cKDTree
@@ -88,16 +68,12 @@ class SpatialIndex:
         tree = cKDTree(points)
         low, high = self.aabb(instance_id)
         bounds = self.bounds[[self._place[i] for i in others]]
-        apart = np.maximum(bounds[:, 0] - high, low - bounds[:, 1]).clip(min=0)
-        least = np.sqrt((apart**2).sum(axis=1)) * (1 - 1e-9)
-        kept: list[tuple[float, int]] = []
-        for n in np.argsort(least, kind="stable"):
-            if len(kept) >= count and least[n] > kept[-1][0]:
-                break
-            bound = kept[-1][0] if len(kept) >= count else np.inf
-            distances, _ = tree.query(self.index.of(others[n]), distance_upper_bound=max(bound * (1 + 1e-9), 1e-30))
-            kept = heapq.nsmallest(count, [*kept, (float(distances.min()), others[n])])
-        return [entry for entry in kept if np.isfinite(entry[0])]
+        apart = np.maximum(bounds[:, 0] - high, low - bounds[:, 1])
+
+        def gap(other: int, most: float) -> float:
+            return float(tree.query(self.index.of(other), distance_upper_bound=max(most * (1 + 1e-9), 1e-30))[0].min())
+
+        return [entry for entry in _closest(others, apart, count, gap) if np.isfinite(entry[0])]
 
     def _apart(self, instance_id: int, region: Region) -> bool:
         """True when the bounding boxes alone show that no point is inside."""
@@ -112,3 +88,22 @@ def _squared(points: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Squared distances [P] in float64 of points [P, 3] to one [3]."""
     difference = np.asarray(points, np.float64) - point
     return np.einsum("ij,ij->i", difference, difference)
+
+
+def _closest(
+    ids: list[int], apart: np.ndarray, count: int, distance: Callable[[int, float], float]
+) -> list[tuple[float, int]]:
+    """The `count` of `ids` with the least distances: (distance, id), nearest first, ties by id.
+
+    apart [I, 3]: distance between bounding boxes by axis, negative where they overlap. Instances are visited by rising
+    distance of the boxes, a lower bound of distance(id, most), which may be infinite beyond `most`. The search stops
+    once this bound exceeds the largest distance that is kept.
+    """
+    least = np.sqrt((apart.clip(min=0) ** 2).sum(axis=1)) * (1 - 1e-9)  # rounding must not hide a tie
+    kept: list[tuple[float, int]] = []
+    for n in np.argsort(least, kind="stable"):
+        most = kept[-1][0] if len(kept) >= count else np.inf
+        if least[n] > most:
+            break
+        kept = heapq.nsmallest(count, [*kept, (distance(ids[n], most), ids[n])])
+    return kept
