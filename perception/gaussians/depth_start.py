@@ -83,7 +83,7 @@ def _discs(gaussians: Gaussians) -> Gaussians:
 
 
 def fuse_depth(views: Sequence[TrainingView], most: int) -> DepthCloud | None:
-    """At most `most` points of the surface that the depth images of `views` show; None when nothing was measured."""
+    """At most `most` points of the surface that the depth images of `views` show; None when they show none."""
     measured = [view for view in views if view.depth is not None and bool((view.depth > 0).any())]
     if not measured:
         return None
@@ -97,7 +97,7 @@ def fuse_depth(views: Sequence[TrainingView], most: int) -> DepthCloud | None:
     while True:
         cloud = _voxels(points, colors, weights, side, measured)
         if len(cloud.points) <= most:
-            return cloud
+            return cloud if len(cloud.points) else None
         side *= max(1.05, float(np.sqrt(len(cloud.points) / most)))
 
 
