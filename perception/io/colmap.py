@@ -10,11 +10,13 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.colmap_check import check_binary_model
+from perception.io.exposure import with_gains
 from perception.io.ignore_masks import mask_of
 from perception.io.lens import lens_from_camera, load_pycolmap
 from perception.io.photos import why_left_out
 from perception.io.safe_names import safe_name
 from perception.io.start_points import Cloud
+from perception.io.tracks import tracks_of_model
 from perception.io.triangulate import MIN_POINTS, cloud_of, posed_scene
 from perception.io.views import fit_lens, make_view
 from perception.progress import Progress
@@ -46,7 +48,8 @@ def read_workspace(
     path, model = max(found.items(), key=lambda item: item[1].num_reg_images())
     if model.num_reg_images() == 0:
         raise InputError(f"{path}: the sparse model is empty (no registered photo); run structure from motion again")
-    views, missing, notes = views_of_model(model, _located(model, folder / "images", path), path, strict)
+    located = _located(model, folder / "images", path)
+    views, missing, notes = views_of_model(model, located, path, strict)
     views = [replace(view, mask=mask_of(masks, view.name)) for view in views]
     if not views:
         raise InputError(f"{folder / 'images'}: none of the {model.num_reg_images()} photos of {path} is there")
@@ -58,7 +61,9 @@ def read_workspace(
         notes.append(f"{path}: the sparse model holds {len(cloud[0])} points; new ones are triangulated")
     facts: dict[str, Any] = {"input": "colmap", "left_out": missing, "warnings": notes}
     facts |= {"model": path.relative_to(folder).as_posix(), "mean_reprojection_error_px": _reprojection_error(model)}
-    return posed_scene(views, cloud, facts, workdir, seed, progress, MIN_POINTS, poses)
+    names = {image_id: name for image_id, (name, _) in located.items()}
+    views, exposure = with_gains(views, tracks_of_model(model, views, names))
+    return posed_scene(views, cloud, {**facts, **exposure}, workdir, seed, progress, MIN_POINTS, poses)
 
 
 def _located(model: Any, images: Path, source: Path) -> dict[int, tuple[str, Path]]:

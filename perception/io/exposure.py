@@ -10,7 +10,7 @@ import numpy as np
 
 from perception.io.bundle_adjustment import conjugate_gradients
 from perception.io.photos import load_photo, scaled_K
-from perception.io.tracks import Features, Tracks, tracks_of
+from perception.io.tracks import Tracks
 from perception.types import View
 
 SIDE = 400
@@ -27,9 +27,12 @@ REMAINS of the differences between colours of the same point. Read: 0.2 and 0.45
 are worth 0.8 dB; 0.1 and 0.8 with a phone that also maps tones by place, 0.1 dB; 0.005 and 0.99 with fixed exposure."""
 
 
-def with_gains(views: list[View], features: Features) -> tuple[list[View], dict[str, Any]]:
+LEAST = 30
+"""Observations of points that another photo sees as well, for gains to be judged."""
+
+
+def with_gains(views: list[View], tracks: Tracks) -> tuple[list[View], dict[str, Any]]:
     """`views` with gains if exposure varies, else as given; an entry "exposure" for the scene's report."""
-    tracks = tracks_of(features, features.pairs)
     logs, usable = _colors(views, tracks)
     gains = photo_gains(logs, usable, tracks, len(views))
     spread = float(gains.std(axis=0).mean())
@@ -45,7 +48,7 @@ def _difference(logs: np.ndarray, usable: np.ndarray, tracks: Tracks) -> float:
     """Median distance of the colours of a point in the first photo that sees it and in the others."""
     first = np.searchsorted(tracks.point, tracks.point)
     other = usable & usable[first] & (first != np.arange(len(first)))
-    return float(np.median(np.linalg.norm(logs - logs[first], axis=1)[other])) if other.any() else 0.0
+    return float(np.median(np.linalg.norm(logs - logs[first], axis=1)[other])) if other.sum() >= LEAST else 0.0
 
 
 def photo_gains(logs: np.ndarray, usable: np.ndarray, tracks: Tracks, count: int) -> np.ndarray:

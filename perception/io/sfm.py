@@ -23,7 +23,7 @@ from perception.io.lens import lens_from_camera, lens_text, load_pycolmap
 from perception.io.photo_folder import PhotoSet, choose_photos
 from perception.io.photos import photo_size
 from perception.io.sfm_checks import model_warnings
-from perception.io.tracks import features_of
+from perception.io.tracks import tracks_of_model
 from perception.io.triangulate import cloud_of
 from perception.progress import Progress
 from perception.types import Lens, Scene
@@ -62,8 +62,8 @@ def reconstruct(
     located = {image_id: (chosen.names[index], photos[index]) for image_id, index in indices.items()}
     views, _, _ = views_of_model(model, located, folder, strict)
     views = [replace(view, mask=mask_of(masks, view.name)) for view in views]
-    staged = dict(zip(chosen.names, store.names, strict=True))
-    views, exposure = with_gains(views, features_of(views, store, [staged[view.name] for view in views]))
+    names = {image_id: name for image_id, (name, _) in located.items()}
+    views, exposure = with_gains(views, tracks_of_model(model, views, names))
     points, colors = cloud_of(model)
     report["left_out"] = sorted([*chosen.left_out, *report["left_out"]], key=lambda entry: entry["name"])
     return Scene(views, points, colors, report={**report, **exposure, "notes": chosen.notes})

@@ -16,6 +16,8 @@ from perception.types import View
 FLAT = 0.03
 """Largest relative difference of depths around a feature: at an edge its depth is not known."""
 
+MOST_POINTS = 20_000
+
 
 @dataclass(frozen=True)
 class Features:
@@ -48,16 +50,15 @@ class Tracks:
         return int(self.point[-1]) + 1 if len(self.point) else 0
 
 
-def features_of(views: list[View], store: FeatureStore, names: list[str] | None = None) -> Features:
-    """The matched features of `views`, which have these `names` in `store`; None: they are all its photos in order."""
+def features_of(views: list[View], store: FeatureStore) -> Features:
+    """The matched features of `views` in `store`, which was made of the same photos in the same order."""
     db = load_pycolmap().Database.open(store.database)
-    images = [db.read_image_with_name(name).image_id for name in names or store.names]
+    images = [db.read_image_with_name(name).image_id for name in store.names]
     keypoints = [np.asarray(db.read_keypoints(image), np.float64)[:, :2] for image in images]
     starts = dict(zip(images, np.cumsum([0, *map(len, keypoints)]), strict=False))
     matches = [np.empty((0, 2), np.int64)]
     for (a, b), geometry in _geometries(db):
-        if a in starts and b in starts:
-            matches.append(np.add(geometry.inlier_matches, (starts[a], starts[b]), dtype=np.int64).reshape(-1, 2))
+        matches.append(np.add(geometry.inlier_matches, (starts[a], starts[b]), dtype=np.int64).reshape(-1, 2))
     db.close()
     pairs = np.concatenate(matches)
     view = np.repeat(np.arange(len(views)), [len(found) for found in keypoints])
@@ -104,3 +105,26 @@ def tracks_of(features: Features, pairs: np.ndarray) -> Tracks:
     kept = kept[np.argsort(component[kept], kind="stable")]
     point = np.unique(component[kept], return_inverse=True)[1]
     return Tracks(view[kept], point, features.rays[kept], features.focal[kept], features.depth[kept])
+
+
+def tracks_of_model(model: Any, views: list[View], names: dict[int, str], most: int = MOST_POINTS) -> Tracks:
+    """At most `most` of the tracks of a COLMAP model, without depth. names: image id to name of the view."""
+    number = {view.name: index for index, view in enumerate(views)}
+    ids = sorted(model.points3D)
+    rank = {point: place for place, point in enumerate(ids[:: max(1, -(-len(ids) // most))])}
+    parts = [(np.empty((0, 2), np.int64), np.empty((0, 3)))]
+    for image_id, name in names.items():
+        if name not in number:
+            continue
+        image = model.images[image_id]
+        camera = model.cameras[image.camera_id]
+        seen = [point for point in image.get_observation_points2D() if point.point3D_id in rank]
+        found = np.array([point.xy for point in seen], np.float64).reshape(-1, 2)
+        rays = np.asarray(camera.cam_from_img(found), np.float64).reshape(-1, 2)
+        index = np.array([(rank[point.point3D_id], number[name]) for point in seen], np.int64).reshape(-1, 2)
+        good = np.isfinite(rays).all(axis=1)
+        parts.append((index[good], np.c_[rays, np.full(len(rays), camera.mean_focal_length())][good]))
+    index, values = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.unique(index, axis=0, return_index=True)[1]  # sorted by point, then by view, each once
+    point = np.unique(index[order, 0], return_inverse=True)[1]
+    return Tracks(index[order, 1], point, values[order, :2], values[order, 2], np.zeros(len(order)))

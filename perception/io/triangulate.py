@@ -14,7 +14,7 @@ from perception.io.exposure import with_gains
 from perception.io.features import build_features
 from perception.io.lens import camera_from_lens, lens_text, load_pycolmap
 from perception.io.pose_refinement import checked_poses
-from perception.io.tracks import features_of
+from perception.io.tracks import features_of, tracks_of
 from perception.io.views import view_lens
 from perception.progress import Progress
 from perception.types import Scene, View
@@ -55,7 +55,7 @@ def posed_scene(
             report |= {key: [*report.get(key, []), *found[key]] for key in ("notes", "warnings")}
             report["poses"] = found["poses"]
             report["seconds"]["refinement"] = time.perf_counter() - started
-        views, found = with_gains(views, features)
+        views, found = with_gains(views, tracks_of(features, features.pairs))
         report |= found
         if few:
             points, colors, found = triangulated_cloud(views, store, seed)

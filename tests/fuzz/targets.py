@@ -244,7 +244,9 @@ def _without_photos() -> None:
 
     triangulate.triangulated_cloud = random
     triangulate.build_features = lambda *_: SimpleNamespace(facts={"seconds": {}})  # type: ignore[assignment, return-value]
-    triangulate.checked_poses = lambda views, *_: (views, {"warnings": []})
+    triangulate.features_of = triangulate.tracks_of = lambda *_: SimpleNamespace(pairs=None)  # type: ignore[assignment]
+    triangulate.checked_poses = lambda views, *_: (views, {"poses": {}, "notes": [], "warnings": []})
+    triangulate.with_gains = lambda views, *_: (views, {})
 
 
 def _png(width: int = 8, height: int = 6, mode: str = "RGB") -> bytes:

@@ -8,8 +8,9 @@ import pytest
 from PIL import Image
 
 from perception.io.exposure import VARIES, photo_gains, with_gains
+from perception.io.lens import load_pycolmap
 from perception.io.map_views import view_from_json, view_json
-from perception.io.tracks import Features, Tracks
+from perception.io.tracks import Features, Tracks, tracks_of, tracks_of_model
 from perception.types import View
 
 PHOTOS, POINTS = 30, 400
@@ -45,7 +46,8 @@ def matched(count):
     """Twenty features a photo, each seen in all of them."""
     rays = np.tile(np.random.default_rng(1).uniform(-0.4, 0.4, (20, 2)), (count, 1))
     pairs = np.stack([np.arange(20 * (count - 1)), np.arange(20, 20 * count)], axis=1)
-    return Features(np.repeat(np.arange(count), 20), rays, np.full(len(rays), 50.0), np.zeros(len(rays)), pairs)
+    features = Features(np.repeat(np.arange(count), 20), rays, np.full(len(rays), 50.0), np.zeros(len(rays)), pairs)
+    return tracks_of(features, pairs)
 
 
 def test_photos_of_changing_exposure_and_white_balance_get_gains(tmp_path):
@@ -70,3 +72,24 @@ def test_gains_are_kept_and_wrong_ones_refused(tmp_path):
     for wrong in ([1, 2], [1, 1, float("nan")], [0, 1, 1]):
         with pytest.raises(ValueError, match="gain"):
             view_from_json({**entry, "gain": wrong})
+
+
+def test_tracks_of_a_model_are_those_it_was_made_with(tmp_path):
+    """Oracle: pycolmap's made scenes; the same, of every second point, when there are more than asked for."""
+    pycolmap = load_pycolmap()
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, 6, 40
+    model = pycolmap.synthesize_dataset(options)
+    names = {image_id: f"{image_id}.png" for image_id in model.images}
+    views = [View(name, tmp_path, np.eye(3), 4, 4, np.eye(4)) for name in sorted(names.values())][1:]
+    tracks = tracks_of_model(model, views, names)
+    right = {(e.image_id, point) for point in model.points3D for e in model.points3D[point].track.elements}
+    right = {(f"{image}.png", rank) for image, point in right for rank in [sorted(model.points3D).index(point)]}
+    found = [(views[v].name, p) for v, p in zip(tracks.view, tracks.point, strict=True)]
+    assert sorted(found) == sorted(pair for pair in right if pair[0] != f"{min(model.images)}.png")
+    points = np.array([model.points3D[i].xyz for i in sorted(model.points3D)])[tracks.point]
+    ids = {name: image_id for image_id, name in names.items()}
+    poses = np.stack([model.images[ids[views[v].name]].cam_from_world().matrix() for v in tracks.view])
+    x = np.einsum("oij,oj->oi", poses[:, :, :3], points) + poses[:, :, 3]
+    np.testing.assert_allclose(tracks.rays, x[:, :2] / x[:, 2:], atol=1e-4)
+    assert tracks_of_model(model, views, names, 20).size == 20
