@@ -58,6 +58,9 @@ class MapFiles:
     def _open(self) -> None:
         facts, raw_facts = _read_facts(self.path)
         check_sizes(self.path, facts)
+        for file in (self.path / name for name in (EDITABLE, "gaussians.ply", *(f"{name}.npy" for name in _ARRAYS))):
+            if file.exists() and not file.is_file():  # to open a FIFO would mean to wait for its writer
+                raise InputError(f"{file}: is no file; the map is damaged, build it again or copy it anew")
         self.facts = facts
         self.info = {key: value for key, value in facts.items() if key != "views"}
         self.instances, raw = _read_instances(self.path / EDITABLE)

@@ -322,6 +322,14 @@ class CoreTarget:
     decides = True
     memory = 512
 
+    def __init__(self) -> None:
+        """Starts all threads that there may be: they stay, and their stacks count where memory is limited."""
+        size = (1024, 1024)
+        make, arguments = _scene(Dice(b""), np.float32, 1, 3, 0, size, -1)
+        inputs = make(**arguments | {"threads": 256})
+        seen = {"visible": np.zeros((1, 3), np.uint8), "radii": np.zeros((1, 3), np.float32)}
+        _core.rasterize_forward_f32(inputs=inputs, **_images(1, size, 0, np.float32), **seen, simd="auto")
+
     def seeds(self) -> list[bytes]:
         """Every function with nothing spoiled."""
         return [bytes([n, 0, 0, 0, 0, 0]) for n in range(len(FUNCTIONS))] + [

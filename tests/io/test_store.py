@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -424,3 +425,17 @@ def test_reading_while_others_replace_the_map_never_mixes_two(copied: Path) -> N
         stop.set()
         thread.join()
     assert sizes <= {(700, 9, 700, 700), (300, 2, 300, 300)} and sizes
+
+
+@pytest.mark.parametrize("name", ["map.json", "instances.json", "gaussians.ply", "features.npy"])
+def test_a_fifo_in_a_received_map_is_not_waited_for(copied: Path, name: str) -> None:
+    info = json.loads((copied / "map.json").read_text())
+    (copied / "map.json").write_text(json.dumps({key: info[key] for key in info if key not in ("files", "sha256")}))
+    (copied / name).unlink()
+    os.mkfifo(copied / name)
+    with ThreadPoolExecutor(1) as pool:
+        reading = pool.submit(read_map, copied)
+        try:
+            assert isinstance(reading.exception(60), InputError)
+        finally:
+            os.close(os.open(copied / name, os.O_RDWR))  # a reader that waits goes on
