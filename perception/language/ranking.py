@@ -12,8 +12,8 @@ Without margin, .8 means "fits better than four of five probes". `margin` is a p
 that resemble a present one (a laptop, a book) score above the probes. For encoders with canonical phrases, the prompt
 must also be more likely than each phrase (LERF's relevancy, temperature 10). Colour words are matched with measured
 colours, shape words (floor, wall, picture, ball: see `shape_words`) also with the measured shape, and all words with
-the texts printed on an instance (see `printed`; a quoted text must be there). A label set by the user counts as a name
-of the instance.
+the texts printed on an instance (see `printed`; a quoted text must be there). In a metric map
+household things have their usual size (see `household`). A label set by the user counts as a name of the instance.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from perception.errors import InputError
 from perception.language.base import Encoder, Part, check_texts, reading_of, unit_rows
 from perception.language.colors import color_match, color_words, without_color_words
 from perception.language.description import InstanceDescription
+from perception.language.household import household_thing, size_misfit
 from perception.language.printed import Printed, quoted_text
 from perception.language.shape_words import HINTS, KINDS, shape_kind
 
@@ -39,9 +40,10 @@ BETA = 0.5  # fraction of the map's mean embedding that is subtracted
 SHAPE_WEIGHT = 6.0  # difference in z between no and full match of shape, for kinds that geometry alone decides
 SHAPE_HINT = 2.0  # added to z for a full match of the kinds in HINTS, where shape is only supporting evidence
 TEMPERATURE = 10.0  # LERF's
-COLOR_WEIGHT = 2.0  # difference in z between no and full match of colour: separates two objects of one kind
+COLOR_WEIGHT = 3.0  # difference in z between no and full match of colour: separates two objects of one kind
 QUOTED_WEIGHT = 10.0  # difference in z between an instance that bears the quoted text and one that does not
 PRINTED_WEIGHT = 4.0  # added to z if all words of the prompt are printed on the instance
+SIZE_WEIGHT = 1.0  # subtracted from z per factor of two that a thing is too small or too large, at most twice
 LABEL_MARGIN = 2.0  # subtracted from z of a label, where z is the similarity of label and prompt relative to the probes
 
 
@@ -74,13 +76,16 @@ class Ranker:
         labels: Sequence[str | None] | None = None,
         shapes: Callable[[], np.ndarray] | None = None,
         printed: Printed | None = None,
+        extents: np.ndarray | None = None,
     ) -> None:
         """labels: the user's name of each instance, or None. shapes: returns scores [I, K] of `shape_words.KINDS`. It
         is called when a prompt first names a shape. printed: the texts of the instances; None: not looked for.
+        extents: [I, 3] sides of their boxes in metres; None if the map's scale is unknown.
         """
         if labels is not None and len(labels) != len(descriptions):
             raise InputError(f"labels: expected one per instance ({len(descriptions)}), found {len(labels)}")
         self._encoder, self._measure_shapes, self._printed = encoder, shapes, printed
+        self._extents = extents
         self.seen = np.array([d.seen for d in descriptions], bool)
         rows = np.array([d.embedding for d in descriptions], np.float32).reshape(
             len(descriptions), len(descriptions[0].embedding) if descriptions else encoder.dim
@@ -106,24 +111,26 @@ class Ranker:
         """A Ranker with the same encoder for other instances, without labels. shapes: as `self.shapes`, for these."""
         return Ranker(descriptions, self._encoder, shapes=None if shapes is None else lambda: shapes)
 
-    def rank(self, prompt: str, min_score: float | None = None) -> Answer:
-        """Scores every instance for one prompt; see the module docstring."""
+    def rank(self, prompt: str, min_score: float | None = None, gain: np.ndarray | float = 0.0) -> Answer:
+        """Scores every instance for one prompt; see the module docstring. gain: [I], added to z."""
         text = check_texts([prompt])[0]
         least = PRESENT if min_score is None else min_score
         if not len(self._plain):
             return Answer(text, [], False)
         quoted = quoted_text(text) if self._printed is not None else None
-        scores = self._scores(text if quoted is None else quoted[0], quoted and quoted[1])
+        scores = self._scores(text if quoted is None else quoted[0], quoted and quoted[1], gain)
         hits = [(int(i), float(scores[i])) for i in np.argsort(-scores, kind="stable")]
         return Answer(text, hits, hits[0][1] >= least)
 
-    def _scores(self, text: str, quoted: str | None = None) -> np.ndarray:
-        """Scores [I] for a prompt; quoted: what must be printed on the instance."""
+    def _scores(self, text: str, quoted: str | None = None, gain: np.ndarray | float = 0.0) -> np.ndarray:
+        """Scores [I] for a prompt; quoted: what must be printed on the instance; gain: added to z."""
         colors = color_words(text)
         row = self._encode([without_color_words(text)])
         relevancy = self._relevancy(row)[0]
         middle, spread = self._null
-        z = (relevancy - middle) / spread - self._reading.margin + self._shape_bonus(text)
+        z = (relevancy - middle) / spread - self._reading.margin + self._shape_bonus(text) + gain
+        if self._extents is not None and (known := household_thing(text)):
+            z = z - SIZE_WEIGHT * np.minimum(size_misfit(self._extents, known.size), 2.0)
         if quoted is not None and self._printed is not None:
             z = z + QUOTED_WEIGHT * (self._printed.quoted(quoted) - 0.5)
         elif self._printed:

@@ -32,12 +32,18 @@ _MEASURES = re.compile(r"\b(?:pair|piece|set|pile|stack|bunch|sheet|kind|sort)s?
 _WORD = re.compile(r"[^\W\d_]+")
 
 
-def head_noun(text: str) -> str:
-    """The singular noun that names the object: "a framed picture of a forest" → "picture"; "" if there is none."""
+def thing_words(text: str) -> list[str]:
+    """The words that name the object, in lower case: "a framed picture of a forest" → ["a", "framed", "picture"]."""
     thing = _MEASURES.sub(" ", text.lower())
     words = _WORD.findall(_RELATIONS.split(thing)[0]) or _WORD.findall(thing)
     while len(words) > 1 and len(words[-1]) == 1:  # "wall E": a single letter is an identifier
         words = words[:-1]
+    return words
+
+
+def head_noun(text: str) -> str:
+    """The singular noun that names the object: "a framed picture of a forest" → "picture"; "" if there is none."""
+    words = thing_words(text)
     return _singular(words[-1]) if words else ""
 
 

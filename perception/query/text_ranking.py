@@ -7,6 +7,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +17,7 @@ from perception.io.map import Map
 from perception.language.base import Encoder
 from perception.language.encoders import make_encoder
 from perception.language.printed import Printed
+from perception.query.relations import Places, ranked
 from perception.query.where import tidy
 
 if TYPE_CHECKING:
@@ -62,7 +64,8 @@ class TextRanking:
                 return answer
             raise
         with _one_thread():
-            answer = ranker.rank(text, min_score)
+            named = self._by_label(text) is not None
+            answer = ranker.rank(text, min_score) if named else ranked(ranker, self._places, text, min_score)
         with self._lock:
             self._ranked[key] = answer
             if len(self._ranked) > REMEMBERED:
@@ -104,7 +107,13 @@ class TextRanking:
             raise InputError(f"{self._gmap.path}: was mapped without an encoder; map again with language.encoder=conse")
         check_encoder(identity, encoder.identity)
         labels = [entry.get("label") for entry in self._gmap.instances]
-        return Ranker(descriptions, encoder, labels, self._shapes, printed_on(self._gmap))
+        extents = np.array([entry["obb"]["extent"] for entry in self._gmap.instances]).reshape(-1, 3)
+        sizes = extents if self._gmap.metric else None
+        return Ranker(descriptions, encoder, labels, self._shapes, printed_on(self._gmap), sizes)
+
+    @cached_property
+    def _places(self) -> Places | None:
+        return Places.of(self._gmap)
 
     def _shapes(self) -> np.ndarray:
         from perception.frame.gravity import Gravity

@@ -1,0 +1,56 @@
+"""Household things: which ImageNet classes look like them, and how large they are (household.txt, made by hand)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from perception.language.shape_words import thing_words
+
+CLASSES = 1000
+
+
+@dataclass(frozen=True)
+class Household:
+    """classes: [1000] float32 ≥ 0, sum 1: share of each ImageNet class among pictures of the thing, 1 / √rank of what
+    the table lists. size: least and largest longest side in metres."""
+
+    classes: np.ndarray
+    size: tuple[float, float]
+
+
+def household_thing(text: str) -> Household | None:
+    """What the table says of the thing that a text names: its longest known ending, as "game controller" of "the red
+    game controller"; None if there is none."""
+    words = thing_words(text)
+    endings = (" ".join(words[start:]) for start in range(len(words)))
+    return next((known for ending in endings if (known := _table().get(ending))), None)
+
+
+def size_misfit(extents: np.ndarray, size: tuple[float, float]) -> np.ndarray:
+    """[I]: how many times the longest side of extents [I, 3] is shorter or longer than `size`, as log2; 0 inside."""
+    longest = np.maximum(extents.max(axis=1), 1e-6)
+    return np.maximum(0.0, np.maximum(np.log2(size[0] / longest), np.log2(longest / size[1])))
+
+
+@lru_cache(maxsize=1)
+def _table() -> dict[str, Household]:
+    from perception.language.conse import class_names
+
+    number: dict[str, int] = {}
+    for n, names in enumerate(class_names()):
+        number.setdefault(names[0], n)
+    table: dict[str, Household] = {}
+    for line in (Path(__file__).parent / "household.txt").read_text(encoding="utf-8").splitlines():
+        if line.startswith("#"):
+            continue
+        words, classes, size = line.split(" | ")
+        shares = np.zeros(CLASSES, np.float32)
+        for rank, name in enumerate(classes.split(", "), start=1):
+            shares[number[name]] += rank**-0.5
+        least, most = (float(cm) / 100 for cm in size.split("-"))
+        table |= dict.fromkeys(words.split(", "), Household(shares / shares.sum(), (least, most)))
+    return table

@@ -1,0 +1,152 @@
+"""Prompts about place: "the mug on the book", "the box left of the lamp". English only.
+
+The thing is ranked by its own words, and each instance gains by how well it stands in the relation to what the other
+words mean:  z_i + WEIGHT · max over present j ≠ i of score(other, j) · g(i, j),  g in [0, 1] from the boxes of i and j
+with z up. "Left", "right", "in front" and "behind" are as most photos that show both see them. If the other thing is
+not in the map, no instance gains.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from perception.io.map import Map
+    from perception.language.ranking import Answer, Ranker
+
+TRIM = 0.02  # share of an instance's points left out of its box at either end of each axis
+WEIGHT = 3.0  # added to z for a full match, in standard deviations of the map's probes
+_RELATION = re.compile(
+    r"^(?P<thing>.*?\w.*?)\s+(?:(?:that|which)\s+)?(?:(?:is|are|stand|sit|lie|hang|lean)(?:s|ing)?\s+)?(?:to\s+the\s+)?"
+    r"(?P<relation>on top of|on|upon|under|underneath|beneath|below|above|over|next to|beside|near|close to|by|inside|"
+    r"in|left of|right of|in front of|behind)\s+(?P<other>.*\w.*)$",
+    re.IGNORECASE,
+)
+_KINDS = {
+    "on": ("on top of", "on", "upon"),
+    "under": ("under", "underneath", "beneath", "below"),
+    "above": ("above", "over"),
+    "beside": ("next to", "beside", "near", "close to", "by"),
+    "in": ("inside", "in"),
+    "left": ("left of",),
+    "right": ("right of",),
+    "front": ("in front of",),
+    "behind": ("behind",),
+}
+_KIND = {words: kind for kind, group in _KINDS.items() for words in group}
+_DETAIL = re.compile(r"\b(?:with|of|full|made|without)\b", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Relation:
+    """thing stands in the relation `kind`, a key of _KINDS, to other."""
+
+    thing: str
+    kind: str
+    other: str
+
+
+def parse(prompt: str) -> Relation | None:
+    """The relation in a prompt, None without one: "a mug on the red book" → Relation("a mug", "on", "the red book").
+
+    What follows "with" or "of" describes the thing itself: "magazine with a shell on the cover" has no relation.
+    """
+    found = _RELATION.match(" ".join(prompt.split()))
+    if found is None or _DETAIL.search(found["thing"]):
+        return None
+    return Relation(found["thing"], _KIND[found["relation"].lower()], found["other"])
+
+
+def ranked(ranker: Ranker, places: Places | None, text: str, min_score: float | None) -> Answer:
+    """The ranking of the instances for a prompt, by the relation in it if there is one and z is known."""
+    from perception.language.printed import quoted_text
+
+    relation = parse(text)
+    if relation is None or places is None or quoted_text(text) is not None:
+        return ranker.rank(text, min_score)
+    others, score = ranker.rank(relation.other), np.zeros(len(places.lows))
+    for n, value in others.hits if others.present else ():
+        score[n] = value
+    gain = WEIGHT * (places.match(relation.kind) * score[None]).max(axis=1, initial=0.0)
+    return replace(ranker.rank(relation.thing, min_score, gain), text=" ".join(text.split()))
+
+
+class Places:
+    """lows, highs: [I, 3] corners of the instances' boxes, z up. poses: [C, 4, 4] cameras from that frame."""
+
+    def __init__(self, lows: np.ndarray, highs: np.ndarray, poses: np.ndarray) -> None:
+        self.lows, self.highs = np.asarray(lows, np.float64), np.asarray(highs, np.float64)
+        self._poses = poses
+
+    @classmethod
+    def of(cls, gmap: Map) -> Places | None:
+        """The places in a map, with z against its gravity or, where that is not recorded, up as the cameras were held;
+        None if they were not held level."""
+        from perception.instances.shapes import level_frame, up_from_cameras
+
+        down = (gmap.info.get("gravity") or {}).get("direction")
+        up = up_from_cameras(gmap.poses) if down is None else -np.asarray(down, np.float64)
+        if up is None:
+            return None
+        level_from_map = level_frame(up / np.linalg.norm(up))
+        boxes = np.zeros((len(gmap.instances), 2, 3))
+        for n, entry in enumerate(gmap.instances):
+            points = gmap.index.of(entry["id"]) @ level_from_map.T
+            if len(points):
+                boxes[n] = np.quantile(points, [TRIM, 1 - TRIM], axis=0)
+        poses = gmap.poses.copy()
+        poses[:, :3, :3] = poses[:, :3, :3] @ level_from_map.T
+        return cls(boxes[:, 0], boxes[:, 1], poses)
+
+    def match(self, kind: str) -> np.ndarray:
+        """g [I, I] in [0, 1]: how well the row's instance stands in the relation to the column's; 0 to itself."""
+        return self._match(kind) * (1 - np.eye(len(self.lows)))
+
+    def _match(self, kind: str) -> np.ndarray:
+        low, high = self.lows[:, None], self.highs[:, None]
+        other_low, other_high = self.lows[None], self.highs[None]
+        size = np.maximum(self.highs - self.lows, 1e-9)
+        shared = np.clip(np.minimum(high, other_high) - np.maximum(low, other_low), 0, None) / size[:, None]
+        covered = shared[..., 0] * shared[..., 1]  # share of its footprint that lies over or under the other's
+        tall, other_tall = size[:, None, 2], size[None, :, 2]
+        slack = 0.25 * np.minimum(tall, other_tall) + 0.02 * np.median(size.max(axis=1))
+        below, top = low[..., 2] - other_high[..., 2], other_low[..., 2] + 0.2 * other_tall
+        if kind == "on":
+            return covered * _ramp(below, 2 * slack, slack) * _ramp(top - low[..., 2], slack, 0 * slack)
+        area = size[:, 0] * size[:, 1]
+        stacked = np.minimum(1, covered * area[:, None] / np.minimum(area[:, None], area[None]))  # of the smaller one's
+        if kind == "above":
+            return stacked * _ramp(-below, 2 * slack, slack)
+        if kind == "under":
+            middle = (self.lows + self.highs)[:, None, 2] / 2
+            return stacked * _ramp(middle - other_high[..., 2], 0 * slack, -slack)
+        if kind == "in":
+            return covered * shared[..., 2]
+        gaps = np.clip(np.maximum(other_low - high, low - other_high), 0, None)
+        gap, reach = np.linalg.norm(gaps, axis=2), (size.max(axis=1)[:, None] + size.max(axis=1)[None]) / 2
+        if kind == "beside":
+            return _ramp(gap, 1.5 * reach, 0.25 * reach) * (1 - stacked)
+        return _ramp(gap, 6 * reach, reach) * np.clip(2 * self._seen(kind) - 1, 0, 1)
+
+    def _seen(self, kind: str) -> np.ndarray:
+        """[I, I]: share of the photos showing both in which the row's instance is left, right, in front or behind."""
+        middles, count = (self.lows + self.highs) / 2, len(self.lows)
+        yes, all_ = np.zeros((2, count, count))
+        for pose in self._poses:
+            x, y, z = pose[:3, :3] @ middles.T + pose[:3, 3:]
+            ahead = (z > 0) & (np.maximum(np.abs(x), np.abs(y)) < z)  # within 45° of the axis
+            x = x / np.maximum(z, 1e-9)
+            value = {"left": -x, "right": x, "front": -z, "behind": z}[kind]
+            both = ahead[:, None] & ahead[None]
+            yes += both & (value[:, None] > value[None])
+            all_ += both
+        return (yes + 0.5) / (all_ + 1)
+
+
+def _ramp(x: np.ndarray, zero: np.ndarray, one: np.ndarray) -> np.ndarray:
+    """Linear from 0 at `zero` to 1 at `one`."""
+    return np.clip((x - zero) / np.where(one == zero, 1e-9, one - zero), 0, 1)

@@ -1,0 +1,62 @@
+"""The table of household things, read by a plain parser of its own; sizes by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perception.language import household
+from perception.language.conse import class_names
+from perception.language.description import InstanceDescription
+from perception.language.household import household_thing, size_misfit
+from perception.language.ranking import Ranker
+
+
+def test_every_line_names_known_classes_and_no_word_twice() -> None:
+    text = (Path(household.__file__).parent / "household.txt").read_text(encoding="utf-8")
+    lines = [line.split(" | ") for line in text.splitlines() if not line.startswith("#")]
+    words = [word for line in lines for word in line[0].split(", ")]
+    firsts = {names[0] for names in class_names()}
+    assert len(words) == len(set(words)) > 450
+    for line in lines:
+        least, most = map(int, line[2].split("-"))
+        assert 0 < least < most < 1000 and set(line[1].split(", ")) <= firsts
+        known = household_thing(f"the big {line[0].split(', ')[-1]} on the table")
+        assert known is not None and known.size == (least / 100, most / 100)
+        best = class_names()[int(known.classes.argmax())][0]
+        assert known.classes.sum() == pytest.approx(1) and best == line[1].split(", ")[0]
+
+
+def test_the_longest_ending_counts() -> None:
+    controller, box, wooden = (household_thing(t) for t in ("a red game controller", "tool-less box", "old wooden box"))
+    assert controller and box and wooden and controller.classes is not box.classes is not wooden.classes
+    assert household_thing("a pair of scissors") is household_thing("scissors")
+    assert household_thing("quasar") is None and household_thing("") is None
+
+
+def test_sizes_by_hand() -> None:
+    extents = np.array([[0.1, 0.2, 0.1], [0.1, 0.8, 0.1], [0.05, 0.01, 0.0], [0, 0, 0]])
+    assert size_misfit(extents, (0.1, 0.2))[:3].tolist() == [0, 2, 1] and size_misfit(extents, (0.1, 0.2))[3] > 9
+
+
+class Same:
+    """Everything looks like every text."""
+
+    identity, dim, templates = "same", 2, ("{}",)
+
+    def encode_images(self, images: object) -> np.ndarray:
+        raise AssertionError
+
+    def encode_texts(self, texts: list[str]) -> np.ndarray:
+        return np.tile(np.float32([1, 0]), (len(texts), 1))
+
+
+def test_of_two_alike_the_one_of_the_usual_size_is_the_mug() -> None:
+    row = np.array([1, 0], np.float32)
+    things = [InstanceDescription(row, row[None], np.zeros((24, 4), np.float32), ["a"], [(0, 0, 1, 1)])] * 2
+    extents = np.array([[0.9, 0.9, 1.0], [0.1, 0.1, 0.1]])
+    assert [n for n, _ in Ranker(things, Same(), extents=extents).rank("red mug").hits] == [1, 0]
+    assert [n for n, _ in Ranker(things, Same(), extents=extents).rank("fridge").hits] == [0, 1]
+    assert [n for n, _ in Ranker(things, Same()).rank("red mug").hits] == [0, 1]

@@ -1,0 +1,121 @@
+"""Relations in prompts: parsing by hand; geometry of a made desk; labels on a ranking with known vectors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from perception.language.description import InstanceDescription
+from perception.language.ranking import Ranker
+from perception.query.relations import Places, Relation, parse, ranked
+
+
+@pytest.mark.parametrize(
+    ("prompt", "expected"),
+    [
+        ("the mug on the red book", ("the mug", "on", "the red book")),
+        ("book on top of another book", ("book", "on", "another book")),
+        ("box to the left of the lamp", ("box", "left", "the lamp")),
+        ("a mug that stands next to a plate", ("a mug", "beside", "a plate")),
+        ("shoes under the chair", ("shoes", "under", "the chair")),
+        ("apple in the bowl", ("apple", "in", "the bowl")),
+        ("cup standing behind the box", ("cup", "behind", "the box")),
+        ("magazine with a shell on the cover", None),
+        ("bowl of fruit in the kitchen", None),
+        ("onion", None),
+        ("on the table", None),
+        ("red mug", None),
+    ],
+)
+def test_parsing_by_hand(prompt: str, expected: tuple[str, str, str] | None) -> None:
+    assert parse(prompt) == (expected and Relation(*expected))
+
+
+# low and high corners: a desk, a book on it, a mug on the book, a lamp on the desk's other end, a bin under the desk
+NAMES = ["desk", "book", "mug", "lamp", "bin"]
+BOXES = np.array(
+    [
+        [[0, 0, 0.70], [1.6, 0.8, 0.75]],
+        [[0.2, 0.2, 0.75], [0.5, 0.4, 0.78]],
+        [[0.3, 0.25, 0.78], [0.38, 0.33, 0.88]],
+        [[1.3, 0.3, 0.75], [1.5, 0.5, 1.20]],
+        [[0.5, 0.2, 0.0], [0.8, 0.5, 0.35]],
+    ]
+)
+
+
+def _desk() -> Places:
+    """Seen by three cameras at y = -2 that look along +y, x to the right."""
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, :3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # right = x, down = -z, ahead = y
+    poses[:, :3, 3] = [[-x, 0.8, 2] for x in (0.2, 0.8, 1.2)]
+    return Places(BOXES[:, 0], BOXES[:, 1], poses)
+
+
+ON = {("book", "desk"), ("mug", "book"), ("lamp", "desk")}
+LEFT = {("book", "lamp"), ("mug", "lamp"), ("bin", "lamp"), ("desk", "lamp"), ("book", "desk"), ("mug", "desk")}
+LEFT |= {("bin", "desk"), ("mug", "book"), ("mug", "bin"), ("book", "bin")}
+FRONT = {("mug", b) for b in ("book", "bin", "lamp", "desk")} | {("book", b) for b in ("bin", "lamp", "desk")}
+FRONT |= {("bin", "lamp"), ("bin", "desk")}
+
+
+@pytest.mark.parametrize(
+    ("kind", "pairs"),
+    [
+        ("on", ON | {("mug", "desk")}),
+        ("under", {(b, a) for a, b in ON} | {("bin", "desk"), ("desk", "mug")}),
+        ("above", ON | {("desk", "bin"), ("mug", "desk")}),
+        ("in", set()),
+        ("left", LEFT),
+        ("right", {(b, a) for a, b in LEFT}),
+        ("front", FRONT),
+        ("behind", {(b, a) for a, b in FRONT}),
+    ],
+)
+def test_relations_of_a_made_desk(kind: str, pairs: set[tuple[str, str]]) -> None:
+    match = _desk().match(kind)
+    assert match.shape == (5, 5) and match.min() >= 0 and match.max() <= 1
+    assert {(NAMES[i], NAMES[j]) for i, j in zip(*np.nonzero(match > 0.3), strict=True)} == pairs
+    assert not np.diagonal(match).any()
+
+
+def test_beside_is_near_and_not_stacked() -> None:
+    lows = np.array([[0.0, 0, 0], [0.15, 0, 0], [0, 0, 0.2], [3, 0, 0]])
+    match = Places(lows, lows + np.array([0.1, 0.1, 0.2]), np.zeros((0, 4, 4))).match("beside")
+    assert match[0, 1] == match[1, 0] == pytest.approx(1, abs=0.2) and match[0, 2] == match[2, 0] == match[0, 3] == 0
+
+
+class Axes:
+    """Known words have an axis each, other texts a fixed random direction."""
+
+    identity, dim, templates = "axes", 24, ("{}",)
+
+    def encode_images(self, images: Any) -> np.ndarray:
+        raise AssertionError
+
+    def encode_texts(self, texts: Any) -> np.ndarray:
+        words = {"book": 0, "the lamp": 1, "the shelf": 3}
+        rows = [np.eye(24)[words[t]] if t in words else _direction(t) for t in texts]
+        return np.array(rows, np.float32).reshape(-1, 24)
+
+
+def _direction(text: str) -> np.ndarray:
+    x = np.random.default_rng(list(text.encode())).normal(size=24)
+    return x / np.linalg.norm(x)
+
+
+def test_the_place_decides_between_equals_and_an_absent_other_changes_nothing() -> None:
+    def thing(axis: int) -> InstanceDescription:
+        row = np.eye(24, dtype=np.float32)[axis]
+        return InstanceDescription(row, row[None], np.zeros((24, 4), np.float32), ["a"], [(0, 0, 1, 1)])
+
+    ranker = Ranker([thing(0), thing(0), thing(1)], Axes())
+    lows = np.array([[0.0, 0, 0], [3, 0, 0], [3.5, 0, 0]])
+    places = Places(lows, lows + np.array([0.3, 0.3, 0.2]), np.zeros((0, 4, 4)))
+    answer = ranked(ranker, places, "book next to the lamp", None)
+    assert answer.text == "book next to the lamp" and [n for n, _ in answer.hits][:1] == [1] and answer.present
+    plain = ranker.rank("book")
+    assert ranked(ranker, places, "book next to the shelf", None).hits == plain.hits
+    assert ranked(ranker, None, "book", None).hits == plain.hits
