@@ -53,8 +53,8 @@ def match_errors(features: Features, poses: Poses) -> tuple[np.ndarray, np.ndarr
 def checked_poses(views: list[View], features: Features, how: str) -> tuple[list[View], dict[str, Any]]:
     """`views` as given or with refined poses, and the report's entries: "poses", "notes", "warnings".
 
-    how: "auto" refines poses that are worse than TOLERANCE,
-    "refine" any. Views that are held out for scoring are refined as well, by features and depth alone.
+    how: "auto" refines poses that are worse than TOLERANCE, "refine" any that gain by it. Views that are held out for
+    scoring are refined as well, by features and depth alone.
     """
     given = poses_of(views)
     if len(features.pairs) < LEAST_MATCHES:
