@@ -19,11 +19,17 @@ def _add_export(commands: Any) -> None:
     p = command(commands, "export", _export, "instances onto a point cloud or mesh, or onto the map's own points")
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("--points", type=Path, metavar="CLOUD")
+    place = p.add_mutually_exclusive_group()
+    place.add_argument(
+        "--align", action="store_true", help="the cloud lies in a frame of its own: register it, or refuse"
+    )
+    place.add_argument(
+        "--transform", type=Path, metavar="FILE", help="as --align, by a known 4 x 4 map_from_scan (text or JSON)"
+    )
     p.add_argument(
         "-o",
         "--output",
         type=Path,
-        required=True,
         metavar="OUT",
         help=".ply, .pcd or .npz; .mcap (Foxglove, RViz): with boxes, cameras and photos",
     )
@@ -38,6 +44,10 @@ def _add_export(commands: Any) -> None:
     p.add_argument("--color", choices=("original", "instance"), default="original")
     p.add_argument("--split", type=Path, metavar="DIR", help="one cloud an instance")
     p.add_argument("--boxes", type=Path, metavar="OUT.json", help="3D boxes")
+    p.add_argument("--mesh", type=Path, metavar="OUT", help="the map's surface as .ply or .glb (extra: open3d)")
+    p.add_argument("--instance", type=int, metavar="ID", help="--mesh: the closed body of this one instead")
+    p.add_argument("--voxels", type=Path, metavar="OUT.npz", help="free, occupied and unknown space; distances")
+    p.add_argument("--voxel-size", type=float, metavar="S", help="of --mesh and --voxels, in map units")
     p.add_argument("--scannet", type=Path, metavar="DIR", help="ScanNet submission layout")
 
 
@@ -46,12 +56,35 @@ def _length(text: str) -> float | str:
 
 
 def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.errors import InputError
     from perception.export import ExportOptions
+    from perception.io.store import read_map
     from perception.pipeline.exporting import Outputs, export_map
+    from perception.pipeline.meshing import check_outputs, export_mesh, export_voxels
 
+    if args.output is None and args.mesh is None and args.voxels is None:
+        raise InputError("export: nothing to write; give -o OUT, --mesh OUT or --voxels OUT.npz")
+    if args.output is None and args.points is not None:
+        raise InputError("export: --points labels a cloud; give the file to write it to with -o")
+    if args.instance is not None and args.mesh is None:
+        raise InputError("export: --instance selects what --mesh writes; give --mesh OUT")
+    check_outputs(args.mesh, args.voxels, args.voxel_size)
+    facts: dict[str, Any] = {}
+    lines = []
+    if args.mesh is not None or args.voxels is not None:
+        gmap = read_map(args.map)
+        if args.mesh is not None:
+            facts["mesh"], text = export_mesh(gmap, args.mesh, args.instance, args.voxel_size, args.color)
+            lines.append(text)
+        if args.voxels is not None:
+            facts["voxels"], text = export_voxels(gmap, args.voxels, args.voxel_size)
+            lines.append(text)
+        if args.output is None:
+            return facts, "\n".join(lines)
     options = ExportOptions(max_distance=args.max_distance, smooth=args.smooth, segments=args.segments)
     outputs = Outputs(args.color, args.split, args.boxes, args.scannet)
-    return export_map(args.map, args.output, args.points, options, outputs)
+    result, table = export_map(args.map, args.output, args.points, options, outputs, args.transform or args.align)
+    return {**facts, **result}, "\n".join([*lines, table])
 
 
 def _add_render(commands: Any) -> None:

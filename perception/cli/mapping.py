@@ -26,7 +26,9 @@ def register(commands: Any) -> None:
 
 
 def _add_map(commands: Any) -> None:
-    p = command(commands, "map", _map, "build a map from photos, a video, a COLMAP workspace, a transforms.json or RGB-D")
+    p = command(
+        commands, "map", _map, "build a map from photos, a video, a COLMAP workspace, a transforms.json or RGB-D"
+    )
     p.formatter_class, p.late_epilog = argparse.RawDescriptionHelpFormatter, _settings
     p.add_argument("input", type=Path, metavar="INPUT")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="MAP")

@@ -18,13 +18,20 @@ from perception.types import PointCloud
 Instances = Mapping[int, Mapping[str, Any]]
 
 
-def write_export(path: str | Path, cloud: PointCloud, labels: np.ndarray, instances: Instances) -> dict[str, Any]:
+def write_export(
+    path: str | Path,
+    cloud: PointCloud,
+    labels: np.ndarray,
+    instances: Instances,
+    facts: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
     """Writes the cloud with `instance_id` and its sidecar JSON (same stem); returns the sidecar.
 
     labels [P] int32, −1 = none; points and order are the cloud's own. instances: {id: {"score", "label"}} of the map.
+    facts: further keys of the sidecar.
     """
     path = Path(path)
-    sidecar = sidecar_of(labels, instances)
+    sidecar = {**(facts or {}), **sidecar_of(labels, instances)}
     with replacing(path.with_suffix(".json")) as file:
         file.write(json.dumps(sidecar, indent=1).encode())
     labelled = {"instance_id": labels.astype(np.int32)}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from perception.colors import rgb8_from_sh
 from perception.errors import InputError
 from perception.io.instance_index import InstanceIndex, build_index
 from perception.io.map_files import MapFiles
@@ -132,6 +133,17 @@ class Map:
     def metric(self) -> bool:
         """Whether the unit of length is known to be the metre."""
         return bool(self.info.get("metric", False))
+
+    def to_open3d(self) -> Any:
+        """All Gaussians' means as an `open3d.t.geometry.PointCloud` in the map's frame: positions, colors (float32 in
+        [0, 1]), instance_id (int32, −1 = none). InputError without the package open3d."""
+        from perception.io.open3d import tensor_cloud
+
+        return tensor_cloud(self.means, rgb8_from_sh(self.sh[:, 0]), self.instance_ids)
+
+    def colors_of(self, instance_id: int) -> np.ndarray:
+        """Colours [P, 3] uint8 of an instance's points, in the order of `index`."""
+        return rgb8_from_sh(self.sh[self.instance_ids == instance_id, 0])
 
     def with_photo(self, view: View) -> View:
         """`view` with the current path of its photo; InputError when the photo is missing or has changed.

@@ -17,6 +17,7 @@ from perception.geometry import move_points, scale_of
 from perception.io.cloud import read_cloud
 from perception.io.recentre import map_from_input
 from perception.io.store import Map, read_map
+from perception.pipeline.placing import aligned, read_transform
 from perception.types import PointCloud
 
 SUFFIXES = (".ply", ".pcd", ".npz", ".mcap")
@@ -39,7 +40,12 @@ class Outputs:
 
 
 def export_map(
-    map_path: Path, output: Path, points: Path | None, options: ExportOptions, outputs: Outputs
+    map_path: Path,
+    output: Path,
+    points: Path | None,
+    options: ExportOptions,
+    outputs: Outputs,
+    place: Path | bool = False,
 ) -> tuple[dict[str, Any], str]:
     """Labels a cloud, writes it and the `outputs`, and returns (JSON-able facts, table).
 
@@ -47,27 +53,41 @@ def export_map(
     result are in the coordinates of the map's input (`map_from_input`). Without `points` they are the map's, or the
     input's if that was only shifted. .ply, .pcd, .npz: the cloud and its sidecar JSON. .mcap: a recording in the
     map's frame, the cloud together with the map's boxes, cameras and photos.
+
+    place: `points` lie in a frame of their own: True registers them (`export.align`), a path names a file with
+    map_from_scan [4, 4]. The result keeps that frame; the sidecar and the facts hold `map_from_scan`.
     """
     if output.suffix.lower() not in SUFFIXES:
         raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected one of {', '.join(SUFFIXES)}")
     if outputs.color not in ("original", "instance"):
         raise InputError(f"color is '{outputs.color}'; expected original or instance")
+    if place and points is None:
+        raise InputError("--align and --transform place a scan in the map; give it with --points")
+    known = None if isinstance(place, bool) else read_transform(place)
     gmap = read_map(map_path)
+    given = None if points is None else read_cloud(points)
     placed = map_from_input(map_path, gmap.info)
     if points is None and not np.array_equal(placed[:3, :3], np.eye(3)):
         placed = np.eye(4)
+    facts: dict[str, Any] = {}
+    if known is not None:
+        placed = known
+    elif place and given is not None:
+        placed, facts["alignment"] = aligned(gmap, given, str(points))
+    if place:
+        facts["map_from_scan"] = placed.tolist()
     moved = not np.array_equal(placed, np.eye(4))
     means = move_points(np.linalg.inv(placed), gmap.means.astype(np.float64)) if moved else gmap.means
     began = time.perf_counter()
-    if points is None:  # every point is its own nearest Gaussian
+    if given is None:  # every point is its own nearest Gaussian
         cloud, options = surface_points(gmap, means), ExportOptions(drop_noise=False, smooth=False)
     else:
-        cloud, options = read_cloud(points), resolved(options, means, gmap.instance_ids)
+        cloud, options = given, resolved(options, means, gmap.instance_ids)
     inside = check_overlap(means, cloud.points)
     labels = export_labels(means, gmap.instance_ids, cloud, options)
     if outputs.color == "instance":
         cloud = replace(cloud, colors=instance_palette(labels))
-    sidecar = _write(output, gmap, cloud, labels, placed, outputs)
+    sidecar = _write(output, gmap, cloud, labels, placed, outputs, facts)
     result = {
         "points": len(labels),
         "labelled": int((labels >= 0).sum()),
@@ -87,7 +107,13 @@ def surface_points(gmap: Map, means: np.ndarray | None = None) -> PointCloud:
 
 
 def _write(
-    output: Path, gmap: Map, cloud: PointCloud, labels: np.ndarray, placed: np.ndarray, outputs: Outputs
+    output: Path,
+    gmap: Map,
+    cloud: PointCloud,
+    labels: np.ndarray,
+    placed: np.ndarray,
+    outputs: Outputs,
+    facts: dict[str, Any],
 ) -> dict[str, Any]:
     """Writes all files, `output` last, so that its existence means success. Returns the sidecar."""
     instances, frame = {entry["id"]: entry for entry in gmap.instances}, str(gmap.info.get("frame", "map"))
@@ -95,16 +121,17 @@ def _write(
         write_split(outputs.split, cloud, labels)
     if outputs.boxes is not None:
         metric = gmap.metric and abs(scale_of(placed) - 1) < 1e-9
-        write_boxes(outputs.boxes, cloud.points, labels, instances, frame=frame, metric=metric)
+        named = "scan" if "map_from_scan" in facts else frame
+        write_boxes(outputs.boxes, cloud.points, labels, instances, frame=named, metric=metric)
     if outputs.scannet is not None:
         write_scannet(outputs.scannet, output.stem, labels, instances)
     if output.suffix.lower() != ".mcap":
-        return write_export(output, cloud, labels, instances)
+        return write_export(output, cloud, labels, instances, facts)
     from perception.export.mcap import write_recording
 
     local = replace(cloud, points=move_points(placed, cloud.points.astype(np.float64)))
     write_recording(output, local, labels, gmap.instances, gmap.located_views(), frame)
-    return sidecar_of(labels, instances)
+    return {**facts, **sidecar_of(labels, instances)}
 
 
 def _table(result: dict[str, Any]) -> str:
@@ -112,6 +139,8 @@ def _table(result: dict[str, Any]) -> str:
     rows = sorted(result["instances"].items(), key=lambda row: -row[1]["num_points"])
     lines += [f"{i:>6}{r['num_points']:>12}{r['score']:>8.3f}  {r['label'] or ''}" for i, r in rows]
     lines.append(f"{result['labelled']} of {result['points']} points labelled, {result['seconds']:.1f} s")
+    if "alignment" in result:
+        lines.append("aligned: " + ", ".join(f"{key} {value}" for key, value in result["alignment"].items()))
     if result["max_distance"] is not None:
         lines.append(f"points farther than {result['max_distance']:.4g} from every Gaussian are -1")
     if result["inside_map"] < 0.5:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,7 +23,8 @@ class Hit:
     obb: oriented bounding box of the points. covariance: [3, 3] float64 of the points about their mean, divided by P.
     score: in [0, 1]; for a text prompt how well the instance matches, else the mapper's confidence. views: the photos
     that show it best, best first. distance: from the query's position to the nearest point; None without a position.
-    parent: for a part, the id of its instance. All of it is in `frame`, in metres when the map is metric.
+    parent: for a part, the id of its instance. colors(): [P, 3] uint8 of the points, read when called; None where they
+    are not known. All of it is in `frame`, in metres when the map is metric.
     """
 
     instance_id: int
@@ -36,6 +38,7 @@ class Hit:
     frame: str = "map"
     distance: float | None = None
     parent: int | None = None
+    colors: Callable[[], np.ndarray] | None = field(default=None, repr=False, compare=False)
 
     def transformed(self, a_from_b: np.ndarray, frame: str | None = None) -> Hit:
         """The same hit in frame a, given a_from_b [4, 4] (rigid or similarity) from the frame it is in now.
@@ -55,6 +58,14 @@ class Hit:
             frame=self.frame if frame is None else frame,
             distance=None if self.distance is None else self.distance * float(np.cbrt(np.linalg.det(linear))),
         )
+
+    def to_open3d(self) -> Any:
+        """The points as an `open3d.t.geometry.PointCloud` in `frame`: positions, colors (float32 in [0, 1], if known),
+        instance_id (int32). InputError without the package open3d."""
+        from perception.io.open3d import tensor_cloud
+
+        ids = np.full(len(self.points), self.instance_id, np.int32)
+        return tensor_cloud(self.points, None if self.colors is None else self.colors(), ids)
 
     def to_json(self) -> dict[str, Any]:
         """The hit as JSON, as in `perception query --json`."""

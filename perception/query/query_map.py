@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -170,6 +170,7 @@ class QueryMap(Map):
             self._views(position),
             self._covariance(position),
             self.frame,
+            colors=partial(self.colors_of, int(entry["id"])),
         )
 
     def position(self, instance_id: int) -> int:

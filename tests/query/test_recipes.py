@@ -43,6 +43,8 @@ def world(kitchen: Path) -> Iterator[dict[str, Any]]:
         patch.setattr(f"perception.query.{module}.make_encoder", encoders)
     patch.chdir(kitchen.parent)
     names: dict[str, Any] = {"before": before}
+    free, far = np.ones((2, 2, 5), np.uint8), np.arange(20, dtype=np.float32).reshape(2, 2, 5) / 10
+    np.savez("space.npz", occupancy=free, esdf=far, origin=np.array([0, 0, -0.25]), voxel_size=0.1, unit="m")
     try:
         with served(kitchen) as (_, port):
             for kind, code in SNIPPETS:
@@ -68,6 +70,11 @@ def test_the_mug_is_found_and_moved(world: dict[str, Any]) -> None:
     for hit in (world["mug_in_base"], world["same"]):
         assert hit.frame == "base_link" and np.allclose(hit.points, expected, atol=1e-5)
     assert np.isclose(world["length"], max(world["mug"].obb.extent) * 2.03 / 4.1)
+
+
+def test_the_slice_is_that_through_zero(world: dict[str, Any]) -> None:
+    assert world["level"] == 2  # -0.25 + 2 · 0.1 ≤ 0 < -0.25 + 3 · 0.1
+    assert world["safe"].tolist() == [[False, True], [True, True]]  # 0.2, 0.7, 1.2, 1.7 away
 
 
 def test_filters_leave_what_lies_there(world: dict[str, Any]) -> None:

@@ -1,0 +1,308 @@
+"""Registers a scan that lies in another frame, and perhaps another unit, to what a map's cameras see.
+
+1. Rotations: the normals of scan and map, as distributions on the sphere, are compared under every rotation of a grid;
+   the best are refined (Makadia et al. 2006, "Fully automatic registration of 3D point clouds").
+2. Scale and shift: for each rotation and scale, the scan's voxels are correlated by FFT with a grid that is positive on
+   the map's surface, negative in space that its cameras see through, and zero where they see nothing.
+3. The best places are refined by point-to-plane ICP and judged by the cameras: scan points on their depth speak for a
+   place, scan points in front of it against it. With colours, the best is refined on the rendered pictures.
+4. It is accepted if few points speak against it, if it cannot slide, and if no other place is nearly as good.
+
+The search covers all places, so of two that look alike both are found. Descriptors of points (FPFH with RANSAC) are not
+used: on surfaces of trained maps, centimetres rough, 2 % of their matches were right. Nothing is random, and no sum
+depends on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import fft
+from scipy.ndimage import binary_dilation
+
+from perception.errors import InputError
+from perception.export.align_rotations import likely_rotations
+from perception.export.align_steps import Place, gray_images, photometric_step, plane_step
+from perception.export.depth_views import DepthView, cell_means, fused_surface, grid_cells, observe
+from perception.export.graph import list_normals, neighbor_lists
+from perception.export.neighbors import Neighbors
+from perception.types import PointCloud
+
+SCALES = 2.0 ** np.arange(-2, 2.01, 1 / 9)
+"""Scales to try around the ratio of the extents, 8 % apart."""
+GRID = 28
+"""Voxels of the correlation along the map's diagonal, divided by √3 in a cube."""
+REFINED, JUDGED = 200, 16
+"""Places that are refined with few points and views, and the best of them, refined with more."""
+FINALISTS = 3
+"""Places apart from each other that are refined with all points and colours."""
+FEW_ROWS, ROWS, FINE_ROWS = 500, 1500, 20_000
+TOLERANCE = 1 / 60
+"""Distance in extents of the map within which a scan point lies on the rendered surface."""
+ELSEWHERE = 0.1
+"""Root mean square distance in extents of the scan's points in one place to those in another place."""
+LEAST_AGREEMENT, LEAST_COVER, MOST_RIVAL, LEAST_STIFFNESS = 0.85, 0.05, 0.85, 1e-3
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """map_from_scan [4, 4]: a rotation times `scale`, and a translation.
+
+    agreement: of the scan's points that some camera sees or sees through, the share on the rendered surface. overlap,
+    cover: the shares of all scan points on the map's surface, and of that surface near the scan. rms: of the distances
+    to the map's planes, weighted as ICP does, in map units. rival: the score of the next best other place over this
+    one's. stiffness: the smallest eigenvalue of ICP's information matrix; 0 if the scan can slide or turn.
+    """
+
+    map_from_scan: np.ndarray
+    scale: float
+    agreement: float
+    overlap: float
+    cover: float
+    rms: float
+    rival: float
+    stiffness: float
+
+    @property
+    def refusal(self) -> str | None:
+        """Why the alignment must not be used; None when it may."""
+        if self.agreement < LEAST_AGREEMENT or self.cover < LEAST_COVER:
+            return (
+                f"the best place has {self.agreement:.0%} of the points on surfaces that the map sees, and covers "
+                f"{self.cover:.0%} of the map (at least {LEAST_AGREEMENT:.0%} and {LEAST_COVER:.0%} are needed)"
+            )
+        if self.stiffness < LEAST_STIFFNESS:
+            return "the part that both see can slide or turn without a difference, as on one plane"
+        if self.rival > MOST_RIVAL:
+            return f"another place fits {self.rival:.0%} as well, as in a symmetric room"
+        return None
+
+
+def align(views: Sequence[DepthView], scan: PointCloud, similar: bool) -> Alignment:
+    """The place of `scan` in the map whose rendered depth is `views`; similar: with a scale, else rigid.
+
+    The caller decides by `Alignment.refusal`. InputError if the map's views or the scan hold too little.
+    """
+    registration = Registration(views, scan, similar)
+    places = registration.refined(registration.candidates())
+    if not places:
+        raise InputError("scan: no place in the map is found for it; it needs surfaces that the map shows")
+    return registration.finished(places)
+
+
+class Registration:
+    """The state of one alignment. Both clouds are moved to their medians; lengths are in map units."""
+
+    def __init__(self, views: Sequence[DepthView], scan: PointCloud, similar: bool):
+        points, self.normals = fused_surface(views)
+        rows = np.flatnonzero(np.isfinite(scan.points).all(axis=1))
+        if min(len(points), len(rows)) < 100:
+            raise InputError(f"scan: {len(rows)} finite points, {len(points)} of the map are seen; 100 are needed")
+        raw = scan.points[rows].astype(np.float64)
+        self.middle, self.scan_middle = np.median(points, axis=0), np.median(raw, axis=0)
+        self.points, raw, self.similar = points - self.middle, raw - self.scan_middle, similar
+        self.extent, scan_extent = _extent(self.points), _extent(raw)
+        if not scan_extent > 0:
+            raise InputError("scan: its points lie in one place; nothing can be aligned")
+        unit = self.extent / scan_extent if similar else 1.0
+        self.scales = unit * SCALES if similar else np.ones(1)
+        self.tolerance = TOLERANCE * self.extent
+        shift = np.eye(4)
+        shift[:3, 3] = self.middle
+        self.views = [replace(view, camera_from_world=view.camera_from_world @ shift) for view in views]
+        self.tree = Neighbors(self.points)
+        self.scan, self.brightness = _thinned(
+            raw, None if scan.colors is None else scan.colors[rows], self.extent / unit / 150
+        )
+        self.scan_normals = list_normals(self.scan, neighbor_lists(self.scan, 24)).astype(np.float64)
+        self.scan_tree = Neighbors(self.scan)
+        self.rows = np.arange(0, len(self.scan), max(len(self.scan) // ROWS, 1))
+
+    def candidates(self) -> list[Place]:
+        """Places by the correlation, best first."""
+        step = self.extent / GRID
+        low = self.points.min(axis=0) - 2 * step
+        grid = self._evidence(low, step)
+        spectra: dict[tuple[int, ...], np.ndarray] = {}
+        rows = self.scan[:: max(len(self.scan) // FINE_ROWS, 1)]
+        found: list[Place] = []
+        for rotation in likely_rotations(self.scan_normals, self.normals):
+            turned = rows @ rotation.T
+            for scale in self.scales:
+                found += _correlated(grid, spectra, low, step, turned * scale, scale * rotation)
+        return sorted(found, key=lambda place: -place.score)
+
+    def _evidence(self, low: np.ndarray, step: float) -> np.ndarray:
+        """[X, Y, Z] float32: 1 in cells with surface, 0.5 beside them, −1 in free space, 0 unknown."""
+        shape = np.ceil((self.points.max(axis=0) + 2 * step - low) / step).astype(int)
+        centres = (np.indices(shape).reshape(3, -1).T + 0.5) * step + low
+        on, free, _ = observe(centres, self.views, step)
+        grid = np.where((free >= 2) & (free > on), -1.0, 0.0).reshape(shape)
+        held = np.zeros(shape, bool)
+        held[tuple(np.floor((self.points - low) / step).astype(int).T)] = True
+        grid[binary_dilation(held)] = 0.5
+        grid[held] = 1.0
+        return grid.astype(np.float32)
+
+    def refined(self, candidates: Sequence[Place]) -> list[Place]:
+        """Up to JUDGED distinct places after ICP, best first by `judged`."""
+        w, places = self.tolerance, self._distinct(candidates, 0.04, REFINED)
+        for views, few, widths in (
+            (self.views[::4], self.rows[:: max(len(self.rows) // FEW_ROWS, 1)], [4 * w] * 4 + [2 * w] * 4),
+            (self.views, self.rows, [2 * w] * 4 + [w] * 4),
+        ):
+            places = [self._icp(place, few, widths)[0] for place in places]
+            places = [replace(place, score=self.judged(place, views)[0]) for place in places]
+            places = self._distinct(sorted(places, key=lambda place: -place.score), 0.02, JUDGED)
+        return places
+
+    def _distinct(self, places: Sequence[Place], distance: float, most: int) -> list[Place]:
+        """The first `most` places that are at least `distance` extents apart."""
+        some = self.scan[self.rows[:: max(len(self.rows) // 50, 1)]]
+        kept, moved = [], np.empty((0, *some.shape))
+        for place in places:
+            there = place(some)
+            if (((moved - there) ** 2).sum(axis=2).mean(axis=1) > (distance * self.extent) ** 2).all():
+                kept.append(place)
+                moved = np.concatenate([moved, there[None]])
+                if len(kept) == most:
+                    break
+        return kept
+
+    def finished(self, places: Sequence[Place]) -> Alignment:
+        """The best of the first places that lie apart, refined with all points and colours, and its figures."""
+        w, fine = self.tolerance, np.arange(0, len(self.scan), max(len(self.scan) // FINE_ROWS, 1))
+        tried = []
+        for place in self._distinct(places, ELSEWHERE, FINALISTS):
+            found, rms, information = self._icp(place, fine, [w] * 3 + [w / 2] * 6 + [w / 4] * 12)
+            found = self._photometric(found, fine)
+            tried.append((self.judged(found), found, rms, information))
+        tried.sort(key=lambda row: -row[0][0])
+        (score, agreement, overlap, cover), best, rms, information = tried[0]
+        rival = max((row[0][0] for row in tried[1:] if self.apart(row[1], best) > ELSEWHERE * self.extent), default=0.0)
+        matrix = np.eye(4)
+        matrix[:3, :3] = best.linear
+        matrix[:3, 3] = best.shift + self.middle - best.linear @ self.scan_middle
+        stiffness = float(np.linalg.eigvalsh(information)[0])
+        return Alignment(matrix, best.scale, agreement, overlap, cover, rms, rival / max(score, 1e-9), stiffness)
+
+    def judged(self, place: Place, views: Sequence[DepthView] | None = None) -> tuple[float, float, float, float]:
+        """(score, agreement, overlap, cover) of a place; the score is (2 agreement − 1) cover, and with colours up to
+        halved where the scan's brightness does not go with the rendered one."""
+        moved = place(self.scan[self.rows])
+        on, free, _ = observe(moved, views or self.views, self.tolerance)
+        good, bad = (on > 0) & (2 * on >= free), (free >= 2) & (2 * on < free)
+        agreement = float(good.sum() / max(good.sum() + bad.sum(), 1))
+        chosen = slice(None, None, max(len(self.points) // ROWS, 1))
+        back = (self.points[chosen] - place.shift) @ np.linalg.inv(place.linear).T
+        index, distance = self.scan_tree.query(back, 1, self.tolerance / place.scale)
+        facing = np.einsum(
+            "ij,ij->i", self.normals[chosen] @ place.linear / place.scale, self.scan_normals[index[:, 0]]
+        )
+        near = (index[:, 0] >= 0) & (np.abs(facing) > 0.7)
+        depth = np.where(near, distance[:, 0] * place.scale / self.tolerance, 1.0)
+        score = max(2 * agreement - 1, 0.0) * float((1 - depth**2).mean())
+        if self.brightness is not None:
+            score *= 0.5 + 0.5 * self._alike(moved, self.brightness[self.rows], views or self.views)
+        return score, agreement, float(good.mean()), float(near.mean())
+
+    def apart(self, a: Place, b: Place) -> float:
+        """Root mean square distance of the scan's points in two places."""
+        some = self.scan[self.rows[:: max(len(self.rows) // 100, 1)]]
+        return float(np.sqrt(((a(some) - b(some)) ** 2).sum(axis=1).mean()))
+
+    def _alike(self, moved: np.ndarray, brightness: np.ndarray, views: Sequence[DepthView]) -> float:
+        """Correlation, at least 0, of the scan's brightness with its mean over the views that see a point."""
+        total, count = np.zeros((2, len(moved)))
+        for view in views:
+            rows, value = view.brightness_at(moved, self.tolerance)
+            total[rows] += value
+            count[rows] += 1
+        seen = count > 0
+        if seen.sum() < 30:
+            return 0.0
+        a, b = total[seen] / count[seen], brightness[seen]
+        a, b = a - a.mean(), b - b.mean()
+        return max(0.0, float((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-12)))
+
+    def _icp(self, place: Place, rows: np.ndarray, widths: Sequence[float]) -> tuple[Place, float, np.ndarray]:
+        rms, information = np.inf, np.zeros((7, 7))
+        for width in widths:
+            index, _ = self.tree.query(place(self.scan[rows]), 1, 3 * width)
+            near = np.flatnonzero(index[:, 0] >= 0)
+            if len(near) < 30:
+                break
+            own, at = rows[near], index[near, 0]
+            place, rms, information = plane_step(
+                place,
+                self.scan[own],
+                self.scan_normals[own],
+                self.points[at],
+                self.normals[at],
+                width,
+                self.extent,
+                self.similar,
+            )
+        return place, rms, information
+
+    def _photometric(self, place: Place, rows: np.ndarray) -> Place:
+        """The place refined on the pictures; unchanged without colours, or if that leads away."""
+        if self.brightness is None:
+            return place
+        found, chosen = place, self.views[:: max(len(self.views) // 30, 1)]
+        for blur in (4.0, 2.0, 1.0):
+            images = gray_images(chosen, blur)
+            for _ in range(6):
+                found = photometric_step(
+                    found, self.scan[rows], self.brightness[rows], images, self.tolerance, self.extent, self.similar
+                )
+        some = self.rows
+        before, after = (self._alike(p(self.scan[some]), self.brightness[some], self.views) for p in (place, found))
+        return found if after > before and self.apart(found, place) < 2 * self.tolerance else place
+
+
+def _extent(points: np.ndarray) -> float:
+    low, high = np.percentile(points, [1, 99], axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def _thinned(points: np.ndarray, colors: np.ndarray | None, width: float) -> tuple[np.ndarray, np.ndarray | None]:
+    """Mean point, and mean brightness in [0, 1] if there are colours, of each cell of a grid."""
+    cell, count = grid_cells(points, width)
+    mean = cell_means(points, cell, count)
+    if colors is None or colors.min() == colors.max():
+        return mean, None
+    return mean, np.bincount(cell, colors.mean(axis=1) / 255) / count
+
+
+def _correlated(
+    grid: np.ndarray,
+    spectra: dict[tuple[int, ...], np.ndarray],
+    low: np.ndarray,
+    step: float,
+    points: np.ndarray,
+    linear: np.ndarray,
+) -> list[Place]:
+    """The best two shifts of points [S, 3] in the grid, by the sum over the cells that they occupy.
+
+    spectra: transforms of the grid by padded shape, kept between calls.
+    """
+    first = points.min(axis=0)
+    cells = ((points - first) / step).astype(np.int64)
+    shape = tuple(4 * (-int(n) // -4) for n in np.array(grid.shape) + cells.max(axis=0) + 1)
+    if shape not in spectra:
+        spectra[shape] = fft.rfftn(grid, shape)
+    held = np.zeros(shape, np.float32)
+    held[tuple(cells.T)] = 1
+    scores = fft.irfftn(spectra[shape] * np.conj(fft.rfftn(held)), shape)
+    found = []
+    for _ in range(2):
+        best = np.array(np.unravel_index(int(np.argmax(scores)), shape))
+        value = float(scores[tuple(best)])
+        around = [(best[axis] + np.arange(-2, 3)) % shape[axis] for axis in range(3)]
+        scores[np.ix_(*around)] = -np.inf
+        offset = np.where(best >= grid.shape, best - shape, best)  # shifts are circular
+        found.append(Place(linear, low + offset * step - first, value))
+    return found

@@ -1,0 +1,160 @@
+"""Depth rendered from a map's own cameras: what each place of the scene is, as those cameras see it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from perception.gaussians.model import Gaussians
+from perception.gaussians.render import render
+from perception.types import View
+
+JUMP = 0.05
+"""A depth that differs from a neighbouring pixel's by more than this share belongs to an edge and is left out."""
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """camera_from_world [4, 4], K [3, 3] pixels, depth [H, W] float32 along the optical axis in map units (0 = none),
+    colors [H, W, 3] float32 in [0, 1]."""
+
+    camera_from_world: np.ndarray
+    K: np.ndarray
+    depth: np.ndarray
+    colors: np.ndarray
+
+    @cached_property
+    def brightness(self) -> np.ndarray:
+        """[H, W] float32, the mean of the colour channels."""
+        return self.colors.mean(axis=2)
+
+    def look(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of points [P, 3]: (in camera axes with u and v, [P, 5]; depth [P] in the pixel of each, 0 = none)."""
+        own = np.einsum("nj,ij->ni", points, self.camera_from_world[:3, :3]) + self.camera_from_world[:3, 3]
+        height, width = self.depth.shape
+        front = own[:, 2] > 1e-9
+        uv = own[:, :2] / np.where(front, own[:, 2], 1.0)[:, None] * np.diag(self.K)[:2] + self.K[:2, 2]
+        inside = np.flatnonzero(front & (uv >= 0).all(axis=1) & (uv < [width, height]).all(axis=1))
+        depth = np.zeros(len(points), np.float32)
+        column, row = uv[inside].astype(np.int64).T
+        depth[inside] = self.depth[row, column]
+        return np.concatenate([own, uv], axis=1), depth
+
+    def seen(self, points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """(rows of the points [P, 3] within `tolerance` of the depth, their u, v, and [R, 3] in camera axes)."""
+        own, depth = self.look(points)
+        rows = np.flatnonzero((depth > 0) & (np.abs(depth - own[:, 2]) <= tolerance))
+        return rows, own[rows, 3], own[rows, 4], own[rows, :3]
+
+    def brightness_at(self, points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+        """(rows of the points [P, 3] within `tolerance` of the depth, the brightness in their pixels)."""
+        rows, u, v, _ = self.seen(points, tolerance)
+        return rows, self.brightness[v.astype(np.int64), u.astype(np.int64)]
+
+
+@torch.no_grad()
+def depth_views(gaussians: Gaussians, views: Sequence[View], long_side: int = 640) -> list[DepthView]:
+    """Expected depth where the map is more than half opaque, edges left out, and colours; of pinhole views scaled to at
+    most `long_side` pixels."""
+    found = []
+    for view in views:
+        width, height, K = _scaled(view, long_side)
+        pose = np.asarray(view.camera_from_world, np.float64)
+        camera, intrinsics = (torch.from_numpy(array.astype(np.float32)) for array in (pose, K))
+        out = render(gaussians, camera, intrinsics, width, height)
+        alpha = out.alphas[0].numpy()
+        depth = np.where(alpha > 0.5, out.depths[0].numpy() / np.maximum(alpha, 1e-6), 0).astype(np.float32)
+        found.append(DepthView(pose, K, _without_edges(depth), out.colors[0].clamp(0, 1).numpy()))
+    return found
+
+
+def _scaled(view: View, long_side: int) -> tuple[int, int, np.ndarray]:
+    share = min(1.0, long_side / max(view.width, view.height))
+    width, height = max(round(view.width * share), 1), max(round(view.height * share), 1)
+    return width, height, np.diag([width / view.width, height / view.height, 1.0]) @ view.K
+
+
+def _without_edges(depth: np.ndarray) -> np.ndarray:
+    kept = np.ones(depth.shape, bool)
+    for axis in (0, 1):
+        step = np.abs(np.diff(depth, axis=axis))
+        low = np.take(depth, range(depth.shape[axis] - 1), axis)
+        jump = step > JUMP * np.maximum(low, 1e-12)
+        first, second = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),)
+        kept[first] &= ~jump
+        kept[second] &= ~jump
+    return np.where(kept, depth, 0).astype(np.float32)
+
+
+def observe(
+    points: np.ndarray, views: Sequence[DepthView], tolerance: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the views say of points [P, 3]: (on, free, gap), each [P].
+
+    on: number of views whose depth there is within `tolerance`; gap: the mean of depth − z over those, positive in
+    front of the surface. free: number of views that see farther. A view that sees less far says nothing: hidden.
+    """
+    on, free = np.zeros((2, len(points)), np.int32)
+    gap = np.zeros(len(points))
+    for view in views:
+        own, depth = view.look(points)
+        ahead = np.where(depth > 0, depth - own[:, 2], -np.inf)
+        near = np.abs(ahead) <= tolerance
+        on += near
+        free += ahead > tolerance
+        gap[near] += ahead[near]
+    return on, free, gap / np.maximum(on, 1)
+
+
+def fused_surface(
+    views: Sequence[DepthView], width: float | None = None, step: int = 2
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean point and unit normal, [P, 3] float64 each, of all depth pixels in each cell of a grid; normals face the
+    cameras. width: of the cells; None = an eightieth of the extent. Every `step`-th pixel is taken."""
+    points, normals = (
+        np.concatenate(parts) for parts in zip(*(_backprojected(view, step) for view in views), strict=True)
+    )
+    if width is None:
+        low, high = np.percentile(points, [2, 98], axis=0)
+        width = float(np.linalg.norm(high - low)) / 80
+    cell, count = grid_cells(points, width)
+    mean = cell_means(points, cell, count)
+    turned = cell_means(normals, cell, count)
+    length = np.linalg.norm(turned, axis=1)
+    kept = (count >= 3) & (length > 0.3)
+    return mean[kept], turned[kept] / length[kept, None]
+
+
+def grid_cells(points: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """(the cell [P], 0 to C − 1, of each of points [P, 3] in a grid of cells of `width`; points per cell [C])."""
+    keys = np.floor((points - points.min(axis=0)) / width).astype(np.int64)
+    sizes = keys.max(axis=0) + 1
+    _, cell, count = np.unique(
+        (keys[:, 0] * sizes[1] + keys[:, 1]) * sizes[2] + keys[:, 2], return_inverse=True, return_counts=True
+    )
+    return cell.reshape(-1), count
+
+
+def cell_means(values: np.ndarray, cell: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Mean [C, D] of values [P, D] in each cell of `grid_cells`."""
+    return np.stack([np.bincount(cell, column) for column in values.T], axis=1) / count[:, None]
+
+
+def _backprojected(view: DepthView, step: int) -> tuple[np.ndarray, np.ndarray]:
+    height, width = view.depth.shape
+    v, u = np.mgrid[:height, :width] + 0.5
+    rays = np.stack([(u - view.K[0, 2]) / view.K[0, 0], (v - view.K[1, 2]) / view.K[1, 1], np.ones_like(u)], axis=-1)
+    own = rays * view.depth[..., None]
+    normal = np.cross(own[2:, 1:-1] - own[:-2, 1:-1], own[1:-1, 2:] - own[1:-1, :-2])[::step, ::step]
+    whole = view.depth > 0
+    whole = (whole[1:-1, 1:-1] & whole[2:, 1:-1] & whole[:-2, 1:-1] & whole[1:-1, 2:] & whole[1:-1, :-2])[
+        ::step, ::step
+    ]
+    inner = own[1:-1, 1:-1][::step, ::step][whole]
+    length = np.linalg.norm(normal[whole], axis=1, keepdims=True)
+    rotation, shift = view.camera_from_world[:3, :3], view.camera_from_world[:3, 3]
+    return (inner - shift) @ rotation, (normal[whole] / np.maximum(length, 1e-30)) @ rotation
