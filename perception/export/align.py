@@ -251,10 +251,10 @@ class Registration:
         """The place refined on the pictures; unchanged without colours, or if that leads away."""
         if self.brightness is None:
             return place
-        found, chosen = place, self.views[:: max(len(self.views) // 30, 1)]
-        for blur in (4.0, 2.0, 1.0):
+        found, chosen = place, self.views[:: max(len(self.views) // 24, 1)]
+        for blur in (8.0, 8.0, 4.0, 2.0, 1.0):
             images = gray_images(chosen, blur)
-            for _ in range(6):
+            for _ in range(5):
                 found = photometric_step(
                     found, self.scan[rows], self.brightness[rows], images, self.tolerance, self.extent, self.similar
                 )
