@@ -1,4 +1,4 @@
-"""`perception label`, `relink` and `upgrade`: names of instances, new photo paths, the new format for older maps."""
+"""`perception label`, `relink`, `upgrade` and `scale`: names, new photo paths, the new format, metres."""
 
 from __future__ import annotations
 
@@ -24,6 +24,17 @@ def register(commands: Any) -> None:
     p = command(commands, "upgrade", _upgrade, "bring an older map to the newest format and encoder")
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("-o", "--output", type=Path, metavar="OUT.gsmap", help="default: in place")
+    p = command(commands, "scale", _scale, "give a finished map metres, by a length, tags, a board or GPS")
+    p.add_argument("map", type=Path, metavar="MAP")
+    p.add_argument("-o", "--output", type=Path, metavar="OUT.gsmap", help="default: in place")
+    p.add_argument(
+        "--known-length",
+        metavar="TEXT",
+        help='"0.297: LABEL, LABEL" (or ids), "0.297: X,Y,Z X,Y,Z" or "0.297: PHOTO X,Y X,Y; PHOTO X,Y X,Y"',
+    )
+    p.add_argument("--tag-size", metavar="M", help="side of the AprilTags or ArUco markers in the photos")
+    p.add_argument("--board", metavar="TEXT", help="a calibration board in the photos, such as charuco:8x11:0.02")
+    p.add_argument("--level", action="store_true", help="turn z up and put the origin on the floor, too")
 
 
 def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -61,6 +72,18 @@ def _transfer(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if transfer.labels:
         set_labels(args.map, dict(transfer.labels))
     return {"labels": transfer.labels, "dropped": [name for _, name in transfer.dropped]}, transfer_text(transfer)
+
+
+def _scale(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.config import FrameConfig, settings_from
+    from perception.frame.moved_map import scale_map
+    from perception.pipeline.summary import frame_lines
+
+    names = ("known_length", "tag_size", "board")
+    given = {n: (getattr(args, n), f"--{n.replace('_', '-')}") for n in names if getattr(args, n) is not None}
+    facts = scale_map(args.map, args.output, settings_from(FrameConfig, given), args.level)
+    lines = [f"{facts['map']}: lengths times {facts['factor']:.6g}", *frame_lines({**facts, "metric": True})]
+    return facts, "\n".join([*lines, *(f"warning: {note}" for note in facts["notes"])])
 
 
 def _relink(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

@@ -46,7 +46,7 @@ def placed_scene(scene: Scene, options: FrameConfig, seed: int = 0) -> Scene:
     if gravity is None or not gravity.confident or keep:
         map_from_world = np.diag([unit, unit, unit, 1.0])
     else:
-        map_from_world = _upright(scene, gravity, unit)
+        map_from_world = upright(scene.views[0].camera_from_world, _real_points(scene), gravity, unit)
     if scale is not None and not metric:
         measured = Measurement(1.0, scale.standard_error / scale.metres, scale.source)
         scene = replace(scene, metric=True, report={**scene.report, "scale": measured.to_json()})
@@ -136,16 +136,18 @@ def _depth_in_units(scene: Scene, scale: Measurement | None, posed: bool) -> Sce
     return replace(scene, views=views)
 
 
-def _upright(scene: Scene, gravity: Gravity, unit: float) -> np.ndarray:
-    """map_from_world [4, 4]: z up, x along the first camera's view, the origin on the floor below it."""
+def upright(pose: np.ndarray, points: np.ndarray, gravity: Gravity, unit: float) -> np.ndarray:
+    """map_from_world [4, 4]: z up, x along the view of the first camera, the origin on the floor below it.
+
+    pose [4, 4]: camera_from_world of that camera. points [P, 3]: of the scene. unit: metres per unit of the world.
+    """
     up = -gravity.direction
-    pose = scene.views[0].camera_from_world
     eye, ahead = camera_centres(pose[None])[0], pose[2, :3] - (pose[2, :3] @ up) * up
     if np.linalg.norm(ahead) < 0.3:  # it looks down or up: what is up in its photo lies ahead
         ahead = -pose[1, :3] * np.sign(pose[2, :3] @ -up) + (pose[1, :3] @ up) * up * np.sign(pose[2, :3] @ -up)
     x = ahead / np.linalg.norm(ahead)
     axes = np.stack([x, np.cross(up, x), up])
-    origin = eye + (floor_height(up, _real_points(scene), eye) - eye @ up) * up
+    origin = eye + (floor_height(up, points, eye) - eye @ up) * up
     map_from_world = np.eye(4)
     map_from_world[:3, :3], map_from_world[:3, 3] = unit * axes, -unit * axes @ origin
     return map_from_world
