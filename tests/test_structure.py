@@ -13,7 +13,19 @@ PACKAGE = Path(__file__).resolve().parents[1] / "perception"
 
 # Bottom to top; a module may import from its own layer and those below.
 LAYERS = [
-    {"errors", "types", "config", "boxes", "geometry", "progress", "listening", "_core", "pictures", "colors"},
+    {
+        "errors",
+        "types",
+        "config",
+        "boxes",
+        "geometry",
+        "progress",
+        "interrupts",
+        "listening",
+        "_core",
+        "pictures",
+        "colors",
+    },
     {"io"},
     {"masks", "demo", "calibration", "bags", "frame"},
     {"gaussians"},

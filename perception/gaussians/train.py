@@ -28,6 +28,7 @@ from perception.gaussians.rates import learning_rates
 from perception.gaussians.record import TrainRecord
 from perception.gaussians.schedule import Schedule
 from perception.gaussians.views import TrainingView, depth_image, psnr, render_view, scene_extent, target_photo
+from perception.interrupts import uninterrupted
 
 __all__ = ["TrainRecord", "Trainer", "TrainingView", "depth_image", "psnr", "render_view", "scene_extent"]
 
@@ -44,7 +45,7 @@ class Observer(Protocol):
         """Called after every iteration, when the schedule has been applied."""
 
     def after_leg(self, trainer: Trainer) -> None:
-        """Called when `Trainer.run` returns or raises."""
+        """Called when `Trainer.run` returns or is interrupted; not when a step failed."""
 
 
 class Trainer:
@@ -76,20 +77,26 @@ class Trainer:
     def run(self, observer: Observer | None = None, until: float = 1.0) -> TrainRecord:
         """Trains until progress `until`. Early stopping is allowed only with until = 1."""
         self._since = time.monotonic()
+        whole = True  # what a failed step left is no state to resume from
         try:
             while (progress := self.progress) < until:
-                self.complete = False
-                loss = self.step(progress)
-                self.schedule.after_step(progress, may_stop=until >= 1.0)
+                with uninterrupted():
+                    whole = False
+                    self.complete = False
+                    loss = self.step(progress)
+                    self.schedule.after_step(progress, may_stop=until >= 1.0)
+                    whole = True
                 if observer is not None:
                     observer.after_step(self, loss)
             if until >= 1.0 and not self.complete:
-                self.schedule.finish()
-                self.complete = True
+                with uninterrupted():
+                    whole = False
+                    self.schedule.finish()
+                    self.complete = whole = True
         finally:
             self.record.seconds, self.record.iterations = self.elapsed, self.iteration
             self._since = None
-            if observer is not None:
+            if observer is not None and whole:
                 observer.after_leg(self)
         return self.record
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import shutil
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from perception.cli import _resume, main
 from perception.config import load_config
 from perception.gaussians.early_stopping import COST_EXPONENT, EarlyStopping
 from perception.gaussians.model import from_points
+from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.rates import cooling
 from perception.gaussians.schedule import Schedule
 from perception.gaussians.train import Trainer
@@ -191,3 +194,35 @@ def test_the_time_between_two_legs_is_not_training(monkeypatch: pytest.MonkeyPat
     now[0] += 1000
     assert trainer.elapsed == 3
     assert trainer.run(Clock()).seconds == trainer.record.iterations == 10
+
+
+@pytest.mark.parametrize("how", ["interrupt", "failure"])
+def test_only_whole_steps_are_kept(monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+    """Half of the third step's tensors have moved: Ctrl-C takes effect after it, and a failure saves nothing."""
+    words = ("train.iterations=6", "train.exchange_db=0")
+    undisturbed, trainer, resumed = (small_trainer(*words) for _ in range(3))
+    undisturbed.run()
+    step_one, saved = SparseAdam._step_one, []
+
+    def disturbed(self: SparseAdam, name: str, *rest: Any) -> tuple[int, int]:
+        if trainer.iteration == 2 and name == list(self.params)[1]:
+            if how == "failure":
+                raise MemoryError
+            signal.raise_signal(signal.SIGINT)
+        return step_one(self, name, *rest)
+
+    class Saver:
+        def after_step(self, trainer: Trainer, loss: float) -> None: ...
+
+        def after_leg(self, trainer: Trainer) -> None:
+            saved.append(copy.deepcopy(trainer.state()))
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt if how == "interrupt" else MemoryError):
+        patch.setattr(SparseAdam, "_step_one", disturbed)
+        trainer.run(Saver())
+    assert [state["iteration"] for state in saved] == ([3] if how == "interrupt" else [])
+    for state in saved:
+        resumed.load(state)
+    resumed.run()
+    for name, tensor in vars(undisturbed.gaussians).items():
+        assert torch.equal(tensor, vars(resumed.gaussians)[name]), name
