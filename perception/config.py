@@ -72,6 +72,9 @@ class TrainConfig(Settings):
         description="dB of held-out PSNR that 10 % more time must gain, else growth or training ends; 0: never",
     )
     budget: int = Field(100_000, ge=100, le=10**8, description="most Gaussians the map may have")
+    transients: bool = Field(
+        False, description="leave out parts of photos that disagree with the others, such as people who walk"
+    )
     sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics that is tried")
 
 

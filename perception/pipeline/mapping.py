@@ -37,6 +37,7 @@ from perception.pipeline.photos import exposed_as_neighbours, load_all, split_vi
 from perception.pipeline.record import Stages, finite, peak_memory_mib, versions
 from perception.pipeline.sensor_depth import depth_errors, depth_used
 from perception.pipeline.summary import depth_text, frame_lines
+from perception.pipeline.transients import train_without_transients
 from perception.pipeline.work_folder import clear_work, frames_folder, working
 from perception.progress import Progress
 from perception.types import Scene, View
@@ -95,6 +96,9 @@ def build_map(
         mark = training_mark(source, config)
         observer = TrainingObserver(work, mark, mask_source.identity, masks_enter, progress)
         observer.take_up(trainer)
+        if config.train.transients:
+            with stages("train"):
+                views = train_without_transients(trainer, views, observer, work / "transients.npz", progress)
 
         # Instance masks M_v,i of every photo (§3.2). Some need the depth of the map, which is then trained first.
         if from_geometry and trainer.progress < GEOMETRY_START:
