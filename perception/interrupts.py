@@ -25,5 +25,5 @@ def uninterrupted() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
-        for number in held[:1]:
-            signal.raise_signal(number)
+        for caught in held[:1]:
+            signal.raise_signal(caught)
