@@ -94,6 +94,7 @@ def export_map(
         "inside_map": inside,
         "seconds": time.perf_counter() - began,
         "max_distance": options.max_distance,
+        "metric": _metric(gmap, placed),
         "smoothed": options.smooth,
         **sidecar,
     }
@@ -120,7 +121,7 @@ def _write(
     if outputs.split is not None:
         write_split(outputs.split, cloud, labels)
     if outputs.boxes is not None:
-        metric = gmap.metric and abs(scale_of(placed) - 1) < 1e-9
+        metric = _metric(gmap, placed)
         named = "scan" if "map_from_scan" in facts else frame
         write_boxes(outputs.boxes, cloud.points, labels, instances, frame=named, metric=metric)
     if outputs.scannet is not None:
@@ -134,11 +135,17 @@ def _write(
     return {**facts, **sidecar_of(labels, instances)}
 
 
+def _metric(gmap: Map, placed: np.ndarray) -> bool:
+    """Whether the exported coordinates are in metres; placed [4, 4]: the map from their frame."""
+    return gmap.metric and abs(scale_of(placed) - 1) < 1e-9
+
+
 def _table(result: dict[str, Any]) -> str:
     lines = [f"{'id':>6}{'points':>12}{'score':>8}  label"]
     rows = sorted(result["instances"].items(), key=lambda row: -row[1]["num_points"])
     lines += [f"{i:>6}{r['num_points']:>12}{r['score']:>8.3f}  {r['label'] or ''}" for i, r in rows]
-    lines.append(f"{result['labelled']} of {result['points']} points labelled, {result['seconds']:.1f} s")
+    unit = "metres" if result["metric"] else "units of the reconstruction"
+    lines.append(f"{result['labelled']} of {result['points']} points labelled, in {unit}, {result['seconds']:.1f} s")
     if "alignment" in result:
         lines.append("aligned: " + ", ".join(f"{key} {value}" for key, value in result["alignment"].items()))
     if result["max_distance"] is not None:
