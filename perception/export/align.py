@@ -43,7 +43,8 @@ TOLERANCE = 1 / 60
 """Distance in extents of the map within which a scan point lies on the rendered surface."""
 ELSEWHERE = 0.1
 """Root mean square distance in extents of the scan's points in one place to those in another place."""
-LEAST_AGREEMENT, LEAST_COVER, MOST_RIVAL, LEAST_STIFFNESS = 0.85, 0.05, 0.85, 1e-3
+LEAST_AGREEMENT, LEAST_COVER, MOST_RIVAL, LEAST_STIFFNESS = 0.95, 0.05, 0.85, 1e-3
+LEAST_LIKENESS = 0.5
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ class Alignment:
     cover: the shares of all scan points on the map's surface, and of that surface near the scan. rms: of the distances
     to the map's planes, weighted as ICP does, in map units. rival: the score of the next best other place over this
     one's. stiffness: the smallest eigenvalue of ICP's information matrix; 0 if the scan can slide or turn.
+    likeness: correlation of the brightness of scan and map; None without colours.
     """
 
     map_from_scan: np.ndarray
@@ -64,6 +66,7 @@ class Alignment:
     rms: float
     rival: float
     stiffness: float
+    likeness: float | None = None
 
     @property
     def refusal(self) -> str | None:
@@ -73,6 +76,8 @@ class Alignment:
                 f"the best place has {self.agreement:.0%} of the points on surfaces that the map sees, and covers "
                 f"{self.cover:.0%} of the map (at least {LEAST_AGREEMENT:.0%} and {LEAST_COVER:.0%} are needed)"
             )
+        if self.likeness is not None and self.likeness < LEAST_LIKENESS:
+            return f"at the best place, the colours of the scan and of the map do not go together ({self.likeness:.2f})"
         if self.stiffness < LEAST_STIFFNESS:
             return "the part that both see can slide or turn without a difference, as on one plane"
         if self.rival > MOST_RIVAL:
@@ -186,11 +191,14 @@ class Registration:
         matrix[:3, :3] = best.linear
         matrix[:3, 3] = best.shift + self.middle - best.linear @ self.scan_middle
         stiffness = float(np.linalg.eigvalsh(information)[0])
-        return Alignment(matrix, best.scale, agreement, overlap, cover, rms, rival / max(score, 1e-9), stiffness)
+        light = self.brightness
+        likeness = None if light is None else self._alike(best(self.scan[self.rows]), light[self.rows], self.views)
+        rival /= max(score, 1e-9)
+        return Alignment(matrix, best.scale, agreement, overlap, cover, rms, rival, stiffness, likeness)
 
     def judged(self, place: Place, views: Sequence[DepthView] | None = None) -> tuple[float, float, float, float]:
-        """(score, agreement, overlap, cover) of a place; the score is (2 agreement − 1) cover, and with colours up to
-        halved where the scan's brightness does not go with the rendered one."""
+        """(score, agreement, overlap, cover) of a place; the score is (2 agreement − 1) cover, with colours times
+        the squared correlation (at least 0.1) of the scan's brightness with the rendered one."""
         moved = place(self.scan[self.rows])
         on, free, _ = observe(moved, views or self.views, self.tolerance)
         good, bad = (on > 0) & (2 * on >= free), (free >= 2) & (2 * on < free)
@@ -205,7 +213,7 @@ class Registration:
         depth = np.where(near, distance[:, 0] * place.scale / self.tolerance, 1.0)
         score = max(2 * agreement - 1, 0.0) * float((1 - depth**2).mean())
         if self.brightness is not None:
-            score *= 0.5 + 0.5 * self._alike(moved, self.brightness[self.rows], views or self.views)
+            score *= max(0.1, self._alike(moved, self.brightness[self.rows], views or self.views)) ** 2
         return score, agreement, float(good.mean()), float(near.mean())
 
     def apart(self, a: Place, b: Place) -> float:
