@@ -14,12 +14,11 @@ from perception.io.exposure import with_gains
 from perception.io.ignore_masks import mask_of
 from perception.io.lens import lens_from_camera, load_pycolmap
 from perception.io.photos import why_left_out
+from perception.io.reading import Reading
 from perception.io.safe_names import safe_name
-from perception.io.start_points import Cloud
 from perception.io.tracks import tracks_of_model
 from perception.io.triangulate import MIN_POINTS, cloud_of, posed_scene
 from perception.io.views import fit_lens, make_view
-from perception.progress import Progress
 from perception.types import Scene, View
 
 
@@ -28,42 +27,32 @@ def is_workspace(folder: Path) -> bool:
     return (folder / "images").is_dir() and bool(_models(folder))
 
 
-def read_workspace(
-    folder: Path,
-    workdir: Path,
-    seed: int,
-    progress: Progress,
-    strict: bool = False,
-    masks: Path | None = None,
-    cloud: Cloud | None = None,
-    poses: str = "auto",
-) -> Scene:
+def read_workspace(folder: Path, how: Reading) -> Scene:
     """The largest sparse model of a workspace as a Scene, in COLMAP's world.
 
-    Photos that are missing or damaged are left out and reported; strict: damaged ones raise InputError. Image names
-    that point outside the photo folder raise InputError. masks: folder of masks. cloud: used instead of the points.
-    poses: see `posed_scene`.
+    Photos that are missing or damaged are left out and reported. Image names that point outside the photo folder raise
+    InputError.
     """
     found = {path: _read_model(path) for path in _models(folder)}
     path, model = max(found.items(), key=lambda item: item[1].num_reg_images())
     if model.num_reg_images() == 0:
         raise InputError(f"{path}: the sparse model is empty (no registered photo); run structure from motion again")
     located = _located(model, folder / "images", path)
-    views, missing, notes = views_of_model(model, located, path, strict)
-    views = [replace(view, mask=mask_of(masks, view.name)) for view in views]
+    views, missing, notes = views_of_model(model, located, path, how.strict)
+    views = [replace(view, mask=mask_of(how.masks, view.name)) for view in views]
     if not views:
         raise InputError(f"{folder / 'images'}: none of the {model.num_reg_images()} photos of {path} is there")
     if len(found) > 1:
         sizes = ", ".join(f"{p.name}: {m.num_reg_images()}" for p, m in found.items())
         notes.append(f"{folder}: {len(found)} sparse models (photos in {sizes}); the largest is used")
-    cloud = cloud_of(model) if cloud is None else cloud
+    cloud = how.cloud or cloud_of(model)
     if len(cloud[0]) < MIN_POINTS:
         notes.append(f"{path}: the sparse model holds {len(cloud[0])} points; new ones are triangulated")
     facts: dict[str, Any] = {"input": "colmap", "left_out": missing, "warnings": notes}
     facts |= {"model": path.relative_to(folder).as_posix(), "mean_reprojection_error_px": _reprojection_error(model)}
     names = {image_id: name for image_id, (name, _) in located.items()}
     views, exposure = with_gains(views, tracks_of_model(model, views, names))
-    return posed_scene(views, cloud, {**facts, **exposure}, workdir, seed, progress, MIN_POINTS, poses)
+    return posed_scene(views, cloud, {**facts, **exposure}, how, MIN_POINTS)
 
 
 def _located(model: Any, images: Path, source: Path) -> dict[int, tuple[str, Path]]:

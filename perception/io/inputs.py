@@ -6,10 +6,12 @@ import shutil
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 from perception.errors import InputError
 from perception.io.camera_file import read_camera
 from perception.io.ignore_masks import with_checked_masks
+from perception.io.reading import Reading
 from perception.io.start_points import check_seen, start_points
 from perception.progress import Progress
 from perception.types import Lens, Scene
@@ -31,7 +33,7 @@ def load_scene(
     frames: Path | None = None,
     masks: Path | None = None,
     init_points: Path | None = None,
-    poses: str = "auto",
+    poses: Literal["auto", "keep", "refine"] = "auto",
 ) -> Scene:
     """Posed views of `source`, sorted by name, with a sparse cloud.
 
@@ -69,18 +71,19 @@ def load_scene(
     lens = None if camera_file is None else read_camera(camera_file)
     cloud = None if init_points is None else start_points(init_points)
     workdir.mkdir(parents=True, exist_ok=True)
+    how = Reading(workdir, seed, tell, strict, masks, cloud, poses)
     if is_video:
         scene = _scene_of_video(source, frames or workdir / "frames", workdir, lens, seed, tell, masks)
     elif recording is not None:
         recording = replace(recording, lens=lens or recording.lens)
-        scene = recorded_scene(recording, workdir, seed, tell, strict, masks, cloud, poses)
+        scene = recorded_scene(recording, how)
     elif unposed:
         refuse_depth_without_poses(source)
         scene = reconstruct(source, workdir, lens, seed, tell, strict, masks)
     elif workspace:
-        scene = read_workspace(source, workdir, seed, tell, strict, masks, cloud, poses)
+        scene = read_workspace(source, how)
     elif file.suffix.lower() == ".json":
-        scene = read_transforms(file, workdir, seed, tell, strict, masks, cloud, poses)
+        scene = read_transforms(file, how)
     else:
         raise InputError(f"{source}: expected {EXPECTED}")
     if init_points is not None:

@@ -14,8 +14,8 @@ from perception.geometry import inverse_se3
 from perception.io.depth import read_depth
 from perception.io.frame_choice import Chooser
 from perception.io.ignore_masks import mask_of
+from perception.io.reading import Reading
 from perception.io.safe_names import safe_name
-from perception.io.start_points import Cloud
 from perception.io.triangulate import posed_scene
 from perception.io.views import fit_lens, make_view, rigid_pose
 from perception.progress import Progress
@@ -56,19 +56,9 @@ class Recording:
     warnings: list[str] = field(default_factory=list)
 
 
-def recorded_scene(
-    recording: Recording,
-    workdir: Path,
-    seed: int,
-    progress: Progress,
-    strict: bool = False,
-    masks: Path | None = None,
-    cloud: Cloud | None = None,
-    poses: str = "auto",
-) -> Scene:
+def recorded_scene(recording: Recording, how: Reading) -> Scene:
     """The chosen frames of a recording as a Scene in its own world, whose unit is the metre.
 
-    masks, cloud, poses: as for `read_transforms`. strict: damaged photos raise InputError, else they are left out.
     InputError for poses that are not rigid, a missing lens, and depth whose unit cannot be right.
     """
     source, kind, lens = recording.source, recording.kind, recording.lens
@@ -78,8 +68,8 @@ def recorded_scene(
         raise InputError(f"{source}: a recording as of {kind} without the intrinsics of its photos; give --camera FILE")
     for frame in recording.frames:
         rigid_pose(frame.world_from_camera, f"{source}: the pose of {frame.name}")
-    chosen, damaged = choose_frames(recording, lens, progress, strict)
-    views = [_view(recording, frame, lens, masks) for frame in chosen]
+    chosen, damaged = choose_frames(recording, lens, how.progress, how.strict)
+    views = [_view(recording, frame, lens, how.masks) for frame in chosen]
     taken = f"{len(chosen)} of {len(recording.frames)} frames chosen, sharp and well spaced"
     facts: dict[str, Any] = {
         "input": kind,
@@ -90,8 +80,8 @@ def recorded_scene(
         "scale": {"source": f"poses and depth of {kind}, in metres by definition"},
     }
     views.sort(key=lambda view: view.name)
-    start = (np.empty((0, 3)), np.empty((0, 3), np.uint8)) if cloud is None else cloud
-    return replace(posed_scene(views, start, facts, workdir, seed, progress, 1, poses), metric=True)
+    start = how.cloud or (np.empty((0, 3)), np.empty((0, 3), np.uint8))
+    return replace(posed_scene(views, start, facts, how, least=1), metric=True)
 
 
 def choose_frames(

@@ -16,11 +16,11 @@ from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.documents import brief, read_json
 from perception.io.ignore_masks import mask_of
 from perception.io.photos import SUFFIXES, photo_size, why_left_out
+from perception.io.reading import Reading
 from perception.io.safe_names import safe_name
 from perception.io.start_points import Cloud, start_points
 from perception.io.triangulate import posed_scene
 from perception.io.views import fit_lens, make_view, rigid_pose
-from perception.progress import Progress
 from perception.types import DepthImage, Lens, Scene, View
 
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
@@ -42,45 +42,35 @@ GRAVITY_ERROR = 1.0
 """Standard error in degrees of a `gravity` without `gravity_std_deg`, as of a phone's motion sensors."""
 
 
-def read_transforms(
-    file: Path,
-    workdir: Path,
-    seed: int,
-    progress: Progress,
-    strict: bool = False,
-    masks: Path | None = None,
-    cloud: Cloud | None = None,
-    poses: str = "auto",
-) -> Scene:
+def read_transforms(file: Path, how: Reading) -> Scene:
     """The frames of a transforms.json whose photos exist, as a Scene in the file's own world.
 
     Intrinsics of a frame override global ones. Without fl_x the focal length is computed from camera_angle_x; without w
     and h the size is that of the photo. Points are read from `ply_file_path`, else triangulated with the given poses.
     The unit is the metre if `metric` is true. View names are paths below the common folder of all photos. Missing and
-    damaged photos are left out and reported; strict: damaged ones raise InputError.
-    masks: folder whose masks precede `mask_path`. cloud: used instead of other points. poses: see `posed_scene`.
+    damaged photos are left out and reported.
     """
     data = _load(file)
     frames = data["frames"]
     if not frames:
         raise InputError(f"{file}: 'frames' is empty; expected at least one posed photo")
-    photos, missing = _photos(file, frames, strict)
+    photos, missing = _photos(file, frames, how.strict)
     if not photos:
         first = f"{missing[0]['name']}: {missing[0]['why']}"
         raise InputError(f"{file}: none of the {len(frames)} photos it lists can be read (first: {first})")
     root = _common_root(list(photos.values()))
-    views, notes = _views(file, data, frames, photos, root, masks)
-    listed = _listed_cloud(file, data) if cloud is None else cloud
+    views, notes = _views(file, data, frames, photos, root, how.masks)
+    listed = how.cloud or _listed_cloud(file, data)
     facts: dict[str, Any] = {
         "input": "transforms",
         "left_out": missing,
         "warnings": notes,
         "mean_reprojection_error_px": None,
     }
-    if cloud is None and len(listed[0]):
+    if how.cloud is None and len(listed[0]):
         facts["points_from"] = str(data["ply_file_path"])
     facts |= _gravity(file, data)
-    scene = posed_scene(views, listed, facts, workdir, seed, progress, 1, poses)
+    scene = posed_scene(views, listed, facts, how, least=1)
     scene.metric = data.get("metric") is True
     return scene
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -14,9 +13,9 @@ from perception.io.exposure import with_gains
 from perception.io.features import build_features
 from perception.io.lens import camera_from_lens, lens_text, load_pycolmap
 from perception.io.pose_refinement import checked_poses
+from perception.io.reading import Reading
 from perception.io.tracks import features_of, tracks_of
 from perception.io.views import view_lens
-from perception.progress import Progress
 from perception.types import Scene, View
 
 MIN_POINTS = 50
@@ -27,38 +26,35 @@ def posed_scene(
     views: list[View],
     cloud: tuple[np.ndarray, np.ndarray],
     facts: dict[str, Any],
-    workdir: Path,
-    seed: int,
-    progress: Progress,
+    how: Reading,
     least: int,
-    poses: str = "auto",
 ) -> Scene:
     """The Scene of views with known poses. cloud: points [P, 3] and colors [P, 3] from the input.
 
     With fewer than `least` points, triangulated points are used instead. facts: report entries, with "warnings".
-    poses: "keep", "refine", or "auto": checked where features are matched anyway or views have depth, refined where
-    they are wrong (see io.pose_refinement).
     """
     cameras = sorted({lens_text(view_lens(view)) for view in views})
     report = {**facts, "registered": len(views), "cameras": cameras, "seconds": {}}
     points, colors = cloud
     few = len(points) < least
-    check = poses == "refine" or (poses == "auto" and (few or any(view.depth is not None for view in views)))
+    check = how.poses == "refine" or (how.poses == "auto" and (few or any(view.depth is not None for view in views)))
     if few or check:
         masks = [v.mask for v in views]
-        store = build_features([v.photo for v in views], [view_lens(v) for v in views], workdir, seed, progress, masks)
+        store = build_features(
+            [v.photo for v in views], [view_lens(v) for v in views], how.workdir, how.seed, how.progress, masks
+        )
         report["seconds"] = store.facts["seconds"]
         features = features_of(views, store)
         if check:
             started = time.perf_counter()
-            views, found = checked_poses(views, features, poses)
+            views, found = checked_poses(views, features, how.poses)
             report |= {key: [*report.get(key, []), *found[key]] for key in ("notes", "warnings")}
             report["poses"] = found["poses"]
             report["seconds"]["refinement"] = time.perf_counter() - started
         views, found = with_gains(views, tracks_of(features, features.pairs))
         report |= found
         if few:
-            points, colors, found = triangulated_cloud(views, store, seed)
+            points, colors, found = triangulated_cloud(views, store, how.seed)
             report |= {**found, "warnings": [*report["warnings"], *found["warnings"]]}
     report["points"] = len(points)
     return Scene(views, points, colors, report=report)

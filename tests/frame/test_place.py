@@ -14,9 +14,9 @@ from perception.config import FrameConfig
 from perception.errors import InputError
 from perception.frame.place import placed_scene
 from perception.geometry import camera_centres
+from perception.io.reading import Reading
 from perception.io.recentre import moved_scene
 from perception.io.transforms import read_transforms
-from perception.progress import Progress
 from perception.types import DepthImage, Scene
 from support.measured_scenes import cameras, random_similarity, room_points
 
@@ -115,7 +115,7 @@ def test_gravity_and_unit_of_a_transforms_json(tmp_path: Path) -> None:
 
     def read(**more: object) -> Scene:
         (tmp_path / "transforms.json").write_text(json.dumps({**base, **more}))
-        return read_transforms(tmp_path / "transforms.json", tmp_path, 0, Progress(quiet=True))
+        return read_transforms(tmp_path / "transforms.json", Reading(tmp_path))
 
     told = read(gravity=[0, -2, 0], gravity_std_deg=0.3, metric=True)
     assert told.metric and told.report["gravity"] == {

@@ -19,7 +19,6 @@ from unittest.mock import patch
 import numpy as np
 
 from perception.errors import InputError
-from perception.progress import Progress
 from support.paths import MAPS
 from support.views_at import views_at
 
@@ -259,6 +258,7 @@ def _png(width: int = 8, height: int = 6, mode: str = "RGB") -> bytes:
 
 def _colmap(binary: bool) -> Target:
     from perception.io.colmap import read_workspace
+    from perception.io.reading import Reading
 
     _without_photos()
     old = _colmap_binary() if binary else _colmap_text()
@@ -269,7 +269,7 @@ def _colmap(binary: bool) -> Target:
     variants = [(name, same, content) for name, content in files.items()]
 
     def read(folder: Path, name: str) -> None:
-        scene = read_workspace(folder / name[:3], folder / "work", 0, Progress(quiet=True))
+        scene = read_workspace(folder / name[:3], Reading(folder / "work"))
         assert scene.views and all(np.isfinite(view.camera_from_world).all() for view in scene.views)
         assert np.isfinite(scene.points).all()
 
@@ -299,6 +299,7 @@ def _with_rigs(model: dict[str, bytes], binary: bool) -> dict[str, bytes]:
 
 
 def _transforms() -> Target:
+    from perception.io.reading import Reading
     from perception.io.transforms import read_frames, read_transforms
 
     _without_photos()
@@ -318,7 +319,7 @@ def _transforms() -> Target:
             read_frames(file)
         except InputError as error:
             _refuse_memory_errors(error)
-        scene = read_transforms(file, folder / "work", 0, Progress(quiet=True))
+        scene = read_transforms(file, Reading(folder / "work"))
         assert all(np.isfinite(v.camera_from_world).all() and np.isfinite(v.K).all() for v in scene.views)
 
     words = [*lens, *angle, "frames", "file_path", "transform_matrix", "NaN", "Infinity", "null", "k1", "k4", "p1"]

@@ -24,6 +24,7 @@ from perception.io.colmap import read_workspace
 from perception.io.inputs import load_scene
 from perception.io.photos import photo_size, read_photo
 from perception.io.ply import read_ply
+from perception.io.reading import Reading
 from perception.io.transforms import read_frames, read_transforms
 from perception.io.views import rigid_pose
 from perception.masks.label_images import load_labels, stored_key
@@ -348,9 +349,9 @@ def test_transforms_that_no_camera_wrote(tmp_path: Path, change: dict[str, Any])
     good["frames"] = [{"file_path": "a.png", "transform_matrix": IDENTITY}]
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps(good))
-    assert len(read_transforms(file, tmp_path, 0, quiet).views) == 1
+    assert len(read_transforms(file, Reading(tmp_path, progress=quiet)).views) == 1
     file.write_text(json.dumps({**good, **change}))
-    refused(read_transforms, file, tmp_path, 0, quiet, match=r"transforms.json|camera PINHOLE")
+    refused(read_transforms, file, Reading(tmp_path, progress=quiet), match=r"transforms.json|camera PINHOLE")
 
 
 @pytest.mark.parametrize("text", ["[" * 200_000, '{"frames": [' + "1" * 5000 + "]}"])
@@ -422,9 +423,9 @@ def image(name: bytes, pose: tuple = (1, 0, 0, 0, 0, 0, 1), camera: int = 1, poi
 )
 def test_damaged_binary_models(tmp_path: Path, file: str, content: bytes) -> None:
     folder = workspace(tmp_path)
-    assert len(read_workspace(folder, folder / "work", 0, quiet).points) == 60
+    assert len(read_workspace(folder, Reading(folder / "work", progress=quiet)).points) == 60
     (folder / "sparse/0" / file).write_bytes(content)
-    refused(read_workspace, folder, folder / "work", 0, quiet, match=r"sparse|camera")
+    refused(read_workspace, folder, Reading(folder / "work", progress=quiet), match=r"sparse|camera")
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.webp", "a.tif"])
