@@ -217,9 +217,13 @@ def test_only_whole_steps_are_kept(monkeypatch: pytest.MonkeyPatch, how: str) ->
         def after_leg(self, trainer: Trainer) -> None:
             saved.append(copy.deepcopy(trainer.state()))
 
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt if how == "interrupt" else MemoryError):
-        patch.setattr(SparseAdam, "_step_one", disturbed)
-        trainer.run(Saver())
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores SIGINT
+    try:
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt if how == "interrupt" else MemoryError):
+            patch.setattr(SparseAdam, "_step_one", disturbed)
+            trainer.run(Saver())
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert [state["iteration"] for state in saved] == ([3] if how == "interrupt" else [])
     for state in saved:
         resumed.load(state)

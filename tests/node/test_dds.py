@@ -33,7 +33,7 @@ from perception.node.participant import Participant
 
 DOMAIN = 20 + os.getpid() % 200
 LABELS = ["red mug", "laptop", "banana", "Kühlschrank"]
-WAIT = 30.0
+WAIT = 90.0
 
 
 def start(path: Path, namespace: str, *pairs: str) -> subprocess.Popen[str]:
