@@ -72,7 +72,7 @@ class ConseEncoder:
         q = np.exp((cosines - cosines.max(axis=1, keepdims=True)) / TAU)
         q /= q.sum(axis=1, keepdims=True)
         for n, text in enumerate(texts):
-            if known := household_thing(text):
+            if (known := household_thing(text)) and known.classes is not None:
                 q[n] = (1 - KNOWN) * q[n] + KNOWN * known.classes
         return unit_rows(np.sqrt(q))
 

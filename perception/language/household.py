@@ -16,9 +16,10 @@ CLASSES = 1000
 @dataclass(frozen=True)
 class Household:
     """classes: [1000] float32 ≥ 0, sum 1: share of each ImageNet class among pictures of the thing, 1 / √rank of what
-    the table lists. size: least and largest longest side in metres."""
+    the table lists; None where ImageNet has a class of that very name, which is better known by it. size: least and
+    largest longest side in metres."""
 
-    classes: np.ndarray
+    classes: np.ndarray | None
     size: tuple[float, float]
 
 
@@ -43,6 +44,7 @@ def _table() -> dict[str, Household]:
     number: dict[str, int] = {}
     for n, names in enumerate(class_names()):
         number.setdefault(names[0], n)
+    named = {name.lower() for names in class_names() for name in names}
     table: dict[str, Household] = {}
     for line in (Path(__file__).parent / "household.txt").read_text(encoding="utf-8").splitlines():
         if line.startswith("#"):
@@ -52,5 +54,6 @@ def _table() -> dict[str, Household]:
         for rank, name in enumerate(classes.split(", "), start=1):
             shares[number[name]] += rank**-0.5
         least, most = (float(cm) / 100 for cm in size.split("-"))
-        table |= dict.fromkeys(words.split(", "), Household(shares / shares.sum(), (least, most)))
+        for word in words.split(", "):
+            table[word] = Household(None if word in named else shares / shares.sum(), (least, most))
     return table

@@ -19,14 +19,20 @@ def test_every_line_names_known_classes_and_no_word_twice() -> None:
     lines = [line.split(" | ") for line in text.splitlines() if not line.startswith("#")]
     words = [word for line in lines for word in line[0].split(", ")]
     firsts = {names[0] for names in class_names()}
+    named = {name.lower() for names in class_names() for name in names}
+    assert "laptop" in named and household_thing("laptop").classes is None  # type: ignore[union-attr]
     assert len(words) == len(set(words)) > 450
     for line in lines:
         least, most = map(int, line[2].split("-"))
         assert 0 < least < most < 1000 and set(line[1].split(", ")) <= firsts
-        known = household_thing(f"the big {line[0].split(', ')[-1]} on the table")
+        word = line[0].split(", ")[-1]
+        known = household_thing(f"the big {word} on the table")
         assert known is not None and known.size == (least / 100, most / 100)
-        best = class_names()[int(known.classes.argmax())][0]
-        assert known.classes.sum() == pytest.approx(1) and best == line[1].split(", ")[0]
+        if word in named:  # its own class is better than what looks like it
+            assert known.classes is None
+            continue
+        assert known.classes is not None and known.classes.sum() == pytest.approx(1)
+        assert class_names()[int(known.classes.argmax())][0] == line[1].split(", ")[0]
 
 
 def test_the_longest_ending_counts() -> None:
