@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError, missing_extra
+from perception.interrupts import uninterrupted
 
 _DTYPES: dict[str, type] = {
     "tensor(float)": np.float32,
@@ -26,7 +27,8 @@ _EDGE = 1 << 20
 def open_session(path: Path) -> Any:
     """An InferenceSession on the first of `wanted_providers` that loads; InputError for an invalid ONNX model."""
     try:
-        import onnxruntime
+        with uninterrupted():  # Ctrl-C inside the import becomes an ImportError
+            import onnxruntime
     except ImportError as error:
         raise missing_extra("onnxruntime", "demo") from error
     if not path.is_file():

@@ -179,7 +179,11 @@ def test_the_place_is_the_same_to_the_bit_on_any_number_of_threads() -> None:
         run = [sys.executable, "-c", code]
         told.add(
             subprocess.run(
-                run, env={**os.environ, **names, "PYTHONPATH": paths}, capture_output=True, check=True
+                run,
+                env={**os.environ, **names, "PYTHONPATH": paths},
+                cwd=Path(__file__).parent,  # not where sources without a core lie
+                capture_output=True,
+                check=True,
             ).stdout
         )
     assert len(told) == 1
