@@ -111,8 +111,9 @@ def scale_of_sightings(
 ) -> Measurement:
     """Metres per unit from things of known size; pixel_error: least standard deviation of their pixels.
 
-    The standard error is the larger of two: of pixel noise, drawn at random, and by jackknife over views, whose pose
-    errors are common to all corners that they see. InputError when the corners do not have the shape.
+    The standard error is the larger of two: the effect of random pixel noise, and the spread when one view at a time is
+    left out (jackknife), since the error of a view's pose moves all its corners.
+    InputError when the corners do not have the shape.
     """
     poses = np.stack([view.camera_from_world for view in views])
     focal = float(np.median([np.sqrt(view.K[0, 0] * view.K[1, 1]) for view in views]))

@@ -53,7 +53,7 @@ def placed_scene(scene: Scene, options: FrameConfig, seed: int = 0) -> Scene:
     if not np.array_equal(map_from_world, np.eye(4)):
         scene = moved_scene(scene, map_from_world)
     if not posed:
-        scene.report.pop("map_from_input", None)  # the frame of structure from motion is nobody's
+        scene.report.pop("map_from_input", None)  # no input has the arbitrary frame of structure from motion
     return scene
 
 

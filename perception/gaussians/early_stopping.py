@@ -65,7 +65,7 @@ class EarlyStopping:
         return f"growth: ended at {gaussians} Gaussians, a trial gains {gain / 2:.3f} dB and {asked:.3f} are asked"
 
     def plateau(self, progress: float) -> str | None:
-        """Reason to begin the cool-down now; None while more training is worthwhile."""
+        """Why training should end early, after a few steps at falling rates; None while it still gains enough."""
         gain = self.gain()
         if gain is None:
             return None

@@ -89,18 +89,18 @@ def test_a_metric_scan_is_found(furnished: list[module.DepthView]) -> None:
     assert found.agreement > 0.97 and found.rival < 0.7 and found.cover > 0.5
 
 
-MISSED = pytest.mark.xfail(reason="the search does not reach this place; it is refused, not placed wrongly")
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [pytest.param(2, marks=MISSED), 3])
-def test_scale_is_found_and_colours_sharpen_the_place(seed: int) -> None:
+@pytest.mark.parametrize(("seed", "may_refuse"), [(2, True), (3, False)])
+def test_scale_is_found_and_colours_sharpen_the_place(seed: int, may_refuse: bool) -> None:
+    """The search does not always reach the place at an unknown scale. Then it refuses the scan."""
     scan_from_map = similarity(seed, [0.001, 39.37][seed - 2])
     scan = scan_of(FURNISHED, scan_from_map, seed)
     true = np.linalg.inv(scan_from_map)
     gray = 0.6 * box_rooms.texture(scan @ true[:3, :3].T + true[:3, 3]) + 0.2  # another exposure
     cloud = PointCloud(scan, np.repeat((gray[:, None] * 255).astype(np.uint8), 3, axis=1))
     found = align(box_rooms.views(FURNISHED, size=(240, 180), textured=True), cloud, similar=True)
+    if may_refuse and found.refusal is not None:
+        return
     assert found.refusal is None
     degrees, away = error(found, scan_from_map, scan)
     assert degrees < 0.1 and away < 0.005
