@@ -186,6 +186,7 @@ def test_scannetpp_from_download_to_table(
     groups = [{"label": names[i], "objectId": i, "segments": [10 * i]} for i in np.unique(ids).tolist() if i in names]
     everything = {"label": "floor", "objectId": 999, "segments": (10 * np.unique(ids)).tolist()}  # larger: loses
     (scene / "scans" / "segments_anno.json").write_text(json.dumps({"segGroups": [everything, *groups]}))
+    write_metadata(tmp_path / "spp", ["wall", "floor", *sorted({group["label"] for group in groups} - {"wall"})])
     (scene / "scans" / "mesh_aligned_0.05_mask.txt").write_text("0\n1\n2\n")
 
     labels = f"labels:{small_scene / 'labels'}"
@@ -194,7 +195,7 @@ def test_scannetpp_from_download_to_table(
     facts = json.loads((tmp_path / "w" / "scannetpp.json").read_text())
     assert facts["result"]["ap50"] > 0.3
     assert facts["result"]["protocol"]["test_photos"] == "held out"
-    assert "84" not in facts["result"]["protocol"]["classes"] and "smallest object" in str(facts["result"]["protocol"])
+    assert "smallest object" in facts["result"]["protocol"]["truth"]
     assert "protocol scannetpp" in capsys.readouterr().out
 
     written = np.loadtxt(tmp_path / "w" / "truth" / "instance-classes" / "0a1b.txt", dtype=int)
@@ -203,6 +204,58 @@ def test_scannetpp_from_download_to_table(
         values = np.unique(written[3:][ids[3:] == i])
         assert len(values) == 1  # one truth id an object, whatever lies around it
         assert (values[0] > 0) == (i in names and names[i] not in ("wall", "floor", "ceiling"))
+
+
+def write_metadata(dataset: Path, names: list[str], mapped: str = "") -> None:
+    """top100.txt, top100_instance.txt (no wall, floor, ceiling), and map_benchmark.csv that ends with `mapped`."""
+    folder = dataset / "metadata" / "semantic_benchmark"
+    folder.mkdir(parents=True)
+    (folder / "top100.txt").write_text("\n".join(names))
+    (folder / "top100_instance.txt").write_text("\n".join(n for n in names if n not in ("wall", "floor", "ceiling")))
+    kept = "".join(f"{name},9,,\n" for name in names)
+    (folder / "map_benchmark.csv").write_text(f"class,count,semantic_map_to,instance_map_to\n{kept}{mapped}")
+
+
+def toolkit_truth(segments: list[int], groups: list[dict], names: list[str], mapping: dict[str, str]) -> list[int]:
+    """ScanNet++'s toolkit vertex by vertex: three slots a vertex, and the slot of the smallest annotation counts."""
+    slots: list[list[tuple[int, int, int]]] = [[] for _ in segments]
+    for index, group in enumerate(groups):
+        label = mapping.get(group["label"])
+        inside = [v for v, segment in enumerate(segments) if segment in group["segments"] and len(slots[v]) < 3]
+        if label in names:
+            for v in inside:
+                slots[v].append((len(inside), names.index(label), index))
+    truth = []
+    for held in slots:
+        _, label, index = min(held, key=lambda slot: slot[0], default=(0, 0, 0))
+        truth.append(1000 * label + index if index > 0 and label > 0 else 0)  # class 0 is the wall
+    return truth
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_scannetpp_truth_is_the_toolkits(seed: int, tmp_path: Path) -> None:
+    rng = np.random.default_rng(seed)
+    names = ["wall", "book", "cup", "box"]
+    write_metadata(tmp_path, names, "books,5,book,\nmug,5,cup,\nREMOVE,5,None,None\ntiny thing,1,,\n")
+    mapping = {name: name for name in [*names, "tiny thing"]} | {"books": "book", "mug": "cup"}
+    segments = rng.integers(0, 12, 200).tolist()
+    labels = ["wall", "books", "book", "mug", "box", "REMOVE", "tiny thing", "never heard of"]
+    groups = [
+        {"label": str(rng.choice(labels)), "objectId": n, "segments": rng.choice(12, rng.integers(1, 8)).tolist()}
+        for n in range(14)
+    ]
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    (scans / "segments.json").write_text(json.dumps({"segIndices": segments}))
+    (scans / "segments_anno.json").write_text(json.dumps({"segGroups": groups}))
+    classes = scannetpp.read_classes(tmp_path)
+    found = scannetpp.vertex_truth(tmp_path, classes)
+    assert found.tolist() == toolkit_truth(segments, groups, names, mapping)
+    last = [max((n for n, g in enumerate(groups) if s in g["segments"]), default=-1000) for s in segments]
+    assert scannetpp.vertex_truth(tmp_path, None).tolist() == [1000 + n for n in last]  # whatever the label
+    (tmp_path / "metadata/semantic_benchmark/map_benchmark.csv").unlink()
+    with pytest.raises(InputError, match=r"map_benchmark\.csv"):
+        scannetpp.read_classes(tmp_path)
 
 
 def test_reference_takes_what_lies_inside_by_more_than_the_share() -> None:
