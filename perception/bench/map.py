@@ -1,19 +1,33 @@
 """Minutes against quality: the Pareto front over presets, budget, resolution, iterations, harmonics, features.
 
-Held-out views are scored at each variant's own resolution; those of another resolution than the default's are marked
-and kept off the front, since a smaller picture is an easier one.
+`perception map` runs in a process of its own for each variant. A finished map stays in OUTPUT/maps with its row, named
+by a key of the scene, the settings and the source code, so a stopped sweep goes on. Held-out views are scored at each
+variant's own resolution; those of another resolution than the default's are marked and kept off the front, since a
+smaller picture is an easier one.
 """
 
 from __future__ import annotations
 
+import argparse
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from perception.bench.output import Column, finish, save_plot, table
-from perception.bench.sweep import Variant, run_sweep, sweep_parser
+import perception
+from perception.bench.instances import score_map
+from perception.bench.output import Column, bench_parser, finish, table
+from perception.config import load_config
+from perception.errors import InputError
+from perception.io.atomic import atomic_file
 
 COLUMNS: tuple[Column, ...] = (
     ("PSNR", "psnr", ".2f"),
@@ -28,7 +42,7 @@ COLUMNS: tuple[Column, ...] = (
     ("MiB", "peak_mib", ".0f"),
     ("front", "front", "s"),
 )
-QUALITY = {"psnr": "held-out PSNR, dB", "ssim": "SSIM", "ap": "AP"}
+QUALITY = ("psnr", "ssim", "ap")
 PRESETS = ("default", "fast", "quality")
 VALUES = {
     "train.budget": (12_500, 25_000, 50_000, 200_000),
@@ -38,6 +52,18 @@ VALUES = {
     "losses.feature_dim": (4, 16),
 }
 """Values of each setting that is varied alone."""
+QUICK_SHORTEN, QUICK_SIDE, QUICK_BUDGET = 6, 320, 20_000
+"""--quick: a sixth of the iterations on small photos. It shows tendencies only; quote figures from a full run."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row: the varied setting (group), its value (name), and the KEY=VALUE pairs that produce it."""
+
+    group: str
+    name: str
+    settings: tuple[str, ...] = ()
+    preset: str = "default"
 
 
 def variants() -> list[Variant]:
@@ -48,6 +74,78 @@ def variants() -> list[Variant]:
         for key, values in VALUES.items()
         for value in values
     ]
+
+
+def settings_of(variant: Variant, options: argparse.Namespace) -> list[str]:
+    """The variant's KEY=VALUE pairs. A run shortened by --quick keeps its number of densifications."""
+    labels = options.scene / "labels"
+    masks = options.masks or (f"labels:{labels}" if labels.is_dir() else "auto")
+    pairs = [f"masks={masks}", "language.encoder=none", *options.pairs, *variant.settings]
+    config = load_config(None, pairs, variant.preset)
+    if options.quick:
+        pairs += [
+            f"train.iterations={max(1, config.train.iterations // QUICK_SHORTEN)}",
+            f"densify.every={max(20, config.densify.every // QUICK_SHORTEN)}",
+            f"train.budget={min(config.train.budget, QUICK_BUDGET)}",
+            f"photos.max_side={min(config.photos.max_side, QUICK_SIDE)}",
+        ]
+    return pairs
+
+
+def run_sweep(options: argparse.Namespace, cells: Sequence[Variant]) -> list[dict[str, Any]]:
+    """The rows of the variants that --only names and of the first, which is the reference; kept rows are reused."""
+    if not options.scene.exists():
+        raise InputError(f"{options.scene}: does not exist; give a scene as `perception map` takes it")
+    chosen = [v for i, v in enumerate(cells) if not i or (options.only or "") in f"{v.group} {v.name}"]
+    rows, code = [], _code_digest()
+    for number, variant in enumerate(chosen, start=1):
+        pairs = settings_of(variant, options)
+        parts = json.dumps([str(options.scene.resolve()), pairs, variant.preset, code])
+        kept = options.output / "maps" / f"{hashlib.sha256(parts.encode()).hexdigest()[:16]}.json"
+        known = kept.is_file()
+        if not known:
+            with atomic_file(kept) as aside:
+                aside.write_text(json.dumps(map_variant(options.scene, variant, pairs, kept)), encoding="utf-8")
+        rows.append({**asdict(variant), **json.loads(kept.read_text(encoding="utf-8"))})
+        line = f"{number}/{len(chosen)} {variant.group} {variant.name}: {60 * rows[-1]['minutes']:.0f} s"
+        print(line + (" (kept)" if known else ""), file=sys.stderr, flush=True)
+    return rows
+
+
+def map_variant(scene: Path, variant: Variant, pairs: list[str], row: Path) -> dict[str, Any]:
+    """Maps the scene beside `row` and scores the map. Minutes are of the whole run, CPU minutes of all its threads."""
+    path = row.with_suffix(".gsmap")
+    command = [sys.executable, "-m", "perception.cli", "map", str(scene.resolve()), "-o", str(path.resolve())]
+    command += ["--json", "--resume", "--preset", variant.preset, *(w for pair in pairs for w in ("--set", pair))]
+    # Started in a repository root, Python would import the sources without _core.
+    paths = [str(Path(perception.__file__).resolve().parents[1]), *filter(None, sys.path)]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))}
+    before = os.times()
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tempfile.gettempdir(), env=env)
+    after = os.times()
+    if done.returncode:
+        raise RuntimeError(f"perception map ended with {done.returncode}: {done.stderr.strip()}")
+    facts = json.loads(done.stdout)
+    found = {
+        "map": str(path),
+        "max_side": load_config(None, pairs, variant.preset).photos.max_side,
+        "minutes": facts["seconds"]["total"] / 60,
+        "cpu_minutes": (sum(after[2:4]) - sum(before[2:4])) / 60,
+        "gaussians": facts["gaussians"],
+        "peak_mib": facts["peak_memory_mib"],
+        **{key: facts["quality"].get(key) for key in ("psnr", "ssim")},
+    }
+    if (scene / "scene.json").is_file():
+        scores = score_map(scene, path)
+        found |= scores["ap"]["all, calibrated"] | {"miou": scores["rendered_miou"]}
+    return found
+
+
+def _code_digest() -> str:
+    """Digest of the package, any file of which can change a row."""
+    root = Path(perception.__file__).resolve().parent
+    files = sorted([*root.rglob("*.py"), *root.glob("_core*.so")])
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
 
 def pareto(points: Sequence[tuple[float, float | None]]) -> list[int]:
@@ -61,43 +159,27 @@ def pareto(points: Sequence[tuple[float, float | None]]) -> list[int]:
     return kept
 
 
+def sweep_parser() -> argparse.ArgumentParser:
+    """The options of `bench map`."""
+    parser = bench_parser("map", __doc__)
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="input of `map`; its truth, where there, gives AP")
+    parser.add_argument("--masks", metavar="SOURCE", help="as of `map`; default: SCENE/labels where there, else auto")
+    parser.add_argument("--quick", action="store_true", help="a sixth of the iterations, 320 pixels, 20 k Gaussians")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
+    parser.add_argument("--only", metavar="TEXT", help="only variants with TEXT in their group or name")
+    return parser
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Prints the table; JSON and a plot go to the output folder."""
-    options = sweep_parser("map", __doc__).parse_args(arguments)
+    """Prints the table; JSON goes to the output folder."""
+    options = sweep_parser().parse_args(arguments)
     rows = run_sweep(options, variants())
     comparable = [row["max_side"] == rows[0]["max_side"] for row in rows]
-    fronts = {
-        key: pareto(
-            [(r["cpu_minutes"], r.get(key) if same else None) for r, same in zip(rows, comparable, strict=True)]
-        )
-        for key in QUALITY
-    }
-    for index, row in enumerate(rows):
-        on = " ".join(key for key, front in fronts.items() if index in front)
-        row["front"] = on if comparable[index] else "other resolution"
+    for row, same in zip(rows, comparable, strict=True):
+        row["front"] = "" if same else "other resolution"
+    for key in QUALITY:
+        values = [row.get(key) if same else None for row, same in zip(rows, comparable, strict=True)]
+        for index in pareto(list(zip((row["cpu_minutes"] for row in rows), values, strict=True))):
+            rows[index]["front"] = f"{rows[index]['front']} {key}".strip()
     text = f"{options.scene.name}; on the front (CPU minutes against ...):\n{table(rows, COLUMNS)}"
-    _plot(options.output / "map.png", options.scene.name, rows, fronts)
     finish("map", options, {"scene": options.scene.name, "rows": rows}, text)
-
-
-def _plot(path: Path, scene: str, rows: Sequence[dict[str, Any]], fronts: dict[str, list[int]]) -> None:
-    """One axis for each measure of quality: all rows, the front as a line, and names on it."""
-
-    def draw(figure: Any) -> None:
-        shown = [key for key in QUALITY if any(row.get(key) is not None for row in rows)]
-        for axis, key in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
-            for index, row in enumerate(rows):
-                if row.get(key) is None:
-                    continue
-                color = "0.7" if row["front"] == "other resolution" else "#4477aa"
-                axis.scatter(row["cpu_minutes"], row[key], color=color, marker="*" if row["group"] == "preset" else "o")
-                if index in fronts[key] or row["group"] == "preset":
-                    axis.annotate(f"{row['group']} {row['name']}", (row["cpu_minutes"], row[key]), fontsize=7)
-            front = [rows[index] for index in fronts[key]]
-            axis.plot([row["cpu_minutes"] for row in front], [row[key] for row in front], color="#4477aa")
-            axis.set(xscale="log", xlabel="CPU minutes", ylabel=QUALITY[key])
-            axis.grid(alpha=0.3)
-        figure.suptitle(f"{scene}: grey points were scored at another resolution", fontsize=10)
-
-    if any(row.get("psnr") is not None for row in rows):
-        save_plot(path, draw, (12, 4.6))

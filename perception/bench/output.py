@@ -1,4 +1,4 @@
-"""Shared by all benchmarks: argument parser, text table, output files, a description of the machine, plots."""
+"""Shared by all benchmarks: argument parser, text table, output files, a description of the machine."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,16 +82,3 @@ def finish(name: str, options: argparse.Namespace, report: dict[str, Any], text:
         aside.write_text(text + "\n", encoding="utf-8")
     print(json.dumps(facts, default=str) if options.json else text)
     print(f"kept in {options.output}: {name}.json, {name}.txt", file=sys.stderr)
-
-
-def save_plot(path: Path, draw: Callable[[Any], None], size: tuple[float, float] = (9, 5)) -> None:
-    """Saves the plot made by `draw(figure)` as a PNG. Without matplotlib it prints one line and skips the plot."""
-    try:
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError:
-        print(f"no {path.name}: plots need matplotlib (pip install '.[bench]' in the clone)", file=sys.stderr)
-        return
-    figure = Figure(figsize=size, dpi=120, layout="constrained")
-    draw(figure)
-    with atomic_file(path) as aside:
-        figure.savefig(aside, format="png")

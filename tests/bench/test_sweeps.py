@@ -12,11 +12,8 @@ import numpy as np
 import pytest
 
 from perception.bench import map as bench_map
-from perception.bench import scaling, sweep
-from perception.bench.map import pareto
+from perception.bench.map import Variant, pareto, run_sweep, settings_of, sweep_parser, variants
 from perception.bench.output import table
-from perception.bench.processes import fresh_peak, status_mib
-from perception.bench.sweep import Variant, run_sweep, settings_of, sweep_parser
 from perception.cli import main
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
@@ -36,29 +33,27 @@ def test_the_front_is_what_brute_force_says() -> None:
     assert pareto([(1.0, None), (2.0, 3.0)]) == [1]
 
 
-@pytest.mark.parametrize("cells", [bench_map.variants(), scaling.variants(640, (1, 2))])
-def test_every_variant_is_a_valid_setting_of_its_own(cells: list[Variant], tmp_path: Path) -> None:
+def test_every_variant_is_a_valid_setting_of_its_own(tmp_path: Path) -> None:
+    cells = variants()
     assert len({(v.group, v.name) for v in cells}) == len(cells)
     for cell in cells:
         settings_of(cell, options_of(tmp_path))
 
 
 def options_of(scene: Path, *more: str) -> argparse.Namespace:
-    return sweep_parser("x", None).parse_args([str(scene), "-o", str(scene / "out"), *more])
+    return sweep_parser().parse_args([str(scene), "-o", str(scene / "out"), *more])
 
 
-def test_every_variant_is_shortened_alike(tmp_path: Path) -> None:
+def test_quick_runs_keep_their_number_of_densifications(tmp_path: Path) -> None:
     def config(preset: str, *more: str) -> MapConfig:
         return load_config(None, settings_of(Variant("a", "b", preset=preset), options_of(tmp_path, *more)), preset)
 
-    plain, rich = config("default", "--shorten", "10"), config("quality", "--shorten", "10")
-    full = config("default")
-    assert plain.train.iterations == round(full.train.iterations / 10) < rich.train.iterations
-    assert plain.densify.every < full.densify.every and plain.train.budget == full.train.budget
-    quick = config("default", "--quick")
-    assert (quick.photos.max_side, quick.train.budget) == (320, 20_000)
-    with pytest.raises(InputError, match="--shorten"):
-        config("default", "--shorten", "-1")
+    plain, quick, rich = config("default"), config("default", "--quick"), config("quality", "--quick")
+    assert quick.train.iterations * 6 == plain.train.iterations < rich.train.iterations * 6
+    assert quick.train.iterations // quick.densify.every == pytest.approx(
+        plain.train.iterations // plain.densify.every, 1
+    )
+    assert (quick.photos.max_side, quick.train.budget, plain.densify.every) == (320, 20_000, 100)
 
 
 def test_an_interrupted_sweep_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,7 +67,7 @@ def test_an_interrupted_sweep_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
         trained.append(variant.name)
         return {"minutes": 1.0, "psnr": 20.0}
 
-    monkeypatch.setattr(sweep, "map_variant", train)
+    monkeypatch.setattr(bench_map, "map_variant", train)
     cells = [Variant("g", name, (f"losses.margin={margin}",)) for name, margin in (("a", 1), ("b", 2), ("c", 3))]
     with pytest.raises(KeyboardInterrupt):
         run_sweep(options_of(tmp_path), cells)
@@ -82,16 +77,6 @@ def test_an_interrupted_sweep_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
     assert trained == ["a", "b", "c", "a"]
     with pytest.raises(InputError, match="does not exist"):
         run_sweep(options_of(tmp_path / "no"), cells)
-
-
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux tells the peak and lets it go")
-def test_a_peak_of_memory_is_forgotten() -> None:
-    fresh_peak()
-    before = status_mib("VmHWM")
-    del (waste := [np.ones(1_000) for _ in range(16_000)])[:]  # 122 MiB in blocks that the allocator likes to keep
-    assert not waste and status_mib("VmHWM") > before + 100
-    fresh_peak()
-    assert status_mib("VmHWM") < before + 50  # the kernel's word; a page here and there is still in use
 
 
 def test_a_table_shows_what_is_missing() -> None:

@@ -1,9 +1,8 @@
-"""The reach of a map measured from its spacing, and the benches on small clouds."""
+"""The reach of a map measured from its spacing, and the switches of `eval instances`."""
 
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -35,16 +34,6 @@ def test_points_beyond_the_map_stay_unlabelled_under_auto() -> None:
     for bad in ("far", -1.0):
         with pytest.raises(InputError, match="max_distance"):
             export_labels(grid, ids, PointCloud(points), ExportOptions(max_distance=bad))
-
-
-def test_bench_clouds_gives_the_answers_of_scipy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    small = ["--points", "2000", "--gaussians", "300", "--turns", "2", "--only", "assignment"]
-    assert main(["bench", "clouds", *small, "-o", str(tmp_path)]) == 0
-    turns = json.loads((tmp_path / "clouds.json").read_text())["turns"]
-    assert list(turns) == ["assignment", "assignment, scipy"] and all(len(rows) == 2 for rows in turns.values())
-    assert len({round(row["mark"], 6) for rows in turns.values() for row in rows}) == 1
-    assert re.search(r"assignment, scipy +", capsys.readouterr().out)
-    assert main(["bench", "clouds", "--only", "nothing", "-o", str(tmp_path)]) == 2
 
 
 def test_eval_takes_the_switches_of_a_protocol(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
