@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians, from_points
-from perception.gaussians.views import TrainingView
+from perception.gaussians.views import TrainingView, unprojected
 from perception.masks.surface import voxel_keys
 
 SAMPLES = 1_500_000
@@ -109,10 +109,7 @@ def _samples(view: TrainingView, every: int) -> tuple[np.ndarray, np.ndarray, np
     known = (z[row, column] > 0) & (_facing(z, K)[row, column] > STEEPEST)
     row, column = row[known], column[known]
     depth = z[row, column]
-    local = np.stack([(column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(depth))], axis=1)
-    pose = view.camera_from_world.double().numpy()
-    # Explicit sums: the rounding of a matrix product can depend on the number of threads.
-    points = ((local * depth[:, None] - pose[:3, 3])[:, :, None] * pose[:3, :3]).sum(axis=1)
+    points = unprojected(K, view.camera_from_world.double().numpy(), column + 0.5, row + 0.5, depth)
     return points, view.photo.numpy()[row, column], depth**-4.0, depth / K[0, 0]
 
 

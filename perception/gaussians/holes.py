@@ -14,7 +14,7 @@ import torch
 from perception.colors import sh_from_rgb
 from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
-from perception.gaussians.views import TrainingView
+from perception.gaussians.views import TrainingView, unprojected
 
 BLOCK = 8
 """Side of a block in pixels."""
@@ -83,10 +83,7 @@ def _placed(
     high = np.minimum(low + BLOCK, [height, width])
     rows, columns = ((low + high) / 2).T
     K = view.K.numpy()
-    rays = np.stack([(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones(len(empty))], axis=1)
-    pose = view.camera_from_world.double().numpy()
-    # Explicit sums: the rounding of a matrix product can depend on the number of threads.
-    means = ((rays * depth[:, None] - pose[:3, 3])[:, :, None] * pose[:3, :3]).sum(axis=1)
+    means = unprojected(K, view.camera_from_world.double().numpy(), columns, rows, depth)
     colors = _block_mean(view.photo.float().permute(2, 0, 1))
     sh = torch.zeros(len(empty), *like.sh.shape[1:])
     sh[:, 0] = sh_from_rgb(colors[:, torch.from_numpy(holes)].T / 255)

@@ -107,13 +107,6 @@ def photometric(
     return PhotometricLoss(value, *parts)
 
 
-def photometric_loss(
-    render: Tensor, target: Tensor | np.ndarray, beta: float = 0.2, weight: Tensor | None = None
-) -> Tensor:
-    """The differentiable scalar of `photometric`."""
-    return photometric(render, target, beta, weight).value
-
-
 # ---------- depth
 
 _DEPTH_NOISE = 0.01
@@ -159,7 +152,7 @@ def depth_loss(depths: Tensor, alphas: Tensor, measured: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class LabelAssignment:
-    """The labels of one photo as the kernels take them; reusable in all iterations if no pixels are sampled out.
+    """The labels of one photo as the kernels take them; reusable in all iterations.
 
     ids: [M] int32 ascending, 0 left out. counts: [M] int64 pixels. first: [M] int64 index of one pixel of each label.
     slots: [P] int32, each pixel's index into ids or −1. shape: (H, W).
@@ -172,11 +165,10 @@ class LabelAssignment:
     shape: tuple[int, ...]
 
 
-def assign_labels(labels: Tensor | np.ndarray, fraction: float = 1.0, seed: int = 0) -> LabelAssignment:
+def assign_labels(labels: Tensor | np.ndarray) -> LabelAssignment:
     """Indexes label image `labels` [H, W] of any integer type (0 = unlabelled, ids need not be dense).
 
-    fraction: each pixel is kept with this probability, decided by a hash of (seed, pixel); M_i is then the set
-    of kept pixels, and a label without any is left out. InputError for other types, ids or fractions.
+    InputError for other types and ids.
     """
     image = np.asarray(labels)
     if image.dtype.kind not in "iu":
@@ -185,12 +177,10 @@ def assign_labels(labels: Tensor | np.ndarray, fraction: float = 1.0, seed: int 
         low, high = int(image.min()), int(image.max())
         if low < 0 or high > _LARGEST_ID:
             raise InputError(f"labels: found ids {low} to {high}, expected 0 to {_LARGEST_ID}")
-    if not 0 < fraction <= 1:
-        raise InputError(f"labels: fraction is {fraction}, expected above 0 and at most 1")
     flat = torch.from_numpy(np.ascontiguousarray(image, dtype=np.int32).reshape(-1))
     slots = torch.empty_like(flat)
     try:
-        ids, counts, first = _kernels.assign(flat, float(fraction), int(seed), slots)
+        ids, counts, first = _kernels.assign(flat, 1.0, 0, slots)
     except ValueError as error:  # an id below 0
         raise InputError(str(error)) from None
     long = torch.int64
@@ -233,32 +223,27 @@ class _Prototypes(Function):
 
 class _Separation(Function):
     @staticmethod
-    def forward(ctx: Any, z: Tensor, others: Tensor | None, margin: float, squared: bool) -> Tensor:
+    def forward(ctx: Any, z: Tensor, margin: float, squared: bool) -> Tensor:
         a = z.detach().double().contiguous()
-        b = None if others is None else others.detach().double().contiguous()
-        grad_a, grad_b = torch.empty_like(a), None if b is None else torch.empty_like(b)
-        value = _kernels.separation(a, b, margin, squared, grad_a, grad_b)
-        ctx.gradients = (grad_a.to(z.dtype), None if grad_b is None else grad_b.to(z.dtype))
+        gradient = torch.empty_like(a)
+        value = _kernels.separation(a, None, margin, squared, gradient, None)
+        ctx.gradient = gradient.to(z.dtype)
         return z.new_tensor(value)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor | None, None, None]:
-        grad_a, grad_b = ctx.gradients
-        return grad_a * grad, None if grad_b is None else grad_b * grad, None, None
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        return ctx.gradient * grad, None, None
 
 
-def separation_loss(
-    prototypes: Tensor, others: Tensor | None = None, margin: float = 1.0, squared: bool = True
-) -> Tensor:
-    """L_neg: mean over pairs of ReLU(γ − ‖z_i − z_j‖²), or of ReLU(γ − ‖z_i − z_j‖) with squared=False.
+def separation_loss(prototypes: Tensor, margin: float = 1.0, squared: bool = True) -> Tensor:
+    """L_neg: mean over pairs i < j of ReLU(γ − ‖z_i − z_j‖²), or of ReLU(γ − ‖z_i − z_j‖) with squared=False.
 
-    prototypes: [M, D]; the pairs are i < j. With others [K, D] (such as prototypes of other views) the pairs
-    are all M·K between the two, differentiable in both. Without pairs the loss is 0. The gradient of ‖z‖ at 0 is 0.
+    prototypes: [M, D]. Without pairs the loss is 0. The gradient of ‖z‖ at 0 is 0.
     """
-    if prototypes.ndim != 2 or (others is not None and others.shape[1:] != prototypes.shape[1:]):
+    if prototypes.ndim != 2:
         raise InputError(f"separation loss: found {list(prototypes.shape)}, expected [M, D]")
-    return _Separation.apply(prototypes, others, float(margin), bool(squared))
+    return _Separation.apply(prototypes, float(margin), bool(squared))
 
 
 @dataclass(frozen=True)
@@ -285,8 +270,6 @@ def instance_loss(
     w_neg: float = 1.0,
     per_pixel: bool = False,
     squared: bool = True,
-    fraction: float = 1.0,
-    seed: int = 0,
 ) -> InstanceLoss:
     """L_inst2D = w_p L_pos + w_n L_neg on a rendered feature map, as in the paper.
 
@@ -296,19 +279,19 @@ def instance_loss(
 
     features: [H, W, D] F. labels: [H, W] integers, 0 = unlabelled, or the result of `assign_labels`.
     The authors' released code differs: per_pixel=True averages L_pos over all labelled pixels instead of per
-    mask, squared=False takes the distance unsquared in L_neg. fraction, seed: see `assign_labels`.
+    mask, squared=False takes the distance unsquared in L_neg.
     """
     if features.ndim != 3 or features.shape[2] < 1:
         raise InputError(f"instance loss: features are {list(features.shape)}, expected [H, W, D]")
     if not isinstance(labels, LabelAssignment):
-        labels = assign_labels(labels, fraction, seed)
+        labels = assign_labels(labels)
     if labels.shape != tuple(features.shape[:2]):
         found = f"{list(labels.shape)} and {list(features.shape)}"
         raise InputError(f"instance loss: labels and features have shapes {found}, expected [H, W] and [H, W, D]")
     _ready("features", features)
     flat = features.reshape(-1, features.shape[2]).contiguous()
     pos, prototypes = _Prototypes.apply(flat, labels, per_pixel)
-    neg = separation_loss(prototypes, None, margin, squared)
+    neg = separation_loss(prototypes, margin, squared)
     return InstanceLoss(w_pos * pos + w_neg * neg, pos, neg, prototypes, labels.ids, labels.counts)
 
 

@@ -20,7 +20,7 @@ import torch
 
 from perception.config import MapConfig
 from perception.gaussians.densify import Statistics
-from perception.gaussians.losses import depth_loss, instance_loss, photometric_loss, variance_loss
+from perception.gaussians.losses import depth_loss, instance_loss, photometric, variance_loss
 from perception.gaussians.model import Gaussians, sigmoid
 from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.rasterize import Rasterization, rasterize
@@ -111,7 +111,7 @@ class Trainer:
         with self.record.timed("losses"):
             image = view.exposed(out.colors[0])
             photo = target_photo(view, image)
-            loss = photometric_loss(image, photo, SSIM_WEIGHT, view.weight)  # L_RGB, eq. 4
+            loss = photometric(image, photo, SSIM_WEIGHT, view.weight).value  # L_RGB, eq. 4
             if with_features:
                 loss = loss + self._feature_losses(view, out)
             images = [image for image in (out.colors, out.features, out.feature_variance) if image is not None]

@@ -8,12 +8,19 @@ outliers with a smooth kernel, but photos are compared with photos, so that deta
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.views import TrainingView, depth_image
+from perception.gaussians.train import Observer, Trainer
+from perception.gaussians.views import TrainingView, depth_image, unprojected
+from perception.geometry import camera_centres
+from perception.io.arrays import read_npz
+from perception.io.atomic import atomic_file
+from perception.progress import Progress
 
 START = 0.25
 """Training progress at which photos are compared: depth is known then, and little of what moved is in the map."""
@@ -25,6 +32,39 @@ DIFFERENT, VISIBLE = 0.15, 0.1
 """Difference of colour (of 1, largest channel) that counts; relative difference of depth at which it is seen."""
 AROUND = 5
 """Blocks that must differ of the 3 × 3 around a block, so that thin edges are kept."""
+_3X3 = list(product((0, 1, 2), repeat=2))
+
+
+def train_without_transients(
+    trainer: Trainer, views: list[TrainingView], observer: Observer, file: Path, progress: Progress
+) -> list[TrainingView]:
+    """Trains until START, and returns the views without what disagrees with the other photos then.
+
+    file: holds the masks, and is read instead when it exists, so that a resumed run takes the same steps.
+    """
+    if trainer.progress < START:
+        trainer.run(observer, until=START)
+    if file.is_file():
+        stored = read_npz(file, file, "it is damaged; delete the work folder to start over")
+        masks = [stored[f"{index}"] for index in range(len(views))]
+    else:
+        masks = transient_masks(trainer.gaussians, views)
+        with atomic_file(file) as aside, aside.open("wb") as stream:
+            np.savez_compressed(stream, **{f"{index}": mask for index, mask in enumerate(masks)})  # type: ignore[arg-type]
+    photos, share = sum(bool(mask.any()) for mask in masks), float(np.mean([mask.mean() for mask in masks]))
+    progress.log(f"moved between photos: {share:.1%} of the pixels, in {photos} of {len(views)} photos, are left out")
+    views = [without_transients(view, mask) for view, mask in zip(views, masks, strict=True)]
+    trainer.show(views)
+    return views
+
+
+def without_transients(view: TrainingView, moved: np.ndarray) -> TrainingView:
+    """The view with weight and depth 0 where `moved` [H, W] is True."""
+    if not moved.any():
+        return view
+    kept = torch.from_numpy(~moved)
+    weight = kept.float() if view.weight is None else view.weight * kept
+    return replace(view, weight=weight, depth=None if view.depth is None else view.depth * kept)
 
 
 @dataclass(frozen=True)
@@ -42,24 +82,23 @@ def transient_masks(gaussians: Gaussians, views: list[TrainingView]) -> list[np.
     """For each view [H, W] bool, True where its photo disagrees with the others."""
     grids = [_grid(gaussians, view) for view in views]
     poses = np.stack([grid.pose for grid in grids])
-    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    centres = camera_centres(poses)
     spread = max(float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()), 1e-9)
     masks = []
-    for index, view in enumerate(views):
+    for index, (view, grid) in enumerate(zip(views, grids, strict=True)):
         apart = np.linalg.norm(centres - centres[index], axis=1) / spread - poses[:, 2, :3] @ poses[index, 2, :3]
         apart[index] = np.inf
         near = np.argsort(apart, kind="stable")[: min(PHOTOS, len(views) - 1)]
-        masks.append(_full_size(_smooth(_differs(grids[index], [grids[other] for other in near])), grids[index], view))
+        differs = _differs(grid, [grids[other] for other in near])
+        blocks = (
+            _around(differs & (_around(differs) >= AROUND)) > 0
+        )  # differ with most neighbours, and all around these
+        row, column = (
+            np.minimum(np.arange(n) // grid.side, m - 1)
+            for n, m in zip(view.photo.shape[:2], blocks.shape, strict=True)
+        )
+        masks.append(np.asarray(blocks[row[:, None], column]))
     return masks
-
-
-def without_transients(view: TrainingView, moved: np.ndarray) -> TrainingView:
-    """The view with weight and depth 0 where `moved` [H, W] is True."""
-    if not moved.any():
-        return view
-    kept = torch.from_numpy(~moved)
-    weight = kept.float() if view.weight is None else view.weight * kept
-    return replace(view, weight=weight, depth=None if view.depth is None else view.depth * kept)
 
 
 def _grid(gaussians: Gaussians, view: TrainingView) -> _Grid:
@@ -76,21 +115,20 @@ def _differs(grid: _Grid, others: list[_Grid]) -> np.ndarray:
     """[h, w] bool: blocks whose colour is DIFFERENT from the median of at least LEAST_PHOTOS other photos."""
     height, width = grid.depth.shape
     y, x = np.mgrid[:height, :width] + 0.5
-    rays = np.stack([(x - grid.K[0, 2]) / grid.K[0, 0], (y - grid.K[1, 2]) / grid.K[1, 1], np.ones_like(x)], axis=-1)
-    points = (rays * grid.depth[..., None] - grid.pose[:3, 3]) @ grid.pose[:3, :3]
+    points = unprojected(grid.K, grid.pose, x, y, grid.depth)
     found = np.full((len(others), height, width), np.nan)
     for row, other in zip(found, others, strict=True):
-        points_there = points @ other.pose[:3, :3].T + other.pose[:3, 3]
-        z = np.where(grid.depth > 0, points_there[..., 2], -1.0)
-        safe = np.where(z > 0, z, 1.0)
-        column = np.floor(other.K[0, 0] * points_there[..., 0] / safe + other.K[0, 2])
-        line = np.floor(other.K[1, 1] * points_there[..., 1] / safe + other.K[1, 2])
+        there = points @ other.pose[:3, :3].T + other.pose[:3, 3]
+        z = np.where(grid.depth > 0, there[..., 2], -1.0)
+        column, line = (
+            np.floor(other.K[i, i] * there[..., i] / np.where(z > 0, z, 1.0) + other.K[i, 2]) for i in (0, 1)
+        )
         inside = (z > 0) & (column >= 1) & (line >= 1)
         inside &= (column < other.depth.shape[1] - 1) & (line < other.depth.shape[0] - 1)
         at = line[inside].astype(np.int64), column[inside].astype(np.int64)
-        shifts = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]  # the map's depth is not exact
-        there = np.stack([other.colors[at[0] + down, at[1] + right] for down, right in shifts])
-        least = np.abs(there - grid.colors[inside]).max(axis=2).min(axis=0)
+        # The map's depth is not exact, so the most similar of 3 × 3 blocks counts.
+        colors = np.stack([other.colors[at[0] + down - 1, at[1] + right - 1] for down, right in _3X3])
+        least = np.abs(colors - grid.colors[inside]).max(axis=2).min(axis=0)
         seen = np.abs(other.depth[at] - z[inside]) < VISIBLE * z[inside]
         row[inside] = np.where(seen, least, np.nan)
     enough = np.isfinite(found).sum(axis=0) >= LEAST_PHOTOS
@@ -98,20 +136,8 @@ def _differs(grid: _Grid, others: list[_Grid]) -> np.ndarray:
     return np.asarray(enough & (median > DIFFERENT))
 
 
-def _smooth(differs: np.ndarray) -> np.ndarray:
-    """Blocks that differ together with most of their neighbours, and all blocks around these."""
-
-    def around(blocks: np.ndarray) -> np.ndarray:
-        padded = np.pad(blocks.astype(np.int64), 1)
-        height, width = blocks.shape
-        shifts = [padded[down : down + height, right : right + width] for down in range(3) for right in range(3)]
-        return np.asarray(np.sum(shifts, axis=0))
-
-    return around(differs & (around(differs) >= AROUND)) > 0
-
-
-def _full_size(blocks: np.ndarray, grid: _Grid, view: TrainingView) -> np.ndarray:
-    height, width = view.photo.shape[:2]
-    row = np.minimum(np.arange(height) // grid.side, blocks.shape[0] - 1)
-    column = np.minimum(np.arange(width) // grid.side, blocks.shape[1] - 1)
-    return np.asarray(blocks[row[:, None], column])
+def _around(blocks: np.ndarray) -> np.ndarray:
+    """Number of True blocks among the 3 × 3 around each."""
+    padded = np.pad(blocks.astype(np.int64), 1)
+    height, width = blocks.shape
+    return np.asarray(np.sum([padded[i : i + height, j : j + width] for i, j in _3X3], axis=0))

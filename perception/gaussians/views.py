@@ -72,6 +72,13 @@ def target_photo(view: TrainingView, image: torch.Tensor) -> torch.Tensor:
     return torch.where(view.weight[..., None] > 0, photo, image.detach())
 
 
+def unprojected(K: np.ndarray, pose: np.ndarray, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """World points [..., 3] of pixels x, y [...] at `depth` [...] along the axis; K [3, 3], pose camera_from_world."""
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x, np.float64)], axis=-1)
+    # Explicit sums: the rounding of a matrix product can depend on the number of threads.
+    return np.asarray(((rays * depth[..., None] - pose[:3, 3])[..., None] * pose[:3, :3]).sum(axis=-2))
+
+
 def scene_extent(views: list[TrainingView]) -> float:
     """1.1 × the largest distance of a camera from the mean camera centre (Kerbl et al. 2023), at least 1e-3."""
     poses = torch.stack([view.camera_from_world for view in views])

@@ -19,6 +19,7 @@ from perception.frame.place import placed_scene
 from perception.gaussians.depth_start import start_on_surface
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
+from perception.gaussians.transients import train_without_transients
 from perception.instances.label_transfer import transfer_labels, transfer_text
 from perception.io.inputs import load_scene
 from perception.io.map_views import stored_view
@@ -37,7 +38,6 @@ from perception.pipeline.photos import exposed_as_neighbours, load_all, split_vi
 from perception.pipeline.record import Stages, finite, peak_memory_mib, versions
 from perception.pipeline.sensor_depth import depth_errors, depth_used
 from perception.pipeline.summary import depth_text, frame_lines
-from perception.pipeline.transients import train_without_transients
 from perception.pipeline.work_folder import clear_work, frames_folder, working
 from perception.progress import Progress
 from perception.types import Scene, View

@@ -22,7 +22,6 @@ from perception.io.store import Map
 from perception.pictures import features_to_rgb, montage, outline, overlay
 from perception.pipeline.rendering import as_gaussians
 from perception.pipeline.summary import depth_text
-from perception.pipeline.top_view import instances_top_view
 from perception.pipeline.view_coverage import weak_coverage
 from perception.query import QueryMap
 from perception.query.hit import printed_texts
@@ -205,7 +204,6 @@ def _overview(gmap: Map, album: _Album) -> dict[str, np.ndarray]:
         return {}
     return {
         f"instances in {name}": overlay(photo, album.ids(name)),
-        "instances, top view": instances_top_view(gmap),
         "instance features (main components)": album.features(name),
     }
 

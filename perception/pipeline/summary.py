@@ -22,19 +22,9 @@ def map_facts(path: Path, info: dict[str, Any], gaussians: int, instances: int) 
         "seconds": info["seconds"],
         "peak_memory_mib": info["peak_memory_mib"],
         "iterations": info["training"]["iterations"],
-        "speed": speed(info["training"]),
         "profile": shares(info["training"]),
         "decisions": info["training"]["decisions"],
         "scene": scene,
-    }
-
-
-def speed(training: dict[str, Any]) -> dict[str, float]:
-    """Iterations and contributing (Gaussian, pixel) pairs per second of training; training: entry of map.json."""
-    seconds = max(training.get("seconds", 0.0), 1e-9)
-    return {
-        "iterations_per_second": round(training.get("iterations", 0) / seconds, 2),
-        "pairs_per_second": round(training.get("pairs", 0) / seconds),
     }
 
 
@@ -49,13 +39,13 @@ def shares(training: dict[str, Any]) -> dict[str, float]:
 def info_text(path: Path, info: dict[str, Any], texts: dict[int, list[dict[str, Any]]] | None = None) -> str:
     """Summary of map.json as text, for `perception info`; texts: those printed on each instance, by its id."""
     quality, training, scene = info.get("quality", {}), info.get("training", {}), info.get("scene", {})
-    seconds = info.get("seconds", {})
+    seconds, trained = info.get("seconds", {}), max(training.get("seconds", 0.0), 1e-9)
     lines = [
         f"{path}: {info['num_gaussians']} Gaussians (harmonics degree {info['sh_degree']}), "
         f"{info['num_instances']} instances, {'metres' if info.get('metric') else 'units of the reconstruction'}",
         f"made from {info.get('source')} (seed {info.get('seed')}) in {seconds.get('total', 0):.0f} s: "
         + ", ".join(f"{name} {value:.0f}" for name, value in seconds.items() if name != "total"),
-        f"trained {training.get('iterations')} iterations ({_rates(training)}); "
+        f"trained {training.get('iterations')} iterations ({training.get('pairs', 0) / trained / 1e6:.1f} M pairs/s); "
         f"peak memory {info.get('peak_memory_mib')} MiB",
     ]
     lines += frame_lines(info)
@@ -99,11 +89,6 @@ def depth_text(errors: dict[str, Any]) -> str:
     in_metres = errors["unit"] == "m"
     median, tolerance = ((f"{100 * errors[key]:.2g} {'cm' if in_metres else '%'}") for key in ("median", "tolerance"))
     return f"depth error {median} in the median, {errors['close']:.0%} within {tolerance}"
-
-
-def _rates(training: dict[str, Any]) -> str:
-    rates = speed(training)
-    return f"{rates['iterations_per_second']:.1f} it/s, {rates['pairs_per_second'] / 1e6:.1f} M pairs/s"
 
 
 def query_text(answers: list[tuple[str, list[Hit]]], metric: bool) -> str:

@@ -7,7 +7,7 @@ import torch
 pytest.importorskip("perception._core")
 from perception import _core
 from perception.errors import InputError
-from perception.gaussians.losses import assign_labels, instance_loss, separation_loss, variance_loss
+from perception.gaussians.losses import assign_labels, instance_loss, variance_loss
 
 
 def torch_instance(features, labels, margin=1.0, per_pixel=False, squared=True):
@@ -119,31 +119,6 @@ def test_gradcheck_through_value_and_prototypes():
     assert torch.autograd.gradcheck(run, (features,), eps=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize("squared", [False, True])
-def test_separation_from_a_memory_of_other_views(squared):
-    random = np.random.default_rng(4)
-    z = torch.from_numpy(random.normal(size=(5, 8)) * 0.3).requires_grad_()
-    memory = torch.from_numpy(random.normal(size=(9, 8)) * 0.3).requires_grad_()
-    run = lambda a, b: separation_loss(a, b, 1.2, squared)  # noqa: E731
-    distance = torch.cdist(z, memory)
-    expected = torch.relu(1.2 - (distance**2 if squared else distance)).mean()
-    assert abs(run(z, memory).item() - expected.item()) < 1e-13
-    assert torch.autograd.gradcheck(run, (z, memory), eps=1e-6, atol=1e-8)
-    assert separation_loss(z, memory[:0]).item() == 0 and separation_loss(z[:0]).item() == 0
-
-
-def test_drawn_pixels_are_a_fair_reproducible_share():
-    features, labels = scene(200, 150, 4, 9)
-    whole, drawn = assign_labels(labels), assign_labels(labels, 0.25, seed=5)
-    share = int((drawn.slots >= 0).sum()) / int((whole.slots >= 0).sum())
-    assert abs(share - 0.25) < 0.02
-    assert torch.equal(drawn.slots, assign_labels(labels, 0.25, seed=5).slots)
-    assert not torch.equal(drawn.slots, assign_labels(labels, 0.25, seed=6).slots)
-    kept = torch.where((drawn.slots >= 0).reshape(labels.shape), labels, 0)
-    compared = instance_loss(features, labels, fraction=0.25, seed=5)
-    assert abs(compared.value.item() - sum(torch_instance(features, kept)[:2]).item()) < 1e-12
-
-
 def test_same_bits_for_any_thread_count():
     features, labels = scene(120, 331, 8, 40)
     features = features.detach().float().reshape(-1, 8)
@@ -200,7 +175,5 @@ def test_bad_input_is_told():
         instance_loss(features, labels.double())
     with pytest.raises(InputError, match="expected 0 to"):
         instance_loss(features, labels.long() + 2**40)
-    with pytest.raises(InputError, match="fraction"):
-        instance_loss(features, labels, fraction=0)
     with pytest.raises(InputError, match="form"):
         variance_loss(features, "other")

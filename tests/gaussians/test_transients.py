@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import torch
 
-from perception.gaussians.transients import transient_masks, without_transients
+from perception.gaussians.transients import train_without_transients, transient_masks, without_transients
+from perception.progress import Progress
 from support.wall_photos import DEPTH, HEIGHT, PERSON, WIDTH, photographed, wall
 
 
@@ -29,3 +34,16 @@ def test_what_moved_is_left_out_of_the_losses_on_color_and_depth() -> None:
     assert found.weight is not None and found.depth is not None
     np.testing.assert_array_equal(found.weight.numpy(), ~moved)
     np.testing.assert_array_equal(found.depth.numpy(), DEPTH * ~moved)
+
+
+def test_a_resumed_run_leaves_the_same_pixels_out(tmp_path: Path) -> None:
+    views = [photographed(shift) for shift in (-0.3, -0.15, 0.0, 0.15, 0.3)]
+    views[2].photo[PERSON] = torch.tensor([250, 20, 230], dtype=torch.uint8)
+    shown: list[Any] = []
+    trainer: Any = SimpleNamespace(progress=0.5, gaussians=wall(), show=shown.append)
+    for _ in range(2):
+        train_without_transients(trainer, views, None, tmp_path / "transients.npz", Progress(quiet=True))  # type: ignore[arg-type]
+        trainer.gaussians = None  # nothing to compare with: the file must do
+    first, second = shown
+    assert [view.weight is None for view in first] == [True, True, False, True, True]
+    assert not first[2].weight[PERSON].any() and torch.equal(first[2].weight, second[2].weight)

@@ -53,14 +53,14 @@ def test_at_most_seven_frames_from_main_to_the_loss(
 
     def loss(*args: Any) -> Any:
         names = [frame.function for frame in inspect.stack()]
-        found.append(["photometric_loss", *names[1 : names.index("main") + 1]])
+        found.append(["photometric", *names[1 : names.index("main") + 1]])
         raise InputError("seen")
 
-    monkeypatch.setattr(train, "photometric_loss", loss)
+    monkeypatch.setattr(train, "photometric", loss)
     words = ["map", str(small_scene / "transforms.json"), "-o", str(tmp_path / "m.gsmap")]
     words += [f"--set={pair}" for pair in [*SETTINGS, f"masks=labels:{small_scene / 'labels'}"]]
     assert main(words) == 2
-    assert found[0] == ["photometric_loss", "step", "run", "build_map", "_map", "main"]
+    assert found[0] == ["photometric", "step", "run", "build_map", "_map", "main"]
 
 
 @pytest.mark.parametrize(
