@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -64,10 +65,8 @@ def best_model(views: list[Detection], size: tuple[int, int], model: str = "auto
         return solve(model, views, size)
     solved = []
     for name in ("pinhole", "fisheye"):
-        try:
+        with contextlib.suppress(InputError):  # this model does not fit the views
             solved.append(solve(name, views, size))
-        except (InputError, cv2.error, np.linalg.LinAlgError):
-            continue  # this model does not fit the views
     if not solved:
         raise InputError("neither a pinhole nor a fisheye camera explains the boards found; is the board flat?")
     if len(solved) == 2 and solved[1].rms > 0.95 * solved[0].rms:

@@ -26,13 +26,7 @@ def _add_export(commands: Any) -> None:
     place.add_argument(
         "--transform", type=Path, metavar="FILE", help="as --align, by a known 4 x 4 map_from_scan (text or JSON)"
     )
-    p.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        metavar="OUT",
-        help=".ply, .pcd or .npz; .mcap (Foxglove, RViz): with boxes, cameras and photos",
-    )
+    p.add_argument("-o", "--output", type=Path, metavar="OUT", help=".ply, .pcd or .npz")
     p.add_argument("--smooth", action=argparse.BooleanOptionalAction, default=True)
     p.add_argument(
         "--max-distance",
@@ -42,8 +36,6 @@ def _add_export(commands: Any) -> None:
     )
     p.add_argument("--segments", type=Path, metavar="X.segs.json", help="ScanNet segments instead of our own")
     p.add_argument("--color", choices=("original", "instance"), default="original")
-    p.add_argument("--split", type=Path, metavar="DIR", help="one cloud an instance")
-    p.add_argument("--boxes", type=Path, metavar="OUT.json", help="3D boxes")
     p.add_argument("--mesh", type=Path, metavar="OUT", help="the map's surface as .ply or .glb (extra: open3d)")
     p.add_argument("--instance", type=int, metavar="ID", help="--mesh: the closed body of this one instead")
     p.add_argument("--voxels", type=Path, metavar="OUT.npz", help="free, occupied and unknown space; distances")
@@ -59,7 +51,7 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.errors import InputError
     from perception.export import ExportOptions
     from perception.io.store import read_map
-    from perception.pipeline.exporting import Outputs, export_map
+    from perception.pipeline.exporting import export_map
     from perception.pipeline.meshing import check_outputs, export_mesh, export_voxels
 
     if args.output is None and args.mesh is None and args.voxels is None:
@@ -82,8 +74,8 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         if args.output is None:
             return facts, "\n".join(lines)
     options = ExportOptions(max_distance=args.max_distance, smooth=args.smooth, segments=args.segments)
-    outputs = Outputs(args.color, args.split, args.boxes, args.scannet)
-    result, table = export_map(args.map, args.output, args.points, options, outputs, args.transform or args.align)
+    place = args.transform or args.align
+    result, table = export_map(args.map, args.output, args.points, options, args.color, args.scannet, place)
     return {**facts, **result}, "\n".join([*lines, table])
 
 

@@ -138,7 +138,6 @@ def _add_info(commands: Any) -> None:
     p = command(commands, "info", _info, "what a map holds, how it was made, how good it is")
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("--verify", action="store_true", help="read every byte and compare it with the checksums")
-    p.add_argument("--sheet", type=Path, metavar="OUT.png", help="picture of every instance with its likeliest names")
 
 
 def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -151,11 +150,6 @@ def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     texts = {entry["id"]: entry["texts"] for entry in entries if entry.get("texts")}
     told = info_text(args.map, info, texts)
     info = {**info, "texts": texts} if texts else info
-    if args.sheet is not None:
-        from perception.pipeline.reporting import write_sheet
-        from perception.query import load_map
-
-        write_sheet(load_map(args.map), args.sheet)
     if not args.verify:
         return info, told
     states = verify_map(args.map)

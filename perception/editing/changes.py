@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
-
 import numpy as np
 
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
@@ -58,12 +55,3 @@ def described(parts: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, np.n
     descriptions, encoder = from_arrays(language)
     left = [description for description, lives in zip(descriptions, alive, strict=True) if lives]
     return {"ids": parts["ids"], **{prefix + name: a for name, a in to_arrays(left, encoder).items()}}
-
-
-def instances_named(calls: Iterable[tuple[str, tuple[Any, ...], dict[str, Any], Any]]) -> set[int]:
-    """Instance ids that edits (method, arguments, named arguments, result) take as input: an id or a list of ids."""
-    named: set[int] = set()
-    for _, args, kwargs, _ in calls:
-        for value in (*args[:1], *(kwargs[name] for name in ("instance", "chosen") if name in kwargs)):
-            named |= set(value) if isinstance(value, list) else {value}
-    return named

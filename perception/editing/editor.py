@@ -1,8 +1,8 @@
 """Manual corrections of a map: rename, hide, merge, split, remove, delete floaters; with undo, redo and save.
 
 An `Editor` holds one opened map. Edits change memory only; `save` writes the whole map to a new place and swaps it in.
-Thread-safe: each edit is one step under a lock, so it is applied completely or not at all. When another program changed
-the map meanwhile, the unsaved edits are applied again to the changed map.
+Thread-safe: each edit is one step under a lock, so it is applied completely or not at all. A map that another program
+changed meanwhile is not overwritten.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 from perception.boxes import oriented_box
 from perception.config import InstanceConfig
-from perception.editing.changes import NEIGHBORS, described, instances_named, isolated, joined, nearest_filled
+from perception.editing.changes import NEIGHBORS, described, isolated, joined, nearest_filled
 from perception.errors import InputError
 from perception.io.map import GAUSSIANS, Map
 from perception.io.map_lock import writing
@@ -29,8 +29,6 @@ from perception.language.description import InstanceDescription, from_arrays, to
 UNDO_DEPTH = 100
 
 F = TypeVar("F", bound=Callable[..., Any])
-Call = tuple[str, tuple[Any, ...], dict[str, Any], Any]
-"""An edit: method name, arguments, named arguments, return value."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,6 @@ class _State:
     kept: np.ndarray
     instances: tuple[dict[str, Any], ...]
     descriptions: tuple[InstanceDescription, ...]
-    call: Call = ("", (), {}, None)
 
 
 def _step(method: F) -> F:
@@ -52,21 +49,6 @@ def _step(method: F) -> F:
             return method(self, *args, **kwargs)
 
     return locked  # type: ignore[return-value]
-
-
-def _edit(method: F) -> F:
-    """A step whose call is recorded, so that `reopen` can repeat it."""
-
-    @_step
-    @wraps(method)
-    def remembered(self: Editor, *args: Any, **kwargs: Any) -> Any:
-        before = self._past[-1]
-        result = method(self, *args, **kwargs)
-        if self._past[-1] is not before:
-            self._past[-1] = dataclasses.replace(self._past[-1], call=(method.__name__, args, kwargs, result))
-        return result
-
-    return remembered  # type: ignore[return-value]
 
 
 class Editor:
@@ -168,18 +150,18 @@ class Editor:
         instances[place] = {**instances[place], **values}
         self._push(what, instances=tuple(instances))
 
-    @_edit
+    @_step
     def rename(self, instance: int, label: str | None) -> None:
         """Sets the user's label of an instance; an empty label or None removes it."""
         label = " ".join(label.split()) if label else None
         self._change(f"named {instance} '{label}'" if label else f"took the name of {instance}", instance, label=label)
 
-    @_edit
+    @_step
     def hide(self, instance: int, hidden: bool = True) -> None:
         """Marks an instance as hidden or visible in the viewer; it stays in the map."""
         self._change(f"{'hid' if hidden else 'showed'} {instance}", instance, hidden=hidden)
 
-    @_edit
+    @_step
     def merge(self, chosen: list[int]) -> int:
         """Joins instances into one with a new id, which is returned; it keeps the first label among them."""
         chosen = sorted(set(chosen))
@@ -198,7 +180,7 @@ class Editor:
         self._replace(f"merged {', '.join(map(str, chosen))} into {new}", places, ids, [merged], joined)
         return new
 
-    @_edit
+    @_step
     def split(self, instance: int) -> list[int]:
         """Splits an instance into new ones; returns their ids. Raises InputError when it cannot be split.
 
@@ -220,14 +202,14 @@ class Editor:
         self._replace(f"split {instance} into {len(parts)}", [place], ids, parts, lambda descriptions: descriptions[0])
         return news
 
-    @_edit
+    @_step
     def remove(self, instance: int) -> None:
         """Removes an instance from the list; its Gaussians stay and belong to no instance."""
         place = self._place(instance)
         ids = np.where(self.ids == instance, -1, self.ids).astype(np.int32)
         self._replace(f"removed {instance}", [place], ids, [], joined)
 
-    @_edit
+    @_step
     def delete_floaters(self) -> int:
         """Deletes isolated Gaussians (see `isolated`); returns how many. Instances left empty are removed."""
         rows = np.flatnonzero(self.kept)
@@ -280,47 +262,21 @@ class Editor:
 
     @_step
     def save(self) -> None:
-        """Writes the edited map in place of the old one, after `reopen` if another program changed that."""
+        """Writes the edited map in place of the old one; InputError if another program changed that meanwhile."""
         with writing(self.path):
             if self.outdated:
-                self.reopen()
+                raise InputError(
+                    f"{self.path}: was changed by another program since it was opened; nothing is saved: open it again "
+                    "and repeat the corrections"
+                )
             write_map(self.path, self.current(), keep_report=True)
             self._signature = map_signature(self.path)
         self._saved = self._now
 
     @_step
-    def reopen(self, discard: bool = False) -> None:
-        """Opens the map now on disk and applies the unsaved edits to it (unless `discard`); history restarts.
-
-        Raises InputError, with nothing changed, when the edits do not fit it: other Gaussians, other instances.
-        """
-        fresh = Editor(self.path)
-        if self.dirty and not discard:
-            for method, args, kwargs, result in self._unsaved(fresh):
-                if getattr(fresh, method)(*args, **kwargs) != result:
-                    raise self._no_fit()
-        for name in ("original", "_encoder", "_past", "_future", "_saved", "_signature"):
-            setattr(self, name, getattr(fresh, name))
-
-    def _unsaved(self, fresh: Editor) -> list[Call]:
-        """The edits since the last save; InputError when the instances that they use differ in `fresh`."""
-        place = next((n for n, state in enumerate(self._past) if state is self._saved), None)
-        kept, there = self._saved.kept, fresh.original
-        if place is None or not np.array_equal(self.original.means[kept], there.means):
-            raise self._no_fit()
-        calls = [state.call for state in self._past[place + 1 :]]
-        mine, theirs = ({entry["id"]: entry for entry in e} for e in (self._saved.instances, fresh.instances))
-        for instance in instances_named(calls):
-            same = np.array_equal(self._saved.ids[kept] == instance, there.instance_ids == instance)
-            if not same or mine.get(instance) != theirs.get(instance):
-                raise self._no_fit()
-        return calls
-
-    def _no_fit(self) -> InputError:
-        return InputError(
-            f"{self.path}: was changed by another program since it was opened, and the unsaved corrections do not fit "
-            "what lies there now; open it again and repeat them"
-        )
+    def reopen(self) -> None:
+        """Opens the map that is on disk now. Unsaved edits and the history are dropped."""
+        self.__dict__.update({name: value for name, value in vars(Editor(self.path)).items() if name != "_lock"})
 
     # ------------------------------------------------------------------ helpers
 

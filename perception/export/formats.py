@@ -1,4 +1,4 @@
-"""Writes labelled clouds: cloud and sidecar, one cloud per instance, boxes, ScanNet submission format."""
+"""Writes labelled clouds: cloud and sidecar, and the submission format of ScanNet."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from perception.boxes import instance_boxes
-from perception.errors import InputError
-from perception.io.atomic import atomic_directory, replacing
+from perception.io.atomic import replacing
 from perception.io.cloud import write_cloud
 from perception.types import PointCloud
 
@@ -48,71 +46,6 @@ def sidecar_of(labels: np.ndarray, instances: Instances) -> dict[str, Any]:
         score = float(known.get("score", 1.0))
         rows[str(i)] = {"score": score, "label": known.get("label"), "num_points": n}
     return {"instances": rows}
-
-
-def write_split(folder: str | Path, cloud: PointCloud, labels: np.ndarray, suffix: str = ".ply") -> list[Path]:
-    """One file for each instance, "<id><suffix>", points in the cloud's order; the folder is written atomically.
-
-    InputError when `folder` holds anything but an older split, which is replaced.
-    """
-    folder = Path(folder)
-    _check_folder(folder, suffix)
-    ids = np.unique(labels[labels >= 0]).tolist()
-    with atomic_directory(folder) as aside:
-        for i in ids:
-            write_cloud(aside / f"{i}{suffix}", _part(cloud, labels, i))
-    return [folder / f"{i}{suffix}" for i in ids]
-
-
-def _part(cloud: PointCloud, labels: np.ndarray, i: int) -> PointCloud:
-    rows = labels == i
-    return PointCloud(
-        cloud.points[rows],
-        None if cloud.colors is None else cloud.colors[rows],
-        None if cloud.normals is None else cloud.normals[rows],
-        _faces_within(cloud.faces, rows),
-        {"instance_id": labels[rows]},
-    )
-
-
-def _check_folder(folder: Path, suffix: str) -> None:
-    try:
-        others = [file for file in folder.iterdir() if not (file.stem.isdigit() and file.suffix == suffix)]
-    except FileNotFoundError:
-        return
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made a folder ({error.strerror})") from error
-    if others:
-        raise InputError(f"{folder}: holds {others[0].name}, which is no part of an older split; give a new folder")
-
-
-def _faces_within(faces: np.ndarray | None, rows: np.ndarray) -> np.ndarray | None:
-    if faces is None:
-        return None
-    renumber = np.cumsum(rows) - 1
-    return renumber[faces[rows[faces].all(axis=1)]].astype(np.int32)
-
-
-def write_boxes(
-    path: str | Path,
-    points: np.ndarray,
-    labels: np.ndarray,
-    instances: Instances,
-    *,
-    frame: str = "map",
-    metric: bool = False,
-) -> dict[str, Any]:
-    """3D boxes as JSON: {"frame", "metric", "boxes": [{"id", "label", "score", "num_points", "centroid",
-    "aabb", "obb"}]}.
-    """
-    rows = []
-    for i, box in instance_boxes(points, labels).items():
-        known = instances.get(i, {})
-        rows.append({"id": i, "label": known.get("label"), "score": float(known.get("score", 1.0))} | box)
-    result = {"frame": frame, "metric": metric, "boxes": rows}
-    with replacing(path) as file:
-        file.write(json.dumps(result, indent=1).encode())
-    return result
 
 
 def write_scannet(

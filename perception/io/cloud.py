@@ -13,17 +13,17 @@ from perception.io.arrays import read_npz
 from perception.io.atomic import replacing
 from perception.io.cloud_memory import require_memory
 from perception.io.cloud_pcd import read_pcd, write_pcd
-from perception.io.cloud_text import read_obj, read_xyz, write_xyz
+from perception.io.documents import brief
 from perception.io.ply import read_ply, write_ply
 from perception.types import PointCloud
 
-_COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-_FACE_NAMES = ("vertex_indices", "vertex_index")
-_NOT_LABELS = {"alpha", "diffuse_alpha", "a"}
+_COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+_NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
+_NOT_LABELS = {"alpha", "diffuse_alpha", "a", "rgb", "rgba"}
 
 
 def read_cloud(path: str | Path) -> PointCloud:
-    """Read .ply (cloud or mesh), .pcd, .xyz/.txt/.pts, .npz, .obj, .las or .laz.
+    """Read .ply (cloud or mesh), .pcd, .npz, .xyz/.txt/.pts, .las or .laz.
 
     points are float64 where the file stores doubles, else float32; integer columns besides the colours become
     `labels`; faces of more than three corners are split into fans. NaN and infinite points are kept in place.
@@ -48,7 +48,7 @@ def read_cloud(path: str | Path) -> PointCloud:
 
 
 def write_cloud(path: str | Path, cloud: PointCloud) -> None:
-    """Write .ply (binary), .pcd (binary), .npz or .xyz: points and those attributes that the format supports."""
+    """Write .ply (binary), .pcd (binary) or .npz: points and those attributes that the format supports."""
     path = Path(path)
     writer = _WRITERS.get(path.suffix.lower())
     if writer is None:
@@ -72,56 +72,6 @@ def to_int32(values: np.ndarray, where: str) -> np.ndarray:
     return values.astype(np.int32)
 
 
-def _read_ply_cloud(path: Path) -> PointCloud:
-    elements = read_ply(path)
-    vertex = elements.get("vertex")
-    if vertex is None or not {"x", "y", "z"} <= vertex.keys():
-        raise InputError(f"{path}: PLY has no element 'vertex' with x, y and z")
-    cloud = PointCloud(np.stack([vertex[axis] for axis in "xyz"], axis=1))
-    if cloud.points.dtype != np.float64:
-        cloud.points = cloud.points.astype(np.float32)
-    used = {"x", "y", "z", "nx", "ny", "nz"} | _NOT_LABELS
-    for names in _COLOR_NAMES:
-        if set(names) <= vertex.keys():
-            cloud.colors = to_uint8(np.stack([vertex[name] for name in names], axis=1))
-            used |= set(names)
-            break
-    if {"nx", "ny", "nz"} <= vertex.keys():
-        cloud.normals = np.stack([vertex[axis] for axis in ("nx", "ny", "nz")], axis=1).astype(np.float32)
-    for name, values in vertex.items():
-        is_id = values.dtype.kind in "iu" or (values.dtype.kind == "f" and name.endswith(("_id", "label")))
-        if name not in used and is_id and values.ndim == 1:
-            # CloudCompare writes every label as a float named scalar_...
-            cloud.labels[name.removeprefix("scalar_")] = to_int32(values, f"{path}: property '{name}'")
-    face = elements.get("face", {})
-    for name in _FACE_NAMES:
-        if name in face:
-            cloud.faces = _triangles(face[name], path)
-    return cloud
-
-
-def _read_las(path: Path) -> PointCloud:
-    """points [P, 3] float64 (scale and offset applied); 16-bit colours become 8-bit; `classification` is a label."""
-    try:
-        import laspy
-    except ImportError as error:
-        raise InputError(f"{path}: LAS and LAZ need the package 'laspy'; run: pip install 'laspy[lazrs]'") from error
-    try:
-        las = laspy.read(path)
-    except (laspy.errors.LaspyException, ValueError, OSError) as error:
-        raise InputError(f"{path}: is not a readable LAS/LAZ file ({error})") from error
-    cloud = PointCloud(np.ascontiguousarray(las.xyz, dtype=np.float64))
-    names = set(las.point_format.dimension_names)
-    if {"red", "green", "blue"} <= names:
-        wide = np.stack([np.asarray(las.red), np.asarray(las.green), np.asarray(las.blue)], axis=1)
-        # The standard asks for 16 bits, but many writers leave 8-bit values unscaled.
-        cloud.colors = (wide >> 8 if wide.max(initial=0) > 255 else wide).astype(np.uint8)
-    for name in ("classification", "instance_id", "semantic_id"):
-        if name in names:
-            cloud.labels[name] = np.asarray(las[name]).astype(np.int32)
-    return cloud
-
-
 def to_uint8(colors: np.ndarray) -> np.ndarray:
     """Colours [P, 3] as uint8: floats in [0, 1] are scaled by 255, 16-bit values by 1/257, bytes are kept."""
     if colors.dtype == np.uint8:
@@ -135,6 +85,111 @@ def to_uint8(colors: np.ndarray) -> np.ndarray:
     return np.clip(colors, 0, 255).astype(np.uint8)
 
 
+def _cloud_of(columns: dict[str, np.ndarray], path: Path) -> PointCloud:
+    """The cloud of named columns [P] of a file at `path`."""
+    columns = {name: values for name, values in columns.items() if values.ndim == 1 and values.dtype != object}
+    if not set("xyz") <= columns.keys():
+        raise InputError(f"{path}: has the fields {', '.join(columns)[:200] or 'none'}; expected x, y and z")
+    points = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    cloud = PointCloud(points if points.dtype == np.float64 else points.astype(np.float32))
+    colors, normals = (next((n for n in kinds if set(n) <= columns.keys()), None) for kinds in (_COLORS, _NORMALS))
+    packed = next((columns[name] for name in ("rgb", "rgba") if name in columns), None)
+    if colors is not None:
+        cloud.colors = to_uint8(np.stack([columns[name] for name in colors], axis=1))
+    elif packed is not None and packed.dtype == np.uint32:
+        cloud.colors = np.stack([packed >> 16, packed >> 8, packed], axis=1).astype(np.uint8)
+    if normals is not None:
+        cloud.normals = np.stack([columns[name] for name in normals], axis=1).astype(np.float32)
+    for name, values in columns.items():
+        is_id = values.dtype.kind in "iu" or (values.dtype.kind == "f" and name.endswith(("_id", "label")))
+        if is_id and name not in {*"xyz", *_NOT_LABELS, *(colors or ()), *(normals or ())}:
+            # CloudCompare writes every label as a float named scalar_...
+            cloud.labels[name.removeprefix("scalar_")] = to_int32(values, f"{path}: property '{name}'")
+    return cloud
+
+
+def _columns_of(cloud: PointCloud, normals: tuple[str, ...]) -> dict[str, np.ndarray]:
+    points = cloud.points if cloud.points.dtype == np.float64 else cloud.points.astype(np.float32)
+    columns = {axis: points[:, i] for i, axis in enumerate("xyz")}
+    if cloud.normals is not None:
+        columns |= {name: cloud.normals[:, i].astype(np.float32) for i, name in enumerate(normals)}
+    return columns
+
+
+def _read_ply_cloud(path: Path) -> PointCloud:
+    elements = read_ply(path)
+    cloud, face = _cloud_of(elements.get("vertex", {}), path), elements.get("face", {})
+    for name in ("vertex_indices", "vertex_index"):
+        if name in face:
+            cloud.faces = _triangles(face[name], path)
+    return cloud
+
+
+def _write_ply_cloud(path: Path, cloud: PointCloud) -> None:
+    vertex = _columns_of(cloud, _NORMALS[0])
+    if cloud.colors is not None:
+        vertex |= {name: cloud.colors[:, i].astype(np.uint8) for i, name in enumerate(_COLORS[0])}
+    elements = {"vertex": vertex | {name: values.astype(np.int32) for name, values in cloud.labels.items()}}
+    if cloud.faces is not None:
+        elements["face"] = {"vertex_indices": cloud.faces.astype(np.int32)}
+    write_ply(path, elements)
+
+
+def _write_pcd_cloud(path: Path, cloud: PointCloud) -> None:
+    """With rgb packed in a float, as PCL does."""
+    columns = _columns_of(cloud, _NORMALS[1])
+    if cloud.colors is not None:
+        r, g, b = cloud.colors.astype(np.uint32).T
+        columns["rgb"] = ((r << 16) | (g << 8) | b).view(np.float32)
+    write_pcd(path, columns | {name: values.astype(np.int32) for name, values in cloud.labels.items()})
+
+
+def _read_xyz(path: Path) -> PointCloud:
+    """Rows of x y z, then optionally r g b (all whole numbers in 0..255) and/or a normal; separators: blank , ;
+
+    Lines starting with # or // and a leading count line (.pts) are skipped. points [P, 3] float64.
+    """
+    text = path.read_text(encoding="utf-8", errors="replace").replace(",", " ").replace(";", " ")
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith(("#", "//"))]
+    if len(lines) > 1 and len(lines[0].split()) == 1:  # a .pts file begins with the number of points
+        del lines[0]
+    try:
+        rows = np.loadtxt(lines, ndmin=2) if lines else np.empty((0, 3))
+    except ValueError as error:
+        raise InputError(f"{path}: expected rows of as many numbers each ({brief(error)})") from error
+    if rows.shape[1] < 3:
+        raise InputError(f"{path}: rows have {rows.shape[1]} columns; expected x y z at least")
+    cloud = PointCloud(np.ascontiguousarray(rows[:, :3]))
+    rest = rows[:, 4:] if rows.shape[1] in (7, 10) else rows[:, 3:]  # an intensity column precedes the colour
+    for triple in (rest[:, i : i + 3] for i in range(0, rest.shape[1] - 2, 3)):
+        whole = bool((triple == np.floor(triple)).all()) and triple.min() >= 0 and 1 < triple.max() <= 255
+        if cloud.colors is None and whole:
+            cloud.colors = triple.astype(np.uint8)
+        elif cloud.normals is None:
+            cloud.normals = triple.astype(np.float32)
+    return cloud
+
+
+def _read_las(path: Path) -> PointCloud:
+    """points [P, 3] float64 (scale and offset applied); 16-bit colours become 8-bit; `classification` is a label."""
+    try:
+        import laspy
+    except ImportError as error:
+        raise InputError(f"{path}: LAS and LAZ need the package 'laspy'; run: pip install 'laspy[lazrs]'") from error
+    try:
+        las = laspy.read(path)
+    except (laspy.errors.LaspyException, ValueError, OSError) as error:
+        raise InputError(f"{path}: is not a readable LAS/LAZ file ({error})") from error
+    known = {"classification", "instance_id", "semantic_id"} & set(las.point_format.dimension_names)
+    columns = {axis: np.asarray(las[axis], np.float64) for axis in "xyz"} | {n: np.asarray(las[n]) for n in known}
+    if {"red", "green", "blue"} <= set(las.point_format.dimension_names):
+        wide = np.stack([np.asarray(las[name]) for name in _COLORS[0]])
+        # The standard asks for 16 bits, but many writers leave 8-bit values unscaled.
+        eight = (wide >> 8 if wide.max(initial=0) > 255 else wide).astype(np.uint8)
+        columns |= dict(zip(_COLORS[0], eight, strict=True))
+    return _cloud_of(columns, path)
+
+
 def _triangles(faces: np.ndarray, path: Path) -> np.ndarray:
     if faces.dtype != object:
         if faces.ndim != 2:
@@ -145,20 +200,6 @@ def _triangles(faces: np.ndarray, path: Path) -> np.ndarray:
         return np.stack(corners, axis=1).reshape(-1, 3).astype(np.int32)
     fans = [(f[0], f[i], f[i + 1]) for f in faces for i in range(1, len(f) - 1)]
     return np.array(fans, np.int32).reshape(-1, 3)
-
-
-def _write_ply_cloud(path: Path, cloud: PointCloud) -> None:
-    points = cloud.points if cloud.points.dtype == np.float64 else cloud.points.astype(np.float32)
-    vertex = {axis: points[:, i] for i, axis in enumerate("xyz")}
-    if cloud.normals is not None:
-        vertex |= {axis: cloud.normals[:, i].astype(np.float32) for i, axis in enumerate(("nx", "ny", "nz"))}
-    if cloud.colors is not None:
-        vertex |= {name: cloud.colors[:, i].astype(np.uint8) for i, name in enumerate(_COLOR_NAMES[0])}
-    vertex |= {name: values.astype(np.int32) for name, values in cloud.labels.items()}
-    elements = {"vertex": vertex}
-    if cloud.faces is not None:
-        elements["face"] = {"vertex_indices": cloud.faces.astype(np.int32)}
-    write_ply(path, elements)
 
 
 def _read_npz(path: Path) -> PointCloud:
@@ -190,20 +231,15 @@ def _write_npz(path: Path, cloud: PointCloud) -> None:
 
 _READERS: dict[str, Callable[[Path], PointCloud]] = {
     ".ply": _read_ply_cloud,
-    ".pcd": read_pcd,
+    ".pcd": lambda path: _cloud_of(read_pcd(path), path),
     ".npz": _read_npz,
-    ".obj": read_obj,
-    ".xyz": read_xyz,
-    ".txt": read_xyz,
-    ".pts": read_xyz,
-    ".las": _read_las,
-    ".laz": _read_las,
+    **dict.fromkeys((".xyz", ".txt", ".pts"), _read_xyz),
+    **dict.fromkeys((".las", ".laz"), _read_las),
 }
 # Memory to read a file as a multiple of its size, for compressed and text formats.
-_BYTES_PER_BYTE = {".laz": 40, ".obj": 12, ".xyz": 4, ".txt": 4, ".pts": 4}
+_BYTES_PER_BYTE = {".laz": 40, ".xyz": 8, ".txt": 8, ".pts": 8}
 _WRITERS: dict[str, Callable[[Path, PointCloud], None]] = {
     ".ply": _write_ply_cloud,
-    ".pcd": write_pcd,
+    ".pcd": _write_pcd_cloud,
     ".npz": _write_npz,
-    ".xyz": write_xyz,
 }

@@ -5,7 +5,6 @@ Format: Greg Turk's "The PLY Polygon File Format" (1994). Binary tables are read
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +38,7 @@ _MOST_ROWS = 1 << 40
 class _Property:
     name: str
     kind: str  # "f4", "u1", ...
-    count_kind: str | None = None  # the type of a list's length; None for a scalar
+    count: str | None = None  # the type of a list's length; None for a scalar
 
 
 @dataclass
@@ -50,7 +49,7 @@ class _Table:
 
     @property
     def has_list(self) -> bool:
-        return any(p.count_kind for p in self.properties)
+        return any(p.count for p in self.properties)
 
 
 def read_ply(path: str | Path) -> dict[str, Element]:
@@ -63,11 +62,14 @@ def read_ply(path: str | Path) -> dict[str, Element]:
     try:
         with path.open("rb") as file:
             order, tables = _read_header(file, path)
-            if order == "":
-                return _read_ascii(file.read(), tables, path)
-            return {table.name: _read_binary(file, table, order, path) for table in tables}
+            body = file.read()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); expected a PLY file") from error
+    try:
+        source = _Binary(body, order) if order else _Text(body)
+    except ValueError as error:
+        raise InputError(f"{path}: holds text where numbers are expected ({error})") from error
+    return {table.name: _read_element(source, table, path) for table in tables}
 
 
 def map_ply(path: str | Path, element: str) -> np.ndarray:
@@ -143,120 +145,92 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_Table]]:
     return order, tables
 
 
-def _read_binary(file: BinaryIO, table: _Table, order: str, path: Path) -> Element:
-    """One element of a binary file; uniform lists are read as a structured array, ragged ones row by row."""
-    start = file.tell()
-    lengths = _first_lengths(file, table, order)
-    file.seek(start)
-    if sum(lengths.values()) > path.stat().st_size:
-        return _read_ragged(file, table, order, path)
-    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
-    for p in table.properties:
-        if p.count_kind:
-            fields += [
-                (f"{p.name}\0count", order + p.count_kind),
-                (p.name, order + p.kind, (lengths[p.name],)),
-            ]
-        else:
-            fields.append((p.name, order + p.kind))
-    dtype = np.dtype(fields)
-    raw = file.read(min(dtype.itemsize * table.rows, path.stat().st_size))
-    if len(raw) == dtype.itemsize * table.rows:
-        rows = np.frombuffer(raw, dtype)
-        if all((rows[f"{name}\0count"] == n).all() for name, n in lengths.items()):
-            return {p.name: rows[p.name].astype(dtype[p.name].base.newbyteorder("=")) for p in table.properties}
-    if not table.has_list:
-        found = len(raw) // max(dtype.itemsize, 1)
+class _Binary:
+    """Values of a binary body, taken one after another."""
+
+    def __init__(self, body: bytes, order: str):
+        self.body, self.order, self.at = body, order, 0
+
+    def take(self, kind: str, count: int) -> np.ndarray:
+        """The next `count` values; ValueError if they are not there."""
+        if count < 0:
+            raise ValueError("a list of negative length")
+        found = np.frombuffer(self.body, self.order + kind, count, self.at) if count else np.empty(0, kind)
+        self.at += found.nbytes
+        return found
+
+    def block(self, table: _Table, lengths: dict[str, int]) -> tuple[Element | None, int]:
+        """All rows if they have lists of these lengths, else None; the number of such rows that fit into the body."""
+        fields: list[tuple] = []
+        for p in table.properties:
+            fields += [(f"{p.name}\0count", self.order + p.count)] if p.count else []
+            fields.append((p.name, self.order + p.kind, *([(lengths[p.name],)] if p.count else [])))
+        dtype = np.dtype(fields)
+        found = (len(self.body) - self.at) // dtype.itemsize
+        if found < table.rows:
+            return None, found
+        rows = np.frombuffer(self.body, dtype, table.rows, self.at) if table.rows else np.empty(0, dtype)
+        if not all((rows[f"{name}\0count"] == n).all() for name, n in lengths.items()):
+            return None, found
+        self.at += rows.nbytes
+        return {p.name: rows[p.name].astype(p.kind) for p in table.properties}, found
+
+
+class _Text:
+    """The same for an ASCII body, whose values are all numbers."""
+
+    def __init__(self, body: bytes):
+        self.numbers, self.at = np.fromstring(body, dtype=np.float64, sep=" "), 0
+
+    def take(self, kind: str, count: int) -> np.ndarray:
+        found = self.numbers[self.at : self.at + count]
+        if count < 0 or len(found) < count:
+            raise ValueError("the numbers end")
+        self.at += count
+        return found
+
+    def block(self, table: _Table, lengths: dict[str, int]) -> tuple[Element | None, int]:
+        found = (len(self.numbers) - self.at) // len(table.properties)
+        if lengths or found < table.rows:
+            return None, found
+        size = table.rows * len(table.properties)
+        rows = self.numbers[self.at : self.at + size].reshape(table.rows, len(table.properties))
+        self.at += size
+        with np.errstate(invalid="ignore"):
+            return {p.name: rows[:, i].astype(p.kind) for i, p in enumerate(table.properties)}, found
+
+
+def _read_element(source: _Binary | _Text, table: _Table, path: Path) -> Element:
+    """One element, as a table if all lists of a property are as long as the first, else value by value."""
+    start, listed = source.at, [p.name for p in table.properties if p.count]
+    try:
+        first = _take_row(source, table) if listed and table.rows else {}
+        source.at = start
+        rows, found = source.block(table, {name: len(first.get(name, ())) for name in listed})
+        if rows is not None:
+            return rows
+        each = [_take_row(source, table) for _ in range(table.rows if listed else 0)]
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"{path}: is cut short within element '{table.name}' ({table.rows} rows expected)") from error
+    if not listed:
         raise InputError(
             f"{path}: is cut short: element '{table.name}' has {found} whole rows, header says {table.rows}"
         )
-    file.seek(start)
-    return _read_ragged(file, table, order, path)
+    return {p.name: _column([row[p.name] for row in each], p) for p in table.properties}
 
 
-def _first_lengths(file: BinaryIO, table: _Table, order: str) -> dict[str, int]:
-    """The list lengths of an element's first row, assumed for all rows until checked."""
-    lengths: dict[str, int] = {}
-    for p in table.properties:
-        if p.count_kind is None:
-            file.seek(np.dtype(p.kind).itemsize, 1)
-            continue
-        raw = file.read(np.dtype(p.count_kind).itemsize)
-        complete = table.rows > 0 and len(raw) == np.dtype(p.count_kind).itemsize
-        lengths[p.name] = max(int(np.frombuffer(raw, order + p.count_kind)[0]), 0) if complete else 0
-        file.seek(lengths[p.name] * np.dtype(p.kind).itemsize, 1)
-    return lengths
-
-
-def _read_ragged(file: BinaryIO, table: _Table, order: str, path: Path) -> Element:
-    start, data, at = file.tell(), file.read(), 0
-    columns: dict[str, list] = {p.name: [] for p in table.properties}
-    steps = []
-    for p in table.properties:
-        count = struct.Struct(order + np.dtype(p.count_kind).char) if p.count_kind else None
-        steps.append((columns[p.name], np.dtype(order + p.kind), count))
-    try:
-        for _ in range(table.rows):
-            for column, dtype, count in steps:
-                n = 1
-                if count is not None:
-                    n = count.unpack_from(data, at)[0]
-                    at += count.size
-                column.append(np.frombuffer(data, dtype, n, at) if n else np.empty(0, dtype))
-                at += n * dtype.itemsize
-    except (struct.error, ValueError) as error:
-        raise InputError(f"{path}: is cut short within element '{table.name}' ({table.rows} rows expected)") from error
-    file.seek(start + at)
-    return {p.name: _column(columns[p.name], p) for p in table.properties}
+def _take_row(source: _Binary | _Text, table: _Table) -> Element:
+    return {p.name: source.take(p.kind, int(source.take(p.count, 1)[0]) if p.count else 1) for p in table.properties}
 
 
 def _column(values: list[np.ndarray], p: _Property) -> np.ndarray:
-    if p.count_kind is None:
-        return np.concatenate(values).astype(p.kind) if values else np.empty(0, p.kind)
-    if len({len(v) for v in values}) <= 1:
-        return np.array(values, p.kind).reshape(len(values), len(values[0]) if values else 0)
+    if p.count is None:
+        return np.concatenate(values).astype(p.kind)
+    if len({len(v) for v in values}) == 1:
+        return np.array(values, p.kind)
     ragged = np.empty(len(values), object)
     ragged[:] = [v.astype(p.kind) for v in values]
     return ragged
-
-
-def _read_ascii(data: bytes, tables: list[_Table], path: Path) -> dict[str, Element]:
-    try:
-        numbers = np.fromstring(data, dtype=np.float64, sep=" ")
-    except ValueError as error:
-        raise InputError(f"{path}: holds text where numbers are expected ({error})") from error
-    elements, at = {}, 0
-    for table in tables:
-        elements[table.name], at = _take_ascii(numbers, at, table, path)
-    return elements
-
-
-def _take_ascii(numbers: np.ndarray, at: int, table: _Table, path: Path) -> tuple[Element, int]:
-    short = InputError(f"{path}: is cut short within element '{table.name}' ({table.rows} rows expected)")
-    if not table.has_list:
-        width = len(table.properties)
-        block = numbers[at : at + table.rows * width]
-        if len(block) < table.rows * width:
-            raise short
-        block = block.reshape(table.rows, width)
-        with np.errstate(invalid="ignore"):
-            columns = {p.name: block[:, i].astype(p.kind) for i, p in enumerate(table.properties)}
-        return columns, at + block.size
-    lists: dict[str, list[np.ndarray]] = {p.name: [] for p in table.properties}
-    for _ in range(table.rows):
-        for p in table.properties:
-            if at >= len(numbers):
-                raise short
-            n = 1
-            if p.count_kind:
-                if not 0 <= numbers[at] <= len(numbers):
-                    raise short
-                n, at = int(numbers[at]), at + 1
-            if at + n > len(numbers):
-                raise short
-            lists[p.name].append(numbers[at : at + n])
-            at += n
-    return {p.name: _column(lists[p.name], p) for p in table.properties}, at
 
 
 def _kind(values: np.ndarray) -> str:

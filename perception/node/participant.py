@@ -1,6 +1,6 @@
 """A DDS participant with ROS 2's conventions: writers and readers by ROS name and type, for raw CDR bytes.
 
-Used by the node and its Python client. Topics are `rt/NAME`; a service is `rq/NAMERequest` and `rr/NAMEReply`, whose
+Topics are `rt/NAME`; a service is `rq/NAMERequest` and `rr/NAMEReply`, whose
 messages carry rmw_cyclonedds' header: the client's id (uint64) and the request's number (int64).
 """
 
@@ -180,7 +180,7 @@ def _from_environment() -> str | None:
 
 
 class _Modules:
-    """CycloneDDS' modules, imported when a node or client is created."""
+    """CycloneDDS' modules, imported when a participant is created."""
 
     def __init__(self) -> None:
         try:

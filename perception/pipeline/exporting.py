@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
-from perception.export.formats import sidecar_of, write_boxes, write_export, write_scannet, write_split
+from perception.export.formats import write_export, write_scannet
 from perception.export.transfer import ExportOptions, check_overlap, export_labels, resolved
 from perception.geometry import move_points, scale_of
 from perception.io.cloud import read_cloud
@@ -20,23 +20,9 @@ from perception.io.store import Map, read_map
 from perception.pipeline.placing import aligned, read_transform
 from perception.types import PointCloud
 
-SUFFIXES = (".ply", ".pcd", ".npz", ".mcap")
+SUFFIXES = (".ply", ".pcd", ".npz")
 SURFACE_OPACITY = 0.5
 """Gaussians of at least this opacity are the surface points of a map."""
-
-
-@dataclass(frozen=True)
-class Outputs:
-    """Paths of the outputs beside the labelled cloud; None = not written.
-
-    color: of the cloud's points, "original" or "instance". split: folder for one cloud per instance; boxes: JSON;
-    scannet: folder of a submission (scene = the output's stem).
-    """
-
-    color: str = "original"
-    split: Path | None = None
-    boxes: Path | None = None
-    scannet: Path | None = None
 
 
 def export_map(
@@ -44,23 +30,24 @@ def export_map(
     output: Path,
     points: Path | None,
     options: ExportOptions,
-    outputs: Outputs,
+    color: str = "original",
+    scannet: Path | None = None,
     place: Path | bool = False,
 ) -> tuple[dict[str, Any], str]:
-    """Labels a cloud, writes it and the `outputs`, and returns (JSON-able facts, table).
+    """Labels a cloud, writes it and its sidecar JSON, and returns (JSON-able facts, table).
 
     Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids. `points` and the
     result are in the coordinates of the map's input (`map_from_input`). Without `points` they are the map's, or the
-    input's if that was only shifted. .ply, .pcd, .npz: the cloud and its sidecar JSON. .mcap: a recording in the
-    map's frame, the cloud together with the map's boxes, cameras and photos.
+    input's if that was only shifted.
 
-    place: `points` lie in a frame of their own: True registers them (`export.align`), a path names a file with
+    color: of the written points, "original" or "instance". scannet: folder of a submission, too (scene = the output's
+    stem). place: `points` lie in a frame of their own: True registers them (`export.align`), a path names a file with
     map_from_scan [4, 4]. The result keeps that frame; the sidecar and the facts hold `map_from_scan`.
     """
     if output.suffix.lower() not in SUFFIXES:
         raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected one of {', '.join(SUFFIXES)}")
-    if outputs.color not in ("original", "instance"):
-        raise InputError(f"color is '{outputs.color}'; expected original or instance")
+    if color not in ("original", "instance"):
+        raise InputError(f"color is '{color}'; expected original or instance")
     if place and points is None:
         raise InputError("--align and --transform place a scan in the map; give it with --points")
     known = None if isinstance(place, bool) else read_transform(place)
@@ -85,16 +72,19 @@ def export_map(
         cloud, options = given, resolved(options, means, gmap.instance_ids)
     inside = check_overlap(means, cloud.points)
     labels = export_labels(means, gmap.instance_ids, cloud, options)
-    if outputs.color == "instance":
+    if color == "instance":
         cloud = replace(cloud, colors=instance_palette(labels))
-    sidecar = _write(output, gmap, cloud, labels, placed, outputs, facts)
+    instances = {entry["id"]: entry for entry in gmap.instances}
+    if scannet is not None:
+        write_scannet(scannet, output.stem, labels, instances)
+    sidecar = write_export(output, cloud, labels, instances, facts)  # last: where it is, everything was written
     result = {
         "points": len(labels),
         "labelled": int((labels >= 0).sum()),
         "inside_map": inside,
         "seconds": time.perf_counter() - began,
         "max_distance": options.max_distance,
-        "metric": _metric(gmap, placed),
+        "metric": gmap.metric and abs(scale_of(placed) - 1) < 1e-9,
         "smoothed": options.smooth,
         **sidecar,
     }
@@ -105,39 +95,6 @@ def surface_points(gmap: Map, means: np.ndarray | None = None) -> PointCloud:
     """The means of opaque Gaussians with their colours; means [N, 3] replaces those of the map."""
     rows = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY)
     return PointCloud((gmap.means if means is None else means)[rows], rgb8_from_sh(gmap.sh[rows, 0]))
-
-
-def _write(
-    output: Path,
-    gmap: Map,
-    cloud: PointCloud,
-    labels: np.ndarray,
-    placed: np.ndarray,
-    outputs: Outputs,
-    facts: dict[str, Any],
-) -> dict[str, Any]:
-    """Writes all files, `output` last, so that its existence means success. Returns the sidecar."""
-    instances, frame = {entry["id"]: entry for entry in gmap.instances}, str(gmap.info.get("frame", "map"))
-    if outputs.split is not None:
-        write_split(outputs.split, cloud, labels)
-    if outputs.boxes is not None:
-        metric = _metric(gmap, placed)
-        named = "scan" if "map_from_scan" in facts else frame
-        write_boxes(outputs.boxes, cloud.points, labels, instances, frame=named, metric=metric)
-    if outputs.scannet is not None:
-        write_scannet(outputs.scannet, output.stem, labels, instances)
-    if output.suffix.lower() != ".mcap":
-        return write_export(output, cloud, labels, instances, facts)
-    from perception.export.mcap import write_recording
-
-    local = replace(cloud, points=move_points(placed, cloud.points.astype(np.float64)))
-    write_recording(output, local, labels, gmap.instances, gmap.located_views(), frame)
-    return {**facts, **sidecar_of(labels, instances)}
-
-
-def _metric(gmap: Map, placed: np.ndarray) -> bool:
-    """Whether the exported coordinates are in metres; placed [4, 4]: the map from their frame."""
-    return gmap.metric and abs(scale_of(placed) - 1) < 1e-9
 
 
 def _table(result: dict[str, Any]) -> str:

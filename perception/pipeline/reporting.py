@@ -1,4 +1,4 @@
-"""Report of a map: images, a contact sheet and a one-page HTML report."""
+"""Report of a map: images and a one-page HTML report."""
 
 from __future__ import annotations
 
@@ -233,36 +233,6 @@ def _rows(opened: QueryMap, album: _Album) -> Iterator[tuple[dict[str, Any], np.
     names = opened.likely_names() if opened.problem is None else [[] for _ in opened.instances]
     for i, entry in enumerate(opened.instances):
         yield entry, _best_crop(opened, i, album, whole=False), printed_texts(entry)[:2] + names[i]
-
-
-def write_sheet(opened: QueryMap, path: Path) -> None:
-    """Writes the contact sheet as an image file; the suffix selects the format."""
-    from PIL import Image
-
-    from perception.io.atomic import atomic_file
-
-    if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise InputError(f"{path}: unknown kind of picture '{path.suffix}', expected .png or .jpg")
-    with atomic_file(path) as file:
-        Image.fromarray(contact_sheet(opened)).save(file, "PNG" if path.suffix.lower() == ".png" else "JPEG")
-
-
-def contact_sheet(opened: QueryMap, columns: int = 6, side: int = 240) -> np.ndarray:
-    """Every instance's best crop with id and label or most likely names, [H, W, 3] uint8; unseen ones left out."""
-    import cv2
-
-    from perception.instances.crops import letterbox
-
-    album = _Album(opened)
-    pictures, titles = [], []
-    for entry, crop, names in _rows(opened, album):
-        if crop is None:
-            continue
-        pictures.append(cv2.resize(letterbox(crop, 255), (side, side), interpolation=cv2.INTER_AREA))
-        titles.append(f"{entry['id']}: {entry.get('label') or ', '.join(name[:18] for name in names)}")
-    if not pictures:
-        raise InputError(f"{opened.path}: no instance has a photo that can still be read; a sheet needs the photos")
-    return montage(pictures, columns, titles)
 
 
 def _query_row(opened: QueryMap, text: str, album: _Album, expected: list[int] | None) -> QueryRow:

@@ -222,32 +222,24 @@ class Viewer:
             self.redraw()
 
     def _watch(self) -> None:
-        """Reopens a map that another program changed, as soon as the unsaved edits here fit it or are gone."""
+        """Reopens a map that another program changed; with unsaved edits here, the page offers to drop them."""
         while not self._stopped.wait(WATCH):
-            try:
-                outdated, problem = self.session.editor.outdated, ""
-            except InputError as error:  # missing; for an instant also between the two renames of a save
-                outdated, problem = False, str(error)
-            if outdated:
-                problem = self._follow()
-            self.panel.offer_renewal(outdated and bool(problem))
+            with self._one:
+                problem, editor = "", self.session.editor
+                try:
+                    if editor.outdated and editor.dirty:
+                        problem = "the map was changed by another program; the corrections here cannot be saved into it"
+                    elif editor.outdated:
+                        self.session.reopen()
+                        self.panel.notify(None, "the map was changed by another program; this is the new one")
+                        self.panel.refresh()
+                        self.redraw()
+                except InputError as error:  # missing; for an instant also between the two renames of a save
+                    problem = str(error)
+                self.panel.offer_renewal(bool(problem) and editor.dirty)
             if problem and problem != self._problem:
                 self.panel.notify(None, problem)
             self._problem = problem
-
-    def _follow(self) -> str:
-        """Reopens the changed map; returns the reason when that fails, else an empty text."""
-        with self._one:
-            try:
-                if not self.session.editor.outdated:
-                    return ""  # saved from here in the meantime
-                self.session.reopen()
-            except InputError as error:
-                return str(error)
-            self.panel.notify(None, "the map was changed by another program; this is the new one")
-            self.panel.refresh()
-            self.redraw()
-        return ""
 
 
 def start_viewer(path: Path, host: str = "127.0.0.1", port: int = 8090, token: str | None = None) -> Viewer:

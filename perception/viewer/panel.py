@@ -131,9 +131,7 @@ class Panel:
             self._renew = self.gui.add_button(
                 "Drop them, open the new map", visible=False, hint="another program replaced the map"
             )
-            self._renew.on_click(
-                lambda event: self.viewer.guarded(lambda: session.reopen(discard=True), event.client, edited=True)
-            )
+            self._renew.on_click(lambda event: self.viewer.guarded(lambda: session.reopen(), event.client, edited=True))
             self._history = self.gui.add_markdown("")
 
     def _unhide(self) -> None:

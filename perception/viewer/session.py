@@ -110,10 +110,10 @@ class Session:
             self.part = self.part if self.part in parts else None
             self.hits = [hit for hit in self.hits if hit.instance_id in (known if hit.parent is None else parts)]
 
-    def reopen(self, discard: bool = False) -> None:
-        """Opens the map that another program changed and applies the unsaved edits to it (see Editor.reopen)."""
+    def reopen(self) -> None:
+        """Opens the map that another program changed; unsaved edits are dropped."""
         with self._lock:
-            self.editor.reopen(discard)
+            self.editor.reopen()
             self.views = self._views()
             self.edited()
 

@@ -9,7 +9,7 @@ import pytest
 
 from perception.boxes import instance_boxes, oriented_box
 from perception.errors import InputError
-from perception.export.formats import write_boxes, write_export, write_scannet, write_split
+from perception.export.formats import write_export, write_scannet
 from perception.export.transfer import ExportOptions, check_overlap, export_labels
 from perception.io.cloud import read_cloud, write_cloud
 from perception.types import PointCloud
@@ -113,31 +113,12 @@ def test_the_box_of_a_turned_brick_is_the_brick(turn):
     assert (np.abs(local) <= box.extent / 2 + 1e-9).all()
 
 
-def test_boxes_of_flat_lone_and_non_finite_instances(tmp_path):
+def test_boxes_of_flat_lone_and_non_finite_instances():
     points = np.array([[1, 2, 3], [0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0.5, 0.5, 0], [np.nan, 0, 0]])
     labels = np.array([4, 2, 2, 2, 2, 2, 2], np.int32)
     boxes = instance_boxes(points, labels)
     assert boxes[4]["obb"]["extent"] == [0, 0, 0] and boxes[4]["centroid"] == [1, 2, 3]
     assert sorted(boxes[2]["obb"]["extent"]) == pytest.approx([0, 1, 1]) and boxes[2]["num_points"] == 5
-    written = write_boxes(tmp_path / "b.json", points, labels, {4: {"score": 0.1, "label": "x"}}, metric=True)
-    assert json.loads((tmp_path / "b.json").read_text()) == written
-    assert [row["id"] for row in written["boxes"]] == [2, 4]
-
-
-def test_split_covers_the_labelled_points_in_order(tmp_path):
-    cloud, labels = scene()
-    cloud.faces = np.array([[0, 1, 2], np.flatnonzero(labels == 1)[:3]], np.int32)
-    paths = write_split(tmp_path / "parts", cloud, labels)
-    assert [p.name for p in paths] == ["0.ply", "1.ply", "2.ply"]
-    for path in paths:
-        part = read_cloud(path)
-        np.testing.assert_array_equal(part.points, cloud.points[labels == int(path.stem)])
-    assert read_cloud(paths[1]).faces.tolist() == [[0, 1, 2]]
-    (tmp_path / "parts" / "7.ply").touch()  # of an older split, which is replaced as a whole
-    assert write_split(tmp_path / "parts", cloud, labels) == paths == sorted((tmp_path / "parts").iterdir())
-    (tmp_path / "parts" / "notes.txt").touch()
-    with pytest.raises(InputError, match=r"holds notes\.txt"):
-        write_split(tmp_path / "parts", cloud, labels)
 
 
 def test_scannet_submission_layout(tmp_path):

@@ -167,20 +167,16 @@ def _cloud() -> Target:
         "faces": np.zeros((1, 3), np.int64),
         "instance_id": np.arange(2),
     }
-    packed = bytes([31]) + bytes(32) + bytes([0xE0, 13, 31]) + bytes([6]) + bytes(7)  # 32 zeros, 22 again, then 7 more
-    packed = bytes([31]) + bytes(32) + bytes([0xE0, 23, 31])
     seeds = [
         ("a.ply", same, _vertices()),
         ("a.ply", same, _vertices("ascii")),
         ("a.ply", same, _RAGGED),
         ("a.pcd", same, _PCD + b"DATA ascii\n0 1 2 255 4 5 6 7\nnan 1 2 3 4 5 6 7\n"),
         ("a.pcd", same, _PCD + b"DATA binary\n" + bytes(64)),
-        ("a.pcd", same, _PCD + b"DATA binary_compressed\n" + struct.pack("<II", len(packed), 64) + packed),
         ("a.npz", same, archive_of({f"{k}.npy": npy(v) for k, v in arrays.items()})),
         *(("a.npz", member(name, arrays), npy(value)) for name, value in arrays.items()),
         ("a.xyz", same, b"# x y z r g b\n0 1 2 3 4 255\n1;2;3;255;0;0\n"),
         ("a.pts", same, b"2\n0 1 2 9 3 4 255 0 0 1\n1 2 3 9 255 0 0 0 0 1\n"),
-        ("a.obj", same, b"v 0 1 2 0.5 1 0\nv 1 2 3 1 1 1\nv 1 2 4 1 1 1\nvn 0 0 1\nf 1/1 2/1 -1\nf 1 2 3 1\n"),
     ]
 
     def read(folder: Path, name: str) -> None:
@@ -192,7 +188,7 @@ def _cloud() -> Target:
         assert all(v.shape == (len(cloud.points),) and v.dtype == np.int32 for v in cloud.labels.values())
 
     words = ["element", "property", "list", "vertex", "face", "double", "uchar", "int", "ascii", "binary_big_endian"]
-    words += ["COUNT", "POINTS", "WIDTH", "DATA", "binary_compressed", "FIELDS", "4294967295", "-1", "nan", "1e400"]
+    words += ["COUNT", "POINTS", "WIDTH", "DATA", "binary", "FIELDS", "4294967295", "-1", "nan", "1e400"]
     return Target(read, {}, seeds, words)
 
 

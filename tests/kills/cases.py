@@ -163,13 +163,13 @@ class Exporting(Case):
             (place / "out").mkdir()
 
     def work(self, place: Path, trial: int) -> int:
-        return self.export(place, "--split", place / "out" / "split") if trial % 2 == 0 else self.export(place)
+        return self.export(place)
 
-    def export(self, place: Path, *more: object) -> int:
+    def export(self, place: Path) -> int:
         """One export into the folder `out`; the exit code."""
         out = place / "out"
         words = ["export", place / "m.gsmap", "--points", self.cloud, "-o", out / "cloud.ply", "--color", "instance"]
-        return command(*words, "--boxes", out / "boxes.json", "--scannet", out / "scannet", *more)
+        return command(*words, "--scannet", out / "scannet")
 
     def after_kill(self, place: Path, trial: int) -> str:
         assert tree(place / "m.gsmap") == tree(self.gmap), "the exported map changed"
@@ -178,8 +178,6 @@ class Exporting(Case):
         wrong = [name for name, digest in here.items() if digest not in (whole.get(name), old.get(name))]
         assert not wrong, f"neither the old file nor the new one: {wrong}"
         assert not [name for name in old if name not in here], "a file of the older export is gone"
-        split = [name for name in here if name.startswith("split")]
-        assert not split or len(split) == sum(name.startswith("split") for name in whole), "half of a split"
         if here.get("cloud.ply") == whole["cloud.ply"]:
             assert here == whole, "the cloud, written last, lies there before the rest does"
         return "all files" if here == whole else "not all files"

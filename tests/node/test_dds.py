@@ -20,16 +20,16 @@ import pytest
 from perception import load_map
 from perception.errors import InputError
 from support.node_maps import encoders, write_small_map
-from support.paths import SUPPORT
+from support.paths import REPOSITORY, SUPPORT
 
 pytest.importorskip("cyclonedds")
 pytest.importorskip("rosbags")
 
 from perception.io.cdr import deserialize, serialize
 from perception.node import channels
-from perception.node.client import NodeClient, cloud_rows
 from perception.node.config import NodeConfig, node_config
 from perception.node.participant import Participant
+from support.node_client import NodeClient, cloud_rows
 
 DOMAIN = 20 + os.getpid() % 200
 LABELS = ["red mug", "laptop", "banana", "Kühlschrank"]
@@ -347,6 +347,14 @@ def test_bad_settings_name_themselves() -> None:
     for key, value in (("namespace", "a b"), ("transport", "carrier pigeon"), ("domain", 300), ("timeout", 0)):
         with pytest.raises(InputError, match=key):
             node_config({key: value})
+
+
+def test_the_example_gets_an_answer(asker: NodeClient) -> None:
+    env = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    command = [sys.executable, str(REPOSITORY / "examples" / "ask_a_node.py"), "laptop", "steady"]
+    ended = subprocess.run(command, env=env, capture_output=True, text=True, timeout=WAIT, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert json.loads(ended.stdout)["hits"] == asker.query(["laptop"], WAIT)[0]["hits"]
 
 
 def test_json_of_answers_is_plain(asker: NodeClient) -> None:

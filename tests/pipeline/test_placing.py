@@ -53,14 +53,12 @@ def test_a_known_transform_places_the_scan_which_keeps_its_frame(path: Path, tmp
         str(tmp_path / "out.ply"),
         "--no-smooth",
     ]
-    assert main([*words, "--transform", str(tmp_path / "place"), "--boxes", str(tmp_path / "b.json")]) == 0
+    assert main([*words, "--transform", str(tmp_path / "place")]) == 0
     out = read_cloud(tmp_path / "out.ply")
     np.testing.assert_array_equal(out.points, points)
     held = gmap.instance_ids >= 0
     assert (out.labels["instance_id"] == gmap.instance_ids)[held].all()
     np.testing.assert_allclose(json.loads((tmp_path / "out.json").read_text())["map_from_scan"], rows)
-    boxes = json.loads((tmp_path / "b.json").read_text())
-    assert boxes["frame"] == "scan" and boxes["metric"] is False
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from perception.io.scene_cache import save_scene
 from perception.io.store import read_map, set_labels, verify_map, write_map
 from perception.masks.label_images import write_labels
 from perception.pipeline.checkpoint import save_checkpoint
-from perception.pipeline.exporting import Outputs, export_map
+from perception.pipeline.exporting import export_map
 from perception.types import Scene
 
 DONE = "done"
@@ -38,12 +38,11 @@ def writers(disk: Path) -> dict[str, Callable[[], Any]]:
     edited.rename(gmap.instances[1]["id"], "renamed")
     scene = Scene([], np.zeros((3000, 3)), np.zeros((3000, 3), np.uint8), False, "f", {"left_out": ["x" * 9000]})
     state = {"values": torch.arange(20_000)}
-    outputs = Outputs(split=disk / "split", boxes=disk / "boxes.json", scannet=disk / "scannet")
     return {
         "write_map": lambda: write_map(path, gmap),
         "labels": lambda: set_labels(path, {gmap.instances[0]["id"]: "a name"}),
         "editor": edited.save,
-        "export": lambda: export_map(path, disk / "out.ply", None, ExportOptions(), outputs),
+        "export": lambda: export_map(path, disk / "out.ply", None, ExportOptions(), scannet=disk / "scannet"),
         "checkpoint": lambda: save_checkpoint(disk / "checkpoint.pt", state, "mark"),
         "scene": lambda: save_scene(disk / "scene", scene),
         "masks": lambda: write_labels(disk / "m.png", np.random.default_rng(0).integers(0, 9, (200, 200))),

@@ -1,4 +1,4 @@
-"""A Python client of the node without ROS 2: queries over DDS, by topic or by service."""
+"""A client of the node for its tests, without ROS 2: queries over DDS, by topic or by service."""
 
 from __future__ import annotations
 
