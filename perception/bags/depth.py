@@ -68,11 +68,11 @@ def decode_depth(message: Any, where: str) -> np.ndarray:
     if hasattr(message, "encoding"):
         image = _raw(message, kind, where)
     elif _COMPRESSED in kind:
-        image = _compressed(bytes(message.data), kind, where)
+        image = _compressed(bytes(message.data), kind)
     else:
         image = cv2.imdecode(np.frombuffer(bytes(message.data) or b"\0", np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 2:
-        raise InputError(f"{where}: a depth image of format '{kind}' cannot be decoded; expected png or rvl")
+        raise InputError(f"{where}: a depth image of format '{kind}' cannot be decoded; expected png")
     metres = image.astype(np.float32) / (np.float32(1) if image.dtype.kind == "f" else np.float32(MILLIMETRES))
     metres[~np.isfinite(metres) | (metres < 0) | ((image == 65535) & (image.dtype == np.uint16))] = 0
     return metres
@@ -90,49 +90,16 @@ def _raw(message: Any, kind: str, where: str) -> np.ndarray:
     return np.asarray(rows.view(dtype))
 
 
-def _compressed(data: bytes, kind: str, where: str) -> np.ndarray | None:
-    """ROS's compressedDepth: a header (int32, float a, float b), then PNG or RVL; 32FC1 stores v = a / depth + b."""
+def _compressed(data: bytes, kind: str) -> np.ndarray | None:
+    """ROS's compressedDepth: a header (int32, float a, float b), then PNG; 32FC1 stores v = a / depth + b."""
     if len(data) <= _HEADER:
         return None
     _, a, b = struct.unpack("<iff", data[:_HEADER])
-    image: np.ndarray | None
-    if "rvl" in kind.lower():
-        image = _rvl(data[_HEADER:], where)
-    else:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8, offset=_HEADER), cv2.IMREAD_UNCHANGED)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8, offset=_HEADER), cv2.IMREAD_UNCHANGED)
     if image is None or not kind.startswith("32FC1"):
         return image
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(image > 0, a / (image.astype(np.float32) - b), 0).astype(np.float32)
-
-
-def _rvl(data: bytes, where: str) -> np.ndarray:
-    """Wilson 2017, "Fast Lossless Depth Image Compression": runs of zeros and of differences, in nibbles of 3 bits."""
-    width, height = struct.unpack("<ii", data[:8])
-    if not 0 < width * height <= 1 << 26:
-        raise InputError(f"{where}: an RVL image of {width}x{height} pixels")
-    words = np.frombuffer(data[8 : 8 + (len(data) - 8) // 4 * 4], "<u4")
-    nibbles = iter(((words[:, None] >> np.arange(28, -1, -4)) & 15).ravel().tolist())
-
-    def number() -> int:
-        value = shift = 0
-        for nibble in nibbles:
-            value |= (nibble & 7) << shift
-            shift += 3
-            if nibble < 8:
-                return value
-        raise InputError(f"{where}: an RVL image ends early")
-
-    image, at, last = np.zeros(width * height, np.int64), 0, 0
-    while at < len(image):
-        at += number()
-        for _ in range(number()):
-            delta = number()
-            last += (delta >> 1) ^ -(delta & 1)
-            if at >= len(image):
-                raise InputError(f"{where}: an RVL image holds more than {width}x{height} pixels")
-            image[at], at = last, at + 1
-    return image.astype(np.uint16).reshape(height, width)
 
 
 def registered(depth: np.ndarray, own: Lens, color: Lens, color_from_depth: np.ndarray) -> np.ndarray:

@@ -8,15 +8,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from perception.calibration.board import Board, Detection
 from perception.calibration.judge import check_count, check_solution, coverage, distinct_views, tilt_spread
-from perception.calibration.pictures import draw_coverage, draw_detection, read_pictures
+from perception.calibration.pictures import read_pictures
 from perception.calibration.solve import NAMES, Solution, solve
 from perception.errors import InputError
-from perception.io.atomic import atomic_directory, atomic_file
+from perception.io.atomic import atomic_file
 from perception.io.camera_file import write_camera
 
 MODELS = ("auto", "pinhole", "fisheye")
@@ -29,14 +28,12 @@ def run_calibration(
     output: Path,
     board: Board,
     model: str = "auto",
-    pictures: Path | None = None,
     log: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, Any], str]:
     """Calibrates a camera from a folder of photos or a video of a board: (JSON-serialisable result, table).
 
-    Writes `output` (ROS camera_info YAML) and next to it a .json with all figures. Draws detections and coverage into
-    `pictures`. Photos are rotated according to EXIF, as in mapping. Raises InputError if no board is found, or if the
-    views are too few or too similar.
+    Writes `output` (ROS camera_info YAML) and next to it a .json with all figures. Photos are rotated according to EXIF,
+    as in mapping. Raises InputError if no board is found, or if the views are too few or too similar.
     """
     if model not in MODELS:
         raise InputError(f"--model is '{model}'; expected one of {', '.join(MODELS)}")
@@ -49,9 +46,6 @@ def run_calibration(
     solution = best_model(views, size, model)
     notes = check_solution(solution, str(source))
     result = _facts(solution, looked_at, len(found), board, notes)
-    if pictures is not None:
-        _write_pictures(pictures, source, solution)
-        result["pictures"] = str(pictures)
     write_camera(output, output.stem, solution.model, solution.size, solution.values)
     with atomic_file(output.with_suffix(".json")) as aside:
         aside.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
@@ -113,15 +107,6 @@ def _facts(solution: Solution, looked_at: int, found: int, board: Board, notes: 
         "tilt_spread_degrees": tilt_spread(solution),
         "warnings": notes,
     }
-
-
-def _write_pictures(folder: Path, source: Path, solution: Solution) -> None:
-    wanted = {view.name: (view, residuals) for view, residuals in zip(solution.views, solution.residuals, strict=True)}
-    with atomic_directory(folder) as aside:
-        for name, picture in read_pictures(source):
-            if name in wanted:
-                cv2.imwrite(str(aside / f"{Path(name).stem}.png"), draw_detection(picture, *wanted[name]))
-        cv2.imwrite(str(aside / "coverage.png"), draw_coverage(solution))
 
 
 def _table(result: dict[str, Any]) -> str:

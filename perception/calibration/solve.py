@@ -106,11 +106,12 @@ def _solved(model: str, views: Sequence[Detection], size: tuple[int, int], free:
     if model == "fisheye":
         K, distortion, turns, shifts = _fisheye(views, size)
     else:
-        points, pixels = ([np.float32(a) for a in each] for each in zip(*((v.board_points, v.pixels) for v in views)))
-        flags = 0 if free[8] else cv2.CALIB_FIX_K3
-        _, K, distortion, turns, shifts = cv2.calibrateCamera(
-            points, pixels, size, None, None, None, None, flags, _STOP
+        points, pixels = (
+            [np.asarray(getattr(v, name), np.float32) for v in views] for name in ("board_points", "pixels")
         )
+        flags = 0 if free[8] else cv2.CALIB_FIX_K3
+        found = cv2.calibrateCamera(points, pixels, size, None, None, None, None, flags, _STOP)  # type: ignore[call-overload]
+        K, distortion, turns, shifts = found[1:]
     values = np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], np.ravel(distortion)[: len(free) - 4]])
     poses = np.hstack([np.reshape(turns, (-1, 3)), np.reshape(shifts, (-1, 3))])
     residuals, normal = _linearised(model, views, values, poses, free)
@@ -124,7 +125,7 @@ def _solved(model: str, views: Sequence[Detection], size: tuple[int, int], free:
 
 
 def _fisheye(views: Sequence[Detection], size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, Any, Any]:
-    """(K, k1..k4, rotation vectors, translations); OpenCV finds no first focal length for this model: some are tried."""
+    """(K, k1..k4, rotation vectors, translations); OpenCV needs a first focal length for this: some are tried."""
     points = [np.asarray(view.board_points, np.float64)[None] for view in views]
     pixels = [np.asarray(view.pixels, np.float64)[None] for view in views]
     found: list[tuple[float, Any]] = []

@@ -26,7 +26,6 @@ def _add_calibrate(commands: Any) -> None:
     p.add_argument("--marker", type=float, metavar="M", help="side of a marker (default 3/4 of the square)")
     p.add_argument("--dictionary", default="5X5_100", help="of the markers, as OpenCV names it")
     p.add_argument("--model", choices=("auto", "pinhole", "fisheye"), default="auto")
-    p.add_argument("--pictures", type=Path, metavar="DIR", help="detections (default: beside the camera file)")
 
 
 def _calibrate(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -37,8 +36,7 @@ def _calibrate(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         raise InputError(f"--squares is '{args.squares}'; expected columns x rows of squares, such as 8x11")
     marker = args.marker if args.marker is not None else 0.75 * args.square
     board = Board(args.board, (int(words[0]), int(words[1])), args.square, marker, args.dictionary)
-    pictures = args.pictures or args.output.with_name(f"{args.output.stem}_detections")
-    return run_calibration(args.input, args.output, board, args.model, pictures)
+    return run_calibration(args.input, args.output, board, args.model)
 
 
 def _add_frames(commands: Any) -> None:

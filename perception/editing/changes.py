@@ -6,22 +6,6 @@ import numpy as np
 
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
 
-FLOATER_SPREAD = 5.0
-"""A Gaussian is a floater when the logarithm of its mean distance to its neighbours exceeds the map's median by this
-many robust deviations. As in statistical outlier removal (Rusu et al. 2008), but without its normal model."""
-NEIGHBORS = 8
-
-
-def isolated(means: np.ndarray) -> np.ndarray:
-    """[N] bool: points [N, 3] whose mean distance to their NEIGHBORS nearest is an outlier (see FLOATER_SPREAD)."""
-    from scipy.spatial import cKDTree
-
-    distance, _ = cKDTree(means).query(means, k=NEIGHBORS + 1, workers=-1)
-    level = np.log(np.maximum(distance[:, 1:].mean(axis=1), 1e-12))
-    middle = np.median(level)
-    spread = 1.4826 * np.median(np.abs(level - middle))  # the standard deviation, for a normal distribution
-    return np.asarray(level > middle + FLOATER_SPREAD * max(spread, 1e-3))
-
 
 def nearest_filled(means: np.ndarray, ids: np.ndarray) -> np.ndarray:
     """ids [N] with −1 replaced by the id of the nearest point that has one."""

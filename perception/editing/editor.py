@@ -1,4 +1,4 @@
-"""Manual corrections of a map: rename, hide, merge, split, remove, delete floaters; with undo, redo and save.
+"""Manual corrections of a map: rename, hide, merge, split, remove; with undo, redo and save.
 
 An `Editor` holds one opened map. Edits change memory only; `save` writes the whole map to a new place and swaps it in.
 Thread-safe: each edit is one step under a lock, so it is applied completely or not at all. A map that another program
@@ -19,9 +19,9 @@ import numpy as np
 
 from perception.boxes import oriented_box
 from perception.config import InstanceConfig
-from perception.editing.changes import NEIGHBORS, described, isolated, joined, nearest_filled
+from perception.editing.changes import described, joined, nearest_filled
 from perception.errors import InputError
-from perception.io.map import GAUSSIANS, Map
+from perception.io.map import Map
 from perception.io.map_lock import writing
 from perception.io.store import map_signature, read_info, read_map, write_map
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
@@ -37,7 +37,6 @@ class _State:
 
     what: str
     ids: np.ndarray
-    kept: np.ndarray
     instances: tuple[dict[str, Any], ...]
     descriptions: tuple[InstanceDescription, ...]
 
@@ -62,8 +61,7 @@ class Editor:
         self.original = read_map(self.path)
         gmap = self.original
         descriptions, self._encoder = from_arrays(gmap.language) if gmap.language else ([], "")
-        kept = np.ones(len(gmap), bool)
-        self._past = [_State("opened", gmap.instance_ids, kept, tuple(gmap.instances), tuple(descriptions))]
+        self._past = [_State("opened", gmap.instance_ids, tuple(gmap.instances), tuple(descriptions))]
         self._future: list[_State] = []
         self._saved = self._past[0]
 
@@ -91,11 +89,6 @@ class Editor:
         return np.full(len(self.ids), -1) if ids is None else np.where(np.isin(ids, known), ids, -1)
 
     @property
-    def kept(self) -> np.ndarray:
-        """[N] bool: Gaussians that are not deleted."""
-        return self._now.kept
-
-    @property
     def dirty(self) -> bool:
         """Whether there are unsaved edits."""
         return self._now is not self._saved
@@ -117,14 +110,15 @@ class Editor:
 
     @_step
     def current(self) -> Map:
-        """The edited map, without deleted Gaussians."""
-        now, kept = self._now, self._now.kept
-        arrays: dict[str, Any] = {name: getattr(self.original, name)[kept] for name in GAUSSIANS}
-        arrays["instance_ids"] = now.ids[kept]
-        arrays["membership"] = np.where(now.ids[kept] >= 0, self.original.membership[kept], 0).astype(np.float32)
-        language = to_arrays(now.descriptions, self._encoder) if self._encoder else {}
+        """The edited map."""
+        now = self._now
         return dataclasses.replace(
-            self.original, **arrays, instances=list(now.instances), language=language, parts=self._parts_now()
+            self.original,
+            instance_ids=now.ids,
+            membership=np.where(now.ids >= 0, self.original.membership, 0).astype(np.float32),
+            instances=list(now.instances),
+            language=to_arrays(now.descriptions, self._encoder) if self._encoder else {},
+            parts=self._parts_now(),
         )
 
     def _parts_now(self) -> dict[str, np.ndarray]:
@@ -134,7 +128,7 @@ class Editor:
             return parts
         known = [part["id"] for entry in self._now.instances for part in entry.get("parts", [])]
         alive = np.isin(np.unique(parts["ids"][parts["ids"] >= 0]), known)
-        ids = np.where(np.isin(parts["ids"], known), parts["ids"], -1)[self._now.kept].astype(np.int32)
+        ids = np.where(np.isin(parts["ids"], known), parts["ids"], -1).astype(np.int32)
         return described({**parts, "ids": ids}, alive)
 
     # ------------------------------------------------------------------ editing
@@ -188,7 +182,7 @@ class Editor:
         clustered by their features again, with finer settings.
         """
         place = self._place(instance)
-        rows = np.flatnonzero((self.ids == instance) & self.kept)
+        rows = np.flatnonzero(self.ids == instance)
         gmap = self.original
         found = self._parts_of(self.instances[place], rows)
         if found.max(initial=-1) < 1:
@@ -208,34 +202,6 @@ class Editor:
         place = self._place(instance)
         ids = np.where(self.ids == instance, -1, self.ids).astype(np.int32)
         self._replace(f"removed {instance}", [place], ids, [], joined)
-
-    @_step
-    def delete_floaters(self) -> int:
-        """Deletes isolated Gaussians (see `isolated`); returns how many. Instances left empty are removed."""
-        rows = np.flatnonzero(self.kept)
-        if len(rows) <= NEIGHBORS:
-            return 0
-        alone = rows[isolated(self.original.means[rows])]
-        if len(alone) == 0:
-            return 0
-        kept = self.kept.copy()
-        kept[alone] = False
-        touched = set(np.unique(self.ids[alone]).tolist()) - {-1}
-        places = [i for i, entry in enumerate(self.instances) if entry["id"] in touched]
-        entries, descriptions = list(self.instances), list(self._now.descriptions)
-        for place in reversed(places):
-            entry = entries[place]
-            if not ((self.ids == entry["id"]) & kept).any():
-                del entries[place]
-                if descriptions:
-                    del descriptions[place]
-                continue
-            shape = self._entry(entry["id"], np.where(kept, self.ids, -1), entry.get("label"), entry["score"])
-            entries[place] = {**entry, **shape}
-        self._push(
-            f"deleted {len(alone)} floaters", kept=kept, instances=tuple(entries), descriptions=tuple(descriptions)
-        )
-        return len(alone)
 
     @_step
     def undo(self) -> str | None:
@@ -299,7 +265,7 @@ class Editor:
         return 1 + max((e["id"] for entry in entries for e in (entry, *entry.get("parts", []))), default=-1)
 
     def _entry(self, instance: int, ids: np.ndarray, label: str | None, score: float) -> dict[str, Any]:
-        rows = (ids == instance) & self.kept
+        rows = ids == instance
         points = self.original.means[rows].astype(np.float64)
         weights = self.original.opacities[rows].astype(np.float64)
         return {

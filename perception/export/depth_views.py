@@ -11,10 +11,9 @@ import torch
 
 from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
+from perception.io.depth import without_edges
+from perception.io.photos import scaled_K, scaled_size
 from perception.types import View
-
-JUMP = 0.05
-"""A depth that differs from a neighbouring pixel's by more than this share belongs to an edge and is left out."""
 
 
 @dataclass(frozen=True)
@@ -62,32 +61,15 @@ def depth_views(gaussians: Gaussians, views: Sequence[View], long_side: int = 64
     most `long_side` pixels."""
     found = []
     for view in views:
-        width, height, K = _scaled(view, long_side)
+        width, height = scaled_size(view, long_side)
+        K = scaled_K(view, width, height)
         pose = np.asarray(view.camera_from_world, np.float64)
         camera, intrinsics = (torch.from_numpy(array.astype(np.float32)) for array in (pose, K))
         out = render(gaussians, camera, intrinsics, width, height)
         alpha = out.alphas[0].numpy()
         depth = np.where(alpha > 0.5, out.depths[0].numpy() / np.maximum(alpha, 1e-6), 0).astype(np.float32)
-        found.append(DepthView(pose, K, _without_edges(depth), out.colors[0].clamp(0, 1).numpy()))
+        found.append(DepthView(pose, K, without_edges(depth), out.colors[0].clamp(0, 1).numpy()))
     return found
-
-
-def _scaled(view: View, long_side: int) -> tuple[int, int, np.ndarray]:
-    share = min(1.0, long_side / max(view.width, view.height))
-    width, height = max(round(view.width * share), 1), max(round(view.height * share), 1)
-    return width, height, np.diag([width / view.width, height / view.height, 1.0]) @ view.K
-
-
-def _without_edges(depth: np.ndarray) -> np.ndarray:
-    kept = np.ones(depth.shape, bool)
-    for axis in (0, 1):
-        step = np.abs(np.diff(depth, axis=axis))
-        low = np.take(depth, range(depth.shape[axis] - 1), axis)
-        jump = step > JUMP * np.maximum(low, 1e-12)
-        first, second = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),)
-        kept[first] &= ~jump
-        kept[second] &= ~jump
-    return np.where(kept, depth, 0).astype(np.float32)
 
 
 def observe(

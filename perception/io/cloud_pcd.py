@@ -88,7 +88,7 @@ def _from_ascii(data: bytes, dtype: np.dtype, points: int, path: Path) -> np.nda
 
 def write_pcd(path: Path, columns: dict[str, np.ndarray]) -> None:
     """Binary PCD 0.7 of named columns [P]."""
-    rows = np.rec.fromarrays(list(columns.values()), names=list(columns))
+    rows = np.rec.fromarrays(list(columns.values()), names=list(columns))  # type: ignore[call-overload]
     kinds = [rows.dtype[name] for name in columns]
     header = (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"

@@ -1,8 +1,8 @@
-"""Small inline SVG charts: line charts and bar charts. The page's style sheet sets the colours; text is escaped."""
+"""Small inline SVG line charts. The page's style sheet sets the colours; text is escaped."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from markupsafe import Markup
@@ -54,28 +54,6 @@ def curve(points: Sequence[tuple[float, float]], label: str, unit: str = "") -> 
     end = Markup('<circle class="dot" cx="{:.1f}" cy="{:.1f}" r="4"/>')
     parts.append(end.format(across(kept[-1, 0]), up(kept[-1, 1])))
     return _svg(f"{label}: {short(kept[-1, 1])} {unit}".rstrip() + " at the end", parts)
-
-
-def columns(values: Mapping[str, float], label: str, unit: str) -> Markup:
-    """A bar per name, with the name below if there is room, and the mean. Non-finite values are left out."""
-    kept = {name: value for name, value in values.items() if np.isfinite(value)}
-    if not kept:
-        return Markup()
-    high, mean = max(*kept.values(), 1e-9), float(np.mean(list(kept.values())))
-    up, pitch = _scale(0, high, BASE, TOP), (RIGHT - LEFT) / len(kept)
-    stems = [name.rsplit("/", 1)[-1].rsplit(".", 1)[0] for name in kept]
-    rect = Markup('<rect class="bar" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" rx="2">')
-    title = Markup("<title>{}: {:.3g} {}</title></rect>")
-    parts = [_gridline(up(y), short(y)) for y in ticks(0, high)]
-    for i, (name, value) in enumerate(kept.items()):
-        top = up(max(value, 0))
-        parts.append(rect.format(LEFT + (i + 0.15) * pitch, top, 0.7 * pitch, BASE - top))
-        parts.append(title.format(name, value, unit))
-        if 6 * max(map(len, stems)) <= pitch:
-            parts.append(_text(LEFT + (i + 0.5) * pitch, HEIGHT - 7, "middle", stems[i]))
-    line = Markup('<line class="mean" x1="{}" x2="{}" y1="{:.1f}" y2="{:.1f}"/>')
-    parts.append(line.format(LEFT, RIGHT, up(mean), up(mean)))
-    return _svg(f"{label}, mean {mean:.3g} {unit}", parts)
 
 
 def _scale(low: float, high: float, start: float, end: float) -> Callable[[float], float]:

@@ -17,7 +17,7 @@ from markupsafe import Markup
 from perception.colors import instance_palette
 from perception.io.atomic import atomic_file
 from perception.pictures import error_map
-from perception.report.charts import clock, columns, curve
+from perception.report.charts import clock, curve
 
 LIMIT = 3_000_000  # maximum size of the page in bytes
 SIZES = ((460, 82), (360, 74), (260, 66), (180, 55), (120, 45))  # (longest side, JPEG quality), tried in this order
@@ -157,14 +157,10 @@ def _views(views: Sequence[ViewRow]) -> list[dict[str, np.ndarray]]:
 
 
 def _charts(data: ReportData) -> dict[str, Markup]:
-    psnr = {view.name: view.psnr for view in data.views if view.psnr is not None}
-    ssim = {view.name: view.ssim for view in data.views if view.ssim is not None}
     charts = {
         "PSNR over iterations (dB)": curve(data.psnr_curve, "PSNR over iterations", "dB"),
         "SSIM over iterations": curve(data.ssim_curve, "SSIM over iterations"),
         "Gaussians over iterations": curve(data.gaussians_curve, "Gaussians over iterations"),
-        "PSNR by view (dB; dashed: mean)": columns(psnr, "PSNR of each held-out view", "dB"),
-        "SSIM by view (dashed: mean)": columns(ssim, "SSIM of each held-out view", ""),
     }
     return {title: svg for title, svg in charts.items() if svg}
 

@@ -22,9 +22,6 @@ from perception.viewer.panel import Panel
 from perception.viewer.session import Session
 from perception.viewer.splats import Splats
 
-FRUSTUM_PHOTO = 96
-"""Pixels of the longer side of the photo drawn in a camera frustum."""
-
 FIRST_LOOK = 1.0
 """Seconds between the coarse picture in a new browser and the whole map."""
 WATCH = 1.0
@@ -50,7 +47,7 @@ class Viewer:
         self.address = f"http://{shown}:{sock.getsockname()[1]}"
         self.url = f"{self.address}/?token={quote(token, safe='')}"
         self._one = threading.RLock()  # the actions of all browsers run one at a time
-        self._overlays: dict[str, list[Any]] = {"cameras": [], "boxes": [], "names": []}
+        self._overlays: dict[str, list[Any]] = {"boxes": [], "names": []}
         self._overlays_on = dict.fromkeys(self._overlays, False)
         self._frame_map()
         self._drawn = self.session.editor.original
@@ -100,8 +97,7 @@ class Viewer:
     def _show(self, client: Any) -> None:
         if client.client_id not in self.server.get_clients():
             return  # it disconnected in the meantime
-        camera = self._camera_of(client) if self.session.mode == "depth" else None
-        self._splats.show(client, self.session.colors(camera), self.session.opacities())
+        self._splats.show(client, self.session.colors(), self.session.opacities())
 
     def redraw(self) -> None:
         """Sends colours and opacities to every browser, in one message each, and redraws the visible overlays."""
@@ -116,11 +112,11 @@ class Viewer:
             for client in clients:
                 self._show(client)
             for kind, on in self._overlays_on.items():
-                if on and kind != "cameras":
+                if on:
                     self._draw(kind)
 
     def overlay(self, kind: str, on: bool) -> None:
-        """Shows or hides "cameras", "boxes" or "names"."""
+        """Shows or hides "boxes" or "names"."""
         with self._one:
             self._overlays_on[kind] = on
             self._draw(kind)
@@ -128,7 +124,7 @@ class Viewer:
     def _draw(self, kind: str) -> None:
         for handle in self._overlays[kind]:
             handle.remove()
-        draw = {"cameras": self._cameras, "boxes": self._boxes, "names": self._names}[kind]
+        draw = {"boxes": self._boxes, "names": self._names}[kind]
         self._overlays[kind] = draw() if self._overlays_on[kind] else []
 
     def _visible_entries(self) -> list[dict[str, Any]]:
@@ -165,44 +161,7 @@ class Viewer:
             for entry in self._visible_entries()
         ]
 
-    def _cameras(self) -> list[Any]:
-        from scipy.spatial.transform import Rotation
-
-        from perception.io.photos import load_photo
-        from perception.query.crops import readable_view
-
-        handles = []
-        centres = [-v.camera_from_world[:3, :3].T @ v.camera_from_world[:3, 3] for v in self.session.views.values()]
-        spread = float(np.ptp(np.array(centres), axis=0).max()) if centres else 1.0
-        for view, centre in zip(self.session.views.values(), centres, strict=True):
-            try:
-                gmap, folders = self.session.editor.original, self.session.folders
-                image = load_photo(readable_view(gmap, view, folders), FRUSTUM_PHOTO)
-            except InputError:  # the photo has moved: the frustum is drawn without it
-                image = None
-            wxyz = Rotation.from_matrix(view.camera_from_world[:3, :3].T).as_quat()[[3, 0, 1, 2]]
-            handles.append(
-                self.server.scene.add_camera_frustum(
-                    f"/map/cameras/{view.name}",
-                    fov=2 * float(np.arctan(view.height / 2 / view.K[1, 1])),
-                    aspect=view.width / view.height,
-                    scale=max(0.03 * spread, 1e-6) * self.scale,
-                    image=image,
-                    wxyz=tuple(wxyz),
-                    position=tuple(centre * self.scale),
-                )
-            )
-        return handles
-
     # ------------------------------------------------------------------- events
-
-    def _camera_of(self, client: Any) -> np.ndarray:
-        from perception.geometry import rotation_from_quaternion
-
-        pose = np.eye(4)
-        pose[:3, :3] = rotation_from_quaternion(np.array(client.camera.wxyz)).T
-        pose[:3, 3] = -pose[:3, :3] @ (np.array(client.camera.position) / self.scale)
-        return pose
 
     def _clicked(self, event: Any, add: bool) -> None:
         origin, direction = np.array(event.ray_origin) / self.scale, np.array(event.ray_direction)

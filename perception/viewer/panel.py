@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from perception.query.hit import printed_texts
 from perception.viewer.paint import MODES
-from perception.viewer.session import Session, selection_ply
+from perception.viewer.session import Session
 
 
 class Page(Protocol):
@@ -25,7 +25,7 @@ class Page(Protocol):
         """Sends colours and opacities anew."""
 
     def overlay(self, kind: str, on: bool) -> None:
-        """Shows or hides "cameras", "boxes" or "names"."""
+        """Shows or hides "boxes" or "names"."""
 
 
 def escaped(text: str) -> str:
@@ -72,7 +72,7 @@ class Panel:
     def _build_show(self) -> None:
         with self.gui.add_folder("Show"):
             mode = self.gui.add_dropdown("colours", MODES, initial_value=self.session.mode)
-            boxes = [(kind, self.gui.add_checkbox(kind, False)) for kind in ("boxes", "names", "cameras")]
+            boxes = [(kind, self.gui.add_checkbox(kind, False)) for kind in ("boxes", "names")]
             clear = self.gui.add_button("Clear selection")
 
         def choose(_: Any) -> None:
@@ -108,13 +108,11 @@ class Panel:
                     "Remove": lambda: editor.remove(session.chosen()),
                 },
             )
-            export = self.gui.add_button("Download points (PLY)")
         form.on_submit(
             lambda event: self.viewer.guarded(
                 lambda: editor.rename(session.chosen(), self._name.value), event.client, edited=True
             )
         )
-        export.on_click(lambda event: self.viewer.guarded(lambda: self._export(event.client), event.client))
 
     def _actions(self, label: str, actions: dict[str, Callable[[], object]]) -> None:
         """A row of buttons, each an edit."""
@@ -125,7 +123,7 @@ class Panel:
         session, editor = self.session, self.session.editor
         with self.gui.add_folder("Corrections"):
             self._actions("history", {"Undo": editor.undo, "Redo": editor.redo})
-            self._actions("map", {"Show hidden": self._unhide, "Delete floaters": editor.delete_floaters})
+            self._actions("map", {"Show hidden": self._unhide})
             save = self.gui.add_button("Save into the map")
             save.on_click(lambda event: self.viewer.guarded(editor.save, event.client, edited=True))
             self._renew = self.gui.add_button(
@@ -138,9 +136,6 @@ class Panel:
         for entry in self.session.editor.instances:
             if entry.get("hidden"):
                 self.session.editor.hide(entry["id"], False)
-
-    def _export(self, client: Any) -> None:
-        client.send_file_download("selection.ply", selection_ply(self.session.editor.current(), self.session.selected))
 
     # ------------------------------------------------------------------- texts
 
@@ -158,7 +153,7 @@ class Panel:
         """Updates all texts of the panel from the session's state."""
         session, editor = self.session, self.session.editor
         unit = "m" if editor.original.info.get("metric") else "map units"
-        self._facts.content = f"**{int(editor.kept.sum()):,} Gaussians · instances: {len(editor.instances)}**"
+        self._facts.content = f"**{len(editor.ids):,} Gaussians · instances: {len(editor.instances)}**"
         self._refresh_answer()
         if not session.selected:
             self._words.content = "Click a thing; shift-click adds another."

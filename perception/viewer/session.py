@@ -11,12 +11,9 @@ import numpy as np
 
 from perception.editing import Editor
 from perception.errors import InputError
-from perception.io.map import Map
-from perception.io.ply import ply_bytes
 from perception.query import Hit, PartsMap, QueryMap
 from perception.query.crops import best_crop
-from perception.types import View
-from perception.viewer.paint import base_colors, highlight, paint
+from perception.viewer.paint import highlight, paint
 from perception.viewer.picking import pick
 
 CROP_SIDE = 320
@@ -38,10 +35,6 @@ class Session:
         self._lock = threading.RLock()
         self._opened: tuple[int, QueryMap] | None = None
         self._edits = 0
-        self.views = self._views()
-
-    def _views(self) -> dict[str, View]:
-        return {view.name: view for view in self.editor.original.views}
 
     # ------------------------------------------------------------------ asking
 
@@ -114,22 +107,20 @@ class Session:
         """Opens the map that another program changed; unsaved edits are dropped."""
         with self._lock:
             self.editor.reopen()
-            self.views = self._views()
             self.edited()
 
     # ----------------------------------------------------------------- showing
 
     def shown(self) -> np.ndarray:
-        """[N] bool: Gaussians that are neither deleted nor of a hidden instance."""
+        """[N] bool: Gaussians of no hidden instance."""
         hidden = [entry["id"] for entry in self.editor.instances if entry.get("hidden")]
-        return np.asarray(self.editor.kept & ~np.isin(self.editor.ids, hidden))
+        return ~np.isin(self.editor.ids, hidden)
 
-    def colors(self, camera_from_world: np.ndarray | None = None) -> np.ndarray:
+    def colors(self) -> np.ndarray:
         """[N, 3] uint8 in the current mode, with the selection (or the hits) highlighted."""
-        scores = {int(entry["id"]): float(entry["score"]) for entry in self.editor.instances}
         ids, parts = self.editor.ids, self.editor.part_ids
         shown = np.where(parts >= 0, parts, ids) if self.mode == "parts" else ids
-        colors = paint(self.editor.original, shown, self.mode, scores, camera_from_world)
+        colors = paint(self.editor.original, shown, self.mode)
         if self.part is not None:
             return highlight(colors, parts, [self.part])
         return highlight(colors, ids, self.lit())
@@ -152,17 +143,6 @@ class Session:
             return best_crop(self._loaded(), instance, CROP_SIDE, self.folders)
         except InputError:
             return None
-
-
-def selection_ply(gmap: Map, chosen: list[int]) -> bytes:
-    """A binary PLY of the chosen instances' means: x y z, red green blue, instance_id. InputError for no instance."""
-    if not chosen:
-        raise InputError("nothing is selected; click a thing first")
-    rows = np.isin(gmap.instance_ids, chosen)
-    points, colors = gmap.means[rows].astype(np.float32), base_colors(gmap)[rows]
-    columns = {axis: points[:, i] for i, axis in enumerate("xyz")}
-    columns |= {name: colors[:, i] for i, name in enumerate(("red", "green", "blue"))}
-    return ply_bytes({"vertex": {**columns, "instance_id": gmap.instance_ids[rows].astype(np.int32)}})
 
 
 def _whole(hit: Hit) -> int:

@@ -44,32 +44,6 @@ BASE_FROM_CAM, CAM_FROM_DEPTH = (
 BASE_FROM_IMU = rigid([0.2, 1.0, -0.4], [0.0, 0.1, 0.0])
 
 
-def rvl(image: np.ndarray) -> bytes:
-    """Wilson's encoder (2017): run of zeros, run of measured pixels, their differences; three bits a nibble."""
-    nibbles: list[int] = []
-
-    def put(value: int) -> None:
-        while value > 7:
-            nibbles.append(8 | value & 7)
-            value >>= 3
-        nibbles.append(value)
-
-    flat, at, last = image.ravel().astype(int), 0, 0
-    while at < len(flat):
-        for measured in (False, True):
-            end = at
-            while end < len(flat) and (flat[end] > 0) == measured:
-                end += 1
-            put(end - at)
-            for value in flat[at:end] if measured else ():
-                delta, last = value - last, value
-                put(int(delta << 1 if delta >= 0 else (-delta << 1) - 1))
-            at = end
-    nibbles += [0] * (-len(nibbles) % 8)
-    words = [int("".join(f"{n:x}" for n in nibbles[i : i + 8]), 16) for i in range(0, len(nibbles), 8)]
-    return struct.pack("<ii", *image.shape[::-1]) + struct.pack(f"<{len(words)}I", *words)
-
-
 def record(path: Path, kind: str, how: str, late: int = 4_000_000) -> None:
     """The wall seen by the moving base: photos, depth as `how` says `late` ns after each, tf, camera_info, IMU."""
     rng, bag = np.random.default_rng(0), Recorder(path, kind)
@@ -110,15 +84,13 @@ def write(bag: Recorder, how: str, time: int, depth: np.ndarray) -> None:
             inverse = np.where(depth > 0, np.round(10000 / depth + 1), 0).astype(np.uint16)
         data = header + cv2.imencode(".png", inverse)[1].tobytes()
         bag.jpeg(topic, time, data, frame, "32FC1; compressedDepth png")
-    elif how == "rvl":
-        bag.jpeg(topic, time, header + rvl(units), frame, "16UC1; compressedDepth rvl")
     else:
         bag.image("/depth/image_raw", time, units, frame, "16UC1")
 
 
 @pytest.mark.parametrize(
     ("kind", "how"),
-    [("ros1", "millimetres"), ("sqlite", "metres"), ("mcap", "png"), ("mcap", "inverse"), ("mcap", "rvl")],
+    [("ros1", "millimetres"), ("sqlite", "metres"), ("mcap", "png"), ("mcap", "inverse")],
 )
 def test_photos_depth_poses_and_gravity_come_back(kind: str, how: str, tmp_path: Path) -> None:
     path = tmp_path / ("drive.bag" if kind == "ros1" else "drive")

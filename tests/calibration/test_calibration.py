@@ -59,7 +59,7 @@ def perfect_views(camera: KnownCamera, count: int, noise: float = 0.0, seed: int
 def test_the_known_camera_is_found_within_what_is_claimed(pictures, tmp_path) -> None:
     camera, folder = pictures
     out = tmp_path / "camera.yaml"
-    text = run_calibration(folder, out, CHARUCO, "auto", tmp_path / "shown")[1]
+    text = run_calibration(folder, out, CHARUCO, "auto")[1]
     facts = json.loads((tmp_path / "camera.json").read_text())
     assert facts["model"] == camera.model and facts["reprojection_error_px"] < 0.3
     for name, true in zip(NAMES[camera.model], camera.values, strict=True):
@@ -79,8 +79,6 @@ def test_the_known_camera_is_found_within_what_is_claimed(pictures, tmp_path) ->
         - project(camera.model, camera.values, np.zeros(6), points)[0]
     )
     assert np.linalg.norm(apart - apart.mean(axis=0), axis=1).max() < 1.0
-    shown = sorted(path.name for path in (tmp_path / "shown").iterdir())
-    assert "coverage.png" in shown and len(shown) == len(facts["views"]) + 1
 
 
 def test_the_file_means_to_the_mapper_what_opencv_means(pictures, tmp_path) -> None:

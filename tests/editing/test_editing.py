@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perception.editing import Editor, isolated
+from perception.editing import Editor
 from perception.errors import InputError
 from perception.io.store import Map, read_map, write_map
 from perception.language.colors import PALETTE
@@ -104,19 +104,6 @@ def test_split_finds_the_two_halves(path: Path) -> None:
         editor.split(0)
 
 
-def test_floaters_go_and_come_back(path: Path) -> None:
-    editor = Editor(path)
-    assert editor.delete_floaters() >= 1
-    assert not editor.kept[-1]
-    editor.save()
-    saved = read_map(path)
-    assert len(saved) == editor.kept.sum()
-    assert np.abs(saved.means).max() < 100
-    editor.undo()
-    editor.save()
-    np.testing.assert_array_equal(read_map(path).means, editor.original.means)
-
-
 def test_remove_leaves_the_gaussians(path: Path) -> None:
     editor = Editor(path)
     editor.remove(0)
@@ -152,12 +139,6 @@ def test_unknown_instances_and_lonely_merges_are_refused(path: Path) -> None:
     assert not editor.dirty and editor.undo() is None
 
 
-def test_isolated_keeps_a_uniform_grid() -> None:
-    grid = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), -1).reshape(-1, 3)
-    assert not isolated(grid).any()
-    assert np.flatnonzero(isolated(np.concatenate([grid, [[100.0, 0, 0]]]))).tolist() == [len(grid)]
-
-
 def with_parts(path: Path) -> Path:
     """Instance 0 gets two parts, of 25 and of 30 of its 60 Gaussians, described by axes 3 and 4."""
     gmap = read_map(path)
@@ -188,11 +169,9 @@ def test_a_split_follows_the_hierarchy(path: Path) -> None:
 def test_parts_survive_what_happens_to_others(path: Path) -> None:
     editor = Editor(with_parts(path))
     editor.remove(2)
-    editor.delete_floaters()
     editor.save()
     saved = read_map(path)
-    assert len(saved.parts["ids"]) == len(saved) == editor.kept.sum()
-    np.testing.assert_array_equal(saved.parts["ids"], editor.original.parts["ids"][editor.kept])
+    np.testing.assert_array_equal(saved.parts["ids"], editor.original.parts["ids"])
     np.testing.assert_array_equal(saved.parts["language_embeddings"], np.eye(8)[3:5])
     editor.merge([0, 1])
     editor.save()

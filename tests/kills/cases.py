@@ -228,7 +228,7 @@ class Editing(Case):
 
 
 def corrections(path: Path) -> int:
-    """What a person does in the viewer: rename, merge, remove, delete floaters, undo; then save."""
+    """What a person does in the viewer: rename, merge, remove, undo; then save."""
     from perception.editing import Editor
 
     editor = Editor(path)
@@ -237,6 +237,5 @@ def corrections(path: Path) -> int:
     editor.merge(ids[1:3])
     editor.remove(editor.instances[-1]["id"])
     editor.undo()
-    editor.delete_floaters()
     editor.save()
     return 0

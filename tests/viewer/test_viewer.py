@@ -70,17 +70,16 @@ def test_covariances_are_those_of_the_rotated_axes() -> None:
 @pytest.mark.parametrize("mode", MODES)
 def test_every_mode_paints_every_gaussian(mode: str) -> None:
     gmap = small_map()
-    scores = {i: 0.2 + 0.3 * i for i in range(3)}
-    colors = paint(gmap, gmap.instance_ids, mode, scores)
+    colors = paint(gmap, gmap.instance_ids, mode)
     assert colors.shape == (len(gmap), 3) and colors.dtype == np.uint8
-    if mode in ("instances", "confidence"):
+    if mode == "instances":
         assert len({tuple(c) for c in colors}) == 4  # three instances and grey
         assert (colors[gmap.instance_ids < 0] == 128).all()
 
 
 def test_highlight_dims_the_rest() -> None:
     gmap = small_map()
-    colors = paint(gmap, gmap.instance_ids, "photo", {})
+    colors = paint(gmap, gmap.instance_ids, "photo")
     lit = highlight(colors, gmap.instance_ids, [1])
     near = np.abs(lit.astype(int) - HIGHLIGHT).sum(axis=1)
     assert near[gmap.instance_ids == 1].max() < near[gmap.instance_ids != 1].min()
