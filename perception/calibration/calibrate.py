@@ -32,8 +32,8 @@ def run_calibration(
 ) -> tuple[dict[str, Any], str]:
     """Calibrates a camera from a folder of photos or a video of a board: (JSON-serialisable result, table).
 
-    Writes `output` (ROS camera_info YAML) and next to it a .json with all figures. Photos are rotated according to EXIF,
-    as in mapping. Raises InputError if no board is found, or if the views are too few or too similar.
+    Writes `output` (ROS camera_info YAML) and next to it a .json with all figures. Photos are rotated according to
+    EXIF, as in mapping. Raises InputError if no board is found, or if the views are too few or too similar.
     """
     if model not in MODELS:
         raise InputError(f"--model is '{model}'; expected one of {', '.join(MODELS)}")

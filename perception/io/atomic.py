@@ -14,13 +14,21 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from glob import escape
 from pathlib import Path
 from typing import BinaryIO
 from uuid import uuid4
 
 from perception.errors import InputError
-from perception.io.file_locks import lock, names
 
+try:
+    import fcntl
+except ImportError:  # Windows has no flock
+    fcntl = None  # type: ignore[assignment]
+
+SUPPORTED = fcntl is not None
+"""Whether files can be locked (flock). The package `filelock` is not used: it leaves lock files behind, cannot lock
+folders and does not name the holder."""
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # from Linux fcntl.h and fs.h
 _REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
@@ -117,7 +125,7 @@ def standing(path: Path) -> Path:
     return next((item for kind, item in reversed(_leftovers(path)) if kind == "old"), path)
 
 
-@contextlib.contextmanager
+@contextmanager
 def _locked(path: Path, make: Callable[[], None]) -> Iterator[None]:
     """Calls `make` to create `path` and holds a lock on it, if the file system supports locks."""
     while True:
@@ -136,12 +144,10 @@ def _locked(path: Path, make: Callable[[], None]) -> Iterator[None]:
 def _leftovers(path: Path) -> list[tuple[str, Path]]:
     """("new" or "old", location) of all temporary siblings of `path`, oldest first."""
     found = []
-    with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(path.parent) as entries:
-        for entry in entries:
-            kind = _kind(entry.name, path)
-            if kind is not None:
-                with contextlib.suppress(FileNotFoundError):  # an active writer has just renamed it
-                    found.append((entry.stat(follow_symlinks=False).st_mtime_ns, kind, Path(entry.path)))
+    for kind in ("new", "old"):
+        for item in path.parent.glob(f".{escape(path.name)}.{kind}-[0-9]*-????????"):
+            with contextlib.suppress(OSError):  # an active writer has just renamed it
+                found.append((item.lstat().st_mtime_ns, kind, item))
     return [(kind, item) for _, kind, item in sorted(found)]
 
 
@@ -176,13 +182,6 @@ def _exchange(a: Path, b: Path) -> bool:
 
 def _sibling(path: Path, kind: str) -> Path:
     return path.with_name(f".{path.name}.{kind}-{os.getpid()}-{uuid4().hex[:8]}")
-
-
-def _kind(name: str, path: Path) -> str | None:
-    """The kind, "new" or "old", of a name that `_sibling` makes for `path`; None for other names."""
-    start = f".{path.name}."
-    parts = name[len(start) :].split("-") if name.startswith(start) else []
-    return parts[0] if len(parts) == 3 and parts[0] in ("new", "old") and parts[1].isdigit() else None
 
 
 def _sync(path: Path) -> None:
@@ -220,3 +219,28 @@ def _disk_errors(path: Path) -> Iterator[None]:
                 f"{path}: cannot be written ({error.strerror}); choose a place you may write to"
             ) from error
         raise
+
+
+def lock(descriptor: int) -> bool:
+    """Takes the exclusive lock on an open file or folder; False when another descriptor holds it.
+
+    OSError where the file system or the operating system does not support flock.
+    """
+    if fcntl is None:
+        raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+            return False
+        raise
+    return True
+
+
+def names(path: Path, descriptor: int) -> bool:
+    """Whether `path` still names the file or folder that was opened as `descriptor`."""
+    try:
+        there, here = path.stat(), os.fstat(descriptor)
+    except FileNotFoundError:
+        return False
+    return (there.st_dev, there.st_ino) == (here.st_dev, here.st_ino)

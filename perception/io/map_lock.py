@@ -10,12 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from perception.errors import InputError
-from perception.io.atomic import recover
-from perception.io.file_locks import SUPPORTED, lock, names
+from perception.io.atomic import SUPPORTED, lock, names, recover
 
-_held: dict[Path, tuple[int, int]] = {}
-"""Locks of this process: resolved path → (thread, depth)."""
-_guard = threading.Lock()
+_held: set[tuple[Path, int]] = set()
+"""Locks of this process: resolved path and thread."""
 
 
 @contextmanager
@@ -27,25 +25,21 @@ def writing(path: Path) -> Iterator[None]:
     Leftovers of killed writers are first restored or deleted (see `atomic.recover`).
     """
     path = Path(path).resolve()
-    me = threading.get_ident()
-    with _guard:
-        owner, depth = _held.get(path, (me, 0))
-        if owner != me:
-            raise InputError(f"{path}: another thread of this process is writing this map; wait for it to finish")
-        _held[path] = (me, depth + 1)
-    descriptor = None
+    mine = (path, threading.get_ident())
+    if mine in _held:
+        yield
+        return
+    descriptor = _take(path)
     try:
-        if depth == 0:
-            descriptor = _take(path)
-            recover(path)
+        _held.add(mine)
+        recover(path)
         yield
     finally:
-        with _guard:
-            if depth == 0:
-                _drop(path, descriptor)
-                del _held[path]
-            else:
-                _held[path] = (me, depth)
+        _held.discard(mine)
+        if descriptor is not None:
+            with contextlib.suppress(OSError):
+                lock_file(path).unlink()  # before the release, so that no other process has locked this file
+            os.close(descriptor)
 
 
 def lock_file(path: Path) -> Path:
@@ -65,6 +59,7 @@ def _take(path: Path) -> int | None:
                 holder = os.pread(descriptor, 32, 0).decode("ascii", "replace").strip()
                 os.close(descriptor)
                 who = f"process {holder}" if holder.isdigit() else "another process"
+                who = "another thread of this process" if holder == str(os.getpid()) else who
                 raise InputError(f"{path}: {who} is writing this map; wait for it to finish, or write to another place")
             if names(file, descriptor):
                 break
@@ -77,11 +72,3 @@ def _take(path: Path) -> int | None:
         raise InputError(
             f"{path}: cannot be written ({error.strerror}: {file.parent}); choose a place you may write to"
         ) from error
-
-
-def _drop(path: Path, descriptor: int | None) -> None:
-    if descriptor is None:
-        return
-    with contextlib.suppress(OSError):
-        lock_file(path).unlink()  # before the release, so that no other process has locked this file
-    os.close(descriptor)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from perception.io.ros_messages import DETECTIONS, DIAGNOSTICS, MARKERS, POINT_CLOUD, STRING
+from perception.node.answers import DETECTIONS, DIAGNOSTICS, MARKERS, POINT_CLOUD, STRING
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ bytes: rosbags makes them, because CycloneDDS' own Python serialiser is two hund
 
 from __future__ import annotations
 
-import importlib
 import threading
 import types
 from dataclasses import dataclass
@@ -17,6 +16,12 @@ from typing import Any
 
 from perception.errors import missing_extra
 from perception.io.cdr import typestore
+
+try:
+    from cyclonedds.idl import IdlStruct
+    from cyclonedds.idl import types as t
+except ImportError as error:
+    raise missing_extra("cyclonedds", "ros") from error
 
 _HASHING = threading.Lock()
 
@@ -65,10 +70,8 @@ def type_hash(kind: str) -> bytes:
 
 def _structure(kind: str, headed: bool = False) -> Any:
     """An IdlStruct with the fields of a ROS type."""
-    _idl()
     fields = {name: _annotation(definition) for name, definition in typestore().fielddefs[kind][1]}
     if headed:
-        t = importlib.import_module("cyclonedds.idl.types")
         fields = {"rmw_client": t.uint64, "rmw_number": t.int64, **fields}
     return _class(dds_type_name(kind), fields)
 
@@ -79,19 +82,13 @@ def _nested(kind: str) -> Any:
 
 
 def _class(name: str, fields: dict[str, Any]) -> Any:
-    base = _idl().IdlStruct
-    scoped = name.replace("::", ".")
-    made = types.new_class(
-        scoped.rsplit(".", 1)[1],
-        (base,),
-        {"typename": scoped},
-        lambda space: space.update(__annotations__=dict(fields)),
+    scoped, made = name.replace("::", "."), {"__annotations__": dict(fields)}
+    return dataclass(
+        types.new_class(scoped.rsplit(".", 1)[1], (IdlStruct,), {"typename": scoped}, lambda space: space.update(made))
     )
-    return dataclass(made)
 
 
 def _annotation(definition: tuple[Any, Any]) -> Any:
-    t = importlib.import_module("cyclonedds.idl.types")
     kind, detail = definition
     if kind.name == "BASE":
         return _BASES.get(detail[0]) or getattr(t, _NAMES.get(detail[0], detail[0]))
@@ -151,10 +148,3 @@ def _rename(value: Any, renamed: dict[bytes, bytes]) -> None:
 def _serialized(value: Any) -> bytes:
     """The XCDR2 form without its 4-byte header; little-endian, as are all machines with CycloneDDS wheels."""
     return bytes(value.serialize(use_version_2=True)[4:])
-
-
-def _idl() -> Any:
-    try:
-        return importlib.import_module("cyclonedds.idl")
-    except ImportError as error:
-        raise missing_extra("cyclonedds", "ros") from error

@@ -6,7 +6,6 @@ messages carry rmw_cyclonedds' header: the client's id (uint64) and the request'
 
 from __future__ import annotations
 
-import importlib
 import os
 import struct
 import threading
@@ -18,6 +17,11 @@ from perception.errors import InputError, missing_extra
 from perception.node.channels import DEPTH
 from perception.node.idl import sample_type
 
+try:
+    from cyclonedds import builtin, core, domain, pub, qos, sub, topic, util
+except ImportError as error:
+    raise missing_extra("cyclonedds", "ros") from error
+
 _HEADER = struct.Struct("<Qq")
 _MAX_BYTES = 256 << 20
 """Largest message in bytes, in or out; the network layer drops larger ones."""
@@ -28,33 +32,30 @@ _BLOCKED_MS = 100
 class Participant:
     """A DDS participant. network: see NodeConfig. Raises InputError when the network cannot be used."""
 
-    def __init__(self, domain: int, network: str | None = None) -> None:
-        dds = self._dds = _Modules()
+    def __init__(self, number: int, network: str | None = None) -> None:
         try:
-            _open_domain(dds, domain, network)
-            self.participant = dds.domain.DomainParticipant(domain)
-        except dds.core.DDSException as error:
+            _open_domain(number, network)
+            self.participant = domain.DomainParticipant(number)
+        except core.DDSException as error:
             raise InputError(
-                f"node: DDS cannot start on domain {domain}, network {network or 'as the system has it'} ({error}); "
+                f"node: DDS cannot start on domain {number}, network {network or 'as the system has it'} ({error}); "
                 "check that the interface exists and is up (`ip addr`), or give --network localhost"
             ) from error
-        self._publications = dds.builtin.BuiltinDataReader(self.participant, dds.builtin.BuiltinTopicDcpsPublication)
+        self._publications = builtin.BuiltinDataReader(self.participant, builtin.BuiltinTopicDcpsPublication)
 
     def writer(self, name: str, kind: str, *, latched: bool = False, headed: bool = False) -> Writer:
         """A reliable writer of ROS type `kind` on DDS topic `name`; latched: late readers receive the last sample."""
-        topic = self._dds.topic.Topic(self.participant, name, sample_type(kind, headed))
-        return Writer(
-            self._dds, self._dds.pub.DataWriter(self.participant, topic, qos=self._qos(latched)), kind, headed
-        )
+        own = topic.Topic(self.participant, name, sample_type(kind, headed))
+        return Writer(pub.DataWriter(self.participant, own, qos=_qos(latched)), kind, headed)
 
     def reader(self, name: str, kind: str, *, latched: bool = False, headed: bool = False) -> Reader:
         """A reliable reader; it keeps the DEPTH newest samples."""
-        topic = self._dds.topic.Topic(self.participant, name, sample_type(kind, headed))
-        return Reader(self._dds, self._dds.sub.DataReader(self.participant, topic, qos=self._qos(latched)), headed)
+        own = topic.Topic(self.participant, name, sample_type(kind, headed))
+        return Reader(sub.DataReader(self.participant, own, qos=_qos(latched)), headed)
 
     def wait_set(self, readers: list[Reader]) -> Any:
         """A WaitSet, whose `wait(nanoseconds)` returns when one of the readers has samples."""
-        waiting = self._dds.core.WaitSet(self.participant)
+        waiting = core.WaitSet(self.participant)
         for reader in readers:
             waiting.attach(reader.condition)
         return waiting
@@ -62,10 +63,8 @@ class Participant:
     def writers_elsewhere(self, name: str) -> int:
         """The number of writers on DDS topic `name` in other participants, as discovered so far."""
         own = self.participant.guid
-        alive = self._dds.core.InstanceState.Alive
-        condition = self._dds.core.ReadCondition(
-            self._publications, self._dds.core.SampleState.Any | self._dds.core.ViewState.Any | alive
-        )
+        alive = core.InstanceState.Alive
+        condition = core.ReadCondition(self._publications, core.SampleState.Any | core.ViewState.Any | alive)
         found = self._publications.read(10_000, condition=condition)
         return sum(1 for one in found if one.topic_name == name and one.participant_key != own)
 
@@ -73,33 +72,34 @@ class Participant:
         """Leaves the network at once instead of when the DDS lease ends. Closes all writers and readers."""
         self.participant.__del__()  # CycloneDDS has no other method for it; may be repeated
 
-    def _qos(self, latched: bool) -> Any:
-        policy, duration = self._dds.qos.Policy, self._dds.util.duration
-        return self._dds.qos.Qos(
-            policy.Reliability.Reliable(duration(milliseconds=_BLOCKED_MS)),
-            policy.Durability.TransientLocal if latched else policy.Durability.Volatile,
-            policy.History.KeepLast(1 if latched else DEPTH),
-            policy.DataRepresentation(use_cdrv0_representation=True),
-        )
+
+def _qos(latched: bool) -> Any:
+    policy = qos.Policy
+    return qos.Qos(
+        policy.Reliability.Reliable(util.duration(milliseconds=_BLOCKED_MS)),
+        policy.Durability.TransientLocal if latched else policy.Durability.Volatile,
+        policy.History.KeepLast(1 if latched else DEPTH),
+        policy.DataRepresentation(use_cdrv0_representation=True),
+    )
 
 
 _OPENING = threading.Lock()
 _DOMAINS: dict[int, Any] = {}
 
 
-def _open_domain(dds: _Modules, domain: int, network: str | None) -> None:
+def _open_domain(number: int, network: str | None) -> None:
     """Configures a DDS domain for this process. Only the first call for a domain has an effect."""
     with _OPENING:
-        if domain not in _DOMAINS:
+        if number not in _DOMAINS:
             own = os.environ.get("CYCLONEDDS_URI", "")  # the user's settings there take precedence
-            _DOMAINS[domain] = dds.domain.Domain(domain, ",".join(filter(None, [network_settings(network), own])))
+            _DOMAINS[number] = domain.Domain(number, ",".join(filter(None, [network_settings(network), own])))
 
 
 class Writer:
     """Sends CDR bytes. `given_up`: number of messages dropped because of slow readers."""
 
-    def __init__(self, dds: _Modules, writer: Any, kind: str, headed: bool) -> None:
-        self._dds, self._writer, self._kind, self._headed = dds, writer, kind, headed
+    def __init__(self, writer: Any, kind: str, headed: bool) -> None:
+        self._writer, self._kind, self._headed = writer, kind, headed
         self.given_up = 0
 
     def write(self, cdr: bytes, header: tuple[int, int] | None = None) -> bool:
@@ -108,7 +108,7 @@ class Writer:
             cdr = cdr[:4] + _HEADER.pack(*header) + cdr[4:]
         try:
             self._writer.write(sample_type(self._kind, self._headed)(cdr))
-        except self._dds.core.DDSException:
+        except core.DDSException:
             self.given_up += 1
             return False
         return True
@@ -122,10 +122,10 @@ class Writer:
 class Reader:
     """Receives CDR bytes."""
 
-    def __init__(self, dds: _Modules, reader: Any, headed: bool) -> None:
+    def __init__(self, reader: Any, headed: bool) -> None:
         self._reader, self._headed = reader, headed
-        states = dds.core.SampleState.Any | dds.core.ViewState.Any | dds.core.InstanceState.Any
-        self.condition = dds.core.ReadCondition(reader, states)
+        states = core.SampleState.Any | core.ViewState.Any | core.InstanceState.Any
+        self.condition = core.ReadCondition(reader, states)
 
     def take(self) -> Iterator[tuple[bytes, tuple[int, int] | None]]:
         """Received messages: CDR bytes and, for services, client and number. Too short ones give empty bytes."""
@@ -177,17 +177,3 @@ def _from_environment() -> str | None:
     if os.environ.get("ROS_LOCALHOST_ONLY") == "1":
         return "localhost"
     return "localhost" if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() in ("LOCALHOST", "OFF") else None
-
-
-class _Modules:
-    """CycloneDDS' modules, imported when a participant is created."""
-
-    def __init__(self) -> None:
-        try:
-            for name in ("builtin", "core", "domain", "pub", "qos", "sub", "topic", "util"):
-                setattr(self, name, importlib.import_module(f"cyclonedds.{name}"))
-        except ImportError as error:
-            raise missing_extra("cyclonedds", "ros") from error
-
-    def __getattr__(self, name: str) -> Any:
-        raise AttributeError(name)

@@ -23,8 +23,8 @@ pytest.importorskip("rosbags")
 
 from perception.geometry import rotation_from_quaternion
 from perception.io.cdr import deserialize, plain, serialize, typestore
-from perception.io.ros_messages import box_markers, detection, header, point_cloud2, pose
 from perception.node import idl
+from perception.node.answers import box_markers, detection, header, point_cloud2, pose
 
 STAMP = (7, 999_999_999)
 REQUEST, RESPONSE = "rcl_interfaces/srv/GetParameters_Request", "rcl_interfaces/srv/GetParameters_Response"
