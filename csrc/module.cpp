@@ -10,6 +10,7 @@ namespace nb = nanobind;
 void bind_rasterizer(nb::module_ &m);
 void bind_training(nb::module_ &m);
 void bind_graph(nb::module_ &m);
+void bind_stereo(nb::module_ &m);
 
 NB_MODULE(_core, m) {
   m.doc() = "Compiled kernels of perception.";
@@ -17,4 +18,5 @@ NB_MODULE(_core, m) {
   bind_rasterizer(m);
   bind_training(m);
   bind_graph(m);
+  bind_stereo(m);
 }

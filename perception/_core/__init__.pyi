@@ -1,5 +1,6 @@
 """Compiled kernels of perception."""
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import numpy
@@ -76,3 +77,8 @@ def plane_normals(points: Annotated[NDArray[numpy.float32], dict(shape=(None, 3)
     Normals [Q, 3] of the planes through neighbour lists [Q, k] of points [N, 3]; zero where there is none.
     """
 
+def plane_sweep(photo: Annotated[NDArray[numpy.uint8], dict(shape=(None, None), order='C', device='cpu', writable=False)], others: Sequence[Annotated[NDArray[numpy.uint8], dict(shape=(None, None), order='C', device='cpu', writable=False)]], homographies: Annotated[NDArray[numpy.float64], dict(shape=(None, 2, 3, 3), order='C', device='cpu', writable=False)], prior: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)], first: float, step: float, planes: int, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')], threads: int = 0, level: str = 'auto') -> None:
+    """
+    Fills depth [h, w] of photo [h, w] from others and a prior depth (0 = none). Plane i has the inverse depth
+    first + step * i. homographies: A, B per other; A + B / z maps pixels, whose centres are integers.
+    """

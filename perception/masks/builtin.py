@@ -18,7 +18,7 @@ from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.progress import Progress
 from perception.types import View
 
-VERSION = 7  # increased whenever the label images change, so that cached ones are recomputed
+VERSION = 8  # increased whenever the label images change, so that cached ones are recomputed
 _SMOOTH = 0.03  # relative to the depth: a pixel with a larger depth step is not part of the surface
 _LEAST_VOXELS = 100
 
@@ -37,7 +37,6 @@ class BuiltinSegmentation:
         self.name = "builtin"
         self.identity = f"builtin {VERSION}"
         self._views: dict[str, StereoView] = {}
-        self._surface: Surface | None = None
         self._segment = np.zeros(0, np.int32)
 
     def check(self, views: list[View]) -> list[str]:
@@ -63,16 +62,16 @@ class BuiltinSegmentation:
         surface = fuse(found)
         if len(surface) < _LEAST_VOXELS:
             return
-        self._surface, self._segment = surface, segments(surface_graph(found, surface))
+        self._segment = segments(surface_graph(found, surface))
         self._views = {view.name: view for view in found}
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
         """[H, W] int32 labels of `photo` [H, W, 3], after `survey`. All 0 if the photo does not show the surface."""
         import cv2
 
-        if self._surface is None or view.name not in self._views:
+        if view.name not in self._views:
             return np.zeros(photo.shape[:2], np.int32)
-        labels = label_view(self._views[view.name], self._surface, self._segment)
+        labels = label_view(self._views[view.name], self._segment)
         return cv2.resize(labels, photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
 
 
@@ -92,19 +91,17 @@ def surface_graph(views: list[StereoView], surface: Surface) -> SurfaceGraph:
     graph = SurfaceGraph(surface, patches(surface, edges), edges)
     for view in views:
         photo, depth = view.cues()
-        voxel = surface.voxel_of(to_world(depth.points, view.world_from_camera))
-        graph.add(np.where(voxel >= 0, graph.patch[voxel], -1), photo, depth)
+        view.voxel = surface.voxel_of(to_world(depth.points, view.world_from_camera))
+        graph.add(np.where(view.voxel >= 0, graph.patch[view.voxel], -1), photo, depth)
     graph.link()
     return graph
 
 
-def label_view(view: StereoView, surface: Surface, segment: np.ndarray) -> np.ndarray:
+def label_view(view: StereoView, segment: np.ndarray) -> np.ndarray:
     """[h, w] int32 segment of each pixel. Pixels off the surface take the nearest segment in the image."""
     from scipy.ndimage import distance_transform_edt
 
-    _, depth = view.cues()
-    voxel = surface.voxel_of(to_world(depth.points, view.world_from_camera))
-    labels = np.where(voxel >= 0, segment[voxel], 0)
+    labels = np.where(view.voxel >= 0, segment[view.voxel], 0)
     if not labels.any():
         return labels
     nearest = distance_transform_edt(labels == 0, return_distances=False, return_indices=True)

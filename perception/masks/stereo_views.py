@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,10 +15,11 @@ _LEAST_DEPTH = 0.05  # share of a photo's pixels that must have depth; other pho
 
 @dataclass
 class StereoView:
-    """One photo. photo: [h, w, 3] uint8 RGB; grey: [h, w] float32; K: [3, 3]; camera_from_world: [4, 4] float64.
+    """One photo. photo: [h, w, 3] uint8 RGB; grey: [h, w] uint8; K: [3, 3]; camera_from_world: [4, 4] float64.
 
     prior: [h, w] depth known before stereo, 0 = none. depth: [h, w] current best depth. confirmed: [h, w] bool, pixels
-    whose depth other photos agree with. measured: the prior comes from a sensor.
+    whose depth other photos agree with. measured: the prior comes from a sensor. voxel: [h, w] int32, the voxel of the
+    surface that each pixel shows, −1 = none, set by `surface_graph`.
     """
 
     name: str
@@ -30,6 +31,7 @@ class StereoView:
     depth: np.ndarray
     confirmed: np.ndarray
     measured: bool = False
+    voxel: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.int32))
 
     @property
     def center(self) -> np.ndarray:
@@ -59,7 +61,7 @@ def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray) -> Stereo
     small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA if ratio < 1 else cv2.INTER_LINEAR)
     prior = cv2.resize(np.where(known, depth, 0).astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
     K = np.diag([size[0] / view.width, size[1] / view.height, 1.0]) @ view.K
-    grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     pose = np.asarray(view.camera_from_world, np.float64)
     measured = view.depth is not None
     return StereoView(view.name, small, grey, K, pose, prior, filled_depth(prior), prior > 0, measured)

@@ -223,9 +223,20 @@ def _plane_normals(dice: Dice) -> Call:
     }
 
 
+def _plane_sweep(dice: Dice) -> Call:
+    shape, others = (dice.pick((5, 1, 41)), dice.pick((6, 1, 33))), dice.pick((2, 1))
+    maps = np.random.default_rng(dice.below(256)).normal(0, dice.pick((0.1, 10.0)), (others, 2, 3, 3))
+    return _core.plane_sweep, {
+        "photo": np.arange(shape[0] * shape[1], dtype=np.uint8).reshape(shape),
+        "others": [np.full((dice.pick((4, 1)), 3), 9, np.uint8)] * others, "homographies": np.eye(3) + maps,
+        "prior": np.ones(shape, np.float32), "first": 2.0, "step": -0.05, "planes": 32,
+        "depth": guarded(shape, np.float32),
+    }  # fmt: skip
+
+
 FUNCTIONS = [_photometric, _assign, _prototypes, _spread, _separation, _sum, _scale, _adam, _tree, _knn]
-FUNCTIONS += [_felzenszwalb, _undirected, _plane_normals]
-_LEVELLED = (_photometric, _prototypes, _spread, _sum, _adam)
+FUNCTIONS += [_felzenszwalb, _undirected, _plane_normals, _plane_sweep]
+_LEVELLED = (_photometric, _prototypes, _spread, _sum, _adam, _plane_sweep)
 
 # ------------------------------------------------------------------ spoiling
 

@@ -13,7 +13,7 @@ from perception.errors import InputError
 from perception.masks import GeometryMaskSource, compute_masks, load_labels, make_source
 from perception.masks.builtin import fuse, surface_graph
 from perception.masks.cues import depth_cues
-from perception.masks.stereo import confirmed, homographies, measure_depths, plane_depths, semi_global
+from perception.masks.stereo import confirmed, homographies, measure_depths, plane_depths
 from perception.masks.stereo_views import StereoView, make_stereo_view
 from perception.masks.surface import pack_voxels, to_world, unpack_voxels, voxel_keys
 from perception.masks.surface_graph import SurfaceGraph, voxel_edges
@@ -136,27 +136,6 @@ def test_homography_carries_points_of_its_plane():
     seen = K @ (eyes[1].camera_from_world[:3, :3] @ world_point + eyes[1].camera_from_world[:3, 3])
     carried = (still + moving / z) @ (pixel - [0.5, 0.5, 0])
     np.testing.assert_allclose(carried[:2] / carried[2] + 0.5, seen[:2] / seen[2])
-
-
-def test_semi_global_costs_against_brute_force():
-    """One row of pixels, all ways through it tried: the cheapest way that ends in each pixel at each plane."""
-    rng = np.random.default_rng(2)
-    volume = rng.random((1, 5, 4)).astype(np.float32)
-    total = semi_global(volume, np.zeros((1, 5), np.float32))
-    little, large = 0.06, 0.6
-
-    def cheapest(costs: np.ndarray) -> np.ndarray:
-        steps = np.abs(np.arange(4)[:, None] - np.arange(4))
-        price = np.where(steps == 0, 0, np.where(steps == 1, little, large))
-        way, ways = costs[0].astype(float), [costs[0]]
-        for cost in costs[1:]:
-            way = cost + (way[None] + price).min(axis=1) - way.min()
-            ways.append(way)
-        return np.stack(ways)
-
-    row = volume[0]
-    expected = cheapest(row) + cheapest(row[::-1])[::-1] + 2 * row  # up and down there is nothing but the pixel itself
-    np.testing.assert_allclose(total[0], expected, atol=1e-5)
 
 
 def test_depths_confirm_each_other_only_where_they_agree():
