@@ -81,7 +81,8 @@ class ScanNetPP(DatasetBench):
         tests = [] if self.args.train_on_test else _read(scene / "dslr" / "train_test_lists.json", "test")
         gmap = self.map(name, source, list(map(str, tests)))
         mesh = read_cloud(scene / "scans" / f"{MESH}.ply")
-        options = ExportOptions(smooth=self.args.smooth, max_distance=self.args.max_distance)
+        segments = scene / "scans" / "segments.json"
+        options = ExportOptions(max_distance=self.args.max_distance, smooth=self.args.smooth, segments=segments)
         labels = export_labels(gmap.means, gmap.instance_ids, mesh, options)
         write_scannet(target, name, labels, {entry["id"]: entry for entry in gmap.instances})
 
@@ -104,7 +105,7 @@ class ScanNetPP(DatasetBench):
             if classes is None
             else f"objects of {len(classes.instance)} instance classes of {len(classes.names)}; labels mapped by "
             "map_benchmark.csv; the smallest object holds a vertex; the first annotation is void (toolkit)",
-            "smoothing": "Felzenszwalb-Huttenlocher on the mesh" if self.args.smooth else "off",
+            "smoothing": "the data set's segments (segments.json)" if self.args.smooth else "off",
             "max_distance": self.args.max_distance,
             "test_photos": "trained on" if self.args.train_on_test else "held out",
         }

@@ -34,7 +34,7 @@ def _add_export(commands: Any) -> None:
         metavar="D",
         help="points farther than D from any Gaussian stay -1 (auto: by the map's own spacing)",
     )
-    p.add_argument("--segments", type=Path, metavar="X.segs.json", help="ScanNet segments instead of our own")
+    p.add_argument("--segments", type=Path, metavar="X.segs.json", help="ScanNet's segments, or scannet: by its rules")
     p.add_argument("--color", choices=("original", "instance"), default="original")
     p.add_argument("--mesh", type=Path, metavar="OUT", help="the map's surface as .ply or .glb (extra: open3d)")
     p.add_argument("--instance", type=int, metavar="ID", help="--mesh: the closed body of this one instead")

@@ -44,18 +44,6 @@ def list_edges(lists: np.ndarray) -> np.ndarray:
     return edges[: _core.undirected(np.ascontiguousarray(lists), edges)]
 
 
-def mesh_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Vertex normals [P, 3] float32, faces weighted by area; zero where a vertex has no face of non-zero area."""
-    corners = points[faces].astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros((len(points), 3))
-    for axis in range(3):
-        for corner in range(3):
-            total[:, axis] += np.bincount(faces[:, corner], normal[:, axis], len(points))
-    return _unit(total)
-
-
 def list_normals(points: np.ndarray, lists: np.ndarray) -> np.ndarray:
     """Normals [P, 3] float32 of the planes through the neighbour lists [P, k] of points [P, 3].
 
@@ -69,9 +57,28 @@ def list_normals(points: np.ndarray, lists: np.ndarray) -> np.ndarray:
     return normals
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.where(length > 0, vectors / np.maximum(length, 1e-300), 0).astype(np.float32)
+def scannet_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Vertex normals [P, 3] float32 of ScanNet's segmentator: the running mean of the unit normals of a vertex's faces.
+
+    Each face counts alike, and the mean is not scaled to length 1: it is short at a crease. Bit for bit the program's
+    arithmetic in float32. Faces without area, which give NaN there, are left out; zero where a vertex has no face.
+    """
+    corners = points[faces].astype(np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sides = [(corners[:, k] - corners[:, 0]).astype(np.float32) for k in (1, 2)]
+        normal = np.cross(*sides)
+        normal /= np.sqrt(_dot(normal, normal))[:, None]
+    sound = np.isfinite(normal).all(axis=1)
+    vertex, normal = faces[sound].reshape(-1), np.repeat(normal[sound], 3, axis=0)
+    order = np.argsort(vertex, kind="stable")
+    turn = np.empty(len(vertex), np.int64)  # how many faces of the same vertex come before
+    turn[order] = np.arange(len(vertex)) - np.searchsorted(vertex[order], vertex[order])
+    normals = np.zeros((len(points), 3), np.float32)
+    for k in range(int(turn.max(initial=-1)) + 1):
+        rows = turn == k
+        share = np.float32(1) / np.float32(k + 1)
+        normals[vertex[rows]] = share * normal[rows] + (np.float32(1) - share) * normals[vertex[rows]]
+    return normals
 
 
 def scannet_weights(points: np.ndarray, normals: np.ndarray, edges: np.ndarray, *, oriented: bool = True) -> np.ndarray:
@@ -80,13 +87,19 @@ def scannet_weights(points: np.ndarray, normals: np.ndarray, edges: np.ndarray, 
     Not oriented: normals of unknown sign; 1 − |n_a·n_b| and no convexity. A missing (zero) normal weighs 1.
     """
     a, b = edges[:, 0], edges[:, 1]
-    cosine = np.einsum("ei,ei->e", normals[a], normals[b])
+    cosine = _dot(normals[a], normals[b])
     if not oriented:
         return np.maximum(1 - np.abs(cosine), 0).astype(np.float32)
     weights = 1 - cosine
-    direction = (points[b] - points[a]).astype(np.float32)
-    convex = np.einsum("ei,ei->e", normals[b], direction) > 0
+    chord = (points[b] - points[a]).astype(np.float32)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        convex = _dot(normals[b], chord / np.sqrt(_dot(chord, chord))[:, None]) > 0
     return np.where(convex, weights * weights, weights).astype(np.float32)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Scalar products [E] of rows [E, 3], added from the first axis to the last."""
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
 def step_weights(points: np.ndarray, normals: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -12,6 +12,8 @@ from perception.export.assign import auto_distance, nearest_gaussian
 from perception.export.smooth import read_segments, segment_cloud, vote
 from perception.types import PointCloud
 
+SCANNET = Path("scannet")
+
 
 @dataclass(frozen=True)
 class ExportOptions:
@@ -19,7 +21,8 @@ class ExportOptions:
 
     drop_noise: Gaussians without an instance are ignored, so every point gets a label (as in the released code).
     max_distance: in map units; None = no limit; "auto" = computed from the map's spacing (`auto_distance`).
-    smooth: superpoint vote, on or off. segments: a ScanNet *.segs.json to use instead of computing a segmentation.
+    smooth: superpoint vote, on or off. segments: a ScanNet *.segs.json to use instead of our own segmentation, or
+    SCANNET for the one that ScanNet's segmentator makes of a mesh.
     """
 
     drop_noise: bool = True
@@ -44,7 +47,10 @@ def export_labels(
     if not options.smooth or not (labels >= 0).any():
         return labels
     given = options.segments
-    segments = segment_cloud(cloud) if given is None else read_segments(given, len(labels))
+    if given in (None, SCANNET):
+        segments = segment_cloud(cloud, scannet=given is not None)
+    else:
+        segments = read_segments(given, len(labels))
     smoothed = vote(labels, segments)
     if limit is not None:
         smoothed[labels < 0] = -1  # points beyond the map stay unlabelled
