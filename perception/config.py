@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeVar, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 from pydantic.fields import FieldInfo
 
-from perception.errors import InputError
+from perception.errors import InputError, refuse_named_pipe
 
 LARGEST_SEED = 2**31 - 1
 """COLMAP's random generator takes 32-bit signed seeds."""
@@ -275,6 +275,7 @@ def flat(table: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 def read_toml(file: Path) -> dict[str, Any]:
     """The tables of a TOML file; InputError if it cannot be read or is not valid TOML."""
+    refuse_named_pipe(file)
     try:
         import tomllib
     except ModuleNotFoundError:  # Python 3.10

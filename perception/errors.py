@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import unicodedata
+from pathlib import Path
 
 
 class InputError(ValueError):
@@ -22,3 +23,9 @@ def _visible(character: str) -> bool:
 def missing_extra(package: str, extra: str) -> InputError:
     """The error for a missing optional dependency, with the exact install command."""
     return InputError(f"the package '{package}' is not installed; run in its clone: pip install \".[{extra}]\"")
+
+
+def refuse_named_pipe(file: Path) -> None:
+    """InputError if opening `file` would wait for the writer of a named pipe; those of the shell (/dev) have one."""
+    if file.is_fifo() and file.parts[:2] != ("/", "dev"):
+        raise InputError(f"{file}: found a named pipe, expected a regular file")

@@ -7,7 +7,7 @@ import ipaddress
 import socket
 from pathlib import Path
 
-from perception.errors import InputError
+from perception.errors import InputError, refuse_named_pipe
 
 MAKE_TOKEN = "openssl rand -hex 24 > token, then --token-file token"
 _MIN_TOKEN = 16
@@ -73,6 +73,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 def read_token(path: Path) -> str:
     """The token in a file, without outer white space; InputError when it is unreadable, too short or not ASCII."""
+    refuse_named_pipe(path)
     try:
         token = path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:

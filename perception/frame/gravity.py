@@ -18,10 +18,13 @@ import numpy as np
 LEVEL = 0.12  # largest mean square of the sine of the cameras' roll at which they count as level
 POINTS, TRIPLES, PLANES = 4000, 3000, 6  # points that RANSAC counts, its samples per plane, largest number of planes
 THICKNESS, LEAST_SHARE = 0.01, 0.05  # of a plane: half its thickness in extents of the scene, least share of the points
-NEAR = np.radians(12)  # largest angle between a level plane or a wall and the first estimate
-TILT, SHARED_ROLL, PITCH, BEND = np.radians([1.0, 1.0, 15.0, 0.5])
+NEAR = np.radians([12, 30])  # angle between a level plane or a wall and the first estimate: least and largest bound
+TILT, SHARED_ROLL, PITCH, BEND = np.radians([1.2, 1.0, 20.0, 0.8])
 """Standard deviations: of floors, tables and walls from level and upright in reconstructions of real rooms; of the
-shared roll; of the first guess; of the reconstruction's bend, which all planes have in common."""
+shared roll; of the cameras' mean y axis from down; of the reconstruction's bend, which all planes have in common."""
+BEFORE, CLUTTER = 3.0, 1.5
+"""Planes whose spread TILT is taken to be, beside those found. Standard error of a plane that has as many points on its
+sides as in it, in half thicknesses over its width: a slab of clutter has any direction. As kitchen_rgbd needs it."""
 CONFIDENT = 3.0
 """Largest standard error in degrees at which a map is turned by its gravity."""
 
@@ -73,23 +76,33 @@ def gravity_of_scene(camera_from_world: np.ndarray, points: np.ndarray, seed: in
     up = up_from_cameras(camera_from_world)
     if up is None:
         return None
-    first, x = -up, np.asarray(camera_from_world[:, 0, :3], np.float64)
-    level, walls = _planes(points, first, seed)
-    down = first
+    x, y = np.asarray(camera_from_world[:, :2, :3], np.float64).transpose(1, 0, 2)
+    guess = y.mean(axis=0) / np.linalg.norm(y.mean(axis=0))
+    down, error = _solved(-up, guess, x, [], [])
+    level, walls = _planes(points, down, float(np.clip(2 * error, *NEAR)), seed)
+    down, error = _solved(down, guess, x, level, walls)
+    source = f"roll of {len(x)} cameras, {len(level)} level planes, {len(walls)} walls"
+    return Gravity(down, float(np.degrees(np.hypot(error, BEND))), source)
+
+
+def _solved(
+    down: np.ndarray, guess: np.ndarray, x: np.ndarray, level: list[Plane], walls: list[Plane]
+) -> tuple[np.ndarray, float]:
+    """Down, from a first estimate, and its standard error in radians. guess: mean y axis of the cameras."""
+    tilt, priors = TILT, len(x) + 3
     for _ in range(12):
         tangent = np.linalg.svd(down[None])[2][1:]  # rows a, b: down + p a + q b, shared roll c are the unknowns
-        rolls = x @ down
-        roll = np.clip(1.4826 * np.median(np.abs(rolls - np.median(rolls))), np.radians(0.5), np.radians(10))
         rows = [
-            (np.c_[x @ tangent.T, -np.ones(len(x))], -rolls, np.full(len(x), roll)),
+            (np.c_[x @ tangent.T, -np.ones(len(x))], -x @ down, np.full(len(x), _standard_error_of_roll(x @ down))),
             (np.array([[0.0, 0, 1]]), np.zeros(1), np.array([SHARED_ROLL])),
-            (np.eye(3)[:2], tangent @ first, np.full(2, PITCH)),
+            (np.eye(3)[:2], tangent @ guess, np.full(2, PITCH)),
         ]
         for normal, sigma in level:
             normal = normal * np.sign(normal @ down)
-            rows.append((np.eye(3)[:2], tangent @ normal / (normal @ down), np.full(2, sigma)))
+            rows.append((np.eye(3)[:2], tangent @ normal / (normal @ down), np.full(2, np.hypot(tilt, sigma))))
         for normal, sigma in walls:
-            rows.append((np.r_[tangent @ normal, 0.0][None], np.array([-normal @ down]), np.array([sigma])))
+            row = np.r_[tangent @ normal, 0.0][None]
+            rows.append((row, np.array([-normal @ down]), np.array([np.hypot(tilt, sigma)])))
         A, b, sigmas = (np.concatenate(parts) for parts in zip(*rows, strict=True))
         A, b = A / sigmas[:, None], b / sigmas
         weights = np.ones(len(b))
@@ -99,18 +112,31 @@ def gravity_of_scene(camera_from_world: np.ndarray, points: np.ndarray, seed: in
             weights = 2.0 / np.maximum(errors, 2.0)  # Huber
         down = down + step[:2] @ tangent
         down /= np.linalg.norm(down)
-    spread = max(1.0, float((weights * errors**2).sum() / max(len(b) - 6, 1)))
-    covariance = np.linalg.inv(A.T @ (weights[:, None] * A))[:2, :2] * spread
-    source = f"roll of {len(x)} cameras, {len(level)} level planes, {len(walls)} walls"
-    return Gravity(down, float(np.degrees(np.sqrt(np.trace(covariance) + BEND**2))), source)
+        off = (errors * sigmas)[priors:]  # of the planes; TILT counts as the spread of BEFORE others
+        tilt = float(np.sqrt((BEFORE * TILT**2 + off @ off) / (BEFORE + len(off))))
+    covariance = np.linalg.inv(A.T @ (weights[:, None] * A))[:2, :2]
+    return down, float(np.sqrt(np.trace(covariance)))
+
+
+def _standard_error_of_roll(rolls: np.ndarray) -> float:
+    """Of each of N rolls, such that their mean has the right error: neighbours in time are alike.
+
+    Their spread times √(N / (n − 2)), n = N (1 − r) / (1 + r) independent rolls, from which two numbers are estimated;
+    r: correlation of neighbours (first-order autoregression).
+    """
+    off = rolls - np.median(rolls)
+    alike = np.clip(float(off[1:] @ off[:-1]) / max(float(off @ off), 1e-12), 0, 0.95)
+    spread = np.clip(1.4826 * np.median(np.abs(off)), np.radians(0.5), np.radians(10))
+    count = max(len(rolls) * (1 - alike) / (1 + alike), 2.5)
+    return float(spread * np.sqrt(len(rolls) / (count - 2)))
 
 
 Plane = tuple[np.ndarray, float]
 """Unit normal [3] and the standard error of its direction in radians."""
 
 
-def _planes(points: np.ndarray, down: np.ndarray, seed: int) -> tuple[list[Plane], list[Plane]]:
-    """The level planes and the walls of a scene, up to NEAR from a first estimate; sequential RANSAC."""
+def _planes(points: np.ndarray, down: np.ndarray, near: float, seed: int) -> tuple[list[Plane], list[Plane]]:
+    """The level planes and the walls of a scene, at most `near` (radians) from a first estimate; sequential RANSAC."""
     rng = np.random.default_rng(seed)
     rest = np.asarray(points, np.float64)
     if len(rest) < 100:
@@ -126,10 +152,10 @@ def _planes(points: np.ndarray, down: np.ndarray, seed: int) -> tuple[list[Plane
         normals = np.cross(b - a, c - a)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
         cosine = np.abs(normals @ down)
-        near = (cosine > np.cos(NEAR)) | ((cosine < np.sin(NEAR)) & (np.linalg.norm(normals, axis=1) > 0.5))
-        if not near.any():
+        close = (cosine > np.cos(near)) | ((cosine < np.sin(near)) & (np.linalg.norm(normals, axis=1) > 0.5))
+        if not close.any():
             break
-        normals, a = normals[near], a[near]
+        normals, a = normals[close], a[close]
         inside = np.abs(rest @ normals.T - (normals * a).sum(axis=1)) < THICKNESS * extent
         best = int(inside.sum(axis=0).argmax())
         mine = inside[:, best]
@@ -141,12 +167,14 @@ def _planes(points: np.ndarray, down: np.ndarray, seed: int) -> tuple[list[Plane
             mine = np.abs((rest - middle) @ axes[1][2]) < THICKNESS * extent
         if mine.sum() < max(least, 30):
             break
+        around = np.abs((rest - middle) @ axes[1][2]) < 2 * THICKNESS * extent
         normal, spread = axes[1][2], axes[0] / np.sqrt(len(rest))
         # slope of a line fitted to N points of deviation s over a spread e: s / (e √N); errors of neighbours correlate
         error = float(2 * spread[2] / max(spread[1], 1e-12) / np.sqrt(mine.sum()))
+        error += CLUTTER * (around.sum() / mine.sum() - 1) * THICKNESS * extent / max(spread[1], 1e-12)
         cosine = abs(float(normal @ down))
-        if cosine > np.cos(NEAR) or cosine < np.sin(NEAR):
-            found[0 if cosine > 0.5 else 1].append((normal, float(np.hypot(TILT, error))))
+        if cosine > np.cos(near) or cosine < np.sin(near):
+            found[0 if cosine > 0.5 else 1].append((normal, error))
         rest = rest[~mine]
     return found
 

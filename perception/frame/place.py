@@ -16,12 +16,16 @@ from perception.frame.gravity import Gravity, floor_height, gravity_of_scene
 from perception.frame.known_size import scale_of_board, scale_of_pixels, scale_of_tags
 from perception.frame.scale import Measurement, combined, known_length, scale_of_depth
 from perception.geometry import camera_centres
+from perception.io.depth import load_depth
 from perception.io.recentre import moved_scene
 from perception.types import Scene, View
 
 UNIT_IS_METRE = 0.03
 """Largest deviation from 1, and largest standard error, at which a measured unit is taken as the metre as it is."""
-
+UNIT_OF_DEPTH = 0.4
+"""Deviation of the unit as depth images measure it from the metre that the input states, up to which both are right."""
+SAMPLED = 200
+"""Views whose depth images are read for the planes that tell gravity."""
 STATED = {"metres_per_unit": 1.0, "source": "the input, which states it", "standard_error": None}
 
 
@@ -36,9 +40,12 @@ def placed_scene(scene: Scene, options: FrameConfig, seed: int = 0) -> Scene:
     posed = scene.report.get("input") != "photos"
     asked = any((options.known_length, options.tag_size, options.board))
     metric, scale, notes = _unit(scene, options, seed)
-    gravity, more = _gravity(scene, seed)
-    scene = replace(scene, metric=metric, report=_with(scene.report, metric, scale, gravity, [*notes, *more]))
+    scene = replace(scene, metric=metric, report=_with(scene.report, metric, scale, notes))
     scene = _depth_in_units(scene, scale, posed)
+    gravity, notes = _gravity(scene, seed)
+    scene.report["warnings"] += notes
+    if gravity is not None:
+        scene.report["gravity"] = gravity.to_json()
     keep = posed if options.keep_world is None else options.keep_world
     unit = 1.0 if metric or scale is None else scale.metres
     if keep and not (posed and asked and options.keep_world is None):
@@ -96,7 +103,9 @@ def _unit(scene: Scene, options: FrameConfig, seed: int) -> tuple[bool, Measurem
 
 def _gravity(scene: Scene, seed: int) -> tuple[Gravity | None, list[str]]:
     """The input's gravity or that of the scene, whichever is more certain, and notes."""
-    found = gravity_of_scene(np.stack([view.camera_from_world for view in scene.views]), _real_points(scene), seed)
+    measured = _measured_points(scene.views)
+    points = measured if len(measured) else _real_points(scene)
+    found = gravity_of_scene(np.stack([view.camera_from_world for view in scene.views]), points, seed)
     if "gravity" not in scene.report:
         return found, []
     given = Gravity.from_json(scene.report["gravity"])
@@ -109,23 +118,37 @@ def _gravity(scene: Scene, seed: int) -> tuple[Gravity | None, list[str]]:
     return given if given.standard_error <= found.standard_error else found, notes
 
 
+def _measured_points(views: Sequence[View]) -> np.ndarray:
+    """[P, 3] in the world: what depth images of at most SAMPLED views measured, thinned to 2 % of the median depth."""
+    found = [np.empty((0, 4))]
+    for view in views[:: -(-len(views) // SAMPLED)]:
+        size = np.array([64, max(round(64 * view.height / view.width), 1)])
+        z = load_depth(view, *size)
+        row, column = np.nonzero(z)
+        pixels = (np.stack([column, row], axis=1) + 0.5) / size * [view.width, view.height]
+        z = z[row, column, None]
+        own = np.c_[(pixels - view.K[:2, 2]) / np.diag(view.K)[:2], np.ones(len(z))] * z
+        found.append(np.c_[(own - view.camera_from_world[:3, 3]) @ view.camera_from_world[:3, :3], z])
+    points, depth = np.split(np.concatenate(found), [3], axis=1)
+    cells = np.floor(points / (0.02 * np.median(depth))) if len(points) else points
+    return points[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
+
+
 def _real_points(scene: Scene) -> np.ndarray:
     return scene.points[:0] if scene.report.get("points_from") == "random" else scene.points
 
 
-def _with(
-    report: dict[str, Any], metric: bool, scale: Measurement | None, gravity: Gravity | None, notes: list[str]
-) -> dict[str, Any]:
+def _with(report: dict[str, Any], metric: bool, scale: Measurement | None, notes: list[str]) -> dict[str, Any]:
     facts: dict[str, Any] = {"scale": scale.to_json()} if scale is not None else {"scale": STATED} if metric else {}
-    facts |= {} if gravity is None else {"gravity": gravity.to_json()}
     return {**report, **facts, "warnings": [*report.get("warnings", []), *notes]}
 
 
 def _depth_in_units(scene: Scene, scale: Measurement | None, posed: bool) -> Scene:
     """The scene with depth images in its own unit, where sensor and poses measure in different units."""
-    if scale is None or scene.metric or not any(view.depth for view in scene.views):
+    if scale is None or not any(view.depth for view in scene.views):
         return scene
-    if posed and abs(np.log(scale.metres)) <= 3 * scale.standard_error / scale.metres + UNIT_IS_METRE:
+    near = 3 * scale.standard_error / scale.metres + (UNIT_OF_DEPTH if scene.metric else UNIT_IS_METRE)
+    if (posed and abs(np.log(scale.metres)) <= near) or (scene.metric and "depth" not in scale.source):
         return scene
     views = [
         view if view.depth is None else replace(view, depth=replace(view.depth, scale=view.depth.scale / scale.metres))

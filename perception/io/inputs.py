@@ -96,11 +96,13 @@ def load_scene(
 
 @dataclass(frozen=True)
 class PhotoSizes:
-    """(width, height) of every photo of an input; posed: the input has camera poses; what: their number as text."""
+    """(width, height) of every photo of an input; posed: the input has camera poses; what: their number as text; depth:
+    photos have depth images."""
 
     sizes: list[tuple[int, int]]
     posed: bool
     what: str
+    depth: bool = False
 
 
 def photo_sizes(source: Path) -> PhotoSizes:
@@ -124,15 +126,16 @@ def photo_sizes(source: Path) -> PhotoSizes:
         count = len(recording.frames)
         size = _size(recording.frames[0].photo) or (640, 480)
         taken = min(count, MOST_RECORDED)
-        return PhotoSizes([size] * taken, True, f"at most {taken} of {count} frames")
+        return PhotoSizes([size] * taken, True, f"at most {taken} of {count} frames", bool(recording.frames[0].depth))
+    depth = False
     if workspace:
         photos = list_photos(source / "images")
     elif file.is_file():
-        photos = listed_photos(file)
+        photos, depth = listed_photos(file)
     else:
         photos = list_photos(source)
     sizes = [size for size in map(_size, photos) if size is not None]
-    return PhotoSizes(sizes, workspace or file.is_file(), f"{len(sizes)} photos")
+    return PhotoSizes(sizes, workspace or file.is_file(), f"{len(sizes)} photos", depth)
 
 
 def _size(photo: Path) -> tuple[int, int] | None:

@@ -83,10 +83,11 @@ def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:
     ]
 
 
-def listed_photos(file: Path) -> list[Path]:
-    """The photos that a transforms.json lists and that exist, in file order."""
-    found = (_find(file.parent, str(frame["file_path"])) for frame in _load(file)["frames"])
-    return [photo for photo in found if photo is not None]
+def listed_photos(file: Path) -> tuple[list[Path], bool]:
+    """The photos that a transforms.json lists and that exist, in file order, and whether it lists depth images."""
+    frames = _load(file)["frames"]
+    found = (_find(file.parent, str(frame["file_path"])) for frame in frames)
+    return [photo for photo in found if photo is not None], any("depth_file_path" in frame for frame in frames)
 
 
 def _views(

@@ -73,9 +73,11 @@ def triangulated_cloud(views: list[View], store: Any, seed: int) -> tuple[np.nda
         "warnings": [],
     }
     if len(points) < MIN_POINTS:
+        measured = any(view.depth for view in views)
         facts["warnings"].append(
             f"only {len(points)} points could be triangulated with the given poses (are they right?); "
-            f"{FALLBACK_POINTS} random points in the cameras' view are used instead"
+            + ("depth images" if measured else f"{FALLBACK_POINTS} random points in the cameras' view")
+            + " are used instead"
         )
         points, colors = random_cloud(views, seed)
         facts["points_from"] = "random"

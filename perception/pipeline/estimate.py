@@ -14,8 +14,9 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.io.inputs import PhotoSizes, photo_sizes
 
-BASE_BYTES, BYTES_PER_GAUSSIAN, BYTES_PER_PIXEL = 900 << 20, 2400, 7
-"""Program and libraries; parameters, gradients and moments of a Gaussian; a decoded photo (3) and its labels (4)."""
+BASE_BYTES, BYTES_PER_GAUSSIAN, BYTES_PER_PIXEL, DEPTH_BYTES = 900 << 20, 2400, 7, 5
+"""Program and libraries; parameters, gradients and moments of a Gaussian; a decoded photo (3) and its labels (4); its
+depth in all resolutions."""
 STEP_BYTES_PER_PIXEL, DECODE_BYTES_PER_PIXEL, READERS = 200, 12, 4
 """Images and gradients of one training step; a photo of full size in one of the threads that read photos."""
 
@@ -24,8 +25,9 @@ def needed_bytes(photos: PhotoSizes, max_side: int, budget: int) -> int:
     """Peak memory of a run in bytes."""
     pixels = [w * h * min(1.0, max_side / max(w, h)) ** 2 for w, h in photos.sizes]
     largest = max((w * h for w, h in photos.sizes), default=0)
+    per_pixel = BYTES_PER_PIXEL + (DEPTH_BYTES if photos.depth else 0)
     at_once = max(STEP_BYTES_PER_PIXEL * max(pixels, default=0), DECODE_BYTES_PER_PIXEL * READERS * largest)
-    return int(BASE_BYTES + budget * BYTES_PER_GAUSSIAN + BYTES_PER_PIXEL * sum(pixels) + at_once)
+    return int(BASE_BYTES + budget * BYTES_PER_GAUSSIAN + per_pixel * sum(pixels) + at_once)
 
 
 def log_estimate(source: Path, config: MapConfig, log: Callable[[str], None]) -> None:

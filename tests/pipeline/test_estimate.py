@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,7 @@ def test_what_grows_the_estimate() -> None:
     small = needed_bytes(base, 800, 100_000)
     assert needed_bytes(more, 800, 100_000) - small == 50 * 640 * 480 * 7  # photo and labels
     assert needed_bytes(base, 800, 200_000) - small == 100_000 * 2400
+    assert needed_bytes(replace(base, depth=True), 800, 100_000) - small == 50 * 640 * 480 * 5
     assert needed_bytes(base, 320, 100_000) < small
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 import threading
 from collections.abc import Iterator
@@ -23,6 +24,7 @@ from openapi_spec_validator import validate as validate_document
 from starlette.testclient import TestClient
 
 from perception.cli import main
+from perception.config import read_toml
 from perception.errors import InputError
 from perception.io.cloud import read_cloud
 from perception.io.store import read_map
@@ -393,6 +395,10 @@ def test_a_token_file_must_hold_one_long_word(tmp_path: Path) -> None:
         read_token(file)
     with pytest.raises(InputError, match="token"):
         read_token(tmp_path / "none")
+    os.mkfifo(tmp_path / "pipe")
+    for read in (read_token, read_toml):
+        with pytest.raises(InputError, match="pipe: found a named pipe, expected a regular file"):
+            read(tmp_path / "pipe")
 
 
 @pytest.mark.parametrize(
