@@ -13,8 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perception.cli import main
-from perception.config import MapConfig, expected, fields, load_config
+from perception.config import METHOD, PAPER, MapConfig, expected, fields, load_config
 from perception.errors import InputError
+from perception.gaussians.train import INSTANCE_WEIGHT, SSIM_WEIGHT
+from perception.instances.crops import EXPANSION
 
 
 def test_pairs_override_file_overrides_preset(tmp_path: Path) -> None:
@@ -23,6 +25,34 @@ def test_pairs_override_file_overrides_preset(tmp_path: Path) -> None:
     config = load_config(file, ["train.budget=2000"], "fast")
     assert (config.seed, config.train.iterations, config.train.budget) == (3, 77, 2000)
     assert config.train.exchange_db == 0.1 and config.densify == load_config().densify
+
+
+def test_the_papers_preset_is_the_published_method() -> None:
+    """Every setting of the method, spelt out: a changed default must not change what `paper` means."""
+    config = load_config(None, [], "paper")
+    found = {
+        name: getattr(config, name).model_dump() for name in ("train", "densify", "losses", "instances", "language")
+    }
+    assert found == {
+        "train": {
+            "iterations": 30_000, "time_limit": None, "stop_psnr": None, "exchange_db": 0, "budget": 10**8,
+            "transients": False, "sh_degree": 3,
+        },
+        "densify": {"every": 100, "grad_threshold": 3.5e-4},
+        "losses": {
+            "feature_dim": 8, "variance_weight": 0.5, "margin": 1, "positive": "per-mask", "negative": "squared",
+            "variance_form": "paper", "depth_weight": 0, "start": 0, "every": 1, "half_resolution": False,
+        },
+        "instances": {
+            "method": "hdbscan", "split": False, "settle": False, "min_cluster_size": 32, "min_samples": 16,
+        },
+        "language": {"encoder": "auto", "views": 5, "zooms": 3, "texts": "off"},
+    }  # fmt: skip
+    changed = {"max_side": 1600, "poses": "keep"}
+    assert config.photos == load_config().photos.model_copy(update=changed) and config.frame == load_config().frame
+    method = {key for key, _ in fields(MapConfig) if key.startswith((*METHOD, "train."))}
+    assert method - set(PAPER) == {"train.time_limit", "train.stop_psnr"}  # the rest is listed, whatever the defaults
+    assert (SSIM_WEIGHT, INSTANCE_WEIGHT, EXPANSION) == (0.2, 0.1, 0.3)  # β, λ_inst2d and the growth of the crops
 
 
 def test_values_take_their_field_type() -> None:

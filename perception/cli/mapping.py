@@ -34,7 +34,7 @@ def _add_map(commands: Any) -> None:
     p.add_argument("-o", "--output", type=Path, required=True, metavar="MAP")
     p.add_argument("--masks", metavar="SOURCE", help="auto, builtin, sam:PATH or labels:DIR")
     p.add_argument("--config", type=Path, metavar="FILE.toml")
-    p.add_argument("--preset", default="default", help="fast, default or quality")
+    p.add_argument("--preset", default="default", help="fast, default, quality or paper")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
     p.add_argument("--camera", type=Path, metavar="FILE.yaml", help="fixed intrinsics, ROS camera_info")
     p.add_argument(

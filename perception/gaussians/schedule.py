@@ -48,7 +48,7 @@ class Schedule:
         """The view of the next step, and whether its features are rendered. Each epoch has a new random order."""
         trainer, losses = self.trainer, self.config.losses
         with_features = trainer.has_labels and progress >= losses.start and trainer.iteration % losses.every == 0
-        coarse = progress < COARSE_UNTIL or (with_features and losses.half_resolution)
+        coarse = losses.half_resolution and (with_features or progress < COARSE_UNTIL)
         epoch, place = divmod(trainer.iteration, len(trainer.views))
         if place == 0 or len(self._order) == 0:
             self._order = np.random.default_rng([self.config.seed, epoch]).permutation(len(trainer.views))

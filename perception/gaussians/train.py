@@ -160,7 +160,7 @@ class Trainer:
         losses = self.config.losses
         assert out.features is not None and out.feature_variance is not None
         variance = out.feature_variance[0] if view.weight is None else out.feature_variance[0] * view.weight[..., None]
-        total = losses.variance_weight * variance_loss(variance)
+        total = losses.variance_weight * variance_loss(variance, losses.variance_form)
         if view.labels is None:
             return total
         instance = instance_loss(

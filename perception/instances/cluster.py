@@ -1,4 +1,4 @@
-"""Clusters Gaussians into instances: HDBSCAN on the features, then a split into spatially connected components.
+"""Clusters Gaussians into instances: HDBSCAN on the features, then (by default) a split into connected components.
 
 HDBSCAN (Campello et al. 2013) as in the paper (§3.2.1). It finds the number of instances; noise has the label −1.
 """
@@ -39,17 +39,19 @@ def cluster_gaussians(
 ) -> Clusters:
     """Instance ids of N Gaussians.
 
-    means [N, 3], scales [N, 3], opacities [N], features [N, D] float. Gaussians fainter than MIN_OPACITY, or with
-    non-finite features, are not clustered and stay noise.
+    means [N, 3], scales [N, 3], opacities [N], features [N, D] float. Gaussians with non-finite features are not
+    clustered and stay noise. So do those fainter than MIN_OPACITY, unless nothing settles them later (`config.settle`).
     """
     count = len(means)
     ids = np.full(count, -1, np.int32)
     membership = np.zeros(count, np.float32)
-    solid = np.flatnonzero((opacities >= MIN_OPACITY) & np.isfinite(features).all(axis=1))
+    least = MIN_OPACITY if config.settle else 0.0
+    solid = np.flatnonzero((opacities >= least) & np.isfinite(features).all(axis=1))
     if len(solid) < config.min_cluster_size:
         return Clusters(ids, membership)
     found, strength = cluster_features(features[solid], config, seed)
-    found = split_disconnected(means[solid], scales[solid], found, config.min_cluster_size)
+    if config.split:
+        found = split_disconnected(means[solid], scales[solid], found, config.min_cluster_size)
     ids[solid] = by_falling_size(found)
     membership[solid] = np.where(ids[solid] >= 0, strength, 0)
     return Clusters(ids, membership)

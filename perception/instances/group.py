@@ -72,9 +72,10 @@ def group(
         parents = np.zeros(0, np.int64)
     else:
         ids, parts, parents = _by_consensus(means, opacities, features, votes, config, seed)
-    ids = reassign(ids, means, opacities, votes, MIN_OPACITY)
-    ids = _without_small(ids, votes, config)
-    ids = reassign(ids, means, opacities, votes, MIN_OPACITY)
+    if config.settle:
+        ids = reassign(ids, means, opacities, votes, MIN_OPACITY)
+        ids = _without_small(ids, votes, config)
+        ids = reassign(ids, means, opacities, votes, MIN_OPACITY)
     return _scored(ids, parts, parents, votes)
 
 

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from perception.cli import _resume, main
-from perception.config import load_config
+from perception.config import PAPER, load_config
 from perception.gaussians.early_stopping import COST_EXPONENT, EarlyStopping
 from perception.gaussians.model import from_points
 from perception.gaussians.optimiser import SparseAdam
@@ -153,6 +153,17 @@ def test_a_trial_is_scored_before_growth_sets_the_picture_back(monkeypatch: pyte
     trainer.run()
     grown = [n for n in range(40) if {"_grow", "_end_trial"} <= set(order.get(n, []))]
     assert len(grown) > 3 and all(order[n][:3] == ["score", "_grow", "_end_trial"] for n in grown)
+
+
+def test_the_papers_preset_trains_features_in_every_step_at_full_resolution() -> None:
+    trainer = small_trainer(*(f"{key}={value}" for key, value in PAPER.items() if key.startswith("losses.")))
+    usual = small_trainer()
+    trainer.has_labels = usual.has_labels = True
+    for trainer.iteration, progress in enumerate((0.0, 0.1, 0.5, 0.99)):
+        view, with_features = trainer.schedule.next_view(progress)
+        assert with_features and view.photo.shape == (12, 16, 3)
+    view, with_features = usual.schedule.next_view(0.0)
+    assert not with_features and view.photo.shape == (6, 8, 3)
 
 
 def test_holes_are_filled_after_growth_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:

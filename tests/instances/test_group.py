@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import hdbscan
 import numpy as np
 import pytest
 import torch
@@ -82,6 +83,16 @@ def test_balls_are_found_in_any_width(dim: int, method: str) -> None:
     found = run(scene, method=method)
     assert found.count == 5 and agrees(found, scene.truth)
     assert (found.scores > 0).all() and (found.scores <= 1).all() and found.membership.max() <= 1
+
+
+def test_the_papers_grouping_is_hdbscan_of_the_features_alone() -> None:
+    """Two objects far apart with one feature stay one cluster, and faint Gaussians are clustered like others."""
+    scene = make_scene(row(4), np.repeat(CODES[:2, :8], 2, axis=0), CAMERAS)
+    scene.gaussians.opacity_logits[::3] = -4.0
+    found = run(scene, method="hdbscan", split=False, settle=False)
+    plain = hdbscan.HDBSCAN(min_cluster_size=32, min_samples=16).fit_predict(scene.gaussians.features.double().numpy())
+    assert adjusted_rand_score(plain, found.ids) == 1 and found.count == 2
+    assert ((found.ids < 0) == (plain < 0)).all()
 
 
 def test_one_object() -> None:
