@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 import cv2
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from perception.demo import textures as tex
 from perception.demo.light import Body, Part
 from perception.demo.shapes import Box, Ellipsoid, Lathe, Tube, rotation_from_axes, spin
+from perception.demo.things import lathe
 
 PIXELS = 260  # pixels per metre of a box's texture
 WOODS = {
@@ -54,13 +54,18 @@ def block(
     return Part(shape, np.concatenate(strips).astype(np.float32), gloss, (6 * texels, texels))
 
 
+def blocks(rng: np.random.Generator, tile: np.ndarray, *rows: Point) -> list[Part]:
+    """Boxes of one material. rows: extent (x, y, z) and centre (x, y, z) of each."""
+    return [block(rng, row[:3], row[3:], tile) for row in rows]
+
+
 def four_legs(
     rng: np.random.Generator, width: float, depth: float, height: float, thick: float, tile: np.ndarray
 ) -> list[Part]:
     """Four legs at the corners of a rectangle centred on the origin."""
     x, y = width / 2 - thick / 2, depth / 2 - thick / 2
-    places = [(sx * x, sy * y, height / 2) for sx in (-1, 1) for sy in (-1, 1)]
-    return [block(rng, (thick, thick, height), place, tile) for place in places]
+    rows = [(thick, thick, height, sx * x, sy * y, height / 2) for sx in (-1, 1) for sy in (-1, 1)]
+    return blocks(rng, tile, *rows)
 
 
 def table(
@@ -71,24 +76,18 @@ def table(
     tile = wood(rng, kind)
     parts = [block(rng, (width, depth, 0.035), (0, 0, height - 0.0175), tile, 0.1)]
     parts += four_legs(rng, width - 0.06, depth - 0.06, height - 0.035, 0.055, tile)
-    apron = (0, height - 0.075)
-    parts += [
-        block(rng, (width - 0.12, 0.02, 0.08), (0, side * (depth / 2 - 0.06), apron[1]), tile) for side in (-1, 1)
-    ]
-    if shelf:
-        parts.append(block(rng, (width - 0.12, depth - 0.12, 0.02), (0, 0, 0.16), tile))
+    aprons = [(width - 0.12, 0.02, 0.08, 0, side * (depth / 2 - 0.06), height - 0.075) for side in (-1, 1)]
+    parts += blocks(rng, tile, *aprons, *([(width - 0.12, depth - 0.12, 0.02, 0, 0, 0.16)] if shelf else []))
     return Body(name, prompts, parts, kind="table")
 
 
 def chair(rng: np.random.Generator, name: str, kind: str, cloth: str) -> Body:
     """A dining chair with an upholstered seat and a slatted back. The back is at +y."""
     tile, seat = wood(rng, kind), tex.fabric(rng, 200, 300, CLOTHS[cloth])
-    parts = [
-        block(rng, (0.43, 0.43, 0.05), (0, 0, 0.445), seat),
-        *four_legs(rng, 0.42, 0.42, 0.42, 0.04, tile),
-        *(block(rng, (0.035, 0.03, 0.47), (x, 0.2, 0.69), tile) for x in (-0.19, 0.19)),
-        *(block(rng, (0.36, 0.02, 0.07), (0, 0.2, z), tile) for z in (0.62, 0.75, 0.88)),
-    ]
+    back = [(0.035, 0.03, 0.47, x, 0.2, 0.69) for x in (-0.19, 0.19)]
+    back += [(0.36, 0.02, 0.07, 0, 0.2, z) for z in (0.62, 0.75, 0.88)]
+    parts = blocks(rng, seat, (0.43, 0.43, 0.05, 0, 0, 0.445))
+    parts += four_legs(rng, 0.42, 0.42, 0.42, 0.04, tile) + blocks(rng, tile, *back)
     return Body(name, ["chair", f"{kind} chair", "wooden chair", "dining chair"], parts, kind="chair")
 
 
@@ -97,16 +96,14 @@ def sofa(rng: np.random.Generator, name: str, width: float, cloth: str, seats: i
     tile = tex.fabric(rng, 420, 760, CLOTHS[cloth])
     seam = tex.fabric(rng, 300, 300, tex.rgb_code(0.9 * tex.rgb(CLOTHS[cloth])))
     depth, inner = 0.86, width - 0.36
-    parts = [
-        block(rng, (width, depth, 0.28), (0, 0, 0.22), tile),
-        block(rng, (width, 0.22, 0.52), (0, depth / 2 - 0.11, 0.60), tile),
-        *(block(rng, (0.18, depth - 0.02, 0.30), (s * (width / 2 - 0.09), -0.02, 0.47), tile) for s in (-1, 1)),
-        *four_legs(rng, width - 0.1, depth - 0.1, 0.08, 0.05, wood(rng, "walnut")),
-    ]
-    for k in range(seats):
-        x, across = (k + 0.5) / seats * inner - inner / 2, inner / seats - 0.02
-        parts.append(block(rng, (across, depth - 0.26, 0.13), (x, -0.10, 0.425), seam))
-        parts.append(block(rng, (across, 0.13, 0.36), (x, depth / 2 - 0.28, 0.66), seam))
+    parts = blocks(
+        rng, tile, (width, depth, 0.28, 0, 0, 0.22), (width, 0.22, 0.52, 0, depth / 2 - 0.11, 0.60),
+        *((0.18, depth - 0.02, 0.30, s * (width / 2 - 0.09), -0.02, 0.47) for s in (-1, 1)),
+    ) + four_legs(rng, width - 0.1, depth - 0.1, 0.08, 0.05, wood(rng, "walnut"))  # fmt: skip
+    across = inner / seats - 0.02
+    for x in ((k + 0.5) / seats * inner - inner / 2 for k in range(seats)):
+        cushions = (across, depth - 0.26, 0.13, x, -0.10, 0.425), (across, 0.13, 0.36, x, depth / 2 - 0.28, 0.66)
+        parts += blocks(rng, seam, *cushions)
     words = ["sofa", "couch"] if seats > 1 else ["armchair"]
     return Body(name, [*words, f"{cloth} {words[0]}"], parts, kind=words[0])
 
@@ -123,11 +120,10 @@ def bookcase(rng: np.random.Generator, name: str, kind: str, width: float, heigh
     """Shelves with rows of books. The books belong to the same instance."""
     tile, depth, board = wood(rng, kind), 0.30, 0.022
     count = round(height / 0.36)
-    pitch = (height - board) / count
-    inner = width - 2 * board
-    parts = [block(rng, (board, depth, height), (s * (width - board) / 2, 0, height / 2), tile) for s in (-1, 1)]
-    parts += [block(rng, (inner, depth, board), (0, 0, board / 2 + k * pitch), tile) for k in range(count + 1)]
-    parts.append(block(rng, (inner, 0.01, height), (0, depth / 2 - 0.005, height / 2), tile))
+    pitch, inner = (height - board) / count, width - 2 * board
+    rows = [(board, depth, height, s * (width - board) / 2, 0, height / 2) for s in (-1, 1)]
+    rows += [(inner, depth, board, 0, 0, board / 2 + k * pitch) for k in range(count + 1)]
+    parts = blocks(rng, tile, *rows, (inner, 0.01, height, 0, depth / 2 - 0.005, height / 2))
     pages = tex.fabric(rng, 120, 300, "#d8cdb2")
     for k in range(count):
         left, full = -inner / 2, rng.uniform(0.55, 0.97) * inner
@@ -161,11 +157,8 @@ def television(rng: np.random.Generator, name: str) -> Body:
     glow = 0.09 + 0.10 * np.clip(1 - np.hypot(x - 1.3, y - 0.2), 0, 1) + 0.01 * tex.noise(rng, 360, 640, (6, 9), 4)
     screen = np.repeat(glow[..., None], 3, -1).astype(np.float32) * [0.9, 1.0, 1.15]
     cv2.rectangle(screen, (0, 0), (639, 359), (0.05, 0.05, 0.05), 12)
-    parts = [
-        block(rng, (1.02, 0.035, 0.60), (0, 0, 0.37), shell, 0.3, front=screen.astype(np.float32)),
-        block(rng, (0.06, 0.03, 0.09), (0, 0, 0.05), shell),
-        block(rng, (0.40, 0.20, 0.015), (0, 0, 0.0075), shell),
-    ]
+    parts = [block(rng, (1.02, 0.035, 0.60), (0, 0, 0.37), shell, 0.3, front=screen.astype(np.float32))]
+    parts += blocks(rng, shell, (0.06, 0.03, 0.09, 0, 0, 0.05), (0.40, 0.20, 0.015, 0, 0, 0.0075))
     return Body(name, ["tv", "flat screen"], parts, kind="television")
 
 
@@ -173,10 +166,9 @@ def laptop(rng: np.random.Generator, name: str) -> Body:
     """An open laptop. The screen faces -y."""
     shell = tex.fabric(rng, 200, 300, "#9fa3a8")
     keys = np.ascontiguousarray(tex.fabric(rng, 240, 340, "#9fa3a8"))
-    for row in range(5):
-        for column in range(13):
-            corner = 16 + 24 * column, 24 + 24 * row
-            cv2.rectangle(keys, corner, (corner[0] + 19, corner[1] + 18), tex.rgb("#26282c").tolist(), -1)
+    for y in range(24, 144, 24):
+        for x in range(16, 328, 24):
+            cv2.rectangle(keys, (x, y), (x + 19, y + 18), tex.rgb("#26282c").tolist(), -1)
     cv2.rectangle(keys, (120, 165), (220, 225), tex.rgb("#7f8388").tolist(), -1)
     picture = tex.landscape(rng, 320, 480, ["#355c9c", "#9fc1e8"], ["#2d6b4f", "#1f4f3c", "#173a2d"], "")
     lid = rotation_from_axes([1, 0, 0], [0, 0.28, 1])
@@ -190,35 +182,34 @@ def laptop(rng: np.random.Generator, name: str) -> Body:
 def floor_lamp(rng: np.random.Generator, name: str, color: str) -> Body:
     """A standing lamp with a cloth shade."""
     metal = tex.glaze(rng, 300, 200, "#3a3a3d", ["#77777c"], 80)
-    pole = [(0.0, 0.0), (0.15, 0.0), (0.15, 0.02), (0.03, 0.035), (0.013, 0.06), (0.013, 1.42), (0.0, 1.42)]
-    shade = [(0.21, 1.28), (0.215, 1.28), (0.12, 1.60), (0.115, 1.60)]
-    cloth = tex.fabric(rng, 200, 600, color)
-    parts = [Part(Lathe(np.array(pole)), metal, 0.3, (40, 16)), Part(Lathe(np.array(shade)), cloth, 0.0, (16, 32))]
+    parts = [
+        Part(lathe("0 0 150 0 150 20 30 35 13 60 13 1420 0 1420"), metal, 0.3, (40, 16)),
+        Part(lathe("210 1280 215 1280 120 1600 115 1600"), tex.fabric(rng, 200, 600, color), 0.0, (16, 32)),
+    ]
     return Body(name, ["lamp", "standing lamp"], parts, kind="lamp")
 
 
 def desk_lamp(rng: np.random.Generator, name: str, color: str) -> Body:
     """A lamp with a bent arm and a conical shade."""
     paint = tex.glaze(rng, 240, 240, color, ["#ffffff", "#222222"], 60)
-    foot = [(0.0, 0.0), (0.085, 0.0), (0.085, 0.012), (0.015, 0.022), (0.010, 0.05), (0.010, 0.24), (0.0, 0.24)]
-    upright = np.stack([np.array([0, -1.0, 0]), np.array([0, 0, 1.0]), np.array([-1.0, 0, 0])], 1)
+    upright = np.array([[0, 0, -1.0], [-1.0, 0, 0], [0, 1.0, 0]])
     arm = Tube(0.11, np.radians(10), np.radians(175), np.full(9, 0.009), upright, np.array([0, -0.11, 0.24]))
-    shade = [(0.075, 0.0), (0.078, 0.0), (0.030, 0.09), (0.0, 0.10)]
     tilt = rotation_from_axes([1, 0, 0], [0, 0.35, 1])
+    shade = Lathe(lathe("75 0 78 0 30 90 0 100").profile, tilt, np.array([0, -0.235, 0.17]))
     parts = [
-        Part(Lathe(np.array(foot)), paint, 0.4, (24, 24)),
+        Part(lathe("0 0 85 0 85 12 15 22 10 50 10 240 0 240"), paint, 0.4, (24, 24)),
         Part(arm, paint, 0.4, (10, 24)),
-        Part(Lathe(np.array(shade), tilt, np.array([0, -0.235, 0.17])), paint, 0.4, (16, 24)),
+        Part(shade, paint, 0.4, (16, 24)),
     ]
     return Body(name, ["lamp", f"{name.split()[0]} lamp", "desk lamp"], parts, kind="lamp")
 
 
 def plant(rng: np.random.Generator, name: str, leaves: int = 15) -> Body:
     """A pot with long arching leaves."""
-    pot = [(0.0, 0.0), (0.11, 0.0), (0.15, 0.24), (0.16, 0.25), (0.165, 0.29), (0.15, 0.29), (0.145, 0.26), (0.0, 0.26)]
     clay = tex.fabric(rng, 300, 500, str(rng.choice(["#b5623a", "#d8d2c4", "#5a6f86"])))
     clay[235:] = tex.rgb("#2e2118") * (1 + 0.2 * tex.noise(rng, 65, 500, (12, 60), 3))[..., None]
-    parts = [Part(Lathe(np.array(pot)), np.clip(clay, 0, 1), 0.1, (24, 32))]
+    pot = lathe("0 0 110 0 150 240 160 250 165 290 150 290 145 260 0 260")
+    parts = [Part(pot, np.clip(clay, 0, 1), 0.1, (24, 32))]
     for k in range(leaves):
         side = spin(360 * k / leaves + rng.uniform(-14, 14))[:, 0]
         bend, up = rng.uniform(0.28, 0.52), np.array([0, 0, 1.0])
@@ -235,9 +226,8 @@ def picture(rng: np.random.Generator, name: str, art: np.ndarray, width: float, 
     """A framed picture. Its back is at y = 0 and its centre at z = 0."""
     height = width * art.shape[0] / art.shape[1]
     border = max(14, art.shape[1] // 26)
-    front = np.pad(art, ((border, border), (border, border), (0, 0)))
-    for edge in (np.s_[:border], np.s_[-border:], np.s_[:, :border], np.s_[:, -border:]):
-        front[edge] = tex.rgb(WOODS[frame][1])
+    front = np.broadcast_to(tex.rgb(WOODS[frame][1]), (art.shape[0] + 2 * border, art.shape[1] + 2 * border, 3)).copy()
+    front[border:-border, border:-border] = art
     part = block(rng, (width, 0.03, height), (0, -0.015, 0), wood(rng, frame), front=front)
     return Body(name, ["picture", "framed picture", "picture on the wall"], [part], kind="picture")
 
@@ -253,13 +243,12 @@ def rug(rng: np.random.Generator, name: str, width: float, depth: float, colors:
 def cardboard(rng: np.random.Generator, name: str, extent: Point) -> Body:
     """A closed carton with tape over its top."""
     tile = tex.fabric(rng, 300, 400, "#b08a5c")
-    top = np.ascontiguousarray(tex.crop(rng, tile, 240, 320))
+    top, front = (np.ascontiguousarray(tex.crop(rng, tile, 240, 320)) for _ in range(2))
     top[108:132] = tex.rgb("#cdb78d")
-    front = np.ascontiguousarray(tex.crop(rng, tile, 240, 320))
     front = tex.draw_text(front, str(rng.choice(["FRAGILE", "BOOKS", "KITCHEN"])), (160, 110), 52, "#4a3520")
-    width, depth, height = extent
-    part = block(rng, (width, depth, height), (0, 0, height / 2), tile, front=front, top=top)
-    return Body(name, ["box", "brown box"], [part], kind="box")
+    return Body(
+        name, ["box", "brown box"], [block(rng, extent, (0, 0, extent[2] / 2), tile, front=front, top=top)], kind="box"
+    )
 
 
 def speaker(rng: np.random.Generator, name: str) -> Body:
@@ -268,21 +257,20 @@ def speaker(rng: np.random.Generator, name: str) -> Body:
     front = np.ascontiguousarray(tex.crop(rng, tile, 320, 321))
     for y, r in ((95, 52), (225, 82)):
         for radius, color in ((r, "#111113"), (r - 10, "#4a4a50"), (r // 3, "#17171a")):
-            cv2.ellipse(
-                front, (160, y), (int(1.5 * radius), radius), 0, 0, 360, tex.rgb(color).tolist(), -1, cv2.LINE_AA
-            )
+            tex.disc(front, (160, y), (int(1.5 * radius), radius), color)
     return Body(name, ["loudspeaker"], [block(rng, (0.2, 0.22, 0.34), (0, 0, 0.17), tile, front=front)], kind="speaker")
 
 
-def turned(name: str, profile: list[tuple[float, float]], paint: np.ndarray, words: list[str]) -> Body:
-    """A body with a single surface of revolution."""
-    return Body(name, words, [Part(Lathe(np.array(profile)), paint, 0.2, (24, 36))])
+TURNED = {  # name: profile, further prompts
+    "waste bin": ("0 0 120 0 150 320 155 330 148 330 115 20 0 20", ["bin", "waste paper basket"]),
+    "wooden stool": ("0 0 140 0 150 20 40 50 30 380 170 410 170 450 0 460", ["stool"]),
+}
 
 
-BIN = [(0.0, 0.0), (0.12, 0.0), (0.15, 0.32), (0.155, 0.33), (0.148, 0.33), (0.115, 0.02), (0.0, 0.02)]
-STOOL = [(0.0, 0.0), (0.14, 0.0), (0.15, 0.02), (0.04, 0.05), (0.03, 0.38), (0.17, 0.41), (0.17, 0.45), (0.0, 0.46)]
-waste_bin = partial(turned, profile=BIN, words=["bin", "waste paper basket"])
-stool = partial(turned, profile=STOOL, words=["stool"])
+def turned(name: str, paint: np.ndarray) -> Body:
+    """One of TURNED: a single surface of revolution."""
+    profile, words = TURNED[name]
+    return Body(name, words, [Part(lathe(profile), paint, 0.2, (24, 36))])
 
 
 def door(rng: np.random.Generator, name: str, kind: str) -> Body:
@@ -290,6 +278,6 @@ def door(rng: np.random.Generator, name: str, kind: str) -> Body:
     front = np.ascontiguousarray(tex.crop(rng, wood(rng, kind), 820, 360))
     for x, y, w, h in ((40, 50, 120, 300), (200, 50, 120, 300), (40, 430, 120, 330), (200, 430, 120, 330)):
         cv2.rectangle(front, (x, y), (x + w, y + h), (tex.rgb(WOODS[kind][1]) * 0.75).tolist(), 6)
-    cv2.circle(front, (334, 410), 13, tex.rgb("#c8a642").tolist(), -1, cv2.LINE_AA)
+    tex.disc(front, (334, 410), 13, "#c8a642")
     part = block(rng, (0.88, 0.04, 2.02), (0, -0.02, 1.01), wood(rng, kind), 0.1, front=front)
     return Body(name, ["door", "room door"], [part], is_stuff=True, kind="door")

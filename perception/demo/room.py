@@ -102,22 +102,15 @@ def _shell(rng: np.random.Generator, half: np.ndarray) -> list[Body]:
     ]
 
 
-def _art(rng: np.random.Generator, kind: str) -> np.ndarray:
-    """Images for framed pictures: mountains, lake, desert or abstract."""
-    skies = {
-        "mountain": (["#f4b183", "#f7e1b5"], ["#8a5a83", "#5d3f72", "#3c2f5c", "#241f42"]),
-        "lake": (["#a9d6e5", "#eef4f7"], ["#61a5c2", "#2a6f97", "#014f86", "#013a63"]),
-        "desert": (["#f6d7a7", "#fbeccb"], ["#d98e4a", "#b5622e", "#8a431f", "#5a2a15"]),
-    }
-    if kind in skies:
-        return tex.landscape(rng, 480, 680, *skies[kind], kind.upper())
-    return tex.mosaic(rng, 620, 520, ["#264653", "#2a9d8f", "#e9c46a", "#f4a261", "#e76f51", "#6d597a"])
-
-
 def _hang(rng: np.random.Generator, room: Room, wall: int, kind: str, along: float, width: float) -> None:
-    frame = str(rng.choice(list(fur.WOODS)))
-    name = f"{kind} picture"
-    room.stand(fur.picture(rng, name, _art(rng, kind), width, frame), wall, along, 0.0, rng.uniform(1.5, 1.62))
+    """A framed picture: one of tex.SKIES, or abstract."""
+    frame, landscape = str(rng.choice(list(fur.WOODS))), kind in tex.SKIES
+    art = (
+        tex.landscape(rng, 480, 680, *tex.SKIES[kind], kind.upper())
+        if landscape
+        else tex.mosaic(rng, 620, 520, tex.ABSTRACT)
+    )
+    room.stand(fur.picture(rng, f"{kind} picture", art, width, frame), wall, along, 0.0, rng.uniform(1.5, 1.62))
 
 
 def _sitting(rng: np.random.Generator, room: Room, wall: int, side: int) -> None:
@@ -128,10 +121,9 @@ def _sitting(rng: np.random.Generator, room: Room, wall: int, side: int) -> None
     colors = rng.permutation(["red", "yellow", "purple", "white"])[:2]
     for color, along in zip(colors, (-0.45, 0.42), strict=True):
         room.stand(fur.cushion(rng, f"{color} cushion", things.COLORS[color]), wall, along, 0.42, 0.48)
-    room.stand(things.teddy(rng, "teddy bear").placed(0, np.zeros(3), 1.5), wall, rng.uniform(-0.1, 0.1), 0.50, 0.49)
-    room.stand(
-        fur.floor_lamp(rng, "floor lamp", str(rng.choice(["#c98a4a", "#c9b48a", "#a8453a"]))), wall, 1.35 * side, 0.36
-    )
+    room.stand(things.teddy(rng).placed(0, np.zeros(3), 1.5), wall, rng.uniform(-0.1, 0.1), 0.50, 0.49)
+    shade = str(rng.choice(["#c98a4a", "#c9b48a", "#a8453a"]))
+    room.stand(fur.floor_lamp(rng, "floor lamp", shade), wall, 1.35 * side, 0.36)
     room.stand(fur.plant(rng, "big plant"), wall, -1.42 * side, 0.45, turn=rng.uniform(0, 360))
     _hang(rng, room, wall, "lake", rng.uniform(-0.2, 0.2), rng.uniform(0.9, 1.1))
     out = 1.62
@@ -142,7 +134,7 @@ def _sitting(rng: np.random.Generator, room: Room, wall: int, side: int) -> None
     top = 0.432
     bowl = things.bowl(rng, "bowl of fruit", things.COLORS["blue"], ["orange", "red apple", "green apple", "lemon"])
     room.stand(bowl.placed(0, np.zeros(3), 1.3), wall, rng.uniform(-0.35, -0.2), out, top)
-    book = things.named_book(rng, str(rng.choice(list(things.BOOKS))))
+    book = things.book(rng, str(rng.choice(list(things.BOOKS))))
     room.stand(book.placed(0, np.zeros(3), 1.2), wall, 0.30, out + 0.05, top, rng.uniform(-40, 40))
     chair = fur.sofa(rng, f"{other} armchair", 0.95, other, 1)
     beside = (room.half[wall % 2] - 1.15) * side  # keeps clear of the group at the next wall
@@ -156,11 +148,11 @@ def _watching(rng: np.random.Generator, room: Room, wall: int) -> None:
     room.stand(stand, wall, -0.35, 0.23)
     room.stand(fur.television(rng, "television"), wall, -0.35, 0.24, 0.48)
     room.stand(fur.speaker(rng, "speaker"), wall, 0.52, 0.22)
-    clock = things.clock(rng, "wall clock", np.zeros(3)).placed(0, np.zeros(3), 1.25)
+    clock = things.clock(rng).placed(0, np.zeros(3), 1.25)
     room.stand(clock, wall, -0.35 + rng.uniform(-0.2, 0.2), 0.01, 1.72)
     room.stand(fur.door(rng, "door", "white" if kind == "walnut" else "pine"), wall, 1.30, 0.0)
     paint = tex.glaze(rng, 200, 300, str(rng.choice(["#5b6f82", "#7b8a5a", "#8a4a4a"])), ["#222222", "#dddddd"], 200)
-    room.stand(fur.waste_bin("waste bin", paint=paint), wall, -1.75, 0.35)
+    room.stand(fur.turned("waste bin", paint), wall, -1.75, 0.35)
 
 
 def _dining(rng: np.random.Generator, room: Room, wall: int) -> None:
@@ -173,18 +165,17 @@ def _dining(rng: np.random.Generator, room: Room, wall: int) -> None:
         turn = rng.uniform(-8, 8) + (180 if away > 0 else 0)
         chair = fur.chair(rng, f"{cloth} chair {k + 1}", kind, cloth)
         room.stand(chair, wall, along + rng.uniform(-0.03, 0.03), out + away, turn=turn)
-    room.stand(things.named_vase(rng), wall, -0.25, out, top)
-    room.stand(things.plate(rng, "dinner plate", "#a8302a"), wall, -0.58, out + 0.20, top)
+    room.stand(things.vase(rng), wall, -0.25, out, top)
+    room.stand(things.plate(rng, "#a8302a"), wall, -0.58, out + 0.20, top)
     room.stand(things.carton(rng), wall, 0.12, out - 0.12, top, rng.uniform(-40, 40))
-    room.stand(things.colored_mug(rng, "red"), wall, 0.16, out + 0.2, top, rng.uniform(0, 360))
+    room.stand(things.mug(rng, "red"), wall, 0.16, out + 0.2, top, rng.uniform(0, 360))
     room.stand(things.bottle(rng, "green bottle", "#2c5a35"), wall, -0.66, out - 0.14, top)
     _hang(rng, room, wall, "desert", -0.25, rng.uniform(0.85, 1.1))
     low = rng.uniform(0.30, 0.36)
     room.stand(fur.cardboard(rng, "cardboard box", (0.55, 0.42, low)), wall, 1.35, 0.32, turn=rng.uniform(-12, 12))
     small = fur.cardboard(rng, "small cardboard box", (0.34, 0.28, 0.22))
     room.stand(small, wall, 1.33, 0.32, low, rng.uniform(-30, 30))
-    ball = things.ball("basketball", (0, 0), 0.12, tex.basketball(rng, 480, 960), [0.5, -0.45, 0.75])
-    room.stand(ball, wall, 1.0, 0.75)
+    room.stand(things.ball(rng, "basketball", 0.12), wall, 1.0, 0.75)
 
 
 def _working(rng: np.random.Generator, room: Room, wall: int) -> None:
@@ -196,11 +187,9 @@ def _working(rng: np.random.Generator, room: Room, wall: int) -> None:
     color = str(rng.choice(["red", "yellow", "green"]))
     lamp = fur.desk_lamp(rng, f"{color} desk lamp", things.COLORS[color])
     room.stand(lamp, wall, -1.22, 0.24, top, rng.uniform(-30, 30))
-    room.stand(things.colored_mug(rng, "blue"), wall, -0.38, 0.42, top, rng.uniform(0, 360))
-    room.stand(things.cactus(rng, "cactus", (0, 0)).placed(0, np.zeros(3), 1.3), wall, -0.28, 0.2, top)
-    wood = np.ascontiguousarray(fur.wood(rng, "pine"))
-    room.stand(fur.stool("wooden stool", paint=wood), wall, -0.75, 0.95)
+    room.stand(things.mug(rng, "blue"), wall, -0.38, 0.42, top, rng.uniform(0, 360))
+    room.stand(things.cactus(rng).placed(0, np.zeros(3), 1.3), wall, -0.28, 0.2, top)
+    room.stand(fur.turned("wooden stool", np.ascontiguousarray(fur.wood(rng, "pine"))), wall, -0.75, 0.95)
     room.stand(fur.bookcase(rng, "bookcase", kind, 0.9, rng.uniform(1.7, 2.0)), wall, 0.75, 0.17)
     _hang(rng, room, wall, "abstract", -0.75, rng.uniform(0.5, 0.62))
-    soccer = things.ball("soccer ball", (0, 0), 0.11, tex.soccer_ball(rng, 440, 880), [0.2, -0.3, 1])
-    room.stand(soccer, wall, 1.45, 0.45)
+    room.stand(things.ball(rng, "soccer ball", 0.11), wall, 1.45, 0.45)

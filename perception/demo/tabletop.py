@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -37,21 +39,18 @@ def build(seed: int, light_samples: int = 20) -> Scene:
 
 
 def _demo_things(rng: np.random.Generator) -> list[Body]:
-    red = things.mug_paint(rng, "#c3161c", "#f6efe0", hearts=True)
-    blue = things.mug_paint(rng, "#1c4fb5", "#f4efdc", hearts=False)
-    basket, soccer = tex.basketball(rng, 480, 960), tex.soccer_ball(rng, 440, 880)
-    return [
-        things.mug(rng, "red mug", (-0.135, -0.155), -35, red),
-        things.mug(rng, "blue mug", (0.055, 0.085), 20, blue),
-        things.vase(rng, "vase", (-0.29, 0.155)),
-        things.ball("basketball", (0.30, 0.13), 0.088, basket, [0.5, -0.45, 0.75]),
-        things.ball("soccer ball", (-0.085, 0.20), 0.066, soccer, [0.2, -0.3, 1]),
-        things.banana(rng, "banana", (-0.365, -0.195), 0),
-        things.fruit(rng, "orange", (0.035, -0.185)),
-        things.book(rng, "book", (0.25, -0.135), -24),
-        things.cactus(rng, "cactus", (0.44, -0.03)),
-        things.clock(rng, "wall clock", np.array([0.27, WALL, 0.46])),
-    ]
+    red, blue = things.mug(rng, "red", True), things.mug(rng, "blue", False, "#f4efdc")
+    balls = [things.ball(rng, "basketball", 0.088), things.ball(rng, "soccer ball", 0.066)]
+    vase = replace(things.vase(rng, "blue"), name="vase", prompts=["blue and white vase", "ceramic vase"])
+    banana, orange = things.banana(rng), things.fruit(rng, "orange")
+    book = replace(things.book(rng, "green book"), name="book", prompts=["green book", "hardback book"])
+    placed = [  # body, x, y, z, turn
+        (red, -0.135, -0.155, 0, -35), (blue, 0.055, 0.085, 0, 20), (vase, -0.29, 0.155, 0, 0),
+        (balls[0], 0.30, 0.13, 0, 0), (balls[1], -0.085, 0.20, 0, 0), (banana, -0.365, -0.195, 0, 0),
+        (orange, 0.035, -0.185, 0, 0), (book, 0.25, -0.135, 0, -24), (things.cactus(rng), 0.44, -0.03, 0, 0),
+        (things.clock(rng), 0.27, WALL, 0.46, 0),
+    ]  # fmt: skip
+    return [body.placed(turn, np.array(spot)) for body, *spot, turn in placed]
 
 
 def _chosen_things(rng: np.random.Generator) -> list[Body]:
@@ -60,21 +59,21 @@ def _chosen_things(rng: np.random.Generator) -> list[Body]:
     book, other = rng.permutation(list(things.BOOKS))[:2]
     fruits = rng.permutation(list(things.FRUITS))
     alone = [  # (radius of the footprint, body about the origin)
-        (0.135, things.named_book(rng, book)),
+        (0.135, things.book(rng, book)),
         (0.090, things.bowl(rng, f"{third} bowl", things.COLORS[third])),
-        (0.100, things.banana(rng, "banana", (-0.02, -0.08), 0)),
-        (0.088, things.ball("basketball", (0, 0), 0.088, tex.basketball(rng, 480, 960), [0.5, -0.45, 0.75])),
-        (0.080, things.named_vase(rng)),
+        (0.100, things.banana(rng).placed(0, np.array([-0.02, -0.08, 0]))),
+        (0.088, things.ball(rng, "basketball", 0.088)),
+        (0.080, things.vase(rng)),
         (0.080, things.carton(rng)),
-        (0.070, things.ball("soccer ball", (0, 0), 0.066, tex.soccer_ball(rng, 440, 880), [0.2, -0.3, 1])),
-        (0.070, things.teddy(rng, "teddy bear")),
-        (0.066, things.colored_mug(rng, first)),
-        (0.066, things.colored_mug(rng, second)),
-        (0.060, things.cactus(rng, "cactus", (0, 0))),
+        (0.070, things.ball(rng, "soccer ball", 0.066)),
+        (0.070, things.teddy(rng)),
+        (0.066, things.mug(rng, first)),
+        (0.066, things.mug(rng, second)),
+        (0.060, things.cactus(rng)),
         (0.040, things.bottle(rng, f"{third} bottle", things.COLORS[third])),
         (0.038, things.tin(rng, "tomato tin")),
-        (0.042, things.colored_fruit(rng, fruits[0])),
-        (0.042, things.colored_fruit(rng, fruits[1])),
+        (0.042, things.fruit(rng, fruits[0])),
+        (0.042, things.fruit(rng, fruits[1])),
     ]
     scales = rng.uniform(0.88, 1.12, len(alone))
     turns = rng.uniform(0, 360, len(alone))
@@ -84,10 +83,11 @@ def _chosen_things(rng: np.random.Generator) -> list[Body]:
         for (_, body), turn, spot, scale in zip(alone, turns, spots, scales, strict=True)
         if spot is not None
     ]
-    stacked = things.named_book(rng, other)
+    stacked = things.book(rng, other)
     if spots[0] is not None:  # the first disc always fits
         placed.append(stacked.placed(turns[0] + 25, np.array([*spots[0], 0.036 * scales[0]]), 0.85))
-    return [*placed, things.clock(rng, "wall clock", np.array([rng.uniform(0.1, 0.4), WALL, 0.46]))]
+    spot = np.array([rng.uniform(0.1, 0.4), WALL, 0.46])
+    return [*placed, things.clock(rng).placed(0, spot)]
 
 
 def _spots(rng: np.random.Generator, radii: list[float]) -> list[tuple[float, float] | None]:
@@ -120,15 +120,14 @@ def _room(rng: np.random.Generator, shuffled: bool) -> list[Body]:
     width, depth = TABLE
     top = tex.wood(rng, 900, 1270, 6, "#c9925a", "#7d4a24")
     edge = tex.wood(rng, 48, 1270, 1, "#b37d49", "#6f4120")
-    plank = things.box_parts(np.array([0, 0, -0.02]), (width, depth, 0.04), np.eye(3), [top, edge, edge], (6, 48))
+    plank = things.box_parts(np.array([0, 0, -0.02]), (width, depth, 0.04), [top, edge, edge], (6, 48))
     plank[0].light_texels = (120, 168)
     for part in plank[1:]:
         part.casts = False
     leg = tex.wood(rng, 80, 700, 1, "#a97443", "#66391a").transpose(1, 0, 2)
-    for x in (-1, 1):
-        for y in (-1, 1):
-            center = np.array([x * (width / 2 - 0.06), y * (depth / 2 - 0.06), (FLOOR - 0.04) / 2])
-            plank += things.box_parts(center, (0.055, 0.055, -FLOOR - 0.04), np.eye(3), [leg], (12, 4), casts=False)
+    for x, y in product((-1, 1), repeat=2):
+        center = np.array([x * (width / 2 - 0.06), y * (depth / 2 - 0.06), (FLOOR - 0.04) / 2])
+        plank += things.box_parts(center, (0.055, 0.055, -FLOOR - 0.04), [leg], (12, 4), casts=False)
     paper = tex.wallpaper(rng, 900, 1550, grounds[0], ["#9db8ac", "#86a699", "#d3dfd8", "#c7a86b", "#7b978f"])
     other = tex.wallpaper(rng, 900, 1100, grounds[1], ["#b7a88d", "#a3957a", "#e0d7c6", "#8a9a86", "#b98a5e"])
     tall, middle = 2.0, FLOOR + 1.0
@@ -153,14 +152,10 @@ def _wall(along, normal, center, width, height, paint, texels) -> Part:  # type:
 
 def _posters(rng: np.random.Generator) -> list[Body]:
     """Framed prints on the walls: flat, 1 cm in front of the wallpaper."""
-    alps = tex.landscape(
-        rng, 640, 470, ["#f4b183", "#f7e1b5"], ["#8a5a83", "#5d3f72", "#3c2f5c", "#241f42"], "MOUNTAINS"
-    )
+    alps = tex.landscape(rng, 640, 470, *tex.SKIES["mountain"], "MOUNTAINS")
     art = tex.mosaic(rng, 620, 620, ["#d1495b", "#edae49", "#00798c", "#30638e", "#003d5b", "#7fb069"])
-    lake = tex.landscape(
-        rng, 560, 760, ["#a9d6e5", "#eef4f7"], ["#61a5c2", "#2a6f97", "#014f86", "#013a63"], "NORTHERN LAKES"
-    )
-    more = tex.mosaic(rng, 640, 760, ["#264653", "#2a9d8f", "#e9c46a", "#f4a261", "#e76f51", "#6d597a"])
+    lake = tex.landscape(rng, 560, 760, *tex.SKIES["lake"], "NORTHERN LAKES")
+    more = tex.mosaic(rng, 640, 760, tex.ABSTRACT)
     back = rotation_from_axes([1, 0, 0], [0, -1, 0])
     left, right = rotation_from_axes([0, 1, 0], [1, 0, 0]), rotation_from_axes([0, -1, 0], [-1, 0, 0])
     hung = [

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+
+SKIES = {  # of landscapes: sky, hills
+    "mountain": (["#f4b183", "#f7e1b5"], ["#8a5a83", "#5d3f72", "#3c2f5c", "#241f42"]),
+    "lake": (["#a9d6e5", "#eef4f7"], ["#61a5c2", "#2a6f97", "#014f86", "#013a63"]),
+    "desert": (["#f6d7a7", "#fbeccb"], ["#d98e4a", "#b5622e", "#8a431f", "#5a2a15"]),
+}
+ABSTRACT = ["#264653", "#2a9d8f", "#e9c46a", "#f4a261", "#e76f51", "#6d597a"]
 
 
 def rgb(code: str) -> np.ndarray:
@@ -47,18 +54,36 @@ def speckle(
     height, width = out.shape[:2]
     for _ in range(count):
         center = int(rng.integers(width)), int(rng.integers(height))
-        axes = tuple(int(x) for x in rng.integers(sizes[0], sizes[1] + 1, 2))
-        color = rgb(colors[rng.integers(len(colors))]).tolist()
-        cv2.ellipse(out, center, axes, float(rng.uniform(0, 180)), 0, 360, color, -1, cv2.LINE_AA)
+        axes = int(rng.integers(sizes[0], sizes[1] + 1)), int(rng.integers(sizes[0], sizes[1] + 1))
+        color = colors[rng.integers(len(colors))]
+        disc(out, center, axes, color, float(rng.uniform(0, 180)))
     return out
+
+
+def disc(
+    picture: np.ndarray, center: tuple[int, int], radius: int | tuple[int, int], color: str, turn: float = 0.0
+) -> None:
+    """Draws a disc, or an ellipse with two semi-axes turned by `turn` degrees, into an image."""
+    if isinstance(radius, tuple):
+        cv2.ellipse(picture, center, radius, turn, 0, 360, rgb(color).tolist(), -1, cv2.LINE_AA)
+    else:
+        cv2.circle(picture, center, radius, rgb(color).tolist(), -1, cv2.LINE_AA)
+
+
+def polygon(picture: np.ndarray, corners: np.ndarray, color: str) -> None:
+    """Draws a filled polygon with corners [n, 2] in pixels, rounded down, into an image."""
+    cv2.fillPoly(picture, [corners.astype(np.int32)], rgb(color).tolist(), cv2.LINE_AA)
+
+
+def paper(color: str, height: int, width: int) -> np.ndarray:
+    """An image of one colour to draw into."""
+    return np.ascontiguousarray(np.broadcast_to(rgb(color), (height, width, 3)), np.float32).copy()
 
 
 def wood(rng: np.random.Generator, height: int, width: int, planks: int, light: str, dark: str) -> np.ndarray:
     """Planks with grain along the width, knots, pores and dark joints."""
-    rows = []
-    edges = np.linspace(0, height, planks + 1).astype(int)
-    for top, bottom in pairwise(edges):
-        rows.append(_plank(rng, bottom - top, width, rgb(light), rgb(dark)))
+    edges = pairwise(np.linspace(0, height, planks + 1).astype(int))
+    rows = [_plank(rng, bottom - top, width, rgb(light), rgb(dark)) for top, bottom in edges]
     return np.clip(np.concatenate(rows), 0, 1)
 
 
@@ -103,15 +128,8 @@ def soccer_ball(rng: np.random.Generator, height: int, width: int) -> np.ndarray
     corners = np.array([(0, a, b * golden) for a in (1, -1) for b in (1, -1)])
     pentagons = np.concatenate([np.roll(corners, k, 1) for k in range(3)]) / np.hypot(1, golden)
     near = pentagons @ pentagons.T > 0.4  # neighbours on the icosahedron
-    hexagons = np.array(
-        [
-            pentagons[[i, j, k]].mean(0)
-            for i in range(12)
-            for j in range(i)
-            for k in range(j)
-            if near[i, j] and near[j, k] and near[i, k]
-        ]
-    )
+    triples = [t for t in combinations(range(12), 3) if all(near[pair] for pair in combinations(t, 2))]
+    hexagons = np.array([pentagons[list(triple)].mean(0) for triple in triples])
     hexagons /= np.linalg.norm(hexagons, axis=1, keepdims=True)
     # Face distances of the solid with unit edge. A direction hits the face with the largest n·c / distance.
     heights = np.concatenate([np.full(12, 2.3274), np.full(20, 2.2673)])
@@ -136,9 +154,8 @@ def peel(rng: np.random.Generator, height: int, width: int, light: str, dark: st
 
 def glaze(rng: np.random.Generator, height: int, width: int, color: str, specks: list[str], count: int) -> np.ndarray:
     """Fired ceramic: one colour with clouds and specks."""
-    base = np.broadcast_to(rgb(color), (height, width, 3))
     cloud = 0.055 * noise(rng, height, width, (4, 8), 5)[..., None] + 0.02 * rng.standard_normal((height, width, 1))
-    return np.clip(speckle(rng, base * (1 + cloud), count, (1, 2), specks), 0, 1).astype(np.float32)
+    return np.clip(speckle(rng, rgb(color) * (1 + cloud), count, (1, 2), specks), 0, 1).astype(np.float32)
 
 
 def draw_text(picture: np.ndarray, text: str, center: tuple[float, float], size: int, color: str) -> np.ndarray:
@@ -151,19 +168,16 @@ def draw_text(picture: np.ndarray, text: str, center: tuple[float, float], size:
 
 def wallpaper(rng: np.random.Generator, height: int, width: int, ground: str, leaves: list[str]) -> np.ndarray:
     """Plaster-coloured wallpaper with random leaves. No two leaves are equal, so image features are unambiguous."""
-    paper = np.broadcast_to(rgb(ground), (height, width, 3)) * (
-        1 + 0.035 * noise(rng, height, width, (height / 40, width / 40), 5)[..., None]
-    )
-    paper = np.ascontiguousarray(paper, np.float32)
+    clouds = 1 + 0.035 * noise(rng, height, width, (height / 40, width / 40), 5)[..., None]
+    paper = np.ascontiguousarray(rgb(ground) * clouds, np.float32)
     for _ in range(height * width // 3600):
         x, y, turn = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0, 2 * np.pi)
-        color = rgb(leaves[rng.integers(len(leaves))]).tolist()
-        reach = rng.uniform(9, 24)
+        color, reach = leaves[rng.integers(len(leaves))], rng.uniform(9, 24)
         for side in (-0.55, 0.0, 0.55):
             a = turn + side
             tip = int(x + reach * np.cos(a)), int(y + reach * np.sin(a))
             axes = int(reach * 0.55) + 1, max(2, int(reach * rng.uniform(0.12, 0.24)))
-            cv2.ellipse(paper, tip, axes, np.degrees(a), 0, 360, color, -1, cv2.LINE_AA)
+            disc(paper, tip, axes, color, np.degrees(a))
     return np.clip(paper, 0, 1)
 
 
@@ -174,7 +188,7 @@ def landscape(
     y = np.linspace(0, 1, height)[:, None] * np.ones((1, width))
     art = blend(y * 1.4, rgb(sky[0]), rgb(sky[1])).astype(np.float32)
     sun = int(width * rng.uniform(0.25, 0.75)), int(height * 0.3)
-    cv2.circle(art, sun, width // 8, rgb("#fff3cf").tolist(), -1, cv2.LINE_AA)
+    disc(art, sun, width // 8, "#fff3cf")
     for i, color in enumerate(hills):
         crest = height * (0.38 + 0.13 * i) + height * 0.05 * noise(rng, 2, width, (1, 3 + i), 5)[0]
         below = np.arange(height)[:, None] > crest[None]
@@ -189,28 +203,24 @@ def landscape(
 
 def mosaic(rng: np.random.Generator, height: int, width: int, colors: list[str]) -> np.ndarray:
     """An abstract poster of overlapping discs, bars and triangles."""
-    art = np.ascontiguousarray(np.broadcast_to(rgb("#f3ead7"), (height, width, 3)), np.float32)
+    art = paper("#f3ead7", height, width)
     for i in range(42):
-        color = rgb(colors[rng.integers(len(colors))]).tolist()
+        color = colors[rng.integers(len(colors))]
         x, y = int(rng.uniform(0.08, 0.92) * width), int(rng.uniform(0.08, 0.92) * height)
         r = int(rng.uniform(0.04, 0.16) * width)
         if i % 3 == 0:
-            cv2.circle(art, (x, y), r, color, -1 if i % 2 else max(3, r // 4), cv2.LINE_AA)
+            cv2.circle(art, (x, y), r, rgb(color).tolist(), -1 if i % 2 else max(3, r // 4), cv2.LINE_AA)
         elif i % 3 == 1:
-            box = cv2.boxPoints(((x, y), (2.4 * r, 0.5 * r), float(rng.uniform(0, 180)))).astype(np.int32)
-            cv2.fillPoly(art, [box], color, cv2.LINE_AA)
+            polygon(art, cv2.boxPoints(((x, y), (2.4 * r, 0.5 * r), float(rng.uniform(0, 180)))), color)
         else:
-            corners = np.array([[x, y]]) + rng.uniform(-r, r, (3, 2))
-            cv2.fillPoly(art, [corners.astype(np.int32)], color, cv2.LINE_AA)
+            polygon(art, np.array([[x, y]]) + rng.uniform(-r, r, (3, 2)), color)
     return np.clip(art * (1 + 0.02 * noise(rng, height, width, (60, 60), 3)[..., None]), 0, 1)
 
 
 def fur(rng: np.random.Generator, height: int, width: int, light: str, dark: str) -> np.ndarray:
     """Short hair: fine noise over clouds."""
-    tone = (
-        0.4 + 0.2 * noise(rng, height, width, (height / 3, width / 3), 1) + 0.12 * noise(rng, height, width, (6, 9), 3)
-    )
-    return np.clip(blend(tone, rgb(light), rgb(dark)), 0, 1)
+    hair, clouds = noise(rng, height, width, (height / 3, width / 3), 1), noise(rng, height, width, (6, 9), 3)
+    return np.clip(blend(0.4 + 0.2 * hair + 0.12 * clouds, rgb(light), rgb(dark)), 0, 1)
 
 
 def fabric(rng: np.random.Generator, height: int, width: int, color: str, dots: list[str] | None = None) -> np.ndarray:
@@ -239,7 +249,7 @@ def rgb_code(color: np.ndarray) -> str:
 
 def bricks(rng: np.random.Generator, height: int, width: int, color: str, course: int = 34) -> np.ndarray:
     """A brick wall with a random tone per brick. course: height of a row in pixels."""
-    wall = np.ascontiguousarray(np.broadcast_to(rgb("#b9ada0"), (height, width, 3)), np.float32).copy()
+    wall = paper("#b9ada0", height, width)
     length = int(2.9 * course)
     for row, top in enumerate(range(0, height, course)):
         for left in range(-length, width, length):
@@ -253,14 +263,14 @@ def bricks(rng: np.random.Generator, height: int, width: int, color: str, course
 def rug(rng: np.random.Generator, height: int, width: int, colors: list[str]) -> np.ndarray:
     """A woven rug: a field of figures mirrored both ways, a medallion, borders, fringes at the short ends."""
     half_h, half_w = (height + 1) // 2, (width + 1) // 2
-    field = np.ascontiguousarray(np.broadcast_to(rgb(colors[0]), (half_h, half_w, 3)), np.float32).copy()
+    field = paper(colors[0], half_h, half_w)
     for _ in range(120):
         center = int(rng.integers(half_w)), int(rng.integers(half_h))
-        color, reach = rgb(colors[rng.integers(1, len(colors))]).tolist(), int(rng.integers(5, 18))
-        corners = cv2.boxPoints((center, (reach, reach * float(rng.uniform(0.4, 1.6))), float(rng.choice([0, 45]))))
-        cv2.fillPoly(field, [corners.astype(np.int32)], color, cv2.LINE_AA)
-    rug = np.concatenate([np.concatenate([field, field[:, ::-1]], 1), np.concatenate([field, field[:, ::-1]], 1)[::-1]])
-    rug = rug[:height, :width].copy()
+        color, reach = colors[rng.integers(1, len(colors))], int(rng.integers(5, 18))
+        size = (reach, reach * float(rng.uniform(0.4, 1.6)))
+        polygon(field, cv2.boxPoints((center, size, float(rng.choice([0, 45])))), color)
+    upper = np.concatenate([field, field[:, ::-1]], 1)
+    rug = np.concatenate([upper, upper[::-1]])[:height, :width].copy()
     for scale, color in ((0.55, colors[1]), (0.42, colors[2]), (0.25, colors[3 % len(colors)])):
         w, h = scale * width / 2, scale * height / 2
         diamond = np.array([[-w, 0], [0, -h], [w, 0], [0, h]]) + np.array([width, height]) / 2
@@ -269,7 +279,7 @@ def rug(rng: np.random.Generator, height: int, width: int, colors: list[str]) ->
         cv2.rectangle(rug, (inset, inset), (width - 1 - inset, height - 1 - inset), rgb(color).tolist(), 7)
     for x in range(18, width - 18, 22):
         for y in (19, height - 20):
-            cv2.circle(rug, (x, y), 4, rgb(colors[3 % len(colors)]).tolist(), -1, cv2.LINE_AA)
+            disc(rug, (x, y), 4, colors[3 % len(colors)])
     wool = 0.07 * noise(rng, height, width, (height / 4, width / 4), 1) + 0.05 * noise(rng, height, width, (5, 8), 4)
     return np.clip(rug * (1 + wool)[..., None], 0, 1).astype(np.float32)
 
