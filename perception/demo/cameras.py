@@ -6,6 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from perception.geometry import look_at
+
+UP = np.array([0, 0, 1.0])
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -26,17 +30,6 @@ class Camera:
         local = points @ self.camera_from_world[:3, :3].T + self.camera_from_world[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             return (local @ self.K.T)[:, :2] / local[:, 2:], local[:, 2]
-
-
-def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """[4, 4] camera_from_world of an upright camera at `eye` that looks at `target` (z up in the world)."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
-    return pose
 
 
 def intrinsics(width: int, height: int, focal_35mm: float) -> np.ndarray:
@@ -62,7 +55,7 @@ def orbit(views: int, width: int, height: int, focal_35mm: float) -> list[Camera
             sway = 0.03 * np.sin(2.1 * i + k)  # deviation from the circle, as in hand-held capture
             eye = np.array([(radius + sway) * np.sin(angle), -(radius + sway) * np.cos(angle), lift + 0.6 * sway])
             target = np.array(aim) + np.array([0.12 * np.sin(angle) * (k == 2), 0, 0.4 * sway])
-            cameras.append(Camera(K, look_at(eye, target), width, height))
+            cameras.append(Camera(K, look_at(eye, target, UP), width, height))
     return cameras[:views]
 
 
@@ -86,5 +79,5 @@ def walk(views: int, width: int, height: int, focal_35mm: float, half: np.ndarra
             eye = np.array([*(out + sway) * half * heading, lift + 0.8 * sway])
             across = angle + 0.25 * np.sin(3 * angle + k)  # varies the heading left and right
             target = np.array([*aim * half * [np.cos(across), np.sin(across)], level + 2 * sway])
-            cameras.append(Camera(K, look_at(eye, target), width, height))
+            cameras.append(Camera(K, look_at(eye, target, UP), width, height))
     return cameras

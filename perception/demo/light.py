@@ -180,9 +180,11 @@ def bake(around: list[Caster], part: Part, lighting: Lighting, rng: np.random.Ge
     points, normals = to_world(part.shape, points), normals @ part.shape.rotation.T
     start = points + 1e-3 * normals
     light = np.zeros((len(start), 3))
+    middle = (start.min(0) + start.max(0)) / 2
     for lamp in lighting.lamps:
-        light += _from_lamp(_between(around, start, lamp), start, normals, lamp, rng, samples)
-    light += _from_around(_within(around, start, lighting.reach), start, normals, lighting, rng, samples)
+        between = _near(around, start, lamp.radius, lamp.center - middle)
+        light += _from_lamp(between, start, normals, lamp, rng, samples)
+    light += _from_around(_near(around, start, lighting.reach), start, normals, lighting, rng, samples)
     grid = light.reshape(rows, columns, 3).astype(np.float32)
     faces = 6 if isinstance(part.shape, Box) else 1  # faces are filtered apart: light must not bleed into the next one
     strips = zip(np.split(part.paint, faces), np.split(grid, faces), strict=True)
@@ -199,21 +201,13 @@ def _recorded(paint: np.ndarray, light: np.ndarray) -> np.ndarray:
     return _RECORD[(_linear(paint) * light * _STEPS).astype(np.int32).clip(0, len(_RECORD) - 1)]
 
 
-def _within(around: list[Caster], start: np.ndarray, reach: float) -> list[Caster]:
-    """The casters that a ray of at most `reach` metres from any of the start points can hit."""
+def _near(around: list[Caster], start: np.ndarray, reach: float, axis: np.ndarray | None = None) -> list[Caster]:
+    """The casters within `reach` metres of the start points, and of these moved along `axis` [3]."""
     center = (start.min(0) + start.max(0)) / 2
-    radius = np.linalg.norm(start - center, axis=1).max() + reach
-    return [caster for caster in around if np.linalg.norm(caster.center - center) < radius + caster.radius]
-
-
-def _between(around: list[Caster], start: np.ndarray, lamp: Lamp) -> list[Caster]:
-    """The casters that a ray from any of the start points to the lamp can hit."""
-    center = (start.min(0) + start.max(0)) / 2
-    radius = np.linalg.norm(start - center, axis=1).max() + lamp.radius
-    axis = lamp.center - center
+    radius, axis = np.linalg.norm(start - center, axis=1).max() + reach, np.zeros(3) if axis is None else axis
     kept = []
     for caster in around:
-        share = np.clip((caster.center - center) @ axis / (axis @ axis), 0, 1)
+        share = np.clip((caster.center - center) @ axis / max(axis @ axis, 1e-12), 0, 1)
         if np.linalg.norm(center + share * axis - caster.center) < radius + caster.radius:
             kept.append(caster)
     return kept

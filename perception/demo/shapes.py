@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -55,12 +56,7 @@ def placed(shape: Any, turn: np.ndarray, shift: np.ndarray, scale: float = 1.0) 
     return replace(shape, rotation=turn @ shape.rotation, origin=scale * turn @ shape.origin + shift, **lengths)
 
 
-def _identity() -> np.ndarray:
-    return np.eye(3)
-
-
-def _zero() -> np.ndarray:
-    return np.zeros(3)
+_identity, _zero = partial(np.eye, 3), partial(np.zeros, 3)
 
 
 def _quadratic(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,12 +8,13 @@ transmittance falls under 1e-4.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import torch
+from torch import Tensor
+
+from perception import _core
 from perception.errors import InputError
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @dataclass
@@ -32,10 +33,6 @@ class RasterizationStats:
     evaluated_pairs: int = 0
     contributing_pairs: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
-
-    def _count(self, frames: Any) -> None:
-        self.evaluated_pairs, self.contributing_pairs = frames.evaluated, frames.contributing
-        self.seconds = frames.seconds
 
 
 @dataclass
@@ -71,35 +68,11 @@ class Settings:
     max_records: int = 0
 
 
-_default_simd = "auto"
-
-
-def simd_levels() -> list[str]:
-    """The SIMD levels this processor supports, best first."""
-    from perception import _core
-
-    return _core.simd_levels()
-
-
-def set_simd(level: str) -> None:
-    """Forces a SIMD level for calls that name none: "auto" (default), "avx512", "avx2" or "baseline"."""
-    global _default_simd
-    if level != "auto" and level not in simd_levels():
-        raise InputError(f"simd level '{level}' is not available; expected auto or one of {simd_levels()}")
-    _default_simd = level
-
-
-def _threads(settings: Settings) -> int:
-    import torch
-
-    return settings.threads if settings.threads > 0 else torch.get_num_threads()
+simd_levels = _core.simd_levels
+"""The SIMD levels this processor supports, best first."""
 
 
 def _core_function(name: str, tensor: Tensor) -> Any:
-    import torch
-
-    from perception import _core
-
     return getattr(_core, f"{name}_{'f64' if tensor.dtype == torch.float64 else 'f32'}")
 
 
@@ -133,7 +106,7 @@ def _core_inputs(inputs: tuple[Tensor | None, ...], background: Tensor | None, s
         settings.sh_degree,
         settings.near_plane,
         settings.eps2d,
-        _threads(settings),
+        settings.threads if settings.threads > 0 else torch.get_num_threads(),
         settings.depth,
         settings.variance,
         settings.max_records,
@@ -146,8 +119,6 @@ def rasterize_forward(inputs: tuple[Tensor | None, ...], background: Tensor | No
     inputs: means [N,3], quats [N,4], scales [N,3], opacities [N], colors [N,3] or [N,K,3], features [N,D] or
     None, viewmats [C,4,4], Ks [C,3,3]: contiguous CPU tensors of one dtype. background: [C,3] or None.
     """
-    import torch
-
     means, features, viewmats = inputs[0], inputs[5], inputs[6]
     assert means is not None and viewmats is not None  # for the type checker
     count, n = viewmats.shape[0], means.shape[0]
@@ -165,10 +136,9 @@ def rasterize_forward(inputs: tuple[Tensor | None, ...], background: Tensor | No
         frames=None,
     )
     images = (out.colors, out.alphas, out.depths, out.features, out.feature_variance, out.visible, out.radii)
-    simd = _default_simd if settings.simd == "auto" else settings.simd
     try:
         out.frames = _core_function("rasterize_forward", means)(
-            _core_inputs(inputs, background, settings), *(_numpy(t) for t in images), simd
+            _core_inputs(inputs, background, settings), *(_numpy(t) for t in images), settings.simd
         )
     except ValueError as error:
         raise InputError(f"rasterize: {error}") from None
@@ -188,8 +158,6 @@ def rasterize_backward(
     cotangents: dL/d colors, alphas, depths, features, feature_variance; None means zero. wanted: which of the
     first seven inputs want a gradient. Returns those gradients and dL/d(2D mean) [C, N, 2] in pixels.
     """
-    import torch
-
     means, viewmats = inputs[0], inputs[6]
     assert means is not None and viewmats is not None  # for the type checker
     grads = [
@@ -207,48 +175,41 @@ def rasterize_backward(
     return grads, mean2d
 
 
-def _autograd_function() -> Any:
-    import torch
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, background: Tensor | None, settings: Settings, stats: RasterizationStats, *inputs: Any
+    ) -> Any:
+        contiguous = tuple(None if t is None else t.detach().contiguous() for t in inputs)
+        shade = None if background is None else background.detach().contiguous()
+        out = rasterize_forward(contiguous, shade, settings)
+        stats.radii = out.radii
+        stats.evaluated_pairs, stats.contributing_pairs = out.frames.evaluated, out.frames.contributing
+        stats.seconds = out.frames.seconds
+        images = (out.colors, out.alphas, out.depths, out.features, out.feature_variance)
+        ctx.settings, ctx.stats = settings, stats
+        if any(ctx.needs_input_grad):
+            ctx.frames = out.frames
+            ctx.save_for_backward(*contiguous, shade, *images)
+        ctx.set_materialize_grads(False)
+        visible = out.visible.view(torch.bool)
+        ctx.mark_non_differentiable(visible)
+        return (*images, visible)
 
-    class RasterizeFunction(torch.autograd.Function):
-        @staticmethod
-        def forward(
-            ctx: Any, background: Tensor | None, settings: Settings, stats: RasterizationStats, *inputs: Any
-        ) -> Any:
-            contiguous = tuple(None if t is None else t.detach().contiguous() for t in inputs)
-            shade = None if background is None else background.detach().contiguous()
-            out = rasterize_forward(contiguous, shade, settings)
-            stats.radii = out.radii
-            stats._count(out.frames)
-            images = (out.colors, out.alphas, out.depths, out.features, out.feature_variance)
-            ctx.settings, ctx.stats = settings, stats
-            if any(ctx.needs_input_grad):
-                ctx.frames = out.frames
-                ctx.save_for_backward(*contiguous, shade, *images)
-            ctx.set_materialize_grads(False)
-            visible = out.visible.view(torch.bool)
-            ctx.mark_non_differentiable(visible)
-            return (*images, visible)
-
-        @staticmethod
-        def backward(ctx: Any, *cotangents: Tensor | None) -> Any:
-            saved = ctx.saved_tensors
-            inputs, background, images = saved[:8], saved[8], saved[9:]
-            wanted = tuple(ctx.needs_input_grad[3:10])
-            none = images[0].new_empty(0)
-            state = Forward(*images, visible=none, radii=none, frames=ctx.frames)  # type: ignore[misc]
-            grads, mean2d = rasterize_backward(inputs, background, ctx.settings, state, cotangents[:5], wanted)
-            ctx.stats.mean2d_grad = mean2d.norm(dim=-1)
-            ctx.stats._count(ctx.frames)
-            shade = None
-            if ctx.needs_input_grad[0] and cotangents[0] is not None:
-                shade = (cotangents[0] * (1 - state.alphas)[..., None]).sum(dim=(1, 2))
-            return (shade, None, None, *grads, None)
-
-    return RasterizeFunction
-
-
-_function: Any = None
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Tensor | None) -> Any:
+        saved = ctx.saved_tensors
+        inputs, background, images = saved[:8], saved[8], saved[9:]
+        wanted = tuple(ctx.needs_input_grad[3:10])
+        none = images[0].new_empty(0)
+        state = Forward(*images, visible=none, radii=none, frames=ctx.frames)  # type: ignore[misc]
+        grads, mean2d = rasterize_backward(inputs, background, ctx.settings, state, cotangents[:5], wanted)
+        ctx.stats.mean2d_grad = mean2d.norm(dim=-1)
+        ctx.stats.seconds = ctx.frames.seconds
+        shade = None
+        if ctx.needs_input_grad[0] and cotangents[0] is not None:
+            shade = (cotangents[0] * (1 - state.alphas)[..., None]).sum(dim=(1, 2))
+        return (shade, None, None, *grads, None)
 
 
 def rasterize(
@@ -285,9 +246,6 @@ def rasterize(
     threads: 0 takes torch.get_num_threads(). The result is the same, bit for bit, for any number of threads.
     Finite inputs up to 1e15 in magnitude give finite images and gradients. InputError names a non-finite input.
     """
-    global _function
-    if _function is None:
-        _function = _autograd_function()
     tensors = {
         "means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors,
         "features": features, "viewmats": viewmats, "Ks": Ks, "background": background,
@@ -300,7 +258,7 @@ def rasterize(
         variance and features is not None, depth, threads, simd,
     )  # fmt: skip
     stats = RasterizationStats(radii=means.new_zeros((0,)))
-    out = _function.apply(background, settings, stats, means, quats, scales, opacities, colors, features, viewmats, Ks)
+    out = _Rasterize.apply(background, settings, stats, means, quats, scales, opacities, colors, features, viewmats, Ks)
     return Rasterization(*out, stats=stats)  # type: ignore[misc]
 
 
@@ -308,8 +266,6 @@ def _check(
     tensors: dict[str, Tensor | None], width: int, height: int, sh_degree: int | None, near_plane: float, eps2d: float
 ) -> None:
     """Raises InputError for the first invalid argument."""
-    import torch
-
     means = tensors["means"]
     for name, t in tensors.items():
         if t is None and name in ("features", "background"):

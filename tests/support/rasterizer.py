@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 import torch
 
 import perception
-from perception.gaussians.rasterize import set_simd, simd_levels
+from perception.gaussians import rasterize as module
+from perception.gaussians.rasterize import simd_levels
 from support import reference_rasterizer as reference
 
 IMAGES = ("colors", "alphas", "depths", "features", "feature_variance")
@@ -19,14 +21,20 @@ LEVELS = [pytest.param(level, marks=[pytest.mark.slow] * (level != simd_levels()
 
 
 @pytest.fixture(params=LEVELS, autouse=True)
-def every_simd_level(request: pytest.FixtureRequest) -> Iterator[str]:
+def every_simd_level(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """Where it is imported, every test of the file runs once at each level that the processor has.
 
     The quick part of the suite runs the first, which is the widest.
     """
-    set_simd(request.param)
+    forward = module.rasterize_forward
+
+    def at_level(inputs, background, settings):
+        return forward(
+            inputs, background, replace(settings, simd=request.param) if settings.simd == "auto" else settings
+        )
+
+    monkeypatch.setattr(module, "rasterize_forward", at_level)
     yield request.param
-    set_simd("auto")
 
 
 def scene(n=60, width=37, height=29, dims=5, cameras=2, sh_degree=None, dtype=torch.float64, seed=0):
