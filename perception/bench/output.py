@@ -7,8 +7,8 @@ import json
 import os
 import platform
 import sys
-import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,30 +45,14 @@ def table(rows: Sequence[dict[str, Any]], columns: Sequence[Column], heads: Sequ
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores, and nanoseconds per addition in a dependent chain (numpy.cumsum of float64, minimum of 5 runs).
-    An addition takes 3 or 4 cycles, so the value shows the effective clock rate of a shared or throttled machine."""
-    import numpy as np
-
-    numbers, least = np.ones(1_000_000), float("inf")
-    for _ in range(5):
-        start = time.thread_time_ns()
-        np.cumsum(numbers, out=numbers)
-        least = min(least, (time.thread_time_ns() - start) / numbers.size)
-        numbers[:] = 1
-    return {"processor": _processor(), "cores": os.cpu_count(), "serial_add_ns": least}
-
-
-def _processor() -> str:
-    """Processor name and the widest SIMD level that our kernels use on it."""
+    """Processor, cores, and the widest SIMD level that our kernels use on it."""
     from perception.gaussians.rasterize import simd_levels
 
     name = platform.processor() or platform.machine()
-    try:
+    with suppress(OSError, StopIteration):  # not Linux, or no model name in /proc/cpuinfo
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         name = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        pass  # not Linux, or no model name in /proc/cpuinfo
-    return f"{name}, {simd_levels()[0]}"
+    return {"processor": name, "cores": os.cpu_count(), "simd": simd_levels()[0]}
 
 
 def finish(name: str, options: argparse.Namespace, report: dict[str, Any], text: str) -> None:

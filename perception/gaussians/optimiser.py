@@ -15,6 +15,7 @@ from perception.errors import InputError
 
 _kernels: Any = _core.training  # takes tensors through DLPack where its stub says arrays
 Rate = float | Tensor
+BETAS, EPS = (0.9, 0.999), 1e-15
 
 
 @dataclass(frozen=True)
@@ -43,18 +44,12 @@ class SparseAdam:
     With every row selected and every gradient finite this equals torch.optim.Adam(eps=1e-15) up to rounding.
     """
 
-    def __init__(
-        self,
-        params: Mapping[str, Tensor],
-        rates: Mapping[str, Rate],
-        betas: tuple[float, float] = (0.9, 0.999),
-        eps: float = 1e-15,
-    ) -> None:
+    def __init__(self, params: Mapping[str, Tensor], rates: Mapping[str, Rate]) -> None:
         if set(params) != set(rates):
             raise InputError(f"SparseAdam: params {sorted(params)} and rates {sorted(rates)} name different tensors")
         self.params = {name: _checked(name, tensor) for name, tensor in params.items()}
         self.rates: dict[str, Rate] = dict(rates)
-        self.betas, self.eps, self.steps = betas, eps, 0
+        self.steps = 0
         self._first = {name: torch.zeros_like(t, requires_grad=False) for name, t in self.params.items()}
         self._second = {name: torch.zeros_like(t, requires_grad=False) for name, t in self.params.items()}
         self._check_rows()
@@ -95,7 +90,7 @@ class SparseAdam:
             raise InputError(f"SparseAdam: rates of {name} are {rate.size}, expected 1 or {width}")
         rate = np.ascontiguousarray(np.broadcast_to(rate, width))
         mask = None if visible is None else visible.numpy()
-        return _kernels.adam(*arrays, mask, rate, self.steps, *self.betas, self.eps)
+        return _kernels.adam(*arrays, mask, rate, self.steps, *BETAS, EPS)
 
     def keep(self, index: Tensor) -> None:
         """Keeps the rows `index` selects, in its order: [N] bool, or int64 row numbers (repeats allowed)."""
@@ -119,7 +114,7 @@ class SparseAdam:
         """Everything needed to continue: copies of params and moments, rates, step count."""
         tables = {"params": self.params, "first": self._first, "second": self._second}
         copies: dict[str, Any] = {k: {n: t.detach().clone() for n, t in d.items()} for k, d in tables.items()}
-        return copies | {"rates": dict(self.rates), "betas": self.betas, "eps": self.eps, "steps": self.steps}
+        return copies | {"rates": dict(self.rates), "steps": self.steps}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a `state_dict`; the number of rows may differ, different names raise InputError."""
@@ -129,7 +124,7 @@ class SparseAdam:
             for name, tensor in state[key].items():
                 table[name] = _leaf_like(table[name], tensor.detach().clone().contiguous())
         self.rates = dict(state["rates"])
-        self.betas, self.eps, self.steps = tuple(state["betas"]), state["eps"], state["steps"]
+        self.steps = state["steps"]
         self._check_rows()
 
     def _check_rows(self) -> None:

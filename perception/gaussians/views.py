@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -45,19 +45,17 @@ class TrainingView:
         blocks = self.photo[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3)
         photo = (blocks.to(torch.int16).sum(dim=(1, 3)) + 2).div(4, rounding_mode="floor").to(torch.uint8)
         labels = None if self.labels is None else self.labels[: 2 * height : 2, : 2 * width : 2].contiguous()
-        depth = None
-        if self.depth is not None:
-            of_block = self.depth[: 2 * height, : 2 * width].reshape(height, 2, width, 2).sum(dim=(1, 3))
-            measured = (self.depth[: 2 * height, : 2 * width] > 0).reshape(height, 2, width, 2).sum(dim=(1, 3))
-            depth = of_block / measured.clamp(min=1)
-        K = self.K.clone()
-        K[:2] *= 0.5
-        weight = self.weight
-        if weight is not None:
-            weight = weight[: 2 * height, : 2 * width].reshape(height, 2, width, 2).amin(dim=(1, 3))
+
+        def four(image: torch.Tensor) -> torch.Tensor:
+            return image[: 2 * height, : 2 * width].reshape(height, 2, width, 2)
+
+        depth = self.depth
+        if depth is not None:
+            depth = four(depth).sum(dim=(1, 3)) / four(depth > 0).sum(dim=(1, 3)).clamp(min=1)
+        weight = None if self.weight is None else four(self.weight).amin(dim=(1, 3))
+        K = self.K * torch.tensor([[0.5], [0.5], [1.0]])
         eps2d = (self.eps2d + 0.25) / 4
-        photo, pose = photo.contiguous(), self.camera_from_world
-        return TrainingView(self.name, photo, labels, K, pose, eps2d, weight, depth, self.gain)
+        return replace(self, photo=photo.contiguous(), labels=labels, K=K, eps2d=eps2d, weight=weight, depth=depth)
 
     def exposed(self, image: torch.Tensor) -> torch.Tensor:
         """`image` [H, W, 3] of the scene as this photo is exposed."""

@@ -19,7 +19,6 @@ WEAK_SHARE = 0.02
 """Least share of weakly covered surface for a warning."""
 
 
-@torch.no_grad()
 def views_of_each(gaussians: Gaussians, views: list[View]) -> np.ndarray:
     """[N] int: number of views in which each Gaussian contributes to some pixel."""
     counts = torch.zeros(len(gaussians), dtype=torch.int64)
@@ -27,38 +26,28 @@ def views_of_each(gaussians: Gaussians, views: list[View]) -> np.ndarray:
         scale = min(1.0, SIDE / max(view.width, view.height))
         width, height = max(1, round(view.width * scale)), max(1, round(view.height * scale))
         K = view.K * np.array([[width / view.width], [height / view.height], [1.0]])
-        out = render(
-            gaussians,
-            torch.from_numpy(view.camera_from_world.astype(np.float32)),
-            torch.from_numpy(K.astype(np.float32)),
-            width,
-            height,
-            depth=False,
-        )
-        counts += out.visible[0]
+        pose, K = (torch.from_numpy(matrix.astype(np.float32)) for matrix in (view.camera_from_world, K))
+        with torch.no_grad():
+            counts += render(gaussians, pose, K, width, height, depth=False).visible[0]
     return counts.numpy()
 
 
 def weak_coverage(gaussians: Gaussians, views: list[View]) -> str | None:
     """One line on the surface seen by fewer than ENOUGH views: how much, where, which photo faces it; else None."""
-    if len(gaussians) == 0 or not views:
-        return None
     solid = gaussians.opacities.detach().numpy() > SOLID
     weak = solid & (views_of_each(gaussians, views) < ENOUGH)
     share = weak.sum() / max(1, solid.sum())
-    if share < WEAK_SHARE:
+    if share < WEAK_SHARE or not views:
         return None
     middle = np.median(gaussians.means.detach().numpy()[weak], axis=0)
-    nearest = min(views, key=lambda view: _off_axis(view, middle))
+
+    def along_axis(view: View) -> float:
+        """Cosine between a view's axis and the direction to `middle`."""
+        local = view.camera_from_world[:3, :3] @ middle + view.camera_from_world[:3, 3]
+        return float(local[2] / max(np.linalg.norm(local), 1e-9))
+
     place = ", ".join(f"{x:.2f}" for x in middle)
     return (
         f"weak coverage: {share:.0%} of the surface is seen by fewer than {ENOUGH} photos, about ({place}), "
-        f"which {nearest.name} faces; take more photos there"
+        f"which {max(views, key=along_axis).name} faces; take more photos there"
     )
-
-
-def _off_axis(view: View, point: np.ndarray) -> float:
-    """Angle in radians between a view's axis and a point; π if the point is the camera centre."""
-    local = view.camera_from_world[:3, :3] @ point + view.camera_from_world[:3, 3]
-    distance = float(np.linalg.norm(local))
-    return float(np.arccos(np.clip(local[2] / distance, -1, 1))) if distance > 0 else float(np.pi)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from perception.query.hit import Description, Hit, Neighbor
     from perception.query.parts import PartsMap
     from perception.query.query_map import QueryMap, load_map
-    from perception.query.regions import Prism, Region, axis_box
+    from perception.query.regions import axis_box
     from perception.query.requests import Reply, Request
     from perception.query.where import Where
 
@@ -27,10 +27,8 @@ _HOMES = {
     "Hit": "hit",
     "Neighbor": "hit",
     "PartsMap": "parts",
-    "Prism": "regions",
     "QueryEngine": "engine",
     "QueryMap": "query_map",
-    "Region": "regions",
     "Reply": "requests",
     "Request": "requests",
     "Where": "where",
@@ -46,10 +44,8 @@ __all__ = [
     "Hit",
     "Neighbor",
     "PartsMap",
-    "Prism",
     "QueryEngine",
     "QueryMap",
-    "Region",
     "Reply",
     "Request",
     "Where",

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, Validatio
 from perception.errors import InputError
 from perception.geometry import scale_of
 from perception.query.frames import Frame
-from perception.query.regions import Prism, Region, axis_box
+from perception.query.regions import axis_box
 from perception.query.requests import MAX_TEXT, MAX_TEXTS, MAX_TOP, Request
 from perception.query.where import Where
 from perception.types import OrientedBox
@@ -24,7 +24,6 @@ MAX_NUMBER = 1e12
 """Largest absolute value of a number; it exceeds every coordinate on the earth in millimetres."""
 MAX_SCALE = 1e9
 """Largest scale of a frame relative to the map; the smallest is 1 / MAX_SCALE."""
-_MAX_CORNERS = 1000
 
 Number = Annotated[float, Field(ge=-MAX_NUMBER, le=MAX_NUMBER)]
 Length = Annotated[float, Field(ge=0, le=MAX_NUMBER)]
@@ -69,7 +68,7 @@ class CornersBody(Body):
     min: Point
     max: Point
 
-    def region(self) -> Region:
+    def region(self) -> OrientedBox:
         return axis_box(self.min, self.max)
 
 
@@ -80,34 +79,16 @@ class BoxBody(Body):
     extent: Annotated[list[Length], Field(min_length=3, max_length=3)]
     rotation: Rotation | None = None
 
-    def region(self) -> Region:
+    def region(self) -> OrientedBox:
         rotation = np.eye(3) if self.rotation is None else np.array(self.rotation)
         return OrientedBox(np.array(self.center), rotation, np.array(self.extent))
 
 
-class PrismBody(Body):
-    """The space over a polygon of x and y, between two heights."""
-
-    polygon: Annotated[
-        list[Annotated[list[Number], Field(min_length=2, max_length=2)]],
-        Field(min_length=3, max_length=_MAX_CORNERS),
-    ]
-    low: Number | None = None
-    high: Number | None = None
-
-    def region(self) -> Region:
-        low, high = (-np.inf if self.low is None else self.low), (np.inf if self.high is None else self.high)
-        return Prism(np.array(self.polygon), low, high)
-
-
-def _region_kind(value: Any) -> str:
-    keys = value if isinstance(value, dict) else ()
-    return "prism" if "polygon" in keys else "box" if "center" in keys or "extent" in keys else "corners"
-
-
 AnyRegion = Annotated[
-    Annotated[CornersBody, Tag("corners")] | Annotated[BoxBody, Tag("box")] | Annotated[PrismBody, Tag("prism")],
-    Discriminator(_region_kind),
+    Annotated[CornersBody, Tag("corners")] | Annotated[BoxBody, Tag("box")],
+    Discriminator(
+        lambda value: "box" if isinstance(value, dict) and value.keys() & {"center", "extent"} else "corners"
+    ),
 ]
 
 
@@ -206,7 +187,7 @@ def parse(model: type[Model], value: Any) -> Model:
 def problem_line(errors: Sequence[Any]) -> str:
     """One of pydantic's errors as a line: field, expected, found. An unknown field takes precedence."""
     first = next((error for error in errors if error["type"] == "extra_forbidden"), errors[0])
-    tags = {"body", "query", "list", "nested", "single", "corners", "box", "prism"}
+    tags = {"body", "query", "list", "nested", "single", "corners", "box"}
     place = ".".join(str(part) for part in first["loc"] if part not in tags)
     found = repr(first.get("input"))
     expected = str(first["msg"]).removeprefix("Value error, ")

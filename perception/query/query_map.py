@@ -21,7 +21,7 @@ from perception.query.where import Where, place, tidy
 from perception.types import OrientedBox
 
 if TYPE_CHECKING:
-    from perception.language.ranking import Answer, Ranker
+    from perception.language.ranking import Ranker
 
 _NEIGHBORS = 3
 _LEAST_COLOR = 0.05
@@ -82,12 +82,19 @@ class QueryMap(Map):
         if not self.instances:
             return []
         answer = self._ranking.rank(text, min_score)
-        if where is None:
-            if not answer.present:
+        chosen, wanted = answer.hits, (where or Where()).in_map(frame)
+        if where is not None:
+            from perception.language.ranking import PRESENT
+
+            allowed = set(self._fulfilling(wanted))
+            chosen = [(n, s) for n, s in chosen if n in allowed]
+            if not chosen or chosen[0][1] < (PRESENT if min_score is None else min_score):
                 return []
-            chosen = answer.hits if min_score is None else [(n, s) for n, s in answer.hits if s >= min_score]
-            return [self._in(frame, self.hit(n, s)) for n, s in chosen[:top_k]]
-        return self._query_where(answer, top_k, min_score, where.in_map(frame), frame)
+        elif not answer.present:
+            return []
+        if min_score is not None:
+            chosen = [(n, s) for n, s in chosen if s >= min_score]
+        return [self._in(frame, self._measured(n, wanted, s)) for n, s in chosen[:top_k]]
 
     def find(self, where: Where | None = None, *, frame: Frame | None = None) -> list[Hit]:
         """All instances that fulfil `where`, in the order of instances.json, scored by the mapper's confidence."""
@@ -191,18 +198,6 @@ class QueryMap(Map):
         return names[0], (x0, y0, x1, y1)
 
     # --------------------------------------------------------------- internals
-
-    def _query_where(
-        self, answer: Answer, top_k: int, min_score: float | None, where: Where, frame: Frame | None
-    ) -> list[Hit]:
-        from perception.language.ranking import PRESENT
-
-        allowed = set(self._fulfilling(where))
-        left = [(n, s) for n, s in answer.hits if n in allowed]
-        if not left or left[0][1] < (PRESENT if min_score is None else min_score):
-            return []
-        chosen = left if min_score is None else [(n, s) for n, s in left if s >= min_score]
-        return [self._in(frame, self._measured(n, where, s)) for n, s in chosen[:top_k]]
 
     def _fulfilling(self, where: Where) -> list[int]:
         """Indices in instances.json of the instances that fulfil `where`, which is in the map's frame."""

@@ -31,7 +31,12 @@ class Request:
     frame: Frame | None = None
 
     def __post_init__(self) -> None:
-        check_text(self.text)
+        if not isinstance(self.text, str):
+            raise InputError(f"query: the text is {type(self.text).__name__}, expected a text")
+        if not self.text.strip():
+            raise InputError('query: the text is empty; ask for a thing, such as "red mug"')
+        if len(self.text) > MAX_TEXT:
+            raise InputError(f"query: the text has {len(self.text)} characters, expected at most {MAX_TEXT}")
         if isinstance(self.top_k, bool) or not isinstance(self.top_k, (int, np.integer)):
             raise InputError(f"query: top_k is {self.top_k!r}, expected a whole number")
         if not 1 <= self.top_k <= MAX_TOP:
@@ -57,14 +62,3 @@ class Reply:
     def to_json(self) -> dict[str, Any]:
         """An entry of `results` in the JSON output."""
         return {"text": self.request.text, "present": bool(self.hits), "hits": [hit.to_json() for hit in self.hits]}
-
-
-def check_text(text: Any) -> str:
-    """`text`, validated; InputError when it is not a str, is empty, or is longer than MAX_TEXT."""
-    if not isinstance(text, str):
-        raise InputError(f"query: the text is {type(text).__name__}, expected a text")
-    if not text.strip():
-        raise InputError('query: the text is empty; ask for a thing, such as "red mug"')
-    if len(text) > MAX_TEXT:
-        raise InputError(f"query: the text has {len(text)} characters, expected at most {MAX_TEXT}")
-    return text

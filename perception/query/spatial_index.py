@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from perception.io.instance_index import InstanceIndex
-from perception.query.regions import Region, inside
+from perception.query.regions import inside
 from perception.types import OrientedBox
 
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -40,7 +40,7 @@ class SpatialIndex:
         apart = np.maximum(bounds[:, 0] - point, point - bounds[:, 1])
         return _closest(known, apart, count, lambda i, _: self.distance(i, point))
 
-    def share_inside(self, instance_id: int, region: Region) -> float:
+    def share_inside(self, instance_id: int, region: OrientedBox) -> float:
         """The share of the instance's points that lies in `region`, in [0, 1]; 0 without points."""
         points = self.index.of(instance_id)
         if not len(points) or self._apart(instance_id, region):
@@ -75,10 +75,8 @@ class SpatialIndex:
 
         return [entry for entry in _closest(others, apart, count, gap) if np.isfinite(entry[0])]
 
-    def _apart(self, instance_id: int, region: Region) -> bool:
+    def _apart(self, instance_id: int, region: OrientedBox) -> bool:
         """True when the bounding boxes alone show that no point is inside."""
-        if not isinstance(region, OrientedBox):
-            return False
         corners = region.center + (_CORNERS * region.extent) @ region.rotation
         low, high = self.aabb(instance_id)
         return bool((corners.max(axis=0) < low - 1e-9).any() or (corners.min(axis=0) > high + 1e-9).any())

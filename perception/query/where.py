@@ -8,23 +8,25 @@ from typing import Any
 
 import numpy as np
 
+from perception.boxes import move_box
 from perception.errors import InputError
 from perception.geometry import check_similarity, move_points, scale_of
 from perception.query.frames import Frame
-from perception.query.regions import Region, check_region, move_region
+from perception.query.regions import check_box
+from perception.types import OrientedBox
 
 
 @dataclass(frozen=True)
 class Where:
     """The conditions that an instance must fulfil to be in the result; None = no condition.
 
-    region: at least `share` of its points lie in this box or prism. near: a point [3], or a pose [4, 4] of which only
+    region: at least `share` of its points lie in this box. near: a point [3], or a pose [4, 4] of which only
     the origin is used; hits then carry their distance. within: largest distance of its nearest point from `near`.
     min_size, max_size: bounds on the longest side of its box. labels: it has one of these labels (case-insensitive).
     Lengths are in the unit of the query's frame.
     """
 
-    region: Region | None = None
+    region: OrientedBox | None = None
     share: float = 0.5
     near: np.ndarray | Sequence[float] | None = None
     within: float | None = None
@@ -34,7 +36,7 @@ class Where:
 
     def __post_init__(self) -> None:
         if self.region is not None:
-            object.__setattr__(self, "region", check_region(self.region))
+            object.__setattr__(self, "region", check_box(self.region))
         if self.near is not None:
             object.__setattr__(self, "near", place(self.near))
         if self.labels is not None:
@@ -62,7 +64,7 @@ class Where:
         within, least, most = (None if x is None else x * scale for x in (self.within, self.min_size, self.max_size))
         return replace(
             self,
-            region=None if self.region is None else move_region(map_from_frame, self.region),
+            region=None if self.region is None else move_box(map_from_frame, self.region),
             near=None if self.near is None else move_points(map_from_frame, np.asarray(self.near)),
             within=within,
             min_size=least,

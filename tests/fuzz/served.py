@@ -50,7 +50,7 @@ class HttpTarget:
     memory = 1024
     words = (
         "GET /", "POST /", "query", "instances/", "/crop.jpg", "?map_id=", "?side=", "?format=ply", "\n\n", "host: ",
-        "content-type: application/json", '"text":', '"where":', '"near":', '"region":', '"polygon":', '"frame":',
+        "content-type: application/json", '"text":', '"where":', '"near":', '"region":', '"frame":',
         '"from_map":', '"\\ud800"', "1e308", "1e-308", "NaN", "[[", "]]", "null", "true", "%00", "%ff", "\\u0000",
     )  # fmt: skip
 
@@ -73,13 +73,12 @@ class HttpTarget:
         boxes = [
             {"min": [0, 0, 0], "max": [1, 1, 1]},
             {"center": [0, 0, 0], "extent": [1, 1, 1], "rotation": np.eye(3).tolist()},
-            {"polygon": [[0, 0], [1, 0], [0, 1]], "low": -1, "high": 1},
         ]
         wheres = [{"region": box, "share": 0.5, "near": [0, 0, 0], "within": 3, "labels": ["mug"]} for box in boxes]
         bodies: list[tuple[str, Any]] = [
             ("query", {"text": ["mug", "lamp"], "top_k": 2, "min_score": 0.1, "where": wheres[0], "frame": frame}),
             ("find", {"where": wheres[1]}),
-            ("find", {"where": wheres[2], "frame": frame}),
+            ("find", {"where": wheres[0], "frame": frame}),
             ("nearest", {"near": np.eye(4).tolist(), "top_k": 3}),
             ("at", {"point": [0, 0, 0], "max_distance": 5, "frame": frame}),
         ]

@@ -11,7 +11,7 @@ import perception
 from perception.errors import InputError
 from perception.geometry import rotation_from_quaternion
 from perception.io.store import Map, read_map, set_labels
-from perception.query import Frame, Prism, QueryMap, Where, axis_box, load_map
+from perception.query import Frame, QueryMap, Where, axis_box, load_map
 from perception.types import OrientedBox
 from support.query_maps import NAMES, encoders, write_map_of
 from support.synthetic_map import SIGMA, grid
@@ -96,17 +96,6 @@ def test_in_box_counts_points(gmap: QueryMap, arrays: Map, share: float) -> None
     assert gmap.in_box(axis_box([5, 5, 5], [6, 6, 6]), share=0.01) == []
 
 
-def test_a_concave_polygon_holds_what_lies_over_it(gmap: QueryMap) -> None:
-    """An L over the cells (0, 0), (1, 0), (2, 0), (0, 1), (0, 2) of the 3 × 3 grid."""
-    corners = np.array([[-0.5, -0.5], [2.5, -0.5], [2.5, 0.5], [0.5, 0.5], [0.5, 2.5], [-0.5, 2.5]])
-    for polygon in (corners, corners[::-1]):
-        ids = [hit.instance_id for hit in gmap.find(Where(region=Prism(polygon), share=1.0))]
-        assert ids == [3, 4, 5, 6, 9]
-    assert gmap.find(Where(region=Prism(corners, low=1.0))) == []
-    half = gmap.find(Where(region=Prism(corners, low=0.0), share=0.4))
-    assert [hit.instance_id for hit in half] == [3, 4, 5, 6, 9]
-
-
 def test_instance_at_follows_the_points_spacing(gmap: QueryMap, arrays: Map) -> None:
     for k, center in zip(range(3, 12), grid(9), strict=True):
         hit = gmap.instance_at(center)
@@ -176,10 +165,10 @@ def test_everything_in_another_frame_is_the_same_thing_moved(gmap: QueryMap, arr
     assert gmap.instance_at(to_base(grid(9)[4]), frame=base).instance_id == 7  # type: ignore[union-attr]
     box = OrientedBox(to_base(grid(9)[4]), (base_from_map[:3, :3] / scale).T, np.full(3, scale))
     assert [hit.instance_id for hit in gmap.in_box(box, frame=base)] == [7]
-    prism = Where(region=Prism(np.array([[-9, -9], [9, -9], [9, 0.5], [-9, 0.5]])))
+    half = Where(region=axis_box([-9, -9, -9], [9, 0.5, 9]))
     z_turn = Frame("turned", np.array([[0, -1.0, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
     # In the turned frame y is the map's x: the half plane y <= .5 there is x <= .5 here.
-    assert [hit.instance_id for hit in gmap.find(prism, frame=z_turn)] == [3, 6, 9]
+    assert [hit.instance_id for hit in gmap.find(half, frame=z_turn)] == [3, 6, 9]
     longest = np.sort([max(gmap.get(k).obb.extent) for k in range(3, 12)])
     size = Where(min_size=scale * float(longest[3] + longest[4]) / 2)
     assert len(gmap.find(size, frame=base)) == 5
@@ -232,7 +221,6 @@ def test_a_description_names_neighbours_by_their_gap(gmap: QueryMap, arrays: Map
         lambda g: g.in_box(axis_box([1, 1, 1], [0, 2, 2])),
         lambda g: g.in_box(OrientedBox(np.zeros(3), np.diag([1, 1, -1.0]), np.ones(3))),
         lambda g: g.in_box(OrientedBox(np.zeros(3), 2 * np.eye(3), np.ones(3))),
-        lambda g: g.find(Where(region=Prism(np.zeros((2, 2))))),
         lambda g: g.get(3).transformed(np.diag([1, 1, -1, 1.0])),
         lambda g: g.get(3).transformed(np.diag([1, 2, 1, 1.0])),
         lambda g: g.get(3).transformed(np.eye(3)),

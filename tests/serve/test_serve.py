@@ -93,8 +93,8 @@ def test_filters_and_frames_pass_through(client: TestClient, engine: QueryEngine
     at = client.post("/at", json={"point": [2, 1, 0]}).json()
     assert [hit["instance_id"] for hit in at["hits"]] == [5]
     assert client.post("/at", json={"point": [2, 1, 50]}).json()["hits"] == []
-    polygon = {"polygon": [[-0.5, -0.5], [0.5, -0.5], [0.5, 2.5], [-0.5, 2.5]]}
-    found = client.post("/find", json={"where": {"region": polygon, "share": 1}}).json()
+    corners = {"min": [-0.5, -0.5, -9], "max": [0.5, 2.5, 9]}
+    found = client.post("/find", json={"where": {"region": corners, "share": 1}}).json()
     assert [hit["instance_id"] for hit in found["hits"]] == [0, 3, 6]
     turned = {"center": [1, 1, 0], "extent": [1, 1, 1], "rotation": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]}
     found = client.post("/find", json={"where": {"region": turned}}).json()
@@ -243,7 +243,7 @@ def _errors(described: dict[str, Any], schema: dict[str, Any], value: Any) -> li
         (b'{"text": "mug", "where": {"region": {}}}', "region"),
         (b'{"text": "mug", "where": {"region": {"min": [0, 0], "max": [1, 1]}}}', "region"),
         (b'{"text": "mug", "where": {"region": {"min": ["a", 0, 0], "max": [1, 1, 1]}}}', "region"),
-        (b'{"text": "mug", "where": {"region": {"polygon": [[0, 0], [1, 1e400], [0, 1]]}}}', "finite"),
+        (b'{"text": "mug", "where": {"region": {"min": [0, 0, 1e400], "max": [1, 1, 1]}}}', "finite"),
         (b'{"text": "mug", "where": {"within": 1}}', "near"),
         (b'{"text": "mug", "where": {"labels": {"a": 1}}}', "labels"),
         (b'{"text": "mug", "frame": "base"}', "frame"),

@@ -53,10 +53,6 @@ MATRICES = st.one_of(similarities(), rows(4, 4))
 REGIONS = st.one_of(
     st.fixed_dictionaries({"min": POINTS, "max": POINTS}),
     st.fixed_dictionaries({"center": POINTS, "extent": POINTS}, optional={"rotation": rows(3, 3)}),
-    st.fixed_dictionaries(
-        {"polygon": st.lists(st.lists(NUMBERS, min_size=2, max_size=2), min_size=3, max_size=6)},
-        optional={"low": NUMBERS, "high": NUMBERS},
-    ),
 )
 
 
