@@ -115,6 +115,7 @@ def test_the_walkthrough_runs(small_scene: Path, tmp_path: Path, monkeypatch: py
     assert any(command.startswith("perception map PHOTOS") for command in commands)
     # The map's own arguments are kept; what is added makes it small, and gives it masks and poses.
     small = f"--masks labels:{small_scene / 'labels'} --iterations 60 --budget 2000 --set instances.min_cluster_size=8"
+    small += " --set language.views=1 --set language.zooms=1"
     for command in commands:
         words = arguments(command)
         words = ["mug" if word == "TEXT" else word for word in words]

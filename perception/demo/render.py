@@ -44,8 +44,8 @@ def cast(bodies: list[Body], lamp: Lamp, camera: Camera, samples: int = 2) -> Pi
             places.append(place)
             window = _window(part, camera, samples)
             if window is not None:
-                painter = _Painter(part, camera.center, lamp)
-                painter.paint(len(owners) - 1, rays[window], depth[window], seen[window], color[window])
+                images = (depth[window], seen[window], color[window])
+                _paint(part, camera.center, lamp, len(owners) - 1, rays[window], images)
     rgb = cv2.resize(color, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     part_blocks, depth_blocks = _blocks(seen, samples), _blocks(depth, samples)
     id_blocks = np.array(owners, np.uint16)[part_blocks]
@@ -82,41 +82,36 @@ def _window(part: Part, camera: Camera, samples: int) -> tuple[slice, slice] | N
     return (slice(low[1], high[1]), slice(low[0], high[0])) if (high > low).all() else None
 
 
-@dataclass(frozen=True)
-class _Painter:
-    """Intersects rays from `eye` with one part and shades the hits."""
+def _paint(
+    part: Part, eye: np.ndarray, lamp: Lamp, number: int, rays: np.ndarray, images: tuple[np.ndarray, ...]
+) -> None:
+    """Intersects rays [h, w, 3] from `eye` with a part and shades the hits: updates depth, seen (with `number`) and
+    color in place where the part is nearest."""
+    depth, seen, color = images
+    origin = to_local(part.shape, eye[None])[0].astype(np.float32)
+    local = rays @ part.shape.rotation.astype(np.float32)
+    t, u, v = part.shape.hit(np.broadcast_to(origin, local.shape), local)
+    rows, columns = np.nonzero(t < depth)
+    if not len(rows):
+        return
+    t, u, v = (array[rows, columns] for array in (t, u, v))
+    height, width = part.lit.shape[:2]
+    map_y = np.clip(v * height - 0.5, 0, height - 1).astype(np.float32)
+    sampled = _sample(part.lit, (u * width - 0.5).astype(np.float32), map_y)
+    depth[rows, columns] = t
+    seen[rows, columns] = number
+    if part.gloss:
+        sampled = np.clip(sampled + _highlight(part, eye, lamp, u, v), 0, 255).astype(np.uint8)
+    color[rows, columns] = sampled
 
-    part: Part
-    eye: np.ndarray
-    lamp: Lamp
 
-    def paint(self, number: int, rays: np.ndarray, depth: np.ndarray, seen: np.ndarray, color: np.ndarray) -> None:
-        """Updates depth, `seen` (with `number`) and color in place where the part is nearest on the rays [h, w, 3]."""
-        shape, lit = self.part.shape, self.part.lit
-        origin = to_local(shape, self.eye[None])[0].astype(np.float32)
-        local = rays @ shape.rotation.astype(np.float32)
-        t, u, v = shape.hit(np.broadcast_to(origin, local.shape), local)
-        rows, columns = np.nonzero(t < depth)
-        if not len(rows):
-            return
-        t, u, v = (array[rows, columns] for array in (t, u, v))
-        height, width = lit.shape[:2]
-        map_y = np.clip(v * height - 0.5, 0, height - 1).astype(np.float32)
-        sampled = _sample(lit, (u * width - 0.5).astype(np.float32), map_y)
-        depth[rows, columns] = t
-        seen[rows, columns] = number
-        color[rows, columns] = self._with_highlight(sampled, u, v) if self.part.gloss else sampled
-
-    def _with_highlight(self, sampled: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Adds the Blinn-Phong highlight of the lamp. [N, 3] uint8."""
-        points, normals = self.part.shape.point_normal(u, v)
-        points, normals = to_world(self.part.shape, points), normals @ self.part.shape.rotation.T
-        to_lamp, to_eye = self.lamp.center - points, self.eye - points
-        half = to_lamp / np.linalg.norm(to_lamp, axis=1, keepdims=True)
-        half += to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True)
-        half /= np.linalg.norm(half, axis=1, keepdims=True)
-        shine = self.part.gloss * np.maximum(np.einsum("nk,nk->n", half, normals), 0) ** 60
-        return np.clip(sampled + 110 * shine[:, None], 0, 255).astype(np.uint8)
+def _highlight(part: Part, eye: np.ndarray, lamp: Lamp, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Blinn-Phong highlight of the lamp at chart coordinates [N], [N, 1] in 8-bit steps."""
+    points, normals = part.shape.point_normal(u, v)
+    points, normals = to_world(part.shape, points), normals @ part.shape.rotation.T
+    half = sum((at - points) / np.linalg.norm(at - points, axis=1, keepdims=True) for at in (lamp.center, eye))
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    return 110 * (part.gloss * np.maximum(np.einsum("nk,nk->n", half, normals), 0) ** 60)[:, None]
 
 
 def _sample(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

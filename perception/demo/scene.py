@@ -95,19 +95,12 @@ def _instances(made: Scene, ids: np.ndarray, pictures: list[Picture]) -> list[Tr
     views = np.zeros(len(made.bodies) + 1, int)
     for picture in pictures:
         views[np.unique(picture.ids)] += 1
-    return [
-        Truth(
-            number,
-            body.name,
-            body.category,
-            1 + categories.index(body.category),
-            body.prompts,
-            body.is_stuff,
-            int(points[number]),
-            int(views[number]),
-        )
-        for number, body in enumerate(made.bodies, start=1)
-    ]
+    found = []
+    for number, body in enumerate(made.bodies, start=1):
+        category, seen = body.category, (int(points[number]), int(views[number]))
+        semantic = 1 + categories.index(category)
+        found.append(Truth(number, body.name, category, semantic, body.prompts, body.is_stuff, *seen))
+    return found
 
 
 def _write_photo(path: Path, rgb: np.ndarray, focal_35mm: int, rng: np.random.Generator) -> None:

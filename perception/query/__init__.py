@@ -19,21 +19,14 @@ if TYPE_CHECKING:
     from perception.query.where import Where
 
 _HOMES = {
-    "AnswerTimeout": "engine",
-    "Description": "hit",
-    "EngineBusy": "engine",
-    "EngineClosed": "engine",
-    "Frame": "frames",
-    "Hit": "hit",
-    "Neighbor": "hit",
-    "PartsMap": "parts",
-    "QueryEngine": "engine",
-    "QueryMap": "query_map",
-    "Reply": "requests",
-    "Request": "requests",
-    "Where": "where",
-    "axis_box": "regions",
-    "load_map": "query_map",
+    "engine": ("AnswerTimeout", "EngineBusy", "EngineClosed", "QueryEngine"),
+    "frames": ("Frame",),
+    "hit": ("Description", "Hit", "Neighbor"),
+    "parts": ("PartsMap",),
+    "query_map": ("QueryMap", "load_map"),
+    "regions": ("axis_box",),
+    "requests": ("Reply", "Request"),
+    "where": ("Where",),
 }
 __all__ = [
     "AnswerTimeout",
@@ -55,8 +48,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        import importlib
+    import importlib
 
-        return getattr(importlib.import_module(f"perception.query.{_HOMES[name]}"), name)
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(importlib.import_module(f"perception.query.{home}"), name)
     raise AttributeError(f"module 'perception.query' has no attribute '{name}'")

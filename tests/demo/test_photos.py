@@ -87,14 +87,12 @@ def test_every_thing_is_seen_and_every_query_has_its_answer(made: tuple[Path, De
     assert red[0] > 2 * red[2] and blue[2] > 2 * blue[0]
 
 
-def test_same_seed_same_photos_other_seed_other_photos(made: tuple[Path, DemoTruth], tmp_path: Path) -> None:
+def test_same_seed_same_photos(made: tuple[Path, DemoTruth], tmp_path: Path) -> None:
     folder, truth = made
     again = make_photos(tmp_path / "again" / "photos", views=5, width=160, height=120, light_samples=2)
-    other = make_photos(tmp_path / "other" / "photos", views=3, width=160, height=120, seed=4, light_samples=2)
     for name in truth.names:
         assert (folder / name).read_bytes() == (tmp_path / "again" / "photos" / name).read_bytes()
     np.testing.assert_array_equal(again.points, truth.points)
-    assert (tmp_path / "other" / "photos" / other.names[0]).read_bytes() != (folder / "000.jpg").read_bytes()
 
 
 def test_photos_tell_their_focal_length(made: tuple[Path, DemoTruth]) -> None:

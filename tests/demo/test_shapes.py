@@ -32,7 +32,7 @@ def _inside_bulb(p: np.ndarray) -> np.ndarray:
 
 def _inside_hook(p: np.ndarray) -> np.ndarray:
     """Nearest of many balls strung along the arc: brute force, no chart."""
-    share = np.linspace(0, 1, 150)
+    share = np.linspace(0, 1, 60)
     angle = HOOK.start + share * (HOOK.stop - HOOK.start)
     centers = HOOK.bend * np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
     radii = np.interp(share, np.linspace(0, 1, 4), HOOK.radii)
@@ -58,20 +58,20 @@ def _rays(count: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "inside", "tolerance"),
-    [(BULB, _inside_bulb, 0.004), (HOOK, _inside_hook, 0.01), (EGG, _inside_egg, 0.004), (CRATE, _inside_crate, 0.004)],
+    [(BULB, _inside_bulb, 0.005), (HOOK, _inside_hook, 0.01), (EGG, _inside_egg, 0.005), (CRATE, _inside_crate, 0.005)],
 )
 def test_first_crossing_is_where_a_dense_walk_enters(shape: Shape, inside, tolerance: float) -> None:
     origins, directions = _rays(150)
     t = shape.hit(origins, directions)[0]
-    walk = np.arange(0.5, 4.5, 0.003)
+    walk = np.arange(0.5, 4.5, 0.004)
     within = np.stack([inside(origins + s * directions) for s in walk], 1)
     entered = np.where(within.any(1), walk[within.argmax(1)], np.inf)
     # A ray that grazes for less than a few steps may be seen by one method only; deep crossings must agree.
-    deep = (within.sum(1) > 25) | ~np.isfinite(t)
+    deep = (within.sum(1) > 19) | ~np.isfinite(t)
     assert deep.sum() > 100 and np.isfinite(t).sum() > 20
-    steady = within.sum(1) > 25
+    steady = within.sum(1) > 19
     np.testing.assert_allclose(t[steady], entered[steady], atol=tolerance)
-    assert (within[~np.isfinite(t)].sum(1) < 25).all()
+    assert (within[~np.isfinite(t)].sum(1) < 19).all()
 
 
 def test_sphere_and_plane_have_their_closed_forms() -> None:
