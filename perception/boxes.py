@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from perception.geometry import scale_of
@@ -34,27 +32,6 @@ def oriented_box(points: np.ndarray, trim: float = 0.0) -> OrientedBox:
     rotation = _in_order(axes[best], extent[best])
     low, high = _sides(rotation[None], points if trim else outline, trim)
     return OrientedBox(rotation.T @ ((low[0] + high[0]) / 2), rotation, high[0] - low[0])
-
-
-def instance_boxes(points: np.ndarray, labels: np.ndarray, trim: float = 0.0) -> dict[int, dict[str, Any]]:
-    """{id: {"num_points", "centroid", "aabb": {"min", "max"}, "obb"}} of labelled points [P, 3], labels [P]
-    (−1 = none). trim as in `oriented_box`; points that are not finite are left out.
-    """
-    inside = (labels >= 0) & np.isfinite(points).all(axis=1)
-    order = np.flatnonzero(inside)
-    order = order[np.argsort(labels[order], kind="stable")]
-    ids, starts = np.unique(labels[order], return_index=True)
-    boxes: dict[int, dict[str, Any]] = {}
-    for i, rows in zip(ids.tolist(), np.split(order, starts[1:]), strict=True):
-        own = points[rows].astype(np.float64)
-        low, high = np.quantile(own, [trim, 1 - trim], axis=0)
-        boxes[i] = {
-            "num_points": len(own),
-            "centroid": own.mean(axis=0).tolist(),
-            "aabb": {"min": low.tolist(), "max": high.tolist()},
-            "obb": oriented_box(own, trim).to_json(),
-        }
-    return boxes
 
 
 def _sides(axes: np.ndarray, points: np.ndarray, trim: float) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Visualisation images: instance colours, depth, errors, outlines, montages. Images are [H, W, 3] uint8 RGB."""
+"""Visualisation images: instance colours, depth, errors, outlines, rows of images. Images are [H, W, 3] uint8 RGB."""
 
 from __future__ import annotations
 
@@ -56,50 +56,32 @@ def outline(
     return cv2.drawContours(np.ascontiguousarray(out), contours, -1, color, thickness, cv2.LINE_AA)
 
 
-def features_to_rgb(features: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+def features_to_rgb(features: np.ndarray) -> np.ndarray:
     """Features [..., D] -> colours [..., 3] uint8: their first three principal components, stretched to 1-99 %.
 
-    mask [...]: the entries from which axes and stretch are computed (default all); axis signs are made unique.
+    Axis signs are made unique.
     """
     flat = features.reshape(-1, features.shape[-1]).astype(np.float64)
-    basis = flat if mask is None or not mask.any() else flat[mask.ravel()]
-    center = basis.mean(0)
-    _, axes = np.linalg.eigh(np.cov((basis - center).T).reshape(flat.shape[1], -1))
+    center = flat.mean(0)
+    _, axes = np.linalg.eigh(np.cov((flat - center).T).reshape(flat.shape[1], -1))
     axes = axes[:, ::-1][:, :3]
     strongest = np.abs(axes).argmax(0)
     axes = axes * np.sign(axes[strongest, np.arange(axes.shape[1])])
-    low, high = np.percentile((basis - center) @ axes, [1, 99], axis=0)
+    low, high = np.percentile((flat - center) @ axes, [1, 99], axis=0)
     level = np.clip(((flat - center) @ axes - low) / np.maximum(high - low, 1e-12), 0, 1)
     level = np.pad(level, ((0, 0), (0, 3 - level.shape[1])), constant_values=0.5)
     return np.round(255 * level).astype(np.uint8).reshape(*features.shape[:-1], 3)
 
 
-def montage(
-    images: Sequence[np.ndarray], columns: int, titles: Sequence[str] | None = None, gap: int = 6
-) -> np.ndarray:
-    """Images in a grid on white, each scaled to the size of the first, with a title above each."""
-    if not images:
-        raise ValueError("montage: no images")
-    height, width = images[0].shape[:2]
-    head = 22 if titles else 0
-    rows = -(-len(images) // columns)
-    sheet = np.full((rows * (height + head + gap) + gap, columns * (width + gap) + gap, 3), 255, np.uint8)
-    for i, image in enumerate(images):
-        y, x = gap + (i // columns) * (height + head + gap), gap + (i % columns) * (width + gap)
-        if titles and i < len(titles):
-            _title(sheet[y : y + head, x : x + width], titles[i])
-        if image.shape[:2] != (height, width):
-            image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        sheet[y + head : y + head + height, x : x + width] = image
-    return sheet
-
-
-def _title(strip: np.ndarray, text: str) -> None:
-    """Draws text into a strip of an image, in place."""
+def titled_row(images: Sequence[np.ndarray], titles: Sequence[str], gap: int = 6, head: int = 22) -> np.ndarray:
+    """Images of one size side by side on white, with a title of `head` pixels above each."""
     from PIL import Image, ImageDraw, ImageFont
 
-    image = Image.fromarray(strip)
-    ImageDraw.Draw(image).text(
-        (2, strip.shape[0] // 2), text, fill=(40, 40, 40), anchor="lm", font=ImageFont.load_default(size=14)
-    )
-    strip[:] = np.asarray(image)
+    height, width = images[0].shape[:2]
+    sheet = Image.new("RGB", (len(images) * (width + gap) + gap, height + head + 2 * gap), "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=14)
+    for k, (image, title) in enumerate(zip(images, titles, strict=True)):
+        x = gap + k * (width + gap)
+        draw.text((x + 2, gap + head // 2), title, fill=(40, 40, 40), anchor="lm", font=font)
+        sheet.paste(Image.fromarray(image), (x, gap + head))
+    return np.asarray(sheet)

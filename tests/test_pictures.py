@@ -75,12 +75,12 @@ def test_features_to_rgb_ignores_rotation_up_to_axis_signs() -> None:
     assert pictures.features_to_rgb(features[..., :2]).shape == (40, 30, 3)
 
 
-def test_outline_and_montage() -> None:
+def test_outline_and_row() -> None:
     photo = np.full((40, 60, 3), 200, np.uint8)
     mask = np.zeros((40, 60), bool)
     mask[10:30, 20:40] = True
     drawn = pictures.outline(photo, mask)
     assert (drawn[20, 30] == 200).all() and (drawn[2, 2] == 110).all() and (drawn[10, 30] != 200).any()
-    sheet = pictures.montage([photo, drawn, photo[:20, :30]], 2, ["one", "two", "three"])
-    assert sheet.shape == (2 * (40 + 22 + 6) + 6, 2 * 66 + 6, 3)
+    sheet = pictures.titled_row([photo, drawn], ["one", "two"])
+    assert sheet.shape == (6 + 22 + 40 + 6, 2 * 66 + 6, 3)
     np.testing.assert_array_equal(sheet[28:68, 72:132], drawn)

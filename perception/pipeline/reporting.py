@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,15 +10,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from perception.config import MapConfig
+from perception.config import MapConfig, flat
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
 from perception.gaussians.train import TrainingView, render_view
+from perception.instances.crops import expand_box, mask_box
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.photos import load_photo, scaled_K
 from perception.io.store import Map
-from perception.pictures import features_to_rgb, montage, outline, overlay
+from perception.pictures import features_to_rgb, outline, overlay, titled_row
 from perception.pipeline.rendering import as_gaussians
 from perception.pipeline.summary import depth_text
 from perception.pipeline.view_coverage import weak_coverage
@@ -32,9 +32,7 @@ SHOWN = ("worst", "middle", "best")
 """Held-out views shown beside their photos, by PSNR."""
 
 
-def write_map_report(
-    opened: QueryMap, path: Path, queries: list[str], expected: dict[str, list[int]] | None = None
-) -> Path:
+def write_map_report(opened: QueryMap, path: Path, queries: list[str]) -> Path:
     """The one-page report of a map, with the answers to `queries`; missing photos are left out."""
     info, album = opened.info, _Album(opened)
     curve = info["training"]["curve"]
@@ -48,14 +46,11 @@ def write_map_report(
         gaussians_curve=[(entry["iteration"], entry["gaussians"]) for entry in curve],
         views=_view_rows(opened, album),
         overview=_overview(opened, album),
-        instances=[
-            InstanceRow(e["id"], crop, e.get("label"), names, e["score"], e["obb"]["extent"], e["num_gaussians"])
-            for e, crop, names in _rows(opened, album)
-        ],
+        instances=_instance_rows(opened, album),
         metric=opened.metric,
-        queries=[_query_row(opened, text, album, (expected or {}).get(text)) for text in queries],
+        queries=[_query_row(opened, text, album) for text in queries],
         warnings=_warnings(info, album.gaussians, list(album.views.values())),
-        settings=_flat(info["config"]),
+        settings=dict(flat(info["config"])),
         command=rerun_command(info, opened.path or Path("MAP")),
     )
     try:
@@ -66,9 +61,9 @@ def write_map_report(
 
 def rerun_command(info: dict[str, Any], path: Path) -> str:
     """The command that builds the map again: its input, and all settings that differ from the defaults."""
-    usual = _flat(MapConfig().to_json())
+    usual = dict(flat(MapConfig().to_json()))
     words = ["perception", "map", str(info["source"]), "-o", str(path), "--seed", str(info["seed"])]
-    for key, value in _flat(info["config"]).items():
+    for key, value in flat(info["config"]):
         if key == "seed" or key not in usual or usual[key] == value:  # older maps have settings that no longer exist
             continue
         text = "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
@@ -162,7 +157,7 @@ def map_picture(opened: QueryMap, text: str) -> np.ndarray:
     ids = album.ids(name)
     answer = outline(photo, ids == hits[0].instance_id) if hits else photo
     titles = ["photo", "the map from the same place", "instances", f'"{text}"']
-    return montage([photo, album.render(name), overlay(photo, ids), answer], 4, titles)
+    return titled_row([photo, album.render(name), overlay(photo, ids), answer], titles)
 
 
 def _figures(gmap: Map) -> dict[str, str]:
@@ -222,31 +217,22 @@ def _best_crop(opened: QueryMap, index: int, album: _Album, whole: bool) -> np.n
     picture = outline(photo, mask)
     if whole:
         return picture
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    margin = 4 + max(len(rows), len(columns)) // 8
-    top, left = max(0, rows[0] - margin), max(0, columns[0] - margin)
-    return picture[top : rows[-1] + margin, left : columns[-1] + margin]
+    x0, y0, x1, y1 = expand_box(mask_box(mask) or (0, 0, *mask.shape[::-1]), 0.15, *mask.shape[::-1])
+    return picture[y0:y1, x0:x1]
 
 
-def _rows(opened: QueryMap, album: _Album) -> Iterator[tuple[dict[str, Any], np.ndarray | None, list[str]]]:
-    """(entry of instances.json, best crop, printed texts and likely names) of each instance; names need an encoder."""
+def _instance_rows(opened: QueryMap, album: _Album) -> list[InstanceRow]:
+    """Every instance with its best crop, printed texts and likely names; names need an encoder."""
     names = opened.likely_names() if opened.problem is None else [[] for _ in opened.instances]
-    for i, entry in enumerate(opened.instances):
-        yield entry, _best_crop(opened, i, album, whole=False), printed_texts(entry)[:2] + names[i]
+    rows = []
+    for i, e in enumerate(opened.instances):
+        crop, called = _best_crop(opened, i, album, whole=False), printed_texts(e)[:2] + names[i]
+        score, size, count = e["score"], e["obb"]["extent"], e["num_gaussians"]
+        rows.append(InstanceRow(e["id"], crop, e.get("label"), called, score, size, count))
+    return rows
 
 
-def _query_row(opened: QueryMap, text: str, album: _Album, expected: list[int] | None) -> QueryRow:
+def _query_row(opened: QueryMap, text: str, album: _Album) -> QueryRow:
     hits = opened.query(text)
-    index = next((i for i, entry in enumerate(opened.instances) if hits and entry["id"] == hits[0].instance_id), None)
-    picture = None if index is None else _best_crop(opened, index, album, whole=True)
-    return QueryRow(text, bool(hits), [(hit.instance_id, hit.score) for hit in hits], picture, expected)
-
-
-def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, object]:
-    flat: dict[str, object] = {}
-    for name, value in config.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = value
-    return flat
+    picture = _best_crop(opened, opened.position(hits[0].instance_id), album, whole=True) if hits else None
+    return QueryRow(text, bool(hits), [(hit.instance_id, hit.score) for hit in hits], picture)

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from perception.boxes import instance_boxes, oriented_box
+from perception.boxes import oriented_box
 from perception.errors import InputError
 from perception.export.formats import write_export, write_scannet
 from perception.export.transfer import ExportOptions, check_overlap, export_labels
@@ -111,14 +111,6 @@ def test_the_box_of_a_turned_brick_is_the_brick(turn):
     assert np.linalg.det(box.rotation) == pytest.approx(1)
     local = (brick @ rotation.T + [5, -3, 1] - box.center) @ box.rotation.T
     assert (np.abs(local) <= box.extent / 2 + 1e-9).all()
-
-
-def test_boxes_of_flat_lone_and_non_finite_instances():
-    points = np.array([[1, 2, 3], [0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0.5, 0.5, 0], [np.nan, 0, 0]])
-    labels = np.array([4, 2, 2, 2, 2, 2, 2], np.int32)
-    boxes = instance_boxes(points, labels)
-    assert boxes[4]["obb"]["extent"] == [0, 0, 0] and boxes[4]["centroid"] == [1, 2, 3]
-    assert sorted(boxes[2]["obb"]["extent"]) == pytest.approx([0, 1, 1]) and boxes[2]["num_points"] == 5
 
 
 def test_scannet_submission_layout(tmp_path):
