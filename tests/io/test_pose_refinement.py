@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from perception.geometry import align_similarity, look_at
 from perception.io.bundle_adjustment import Poses, _linearised, _Problem, starting_points
-from perception.io.pose_refinement import checked_poses, match_errors, poses_of, refine
+from perception.io.pose_refinement import checked_poses, match_errors, moved_back, poses_of, refine
 from perception.io.tracks import Features, Tracks, tracks_of
 from perception.types import View
 
@@ -82,9 +82,14 @@ def test_the_world_frame_is_kept(made):
     rng, right, features = made
     given = drifted(rng, right)
     found = refine(features, given)
-    offset = found.center - given.center
+    offset = (found.center + 3 * found.rotation[:, 2]) - (given.center + 3 * given.rotation[:, 2])  # of what is seen
     assert np.linalg.norm(offset.mean(0)) < 0.3 * np.linalg.norm(offset, axis=1).mean()
     assert align_similarity(found.center, given.center)[0] == pytest.approx(1, abs=0.02)
+    turn, shift = Rotation.from_euler("xyz", [3, -2, 5], degrees=True).as_matrix(), np.array([0.3, -0.1, 0.2])
+    jumped = replace(given, center=given.center + 9 * (np.arange(VIEWS) == 3)[:, None])  # one view is far off
+    back = moved_back(Poses(given.rotation @ turn.T, given.center @ turn.T + shift), jumped, 3.0)
+    np.testing.assert_allclose(back.rotation, given.rotation, atol=0.01)
+    np.testing.assert_allclose(back.center, given.center, atol=0.01)
 
 
 def test_a_world_far_from_its_origin_makes_no_difference(made):
