@@ -61,6 +61,16 @@ class FrameConfig(Settings):
     board: str | None = Field(None, description="KIND:COLSxROWS:SQUARE[:MARKER[:DICTIONARY]]: a board in the photos")
 
 
+class SamConfig(Settings):
+    points_per_side: int = Field(32, ge=1, le=256, description="side of the grid of point prompts")
+    skip_covered: bool = Field(
+        True, description="leave out prompts that lie in the smallest good mask of an earlier one; false: as published"
+    )
+    crop_layers: int = Field(0, ge=0, le=3, description="layer i prompts 4^i overlapping crops of the photo as well")
+    pred_iou: float = Field(0.88, ge=0, le=1, description="smallest IoU of a mask as the model predicts it")
+    stability: float = Field(0.95, ge=0, le=1, description="smallest IoU of the masks cut at logits of -1 and 1")
+
+
 class TrainConfig(Settings):
     iterations: int = Field(3000, ge=1, le=10**8, description="iterations of training; all schedules scale with them")
     time_limit: float | None = Field(None, gt=0, description="seconds of training; all schedules shrink to fit")
@@ -136,6 +146,7 @@ class MapConfig(Settings):
     seed: int = Field(0, ge=0, le=LARGEST_SEED, description="of all random choices")
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="what computes; there is no CUDA build yet")
     masks: str = Field("auto", description="auto, builtin, sam:PATH or labels:DIR: where object masks come from")
+    sam: SamConfig = SamConfig()
     photos: PhotoConfig = PhotoConfig()
     frame: FrameConfig = FrameConfig()
     train: TrainConfig = TrainConfig()

@@ -14,6 +14,7 @@ from perception.io.atomic import atomic_directory
 from perception.io.checksums import facts_of, sha256
 from perception.io.download import download, is_url
 from perception.io.model_store import (
+    RECORD,
     StoredModel,
     check_name,
     find_model,
@@ -23,10 +24,11 @@ from perception.io.model_store import (
     stored_models,
     write_record,
 )
+from perception.io.onnx_sessions import model_graphs, model_root, side_files
 from perception.progress import Progress
 
 _PARTS = ".parts"
-_KEPT = (".onnx", ".onnx_data", ".data", ".json", ".txt")  # of a folder: graphs, weights beside them, tokenizers
+_KEPT = (".json", ".txt")  # of a folder, beside graphs and their weights: configurations and tokenizers
 _PURPOSES = {"encoder": "sam", "decoder": "sam", "image tower": "clip", "text tower": "clip", "both towers": "clip"}
 
 
@@ -38,8 +40,9 @@ def check_file(file: str) -> dict[str, Any]:
     """
     stored = find_model(file)
     path = stored.folder if stored and not Path(file).exists() else Path(file).expanduser()
+    left_out: list[Path] = []
     if path.is_dir():
-        graphs = sorted([*path.glob("*.onnx"), *path.glob("onnx/*.onnx")])
+        graphs, left_out = model_graphs(path)
         if not graphs:
             raise InputError(f"{path}: no .onnx file in this folder; expected ONNX models")
     elif path.is_file():
@@ -49,7 +52,18 @@ def check_file(file: str) -> dict[str, Any]:
     found = [describe_graph(graph) for graph in graphs]
     family, purpose, problem = judge(found)
     warnings = [text for text in (*(entry.pop("warning") for entry in found), problem) if text]
-    return {"model": str(path), "family": family, "purpose": purpose, "files": found, "warnings": warnings}
+    if not problem:
+        warnings += _opened(purpose, str(path))
+    unused = [str(graph) for graph in left_out]
+    about = {"model": str(path), "family": family, "purpose": purpose, "files": found, "left_out": unused}
+    return {**about, "warnings": list(dict.fromkeys(warnings))}
+
+
+def _opened(purpose: str | None, spec: str) -> list[str]:
+    """Warnings of the model when it is opened as for use, where towers or encoder and decoder must fit together."""
+    from perception.masks.sam_models import open_sam
+
+    return open_sam(spec).warnings if purpose == "sam" else []
 
 
 def describe_graph(path: Path) -> dict[str, Any]:
@@ -77,7 +91,7 @@ def recognise(graph: Any) -> tuple[str | None, str | None]:
     from perception.masks.sam_models import decoder_family, encoder_family
 
     if graph.is_decoder:
-        return decoder_family(graph), "decoder"
+        return decoder_family(graph).name, "decoder"
     inputs, outputs = graph.session.get_inputs(), graph.session.get_outputs()
     rows = any(len(value.shape) == 2 for value in outputs)
     pixels = any(len(value.shape) == 4 for value in inputs)
@@ -178,14 +192,16 @@ def _local(source: str, expected: str | None, parts: Path, progress: Progress | 
         return [(file_name, part, source)]
     path = Path(source).expanduser()
     if path.is_dir():
-        files = [f for f in sorted(path.rglob("*")) if f.is_file() and f.suffix in _KEPT]
-        return [(str(f.relative_to(path)), f, str(f)) for f in files]
+        root, graphs = model_root(path), model_graphs(path)[0]
+        files = [*graphs, *(f for graph in graphs for f in side_files(graph) if f.is_file())]
+        files += [f for f in sorted(root.rglob("*")) if f.is_file() and f.suffix in _KEPT and f.name != RECORD]
+        return [(str(f.relative_to(root)), f, str(f)) for f in files]
     if not path.is_file():
         raise InputError(f"{source}: no such file or folder, and no http(s) address")
     if expected is not None and sha256(path) != expected:
         raise InputError(f"{source}: sha256 is {sha256(path)}, expected {expected}; is it the right file?")
-    beside = [path.with_name(path.name + suffix) for suffix in ("_data", ".data")]
-    return [(p.name, p, str(p)) for p in [path, *beside] if p.is_file()]
+    beside = side_files(path) if path.suffix == ".onnx" else []
+    return [(str(p.relative_to(path.parent)), p, str(p)) for p in [path, *beside] if p.is_file()]
 
 
 def _install(name: str, files: Sequence[tuple[str, Path, str]], expected: dict[str, str]) -> None:

@@ -101,7 +101,7 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def sam(tmp_path: Path) -> tuple[Path, Path]:
     """Encoder and decoder by SAM's signatures that do nothing."""
     embedding = np.zeros((1, 2, 64, 64), np.float32)
-    masks, iou = np.zeros((1, 1, 8, 8), np.float32), np.zeros((1, 1), np.float32)
+    masks, iou = np.zeros((1, 4, 8, 8), np.float32), np.zeros((1, 4), np.float32)
     folder = tmp_path / "published"
     folder.mkdir()
     write_onnx(folder / "a.encoder.onnx", {"x": IMAGE}, {"image_embeddings": embedding})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from perception.cli.parser import Parser, command
@@ -44,6 +45,8 @@ def _check(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         lines.append(f"{entry['file']}: {what}, {entry['bytes'] / 1e6:.1f} MB, runs on {', '.join(entry['providers'])}")
         for side in ("inputs", "outputs"):
             lines += [f"  {side[:-1]:6} {v['name']} {v['shape']} {v['type']}" for v in entry[side]]
+    if found["left_out"]:
+        lines.append(f"not used, of less precision: {', '.join(Path(f).name for f in found['left_out'])}")
     return found, "\n".join(lines + [f"warning: {text}" for text in found["warnings"]])
 
 

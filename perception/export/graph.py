@@ -6,7 +6,8 @@ import numpy as np
 
 from perception import _core
 from perception.errors import InputError
-from perception.export.neighbors import Neighbors, cores
+from perception.export.neighbors import Neighbors
+from perception.io.cloud_memory import cores
 
 
 def mesh_edges(faces: np.ndarray, num_points: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Checks available memory before large allocations, to avoid swapping and the out-of-memory killer."""
+"""Cores, and checks of available memory before large allocations, to avoid swapping and the out-of-memory killer."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ def available_memory() -> int:
     except OSError:
         pass
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def cores() -> int:
+    """Number of CPU cores available to this process."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def require_memory(needed: float, what: str, advice: str) -> None:

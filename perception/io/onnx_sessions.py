@@ -1,8 +1,11 @@
-"""ONNX models in onnxruntime: sessions, types and shapes of inputs and outputs, file fingerprints."""
+"""ONNX models in onnxruntime: their files, sessions, types and shapes of inputs and outputs, fingerprints."""
 
 from __future__ import annotations
 
 import hashlib
+import json
+import mmap
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -20,12 +23,69 @@ _DTYPES: dict[str, type] = {
     "tensor(int32)": np.int32,
     "tensor(uint8)": np.uint8,
 }
-_SIDE_FILES = ("_data", ".data")  # suffixes of external weight files beside the graph
+# Suffixes that name the precision of a graph in public exports, the most precise first.
+_PRECISIONS = ("", "_fp16", "_quantized", "_q8", "_int8", "_uint8", "_q4f16", "_q4", "_bnb4")
+_LOCATION = re.compile(rb"\x0a\x08location\x12([\x01-\x7f])")  # StringStringEntryProto of TensorProto.external_data
 _EDGE = 1 << 20
 
 
-def open_session(path: Path) -> Any:
-    """An InferenceSession on the first of `wanted_providers` that loads; InputError for an invalid ONNX model."""
+def model_root(folder: Path) -> Path:
+    """The folder itself, or of an entry of the Hugging Face cache the revision that was fetched last."""
+    revisions = [path for path in folder.glob("snapshots/*") if path.is_dir()]
+    return max(revisions, key=lambda path: path.stat().st_mtime, default=folder)
+
+
+def model_graphs(folder: Path) -> tuple[list[Path], list[Path]]:
+    """The ONNX files of a model folder and its subfolders (`onnx/`, `visual/`), and those left out.
+
+    Of files that differ only in precision (`model.onnx`, `model_fp16.onnx`, `model_quantized.onnx`) the most precise
+    one is the model's.
+    """
+    root = model_root(folder)
+    found = sorted([*root.glob("*.onnx"), *root.glob("*/*.onnx")], key=_precision)
+    best: dict[tuple[Path, str], Path] = {}
+    for path in found:
+        best.setdefault((path.parent, graph_name(path)), path)
+    return sorted(best.values()), [path for path in found if path not in best.values()]
+
+
+def graph_name(path: Path) -> str:
+    """The file name without suffix and precision."""
+    return path.stem.removesuffix(_PRECISIONS[_precision(path)])
+
+
+def _precision(path: Path) -> int:
+    return next((n for n, suffix in enumerate(_PRECISIONS) if n and path.stem.endswith(suffix)), 0)
+
+
+def side_files(path: Path) -> list[Path]:
+    """The files beside an ONNX file that hold its weights, as the graph names them (`external_data`)."""
+    if not path.stat().st_size:
+        return []
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        ends = [(match.end(), match[1][0]) for match in _LOCATION.finditer(data)]
+        names = dict.fromkeys(data[end : end + size].decode("utf-8", "replace") for end, size in ends)
+    return [path.parent / name for name in names if not {"..", "/"} & set(Path(name).parts)]
+
+
+def read_config(model: Path, name: str) -> dict[str, Any]:
+    """A JSON file in the model's folder or its parent (graphs often lie in `onnx/`); {} if there is none."""
+    for folder in (model.parent, model.parent.parent):
+        path = folder / name
+        if path.is_file():
+            try:
+                known = json.loads(path.read_text(encoding="utf-8"))
+            except ValueError as error:
+                raise InputError(f"{path}: not valid JSON ({error})") from error
+            return known if isinstance(known, dict) else {}
+    return {}
+
+
+def open_session(path: Path, threads: int = 0) -> Any:
+    """An InferenceSession on the first of `wanted_providers` that loads. threads: of one run; 0: all cores.
+
+    InputError for what is no ONNX model, for missing weights, and for a graph that this onnxruntime cannot run.
+    """
     try:
         with uninterrupted():  # Ctrl-C inside the import becomes an ImportError
             import onnxruntime
@@ -33,14 +93,27 @@ def open_session(path: Path) -> Any:
         raise missing_extra("onnxruntime", "demo") from error
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected an ONNX model")
+    missing = [side.name for side in side_files(path) if not side.is_file()]
+    if missing:
+        raise InputError(
+            f"{path}: its weights are in {', '.join(missing)}, not beside it; fetch that file too, by this name"
+        )
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
+    options.intra_op_num_threads = threads
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads leave the core to others
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # `provider_warning` reports a provider that does not load
             return onnxruntime.InferenceSession(str(path), options, providers=wanted_providers())
     except Exception as error:  # onnxruntime's exceptions share no public base class
         first = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+        if "NOT_IMPLEMENTED" in first:
+            raise InputError(
+                f"{path}: onnxruntime lacks a kernel for it here ({first}); take full precision"
+            ) from error
+        if path.open("rb").read(40).startswith(b"version https://git-lfs"):
+            raise InputError(f"{path}: a Git LFS pointer, not the model; fetch it with git lfs pull") from error
         raise InputError(f"{path}: not an ONNX model that onnxruntime can open ({first})") from error
 
 
@@ -81,9 +154,7 @@ def fingerprint(path: Path) -> str:
     This distinguishes weights without reading the whole files, which can be gigabytes.
     """
     digest = hashlib.sha256()
-    for part in (path, *(path.with_name(path.name + suffix) for suffix in _SIDE_FILES)):
-        if not part.is_file():
-            continue
+    for part in (path, *side_files(path)):
         size = part.stat().st_size
         digest.update(str(size).encode())
         with part.open("rb") as file:

@@ -10,6 +10,7 @@ import hashlib
 import os
 import struct
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,25 +46,31 @@ def compute_masks(
     Report: source, identity, photos, skipped, seconds, masks (mean per photo), empty (names), warnings.
     """
     warnings = source.check(views)
-    start, skipped, empty, counts = perf_counter(), 0, [], []
+    start, skipped, counts = perf_counter(), 0, list[int]()
     if isinstance(source, GeometryMaskSource):
         if load_depth is None:
             raise ValueError(f"masks from {source.name} need load_depth")
         if any(stored_key(label_file(folder, view)) != _key(view, source, depth_key) for view in views):
             source.survey(views, load_photo, load_depth, progress)
-    for done, view in enumerate(views, start=1):
+
+    def masks_of(view: View) -> tuple[int, bool]:
+        """Number of masks in the view's label image, and whether it was there already."""
         key, file = _key(view, source, depth_key), label_file(folder, view)
-        if stored_key(file) == key:
+        known = stored_key(file) == key
+        if known:
             labels = load_labels(folder, view)
-            skipped += 1
         else:
             labels = source.label_image(view, load_photo(view))
             write_labels(file, labels, key)
-        counts.append(len(np.setdiff1d(labels, [0])))
-        if not labels.any():
-            empty.append(view.name)
-        if progress is not None:
-            progress.update(f"masks ({source.name})", done, len(views))
+        return len(np.setdiff1d(labels, [0])), known
+
+    with ThreadPoolExecutor(getattr(source, "photos_at_once", 1)) as pool:
+        for done, (count, known) in enumerate(pool.map(masks_of, views), start=1):
+            counts.append(count)
+            skipped += known
+            if progress is not None:
+                progress.update(f"masks ({source.name})", done, len(views))
+    empty = [view.name for view, count in zip(views, counts, strict=True) if not count]
     if empty:
         warnings = [
             *warnings,

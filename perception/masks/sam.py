@@ -1,44 +1,46 @@
 """`sam:PATH`: automatic mask generation with Segment Anything (Kirillov et al. 2023, app. B) in onnxruntime.
 
 A grid of points prompts the model. Masks are filtered by predicted IoU, by stability, and by non-maximum suppression.
-Rules and defaults are those of the published `SamAutomaticMaskGenerator` without crops, as used in the paper (§4).
+Rules and defaults are those of the published `SamAutomaticMaskGenerator`, used without crops in the paper (§4).
+
+On a CPU nearly all time goes into the prompts. With `skip_covered` they come in random order, and a prompt is left out
+where the smallest good mask of an earlier prompt lies: SAM's masks of a point are nested (part, thing, group), so that
+a point in the same smallest part asks for the same masks again.
 """
 
 from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from perception.config import SamConfig
+from perception.io.cloud_memory import cores
 from perception.masks.sam_models import SamModel, open_sam
 from perception.types import View
 
 POINTS_PER_BATCH = 64
+COVERING_BATCH = 8  # prompts of one call with `skip_covered`: those of a call do not see each other's masks
 STABILITY_OFFSET = 1.0  # added to and subtracted from the logit threshold
 BOX_NMS = 0.7  # box IoU above which two masks are duplicates
+CROP_OVERLAP = 512 / 1500  # of the shorter side
+EDGE = 20  # pixels: a mask so near to the edge of its crop is cut off
+AT_ONCE = 4  # photos, at most: each needs the encoder's working memory
 _BATCH_BYTES = 512 << 20  # masks of one batch; some graphs return them at full size
-
-
-@dataclass(frozen=True)
-class SamSettings:
-    """points_per_side: of the prompt grid. pred_iou, stability: minimum values of a mask."""
-
-    points_per_side: int = 32
-    pred_iou: float = 0.88
-    stability: float = 0.95
+Box = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
 class SamMask:
-    """A mask of a photo. packed: its bits, compressed with deflate; shape: (h, w); box: [4] int64, see `mask_box`;
-    pred_iou: IoU predicted by the model; point: [2] (x, y), the prompt in pixels."""
+    """A mask of a photo. packed: its bits, compressed with deflate; shape: (h, w); area: in pixels; box: [4] int64, see
+    `mask_box`; pred_iou: IoU predicted by the model; point: [2] (x, y), the prompt in pixels."""
 
     packed: bytes
     shape: tuple[int, int]
+    area: int
     box: np.ndarray
     pred_iou: np.float32
     stability: np.float32
@@ -53,14 +55,17 @@ class SamMask:
 class SamSource:
     """The mask source of `sam:PATH`. The constructor opens the models and checks their signatures."""
 
-    def __init__(self, spec: str) -> None:
-        self.model = open_sam(spec)
-        self.settings = SamSettings()
+    def __init__(self, spec: str, settings: SamConfig) -> None:
+        self.photos_at_once = min(cores(), AT_ONCE)
+        self.model = open_sam(spec, threads=-(-cores() // self.photos_at_once))
+        if "CPU" not in self.model.provider:
+            self.photos_at_once = 1
+        self.settings = settings
         self.name = f"sam ({self.model.family}, {self.model.provider})"
         self.identity = f"sam {self.model.fingerprint} {self.settings}"
 
     def check(self, views: list[View]) -> list[str]:
-        """Returns warnings about an accelerator that could not be loaded."""
+        """Returns warnings about an accelerator that could not be loaded and a decoder of single masks."""
         return list(self.model.warnings)
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
@@ -68,17 +73,75 @@ class SamSource:
         return paint(automatic_masks(self.model, photo, self.settings), (photo.shape[0], photo.shape[1]))
 
 
-def automatic_masks(model: SamModel, photo: np.ndarray, settings: SamSettings) -> list[SamMask]:
-    """Masks of photo [h, w, 3] uint8 RGB, sorted by falling predicted IoU."""
+def automatic_masks(model: SamModel, photo: np.ndarray, settings: SamConfig) -> list[SamMask]:
+    """Masks of photo [h, w, 3] uint8 RGB, sorted by falling predicted IoU; with crops, masks of small crops first."""
     height, width = photo.shape[:2]
-    embedding = model.encode(np.ascontiguousarray(photo))
-    points = point_grid(settings.points_per_side) * np.array([width, height])
-    step = max(1, min(POINTS_PER_BATCH, _BATCH_BYTES // (width * height * 4 * 4)))
     found: list[SamMask] = []
-    for start in range(0, len(points), step):
-        found += _good_masks(model, embedding, points[start : start + step], settings)
-    boxes, scores = (np.array([getattr(mask, name) for mask in found]) for name in ("box", "pred_iou"))
-    return [found[row] for row in box_nms(boxes.reshape(-1, 4), scores, BOX_NMS)]
+    areas: list[int] = []
+    for crop in crop_boxes(height, width, settings.crop_layers):
+        x0, y0, x1, y1 = crop
+        masks = _prompted(model, np.ascontiguousarray(photo[y0:y1, x0:x1]), settings)
+        if settings.crop_layers:
+            masks = [_placed(mask, crop, (height, width)) for mask in masks if not _cut(mask, crop, (height, width))]
+        found += masks
+        areas += [(x1 - x0) * (y1 - y0)] * len(masks)
+    return _without_duplicates(found, -np.array(areas, float)) if settings.crop_layers else found
+
+
+def crop_boxes(height: int, width: int, layers: int) -> list[Box]:
+    """(x0, y0, x1, y1) of the photo and of the 2^i × 2^i overlapping crops of each layer i, as published."""
+    boxes = [(0, 0, width, height)]
+    for layer in range(1, layers + 1):
+        side = 2**layer
+        overlap = int(CROP_OVERLAP * min(height, width) * 2 / side)
+        w, h = (math.ceil((overlap * (side - 1) + length) / side) for length in (width, height))
+        corners = [((w - overlap) * i, (h - overlap) * j) for i in range(side) for j in range(side)]
+        boxes += [(x, y, min(x + w, width), min(y + h, height)) for x, y in corners]
+    return boxes
+
+
+def _prompted(model: SamModel, photo: np.ndarray, settings: SamConfig) -> list[SamMask]:
+    """The masks of one grid of prompts, sorted by falling predicted IoU."""
+    height, width = photo.shape[:2]
+    embedding = model.encode(photo)
+    points = point_grid(settings.points_per_side) * np.array([width, height])
+    covered = np.zeros((height, width), bool)
+    at_once = POINTS_PER_BATCH
+    if settings.skip_covered:
+        points = points[np.random.default_rng(0).permutation(len(points))]
+        at_once = COVERING_BATCH if model.batched else 1
+    step = max(1, min(at_once, _BATCH_BYTES // (width * height * 4 * 4)))
+    found: list[SamMask] = []
+    while len(points):
+        good = _good_masks(model, embedding, points[:step], settings)
+        found += [mask for masks in good for mask in masks]
+        points = points[step:]
+        if settings.skip_covered:
+            for masks in filter(None, good):
+                covered |= min(masks, key=lambda mask: mask.area).pixels()
+            points = points[~covered[points[:, 1].astype(int), points[:, 0].astype(int)]]
+    return _without_duplicates(found, np.array([mask.pred_iou for mask in found]))
+
+
+def _without_duplicates(masks: list[SamMask], scores: np.ndarray) -> list[SamMask]:
+    boxes = np.array([mask.box for mask in masks]).reshape(-1, 4)
+    return [masks[row] for row in box_nms(boxes, scores, BOX_NMS)]
+
+
+def _cut(mask: SamMask, crop: Box, shape: tuple[int, int]) -> bool:
+    """Whether the mask of a crop ends at an edge of the crop that is none of the photo [h, w]."""
+    of_photo = (0, 0, shape[1], shape[0])
+    box = mask.box + np.array([crop[0], crop[1]] * 2)
+    near, end = (np.abs(box - np.array(edges)) <= EDGE for edges in (crop, of_photo))
+    return bool((near & ~end).any())
+
+
+def _placed(mask: SamMask, crop: Box, shape: tuple[int, int]) -> SamMask:
+    """The mask of a crop in the photo [h, w]."""
+    whole = np.zeros(shape, bool)
+    whole[crop[1] : crop[3], crop[0] : crop[2]] = mask.pixels()
+    corner = np.array(crop[:2])
+    return replace(mask, packed=_pack(whole), shape=shape, box=mask_box(whole), point=mask.point + corner)
 
 
 def paint(masks: list[SamMask], shape: tuple[int, int]) -> np.ndarray:
@@ -132,14 +195,20 @@ def box_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.ndarr
     return np.array(keep, dtype=np.int64)
 
 
-def _good_masks(model: SamModel, embedding: Any, points: np.ndarray, settings: SamSettings) -> Iterator[SamMask]:
-    """Masks for points [P, 2] that pass both thresholds. One mask at a time is upscaled to the photo's size."""
+def _good_masks(model: SamModel, embedding: Any, points: np.ndarray, settings: SamConfig) -> list[list[SamMask]]:
+    """For each of points [P, 2], the masks that pass both thresholds. One mask at a time has the photo's size."""
     raw, pred_iou = model.decode(embedding, points)
+    good: list[list[SamMask]] = [[] for _ in points]
     for point, which in np.argwhere(pred_iou > settings.pred_iou):
         logits = model.upscale(embedding, raw[point, which])
         stable = stability(logits)
         if stable >= np.float32(settings.stability):  # compared in float32, as published; false for NaN
             mask = logits > 0
-            packed = zlib.compress(np.packbits(mask).tobytes(), 1)
-            shape = (mask.shape[0], mask.shape[1])
-            yield SamMask(packed, shape, mask_box(mask), pred_iou[point, which], stable, points[point])
+            shape, area = (mask.shape[0], mask.shape[1]), np.count_nonzero(mask)
+            scores = pred_iou[point, which], stable
+            good[point].append(SamMask(_pack(mask), shape, area, mask_box(mask), *scores, points[point]))
+    return good
+
+
+def _pack(mask: np.ndarray) -> bytes:
+    return zlib.compress(np.packbits(mask).tobytes(), 1)

@@ -1,11 +1,7 @@
 """Segment Anything exports with separate encoder and decoder, recognised by the names of their inputs and outputs.
 
-| family | encoder input | coordinates of decoder points |
-|---|---|---|
-| SAM, MobileSAM | HWC 0–255, or 1×3×S×S normalised and padded bottom and right | pixels of the square |
-| EfficientSAM | 1×3×h×w in 0–1, original size | pixels of the photo |
-| SAM 2 | 1×3×S×S normalised, resized without keeping the aspect ratio | pixels of the square |
-| SAM by optimum | 1×3×S×S as SAM | pixels of the square |
+Exporters and the names they use: segment-anything and samexporter (SAM, MobileSAM), EdgeSAM, EfficientSAM, transformers
+and optimum (SAM, SlimSAM, SAM 2 and 2.1), samexporter, onnxruntime and osam (SAM 2). `FAMILIES` lists how they differ.
 """
 
 from __future__ import annotations
@@ -18,27 +14,75 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.model_store import known_names, resolve
-from perception.io.onnx_sessions import dtype_of, fingerprint, open_session, provider_warning, shape_of, signature
+from perception.io.onnx_sessions import (
+    dtype_of,
+    fingerprint,
+    model_graphs,
+    open_session,
+    provider_warning,
+    read_config,
+    shape_of,
+    signature,
+)
 
 # Role -> names of it in public exporters.
 _ALIASES = {
     "image": ("input_image", "image", "batched_images", "pixel_values", "x", "input", "images"),
-    "embedding": ("image_embeddings", "image_embed", "image_embedding", "embeddings"),
-    "high_res_0": ("high_res_feats_0", "high_res_feat_0", "high_res_features1"),
-    "high_res_1": ("high_res_feats_1", "high_res_feat_1", "high_res_features2"),
+    "embedding": ("image_embeddings", "image_embed", "image_embedding", "embeddings", "image_embeddings.2"),
+    "high_res_0": (
+        "high_res_feats_0",
+        "high_res_feat_0",
+        "high_res_features1",
+        "image_features_0",
+        "image_embeddings.0",
+    ),
+    "high_res_1": (
+        "high_res_feats_1",
+        "high_res_feat_1",
+        "high_res_features2",
+        "image_features_1",
+        "image_embeddings.1",
+    ),
     "positional": ("image_positional_embeddings",),
     "points": ("point_coords", "batched_point_coords", "input_points"),
     "labels": ("point_labels", "batched_point_labels", "input_labels"),
-    "mask_input": ("mask_input",),
-    "has_mask": ("has_mask_input",),
-    "size": ("orig_im_size",),
-    # Low resolution first: some exports fix the photo size that they were traced with.
+    "boxes": ("input_boxes",),
+    "mask_input": ("mask_input", "input_masks"),
+    "has_mask": ("has_mask_input", "has_input_masks"),
+    "size": ("orig_im_size", "original_image_size"),
+    # Low resolution first: some exports fix the photo size that they were traced with, or give no logits at full size.
     "masks": ("low_res_masks", "pred_masks", "masks", "output_masks"),
-    "iou": ("iou_predictions", "iou_scores", "iou_preds"),
+    "iou": ("iou_predictions", "iou_scores", "iou_preds", "scores"),
 }
 _ROLES = {alias: role for role, aliases in reversed(_ALIASES.items()) for alias in aliases}
-_MEAN = np.array([123.675, 116.28, 103.53], np.float32)
-_STD = np.array([58.395, 57.12, 57.375], np.float32)
+_MEAN = (123.675, 116.28, 103.53)
+_STD = (58.395, 57.12, 57.375)
+
+
+@dataclass(frozen=True)
+class Family:
+    """How a family's exports differ from each other.
+
+    fit: the photo in the encoder's input: "pad" (long side fills the square, padded bottom and right), "squash" (both
+    sides do) or "whole" (in 0–1, its own size, and prompts in its pixels). nested: prompts are [1, P, 1, 2], else
+    [P, n, 2]. pads: a point prompt is followed by the point (0, 0) with label −1, as in the published predictor; the
+    others' decoders add it themselves.
+    """
+
+    name: str
+    fit: str = "pad"
+    nested: bool = False
+    pads: bool = False
+
+
+# (an input of the decoder, whether it takes high-resolution features) -> family
+FAMILIES = {
+    ("point_coords", False): Family("SAM", pads=True),
+    ("point_coords", True): Family("SAM 2", "squash"),
+    ("batched_point_coords", False): Family("EfficientSAM", "whole", nested=True),
+    ("input_points", False): Family("SAM by Hugging Face", nested=True),
+    ("input_points", True): Family("SAM 2 by Hugging Face", "squash", nested=True),
+}
 
 
 @dataclass(frozen=True)
@@ -60,10 +104,14 @@ class Graph:
 
     def run(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Runs the graph. values: inputs by role, cast to the graph's dtypes. Returns the outputs by role."""
+        import onnxruntime
+
         feeds: dict[str, np.ndarray] = {
             x.name: values[role].astype(dtype_of(x), copy=False) for role, x in self.inputs.items()
         }
-        results = self.session.run(list(self.outputs.values()), feeds)
+        options = onnxruntime.RunOptions()
+        options.only_execute_path_to_fetches = True  # no masks at the photo's size when those at low resolution do
+        results = self.session.run(list(self.outputs.values()), feeds, options)
         return dict(zip(self.outputs, results, strict=True))
 
 
@@ -79,16 +127,24 @@ class Encoded:
 
 
 class SamModel:
-    """An encoder and a matching decoder."""
+    """An encoder and a matching decoder. batched: whether the decoder takes several point prompts per call."""
 
     def __init__(self, encoder: Graph, decoder: Graph) -> None:
         self.encoder, self.decoder = encoder, decoder
-        self.family = decoder_family(decoder)
+        self.kind = decoder_family(decoder)
+        self.family = self.kind.name
         _check_pair(encoder, decoder)
         self.fingerprint = f"{fingerprint(encoder.path)}-{fingerprint(decoder.path)}"
         self.provider = " + ".join(dict.fromkeys(g.session.get_providers()[0] for g in (encoder, decoder)))
         found = (provider_warning(graph.path, graph.session) for graph in (encoder, decoder))
         self.warnings = [warning for warning in found if warning]
+        config = read_config(encoder.path, "preprocessor_config.json")
+        mean, std = (config.get(key) for key in ("image_mean", "image_std"))
+        self._mean, self._std = (
+            np.asarray(known, np.float32) * 255 if known else np.asarray(usual, np.float32)
+            for known, usual in ((mean, _MEAN), (std, _STD))
+        )
+        self.batched = self._probe()
 
     def encode(self, photo: np.ndarray) -> Encoded:
         """photo: [h, w, 3] uint8 RGB."""
@@ -99,42 +155,65 @@ class SamModel:
 
     def decode(self, embedding: Encoded, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """points: [P, 2] (x, y) in photo pixels. Raw masks [P, m, ?, ?] and predicted IoU [P, m], float32."""
-        if self._batched:
+        if self.batched:
             return self._decode(embedding, points)
         parts = [self._decode(embedding, points[i : i + 1]) for i in range(len(points))]
         return np.concatenate([logits for logits, _ in parts]), np.concatenate([iou for _, iou in parts])
 
-    @property
-    def _batched(self) -> bool:
-        """Whether the graph accepts several single-point prompts per call: the axis is dynamic, not fixed to 1."""
-        axis = 1 if self.family in ("EfficientSAM", "SAM by optimum") else 0
-        return shape_of(self.decoder.inputs["points"])[axis] is None
+    def _probe(self) -> bool:
+        """Whether two prompts of an empty embedding are answered in one call. Declared axes are not to be trusted.
+
+        Warns of a decoder that gives one mask a prompt. InputError if the decoder does not run at all.
+        """
+        shapes = {role: shape_of(x) for role, x in self.decoder.inputs.items() if role in self.encoder.outputs}
+        axis = 1 if self.kind.nested else 0
+        fixed = shape_of(self.decoder.inputs["points"])[axis]
+        if None in {size for shape in shapes.values() for size in shape[1:]}:
+            return fixed is None
+        tensors = {role: np.zeros([shape[0] or 1, *shape[1:]]) for role, shape in shapes.items()}
+        side = 16 * tensors["embedding"].shape[-1]
+        empty = Encoded(tensors, (side, side), (1.0, 1.0), (side, side), (side, side))
+        points = np.full((2, 2), side / 2.0)
+        for count in (2, 1)[fixed == 1 :]:
+            try:
+                _, iou = self._decode(empty, points[:count])
+            except Exception as error:  # onnxruntime's exceptions share no public base class
+                if count == 1:
+                    first = str(error).splitlines()[0][:200]
+                    raise InputError(f"{self.decoder.path}: a point prompt fails ({first}); export it anew") from error
+                continue
+            if iou.shape[1] == 1:
+                self.warnings.append(
+                    f"{self.decoder.path.name}: gives one mask a prompt; the published masks need all three "
+                    "(return_single_mask=False)"
+                )
+            break
+        return count == 2
 
     def _prepare(self, photo: np.ndarray) -> tuple[np.ndarray, tuple[int, int], tuple[int, int]]:
         """The encoder's input, the (h, w) that the photo covers in it, and the input's (h, w)."""
         shape = shape_of(self.encoder.inputs["image"])
-        if self.family == "EfficientSAM":
+        if self.kind.fit == "whole":
             return photo.transpose(2, 0, 1)[None] / np.float32(255), photo.shape[:2], photo.shape[:2]
-        if self.family == "SAM 2":
-            height, width = (n or 1024 for n in shape[2:])
-            squashed = _resize(photo, height, width)
-            normal = (squashed / np.float32(255) - _MEAN / 255) / (_STD / 255)
-            return normal.transpose(2, 0, 1)[None], (height, width), (height, width)
-        raw = len(shape) == 3
+        raw = len(shape) == 3  # [h, w, 3] in 0–255, normalised by the graph
         height, width = (n or 1024 for n in (shape[:2] if raw else shape[2:]))
-        ratio = min(height / photo.shape[0], width / photo.shape[1])
-        used = (int(photo.shape[0] * ratio + 0.5), int(photo.shape[1] * ratio + 0.5))
+        used = (height, width)
+        if self.kind.fit == "pad":
+            ratio = min(height / photo.shape[0], width / photo.shape[1])
+            used = (int(photo.shape[0] * ratio + 0.5), int(photo.shape[1] * ratio + 0.5))
         resized = _resize(photo, *used).astype(np.float32)
         if raw and shape[0] is None:
             return resized, used, used  # the graph pads internally
         padded = np.zeros((height, width, 3), np.float32)
-        padded[: used[0], : used[1]] = resized if raw else (resized - _MEAN) / _STD
+        padded[: used[0], : used[1]] = resized if raw else (resized - self._mean) / self._std
         return (padded if raw else padded.transpose(2, 0, 1)[None]), used, (height, width)
 
     def _decode(self, embedding: Encoded, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         values = {**embedding.tensors, **self._prompts(embedding, points)}
         result = self.decoder.run(values)
         masks, iou = result["masks"], result["iou"]
+        if masks.shape[1 if self.kind.nested else 0] != len(points):
+            raise ValueError(f"masks of shape {list(masks.shape)} for {len(points)} prompts")
         masks = masks.reshape(len(points), -1, *masks.shape[-2:]).astype(np.float32, copy=False)
         iou = iou.reshape(len(points), -1).astype(np.float32, copy=False)
         if iou.shape[1] == 4:  # index 0 is the output for several prompts, not for a single point
@@ -144,34 +223,32 @@ class SamModel:
     def _prompts(self, embedding: Encoded, points: np.ndarray) -> dict[str, np.ndarray]:
         scaled = (points * np.array(embedding.scale)).astype(np.float32)[:, None]
         labels = np.ones((len(points), 1), np.float32)
-        if self.family in ("EfficientSAM", "SAM by optimum"):  # [1, P, 1, 2]: one image, P queries
-            size = np.array(embedding.size)
-            return {"points": scaled[None], "labels": labels[None], "size": size}
-        # A point prompt without a box is followed by a padding point, as in the published predictor.
-        scaled = np.concatenate([scaled, np.zeros_like(scaled)], axis=1)
-        labels = np.concatenate([labels, -labels], axis=1)
-        rows, height, width = self._mask_shape(len(points), 4 * embedding.tensors["embedding"].shape[-1])
+        if self.kind.pads:
+            scaled = np.concatenate([scaled, np.zeros_like(scaled)], axis=1)
+            labels = np.concatenate([labels, -labels], axis=1)
+        has_mask = self.decoder.inputs.get("has_mask")
+        whole = self.kind.fit != "pad" or self._whole_photo(embedding)
         return {
-            "points": scaled,
-            "labels": labels,
-            "mask_input": np.zeros((rows, 1, height, width), np.float32),
-            "has_mask": np.zeros(rows, np.float32),
-            "size": np.array(embedding.size if self._whole_photo(embedding) else embedding.canvas),
+            "points": scaled[None] if self.kind.nested else scaled,
+            "labels": labels[None] if self.kind.nested else labels,
+            "boxes": np.zeros((1, 0, 4), np.float32),
+            "mask_input": np.zeros(self._mask_shape(len(points), 4 * embedding.tensors["embedding"].shape[-1])),
+            # One flag for all prompts: exporters multiply by it as if it were a scalar.
+            "has_mask": np.zeros((shape_of(has_mask)[0] if has_mask else None) or 1),
+            "size": np.array(embedding.size if whole else embedding.canvas),
         }
 
-    def _mask_shape(self, points: int, side: int) -> tuple[int, int, int]:
-        """Rows, height and width of the (empty) mask prompt: one row, or one row per point if the axis is dynamic."""
+    def _mask_shape(self, points: int, side: int) -> tuple[int, int, int, int]:
+        """Shape of the empty mask prompt: one row, or one row per point if the axis is dynamic."""
         argument = self.decoder.inputs.get("mask_input")
         shape = [1, 1, side, side] if argument is None else shape_of(argument)
-        return shape[0] or points, shape[2] or side, shape[3] or side
+        return shape[0] or points, 1, shape[2] or side, shape[3] or side
 
     def _whole_photo(self, embedding: Encoded) -> bool:
         """Whether the decoder may upscale to the photo's size itself, i.e. whether its scaling equals that of `encode`.
 
         SAM's graph assumes that the long side fills the square. Encoders with a fixed non-square input differ.
         """
-        if self.family == "SAM 2":
-            return True
         return max(embedding.used) == _square(embedding) and max(embedding.canvas) == max(embedding.used)
 
     def upscale(self, embedding: Encoded, raw: np.ndarray) -> np.ndarray:
@@ -181,7 +258,7 @@ class SamModel:
         height, width = embedding.size
         if raw.shape == (height, width):
             return raw
-        if self.family != "SAM 2":  # a quarter of the padded square; the photo covers its top left
+        if self.kind.fit == "pad":  # a quarter of the padded square; the photo covers its top left
             if raw.shape != embedding.canvas:
                 side = _square(embedding)
                 raw = cv2.resize(raw, (side, side), interpolation=cv2.INTER_LINEAR)
@@ -189,13 +266,14 @@ class SamModel:
         return cv2.resize(raw, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
-def open_sam(spec: str) -> SamModel:
-    """spec: a folder with both graphs, an encoder file next to its decoder, `ENCODER,DECODER`, or a stored name."""
+def open_sam(spec: str, threads: int = 0) -> SamModel:
+    """spec: a folder with both graphs, an encoder file next to its decoder, `ENCODER,DECODER`, or a stored name.
+
+    threads: of one run; 0: all cores.
+    """
     spec = resolve(spec)
-    if "," in spec:
-        graphs = [open_graph(Path(part.strip())) for part in spec.split(",")]
-    else:
-        graphs = [open_graph(path) for path in _candidates(Path(spec))]
+    paths = [Path(part.strip()) for part in spec.split(",")] if "," in spec else _candidates(Path(spec).expanduser())
+    graphs = [open_graph(path, threads) for path in paths]
     encoders, decoders = [g for g in graphs if g.is_encoder], [g for g in graphs if g.is_decoder]
     if len(encoders) == 1 and len(decoders) == 1:
         return SamModel(encoders[0], decoders[0])
@@ -213,9 +291,9 @@ def open_sam(spec: str) -> SamModel:
     raise InputError(f"sam:{spec}: several models found ({names}); write sam:ENCODER,DECODER")
 
 
-def open_graph(path: Path) -> Graph:
+def open_graph(path: Path, threads: int = 0) -> Graph:
     """Opens an ONNX file and assigns roles to its inputs and outputs."""
-    session = open_session(path)
+    session = open_session(path, threads)
     inputs = {_ROLES.get(argument.name, argument.name): argument for argument in session.get_inputs()}
     return Graph(path, session, inputs, _outputs([argument.name for argument in session.get_outputs()]))
 
@@ -234,7 +312,7 @@ def _outputs(names: list[str]) -> dict[str, str]:
 
 def _candidates(path: Path) -> list[Path]:
     if path.is_dir():
-        files = sorted(path.glob("*.onnx"))
+        files, _ = model_graphs(path)
         if not files:
             raise InputError(f"sam:{path}: no .onnx file in this folder; expected an encoder and a decoder")
         return files
@@ -249,14 +327,12 @@ def _candidates(path: Path) -> list[Path]:
     return [path, *(beside or (other if len(other) == 1 else []))]
 
 
-def decoder_family(decoder: Graph) -> str:
+def decoder_family(decoder: Graph) -> Family:
     """The family of a decoder, from the names of its inputs."""
-    names = {argument.name for argument in decoder.session.get_inputs()}
-    if "batched_point_coords" in names:
-        return "EfficientSAM"
-    if "high_res_0" in decoder.inputs:
-        return "SAM 2"
-    return "SAM by optimum" if "input_points" in names else "SAM"
+    family = FAMILIES.get((decoder.inputs["points"].name, "high_res_0" in decoder.inputs))
+    if family is None:
+        raise InputError(f"{decoder.path}: a decoder of no known family ({signature(decoder.session)})")
+    return family
 
 
 def encoder_family(encoder: Graph) -> str:
@@ -267,7 +343,7 @@ def encoder_family(encoder: Graph) -> str:
 
 
 def _check_pair(encoder: Graph, decoder: Graph) -> None:
-    known = {"points", "labels", "mask_input", "has_mask", "size"}
+    known = {"points", "labels", "boxes", "mask_input", "has_mask", "size"}
     unmet = [a.name for role, a in decoder.inputs.items() if role not in known and role not in encoder.outputs]
     if unmet:
         raise InputError(f"{decoder.path}: needs {', '.join(unmet)}, which {encoder.path.name} does not give")
@@ -275,6 +351,9 @@ def _check_pair(encoder: Graph, decoder: Graph) -> None:
     if lacking:
         found = ", ".join(argument.name for argument in decoder.session.get_outputs())
         raise InputError(f"{decoder.path}: no output for {' and '.join(lacking)} (found {found}); not a SAM decoder")
+    logits = next(x for x in decoder.session.get_outputs() if x.name == decoder.outputs["masks"])
+    if "bool" in logits.type:
+        raise InputError(f"{decoder.path}: gives masks without logits; stability cannot be measured")
 
 
 def _square(embedding: Encoded) -> int:

@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from perception.config import read_toml
+from perception.config import SamConfig, read_toml
 from perception.errors import InputError
 from perception.io.model_store import default_model
 from perception.progress import Progress
@@ -20,6 +20,7 @@ class MaskSource(Protocol):
     """Gives each photo a label image. Ids need not be consistent across photos.
 
     name: short, for messages. identity: cache key; it changes whenever the label images could change.
+    A source may have `photos_at_once`, the number of threads in which `label_image` is called; else it is one.
     """
 
     name: str
@@ -49,13 +50,13 @@ class GeometryMaskSource(MaskSource, Protocol):
         ...
 
 
-def make_source(spec: str) -> MaskSource:
+def make_source(spec: str, sam: SamConfig | None = None) -> MaskSource:
     """Parses `auto`, `builtin`, `labels:DIR`, or `sam:PATH` (folder, encoder file, or `ENCODER,DECODER`).
 
     `auto` uses the first SAM found: the environment variable PERCEPTION_SAM, `masks.sam` in the user's configuration
     (`perception/config.toml` under XDG_CONFIG_HOME), or the default set by `perception models add --default`. Without
     one it is `builtin`. Files, model signatures and packages are checked here, before any work. InputError names what
-    is missing or wrong.
+    is missing or wrong. sam: settings of SAM's mask generation; None: the defaults.
     """
     kind, _, argument = spec.partition(":")
     if kind == "auto" and not argument:
@@ -72,7 +73,7 @@ def make_source(spec: str) -> MaskSource:
     if kind == "sam" and argument:
         from perception.masks.sam import SamSource
 
-        return SamSource(argument)
+        return SamSource(argument, sam or SamConfig())
     raise InputError(f"--masks {spec}: expected auto, builtin, sam:PATH or labels:DIR")
 
 

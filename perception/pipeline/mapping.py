@@ -76,7 +76,7 @@ def build_map(
 
     with working(source, output, resume) as work:
         # Files and models are opened first, so that errors appear before hours of work.
-        mask_source = make_source(config.masks)
+        mask_source = make_source(config.masks, config.sam)
         encoder = _encoder(config.language.encoder, progress)
         reader = make_reader(config.language.texts)
 

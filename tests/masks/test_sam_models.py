@@ -10,8 +10,9 @@ import pytest
 from perception.errors import InputError
 from perception.masks import make_source
 from perception.masks.sam_models import open_sam
+from perception.models import check_file
 from perception.types import View
-from support.onnx_files import FLOAT, INT64, SAM_DECODER, write_onnx
+from support.onnx_files import FLOAT, INT32, INT64, SAM_DECODER, write_onnx
 
 EMBEDDING = np.zeros((1, 2, 64, 64), np.float32)
 SAM2_DECODER = {
@@ -36,29 +37,66 @@ OPTIMUM_DECODER = {
     "input_points": ((1, "q", "n", 2), FLOAT),
     "input_labels": ((1, "q", "n"), INT64),
 }
-HIGH_RES = {f"high_res_feats_{i}": np.zeros((1, 1, 2, 2), np.float32) for i in (0, 1)}
-# family: encoder input, encoder outputs, decoder, name of the masks, of the scores and of the points
-FAMILIES = {
-    "SAM": (("x", (1, 3, 1024, 1024)), {}, SAM_DECODER, "masks", "iou_predictions", "point_coords"),
-    "SAM 2": (("image", (1, 3, 1024, 1024)), HIGH_RES, SAM2_DECODER, "masks", "iou_predictions", "point_coords"),
+HF_SAM2_DECODER = {
+    **{f"image_embeddings.{n}": ((1, 2, 64, 64) if n == 2 else (1, 1, 2, 2), FLOAT) for n in range(3)},
+    "input_points": ((1, "q", "n", 2), FLOAT),
+    "input_labels": ((1, "q", "n"), INT64),
+    "input_boxes": ((1, "b", 4), FLOAT),
+}
+EDGE_DECODER = {name: SAM_DECODER[name] for name in ("image_embeddings", "point_coords", "point_labels")}
+ORT_SAM2_DECODER = {
+    "image_features_0": ((1, 1, 2, 2), FLOAT),
+    "image_features_1": ((1, 1, 2, 2), FLOAT),
+    "image_embeddings": ((1, 2, 64, 64), FLOAT),
+    "point_coords": (("p", "n", 2), FLOAT),
+    "point_labels": (("p", "n"), INT32),
+    "input_masks": (("p", 1, 256, 256), FLOAT),
+    "has_input_masks": (("p",), FLOAT),
+    "original_image_size": ((2,), INT32),
+}
+FEATURE = np.zeros((1, 1, 2, 2), np.float32)
+POSITIONAL = {"image_positional_embeddings": EMBEDDING}
+SQUARE, WHOLE = (1, 3, 1024, 1024), (1, 3, "h", "w")
+# layout: family, encoder input, its shape, embedding, other encoder outputs, decoder, names of masks and scores
+LAYOUTS = {
+    "MobileSAM": ("SAM", "x", SQUARE, "image_embeddings", {}, SAM_DECODER, "masks", "iou_predictions"),
+    "EdgeSAM": ("SAM", "image", SQUARE, "image_embeddings", {}, EDGE_DECODER, "masks", "scores"),
+    "samexporter SAM 2": (
+        "SAM 2", "image", SQUARE, "image_embed", {f"high_res_feats_{n}": FEATURE for n in (0, 1)}, SAM2_DECODER,
+        "masks", "iou_predictions",
+    ),
+    "onnxruntime SAM 2": (
+        "SAM 2", "image", SQUARE, "image_embeddings", {f"image_features_{n}": FEATURE for n in (0, 1)},
+        ORT_SAM2_DECODER, "low_res_masks", "iou_predictions",
+    ),
+    "Hugging Face SAM 2.1": (
+        "SAM 2 by Hugging Face", "pixel_values", SQUARE, "image_embeddings.2",
+        {f"image_embeddings.{n}": FEATURE for n in (0, 1)}, HF_SAM2_DECODER, "pred_masks", "iou_scores",
+    ),
     "EfficientSAM": (
-        ("batched_images", (1, 3, "h", "w")), {}, EFFICIENT_DECODER, "output_masks", "iou_predictions",
-        "batched_point_coords",
+        "EfficientSAM", "batched_images", WHOLE, "image_embeddings", {}, EFFICIENT_DECODER, "output_masks",
+        "iou_predictions",
     ),
-    "SAM by optimum": (
-        ("pixel_values", (1, 3, 1024, 1024)), {"image_positional_embeddings": EMBEDDING}, OPTIMUM_DECODER,
-        "pred_masks", "iou_scores", "input_points",
+    "SlimSAM": (
+        "SAM by Hugging Face", "pixel_values", SQUARE, "image_embeddings", POSITIONAL, OPTIMUM_DECODER, "pred_masks",
+        "iou_scores",
     ),
+}  # fmt: skip
+# family: where (20, 30) of an 80×60 photo lies for the decoder, and whether the point (0, 0) follows it
+EXPECTED = {
+    "SAM": ((256, 384), True), "SAM by Hugging Face": ((256, 384), False), "SAM 2": ((256, 512), False),
+    "SAM 2 by Hugging Face": ((256, 512), False), "EfficientSAM": ((20, 30), False),
 }  # fmt: skip
 
 
-def write_family(folder: Path, family: str, encoder_passes_image: bool = False) -> None:
+def write_layout(folder: Path, layout: str, encoder_passes_image: bool = False) -> None:
     """A pair with a signature; the decoder's "predicted IoU" are the coordinates it was given."""
-    (image, shape), extra, decoder, masks, iou, points = FAMILIES[family]
-    name = "image_embed" if family == "SAM 2" else "image_embeddings"
+    _, image, shape, name, extra, decoder, masks, iou = LAYOUTS[layout]
     embedding = image if encoder_passes_image else EMBEDDING
     write_onnx(folder / "encoder.onnx", {image: (shape, FLOAT)}, {name: embedding, **extra})
-    constant = np.zeros((1, 3, 256, 256), np.float32)
+    points = next(name for name in decoder if "point" in name)
+    nested = len(decoder[points][0]) == 4
+    constant = np.zeros((1, 1, 3, 256, 256) if nested else (1, 3, 256, 256), np.float32)
     write_onnx(folder / "decoder.onnx", decoder, {masks: constant, iou: points})
 
 
@@ -66,20 +104,60 @@ def photo(height: int = 60, width: int = 80) -> np.ndarray:
     return np.random.default_rng(0).integers(0, 256, (height, width, 3)).astype(np.uint8)
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-def test_family_and_where_its_points_lie(tmp_path, family):
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_family_and_where_its_points_lie(tmp_path, layout):
     """A photo of 80×60: the long side fills 1024 (SAM), both sides do (SAM 2), or nothing is scaled."""
-    write_family(tmp_path, family)
+    write_layout(tmp_path, layout)
     model = open_sam(str(tmp_path))
-    assert model.family == family and model.provider == "CPUExecutionProvider" and model.warnings == []
+    assert model.family == LAYOUTS[layout][0] and model.provider == "CPUExecutionProvider" and model.warnings == []
     _, given = model.decode(model.encode(photo()), np.array([[20.0, 30.0]]))
-    x, y = {"SAM": (256, 384), "SAM 2": (256, 512), "EfficientSAM": (20, 30), "SAM by optimum": (256, 384)}[family]
-    padded = family in ("SAM", "SAM 2")  # x, y, 0, 0, of which the first of four is dropped
+    (x, y), padded = EXPECTED[model.family]
+    # x, y, 0, 0, of which the first of four is dropped
     np.testing.assert_allclose(given[0], [y, 0, 0] if padded else [x, y], rtol=1e-6)
 
 
+def test_prompts_go_one_by_one_where_an_export_only_claims_to_take_several(tmp_path):
+    write_layout(tmp_path, "samexporter SAM 2")  # its axes are dynamic, its masks are those of one prompt
+    model = open_sam(str(tmp_path))
+    assert not model.batched
+    _, given = model.decode(model.encode(photo()), np.array([[20.0, 30.0], [40.0, 30.0]]))
+    np.testing.assert_allclose(given, [[256, 512], [512, 512]])
+
+
+def test_of_a_hugging_face_cache_the_most_precise_graphs_are_taken(tmp_path):
+    """`models--ORG--NAME/snapshots/REVISION/onnx`, links into `blobs/`, siblings in other precisions."""
+    (tmp_path / "blobs").mkdir()
+    home = tmp_path / "snapshots" / "814a066" / "onnx"
+    home.mkdir(parents=True)
+    write_layout(tmp_path / "blobs", "Hugging Face SAM 2.1")
+    for link, blob in (("vision_encoder", "encoder"), ("prompt_encoder_mask_decoder", "decoder")):
+        (home / f"{link}.onnx").symlink_to(f"../../../blobs/{blob}.onnx")
+        for precision in ("_fp16", "_quantized", "_q4f16"):
+            (home / f"{link}{precision}.onnx").write_bytes(b"not to be opened")
+    model = open_sam(str(tmp_path))
+    assert model.encoder.path == home / "vision_encoder.onnx" and model.family == "SAM 2 by Hugging Face"
+    (home / "vision_encoder.onnx").unlink()
+    with pytest.raises(InputError, match=r"vision_encoder_fp16\.onnx: not an ONNX model"):
+        open_sam(str(tmp_path))
+
+
+def test_one_mask_a_prompt_is_told(tmp_path):
+    write_layout(tmp_path, "MobileSAM")
+    one = {"masks": np.zeros((1, 1, 256, 256), np.float32), "iou_predictions": np.zeros((1, 1), np.float32)}
+    write_onnx(tmp_path / "decoder.onnx", SAM_DECODER, one)
+    assert "one mask a prompt" in make_source(f"sam:{tmp_path}").check([])[0]
+    assert "one mask a prompt" in check_file(str(tmp_path))["warnings"][0]
+
+
+def test_other_normalisation_is_read_beside_the_graphs(tmp_path):
+    write_layout(tmp_path, "Hugging Face SAM 2.1", encoder_passes_image=True)
+    (tmp_path / "preprocessor_config.json").write_text('{"image_mean": [0.5, 0.5, 0.5], "image_std": [0.5, 0.5, 0.5]}')
+    image = open_sam(str(tmp_path)).encode(np.full((60, 80, 3), 255, np.uint8)).tensors["embedding"]
+    assert image.min() == image.max() == 1
+
+
 def test_normalisation_and_padding(tmp_path):
-    write_family(tmp_path, "SAM", encoder_passes_image=True)
+    write_layout(tmp_path, "MobileSAM", encoder_passes_image=True)
     grey = np.full((60, 80, 3), 100, np.uint8)
     image = open_sam(str(tmp_path)).encode(grey).tensors["embedding"]
     expected = (100 - np.array([123.675, 116.28, 103.53])) / [58.395, 57.12, 57.375]
@@ -99,12 +177,12 @@ def test_raw_encoder_takes_the_photo_as_it_is(tmp_path):
 
 @pytest.mark.parametrize("spec", ["{0}", "{0}/encoder.onnx", "{0}/decoder.onnx", "{0}/encoder.onnx,{0}/decoder.onnx"])
 def test_ways_to_name_a_pair(tmp_path, spec):
-    write_family(tmp_path, "SAM")
+    write_layout(tmp_path, "MobileSAM")
     assert open_sam(spec.format(tmp_path)).family == "SAM"
 
 
 def test_photo_in_which_nothing_is_found(tmp_path):
-    write_family(tmp_path, "SAM")
+    write_layout(tmp_path, "MobileSAM")
     scores = {
         "masks": np.zeros((1, 4, 256, 256), np.float32),
         "iou_predictions": np.zeros((1, 4), np.float32),
@@ -118,7 +196,7 @@ def test_photo_in_which_nothing_is_found(tmp_path):
 
 
 def test_identity_follows_the_weights(tmp_path):
-    write_family(tmp_path, "SAM")
+    write_layout(tmp_path, "MobileSAM")
     before = make_source(f"sam:{tmp_path}").identity
     write_onnx(tmp_path / "encoder.onnx", {"x": ((1, 3, 1024, 1024), FLOAT)}, {"image_embeddings": EMBEDDING + 1})
     assert make_source(f"sam:{tmp_path}").identity != before
@@ -139,7 +217,7 @@ def test_nothing_there(tmp_path):
 
 @pytest.mark.parametrize(("kept", "missing"), [("decoder", "encoder"), ("encoder", "decoder")])
 def test_one_half_of_a_pair(tmp_path, kept, missing):
-    write_family(tmp_path, "SAM")
+    write_layout(tmp_path, "MobileSAM")
     (tmp_path / f"{missing}.onnx").unlink()
     with pytest.raises(InputError, match=f"is a {'decoder' if kept == 'decoder' else 'encoder'}.*{missing} is missing"):
         open_sam(str(tmp_path))
@@ -153,21 +231,21 @@ def test_another_kind_of_network(tmp_path):
 
 
 def test_decoder_without_scores(tmp_path):
-    write_family(tmp_path, "SAM")
+    write_layout(tmp_path, "MobileSAM")
     write_onnx(tmp_path / "decoder.onnx", SAM_DECODER, {"masks": np.zeros((1, 4, 256, 256), np.float32)})
     with pytest.raises(InputError, match="no output for iou"):
         open_sam(str(tmp_path))
 
 
 def test_pair_of_two_families(tmp_path):
-    write_family(tmp_path, "SAM 2")
+    write_layout(tmp_path, "samexporter SAM 2")
     write_onnx(tmp_path / "encoder.onnx", {"x": ((1, 3, 1024, 1024), FLOAT)}, {"image_embeddings": EMBEDDING})
     with pytest.raises(InputError, match=r"needs high_res_feats_0.*does not give"):
         open_sam(str(tmp_path))
 
 
 def test_two_decoders_in_a_folder(tmp_path):
-    write_family(tmp_path, "SAM")
+    write_layout(tmp_path, "MobileSAM")
     (tmp_path / "other_decoder.onnx").write_bytes((tmp_path / "decoder.onnx").read_bytes())
     with pytest.raises(InputError, match="several models found"):
         open_sam(str(tmp_path))

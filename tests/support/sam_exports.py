@@ -1,7 +1,7 @@
 """segment-anything without torchvision, and its models exported to ONNX as the published exporter does.
 
-`python tests/sam_exports.py vit_b OUT` writes encoder.onnx and decoder.onnx of a SAM of real size with random weights:
-its masks mean nothing, its speed is that of the trained one.
+`python tests/support/sam_exports.py vit_b OUT` writes encoder.onnx and decoder.onnx of a SAM of real size with random
+weights: its speed is that of the trained one. `mobile`: SAM's decoder behind an encoder as expensive as MobileSAM's.
 """
 
 from __future__ import annotations
@@ -70,6 +70,47 @@ def imported() -> Iterator[Any]:
         sys.modules.update(before)
 
 
+def local_sam(side: int, channels: int, depth: int, width: int, mlp: int = 64) -> Any:
+    """A SAM with random weights whose masks gather round the prompt, as a trained one's do.
+
+    The inner product of two positional encodings falls with distance; three cuts of it give three sizes.
+    """
+    from segment_anything import modeling as m
+
+    class LocalDecoder(m.MaskDecoder):
+        def predict_masks(self, image_embeddings, image_pe, sparse_prompt_embeddings, dense_prompt_embeddings):
+            masks, iou = super().predict_masks(
+                image_embeddings, image_pe, sparse_prompt_embeddings, dense_prompt_embeddings
+            )
+            near = torch.einsum("pc,chw->phw", sparse_prompt_embeddings[:, 0], image_pe[0])[:, None] * (2 / channels)
+            near = torch.nn.functional.interpolate(near, scale_factor=4, mode="bilinear")
+            cuts = torch.tensor([0.5, 0.2, 0.45, 0.7])[None, :, None, None]
+            return 180.0 * (near - cuts) + 100.0 * masks, iou
+
+    torch.manual_seed(0)
+    heads = max(2, width // 64)
+    encoder = m.ImageEncoderViT(
+        depth=depth, embed_dim=width, img_size=side, mlp_ratio=2, norm_layer=partial(torch.nn.LayerNorm, eps=1e-6),
+        num_heads=heads, patch_size=16, qkv_bias=True, use_rel_pos=True, global_attn_indexes=(), window_size=8,
+        out_chans=channels,
+    )  # fmt: skip
+    grid = (side // 16, side // 16)
+    prompts = m.PromptEncoder(
+        embed_dim=channels, image_embedding_size=grid, input_image_size=(side, side), mask_in_chans=16
+    )
+    transformer = m.TwoWayTransformer(depth=2, embedding_dim=channels, mlp_dim=mlp, num_heads=2)
+    decoder = LocalDecoder(
+        num_multimask_outputs=3, transformer=transformer, transformer_dim=channels,
+        iou_head_depth=3, iou_head_hidden_dim=32,
+    )  # fmt: skip
+    with torch.no_grad():
+        for name, weight in transformer.named_parameters():
+            if "q_proj.weight" in name or "k_proj.weight" in name:
+                weight.mul_(6.0)  # sharp attention: the answer depends on where the prompt lies
+        decoder.iou_prediction_head.layers[-1].bias.add_(0.9)
+    return m.Sam(encoder, prompts, decoder).eval()
+
+
 def export(sam: Any, folder: Path) -> None:
     """Encoder and decoder of a SAM into `folder`; to be called within `imported()`."""
     from segment_anything.utils.onnx import SamOnnxModel
@@ -101,7 +142,9 @@ def main(size: str, folder: str) -> None:
     Path(folder).mkdir(parents=True, exist_ok=True)
     torch.manual_seed(0)
     with imported() as package:
-        export(package.sam_model_registry[size]().eval(), Path(folder))
+        mobile = size == "mobile"
+        sam = local_sam(1024, 256, 4, 320, 2048) if mobile else package.sam_model_registry[size]().eval()
+        export(sam, Path(folder))
 
 
 if __name__ == "__main__":
