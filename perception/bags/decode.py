@@ -49,15 +49,20 @@ def _raw(message: Any, where: str) -> np.ndarray:
             "(a depth image? give another --topic)"
         )
     channels, conversion = _EIGHT_BIT[encoding]
+    rows = raw_rows(message, channels, where)
+    picture = rows if channels == 1 else rows.reshape(len(rows), -1, channels)
+    return picture if conversion is None else np.asarray(cv2.cvtColor(picture, conversion))
+
+
+def raw_rows(message: Any, size: int, where: str) -> np.ndarray:
+    """The pixels [height, width * size] uint8 of an Image without padding; size: bytes of a pixel."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.frombuffer(bytes(message.data), np.uint8)
-    if min(height, width) < 1 or step < width * channels or data.size < step * height:
+    if min(height, width) < 1 or step < width * size or data.size < step * height:
         raise InputError(
-            f"{where}: an image of {width}x{height} ({encoding}, rows of {step} bytes) holds {data.size} bytes"
+            f"{where}: an image of {width}x{height} ({message.encoding}, rows of {step} bytes) holds {data.size} bytes"
         )
-    rows = data[: step * height].reshape(height, step)[:, : width * channels]
-    picture = np.ascontiguousarray(rows).reshape((height, width) if channels == 1 else (height, width, channels))
-    return picture if conversion is None else np.asarray(cv2.cvtColor(picture, conversion))
+    return np.ascontiguousarray(data[: step * height].reshape(height, step)[:, : width * size])
 
 
 def encoded(message: Any, picture: np.ndarray) -> tuple[str, bytes]:

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from perception.bags.decode import raw_rows
 from perception.bags.poses import Poses
 from perception.bags.read import CAMERA_INFO, IMAGES, Bag, stamp_of
 from perception.errors import InputError
@@ -82,12 +83,7 @@ def _raw(message: Any, kind: str, where: str) -> np.ndarray:
     if kind not in _TYPES:
         raise InputError(f"{where}: depth is encoded as '{kind}'; expected 16UC1 (mm) or 32FC1 (m)")
     dtype = np.dtype(_TYPES[kind]).newbyteorder(">" if message.is_bigendian else "<")
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    data = np.frombuffer(bytes(message.data), np.uint8)
-    if min(height, width) < 1 or step < width * dtype.itemsize or data.size < step * height:
-        raise InputError(f"{where}: a depth image of {width}x{height} (rows of {step} bytes) holds {data.size} bytes")
-    rows = np.ascontiguousarray(data[: step * height].reshape(height, step)[:, : width * dtype.itemsize])
-    return np.asarray(rows.view(dtype))
+    return np.asarray(raw_rows(message, dtype.itemsize, where).view(dtype))
 
 
 def _compressed(data: bytes, kind: str) -> np.ndarray | None:

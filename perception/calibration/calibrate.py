@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from perception.calibration.board import Board, Detection
 from perception.calibration.judge import check_count, check_solution, coverage, distinct_views, tilt_spread
-from perception.calibration.pictures import read_pictures
 from perception.calibration.solve import NAMES, Solution, solve
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
 from perception.io.camera_file import write_camera
+from perception.io.photos import SUFFIXES
+from perception.io.video import frames
 
+MAX_FRAMES = 240
+"""Maximum number of video frames that are read, evenly spaced."""
 MODELS = ("auto", "pinhole", "fisheye")
 MAX_VIEWS = 60
 """Maximum number of views used. More of them increase the run time without changing the result."""
@@ -68,10 +72,35 @@ def best_model(views: list[Detection], size: tuple[int, int], model: str = "auto
     return solved[-1]
 
 
+def _pictures(source: Path) -> Iterator[tuple[str, np.ndarray]]:
+    """(name, grey image [H, W] uint8) of a folder's photos in order of name, or of a video's frames."""
+    if source.is_dir():
+        files = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
+        if not files:
+            raise InputError(f"{source}: holds no photos; expected pictures of a calibration board")
+        for file in files:
+            picture = cv2.imdecode(np.frombuffer(file.read_bytes() or b"\0", np.uint8), cv2.IMREAD_GRAYSCALE)
+            if picture is None:
+                raise InputError(f"{file}: is not a readable picture")
+            yield file.name, np.asarray(picture)
+    elif source.is_file():
+        yield from _video(source)
+    else:
+        raise InputError(f"{source}: no such file or folder; give photos of a calibration board, or a video of it")
+
+
+def _video(source: Path) -> Iterator[tuple[str, np.ndarray]]:
+    number = None
+    for number, _, frame in frames(source, most=MAX_FRAMES):
+        yield f"frame_{number:06d}", cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+    if number is None:
+        raise InputError(f"{source}: is not a readable video (nor a folder of photos)")
+
+
 def _detect(source: Path, board: Board) -> tuple[list[Detection], tuple[int, int], int]:
     found: list[Detection] = []
     size, looked_at = None, 0
-    for name, picture in read_pictures(source):
+    for name, picture in _pictures(source):
         looked_at += 1
         here = (picture.shape[1], picture.shape[0])
         if size is None:

@@ -32,30 +32,17 @@ def _add_map(commands: Any) -> None:
     p.formatter_class, p.late_epilog = argparse.RawDescriptionHelpFormatter, _settings
     p.add_argument("input", type=Path, metavar="INPUT")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="MAP")
-    p.add_argument("--masks", metavar="SOURCE", help="auto, builtin, sam:PATH or labels:DIR")
     p.add_argument("--config", type=Path, metavar="FILE.toml")
     p.add_argument("--preset", default="default", help="fast, default, quality or paper")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
-    p.add_argument("--camera", type=Path, metavar="FILE.yaml", help="fixed intrinsics, ROS camera_info")
     p.add_argument(
         "--strict", action="store_const", const=True, help="refuse damaged photos instead of leaving them out"
     )
-    p.add_argument("--ignore-masks", metavar="DIR", help="PNG masks, same stem as the photo; black pixels are ignored")
-    p.add_argument("--init-points", metavar="CLOUD", help="start from these points, in the frame of the input's poses")
     p.add_argument(
         "--keep-world", action=argparse.BooleanOptionalAction, help="keep the input's frame (default: if it has poses)"
     )
-    p.add_argument("--known-length", metavar="TEXT", help='"0.297: a.jpg 100,200 300,220; b.jpg 110,190 310,215"')
-    p.add_argument("--tag-size", metavar="M", help="side of the AprilTags or ArUco markers in the photos")
-    p.add_argument("--board", metavar="TEXT", help="a calibration board in the photos, such as charuco:8x11:0.02")
-    p.add_argument("--max-side", metavar="PX", help="long side in pixels at which the map is trained")
-    p.add_argument("--budget", metavar="N", help="most Gaussians the map may have")
-    p.add_argument("--iterations", metavar="N")
-    p.add_argument("--time-limit", metavar="S", help="seconds of training; all schedules shrink to fit")
-    p.add_argument("--stop-psnr", metavar="DB", help="held-out PSNR at which training ends")
-    p.add_argument("--holdout", metavar="N", help="every N-th view is kept for scoring, 0 trains on all")
-    p.add_argument("--seed", metavar="S")
-    p.add_argument("--device", help="auto, cpu or cuda")
+    for key, (metavar, text) in _SHORTCUTS.items():
+        p.add_argument(f"--{key.rpartition('.')[2].replace('_', '-')}", metavar=metavar, help=text, dest=key)
     p.add_argument("--labels-from", type=Path, metavar="OLD.gsmap", help="carry over the names given to its instances")
     p.add_argument("--resume", action="store_true", help="go on with an interrupted run")
 
@@ -67,30 +54,31 @@ def _settings() -> str:
 
 
 _SHORTCUTS = {
-    "masks": "masks",
-    "camera": "photos.camera",
-    "strict": "photos.strict",
-    "ignore_masks": "photos.ignore_masks",
-    "init_points": "photos.init_points",
-    "keep_world": "frame.keep_world",
-    "known_length": "frame.known_length",
-    "tag_size": "frame.tag_size",
-    "board": "frame.board",
-    "max_side": "photos.max_side",
-    "budget": "train.budget",
-    "iterations": "train.iterations",
-    "time_limit": "train.time_limit",
-    "stop_psnr": "train.stop_psnr",
-    "holdout": "photos.holdout",
-    "seed": "seed",
-    "device": "device",
+    "masks": ("SOURCE", "auto, builtin, sam:PATH or labels:DIR"),
+    "photos.camera": ("FILE.yaml", "fixed intrinsics, ROS camera_info"),
+    "photos.ignore_masks": ("DIR", "PNG masks, same stem as the photo; black pixels are ignored"),
+    "photos.init_points": ("CLOUD", "start from these points, in the frame of the input's poses"),
+    "frame.known_length": ("TEXT", '"0.297: a.jpg 100,200 300,220; b.jpg 110,190 310,215"'),
+    "frame.tag_size": ("M", "side of the AprilTags or ArUco markers in the photos"),
+    "frame.board": ("TEXT", "a calibration board in the photos, such as charuco:8x11:0.02"),
+    "photos.max_side": ("PX", "long side in pixels at which the map is trained"),
+    "train.budget": ("N", "most Gaussians the map may have"),
+    "train.iterations": ("N", None),
+    "train.time_limit": ("S", "seconds of training; all schedules shrink to fit"),
+    "train.stop_psnr": ("DB", "held-out PSNR at which training ends"),
+    "photos.holdout": ("N", "every N-th view is kept for scoring, 0 trains on all"),
+    "seed": ("S", None),
+    "device": ("DEVICE", "auto, cpu or cuda"),
 }
+"""Settings with an option of their own: the last part of their name."""
 
 
 def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.config import load_config
 
-    given = [f"{key}={getattr(args, name)}" for name, key in _SHORTCUTS.items() if getattr(args, name) is not None]
+    values = {key: getattr(args, key) for key in _SHORTCUTS}
+    values |= {"photos.strict": args.strict, "frame.keep_world": args.keep_world}
+    given = [f"{key}={value}" for key, value in values.items() if value is not None]
     config = load_config(args.config, args.pairs + given, args.preset)
     from perception.pipeline.mapping import build_map
     from perception.pipeline.summary import map_facts

@@ -87,7 +87,7 @@ def _scale(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _relink(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.relink import relink
+    from perception.io.store import relink
 
     facts = relink(args.map, args.folder)
     lines = [f"{args.map}: {facts['linked']} photos found in {args.folder}"]

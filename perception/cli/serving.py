@@ -34,7 +34,6 @@ def _add_serve(commands: Any) -> None:
     p.add_argument("--timeout", type=float, default=10.0, metavar="S", help="seconds an answer may take")
     p.add_argument("--workers", type=int, default=2, metavar="N", help="questions answered at once")
     p.add_argument("--queue", type=int, default=64, metavar="N", help="questions that may wait; more are refused")
-    p.add_argument("--rate", type=float, default=100.0, metavar="R", help="requests a second and client, 0: no bound")
     p.add_argument("--watch", type=float, default=1.0, metavar="S", help="look for a new map this often, 0: never")
 
 
@@ -49,7 +48,6 @@ def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         timeout=args.timeout,
         workers=args.workers,
         queue_size=args.queue,
-        rate=args.rate,
         watch=args.watch,
         photos=tuple(args.photos),
     )

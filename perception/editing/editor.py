@@ -19,7 +19,6 @@ import numpy as np
 
 from perception.boxes import oriented_box
 from perception.config import InstanceConfig
-from perception.editing.changes import described, joined, nearest_filled
 from perception.errors import InputError
 from perception.io.map import Map
 from perception.io.map_lock import writing
@@ -129,7 +128,7 @@ class Editor:
         known = [part["id"] for entry in self._now.instances for part in entry.get("parts", [])]
         alive = np.isin(np.unique(parts["ids"][parts["ids"] >= 0]), known)
         ids = np.where(np.isin(parts["ids"], known), parts["ids"], -1).astype(np.int32)
-        return described({**parts, "ids": ids}, alive)
+        return _described({**parts, "ids": ids}, alive)
 
     # ------------------------------------------------------------------ editing
 
@@ -171,7 +170,7 @@ class Editor:
         merged["views"] = max(int(entry.get("views", 0)) for entry in entries)
         if texts := [text for entry in entries for text in entry.get("texts", [])]:
             merged["texts"] = texts
-        self._replace(f"merged {', '.join(map(str, chosen))} into {new}", places, ids, [merged], joined)
+        self._replace(f"merged {', '.join(map(str, chosen))} into {new}", places, ids, [merged], _joined)
         return new
 
     @_step
@@ -189,7 +188,7 @@ class Editor:
             raise InputError(f"instance {instance}: its Gaussians are all alike, there is nothing to split")
         first = self._next_id()
         ids = self.ids.copy()
-        ids[rows] = nearest_filled(gmap.means[rows], found) + first
+        ids[rows] = _nearest_filled(gmap.means[rows], found) + first
         news = list(range(first, first + int(found.max()) + 1))
         entry = self.instances[place]
         parts = [{**self._entry(new, ids, None, entry["score"]), "views": entry.get("views", 0)} for new in news]
@@ -201,7 +200,7 @@ class Editor:
         """Removes an instance from the list; its Gaussians stay and belong to no instance."""
         place = self._place(instance)
         ids = np.where(self.ids == instance, -1, self.ids).astype(np.int32)
-        self._replace(f"removed {instance}", [place], ids, [], joined)
+        self._replace(f"removed {instance}", [place], ids, [], _joined)
 
     @_step
     def undo(self) -> str | None:
@@ -297,3 +296,37 @@ class Editor:
         if said:
             descriptions[places[0] : places[0]] = [describe(said) for _ in news]
         self._push(what, ids=ids, instances=tuple(entries), descriptions=tuple(descriptions))
+
+
+def _nearest_filled(means: np.ndarray, ids: np.ndarray) -> np.ndarray:
+    """ids [N] with −1 replaced by the id of the nearest point that has one."""
+    from scipy.spatial import cKDTree
+
+    known = ids >= 0
+    _, nearest = cKDTree(means[known]).query(means)
+    return np.asarray(np.where(known, ids, ids[known][nearest]))
+
+
+def _joined(descriptions: list[InstanceDescription]) -> InstanceDescription:
+    """One description of several instances: all views, their mean embedding, the palette of the one with most views."""
+    best = max(descriptions, key=lambda d: len(d.views))
+    total = np.sum([d.embedding * len(d.views) for d in descriptions], axis=0)
+    norm = float(np.linalg.norm(total))
+    return InstanceDescription(
+        (total / norm if norm > 0 else best.embedding).astype(np.float32),
+        np.concatenate([d.per_view for d in descriptions]),
+        best.palette,
+        [name for d in descriptions for name in d.views],
+        [box for d in descriptions for box in d.boxes],
+    )
+
+
+def _described(parts: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, np.ndarray]:
+    """The arrays of parts.npz with language rows only for parts that are alive [P] bool, in ascending id."""
+    prefix = "language_"
+    language = {name[len(prefix) :]: array for name, array in parts.items() if name.startswith(prefix)}
+    if not language or alive.all():
+        return parts
+    descriptions, encoder = from_arrays(language)
+    left = [description for description, lives in zip(descriptions, alive, strict=True) if lives]
+    return {"ids": parts["ids"], **{prefix + name: a for name, a in to_arrays(left, encoder).items()}}

@@ -23,8 +23,7 @@ from scipy import fft
 from scipy.ndimage import binary_dilation
 
 from perception.errors import InputError
-from perception.export.align_rotations import likely_rotations
-from perception.export.align_steps import Place, gray_images, photometric_step, plane_step
+from perception.export.align_steps import Place, gray_images, likely_rotations, photometric_step, plane_step
 from perception.export.depth_views import DepthView, cell_means, fused_surface, grid_cells, observe
 from perception.export.graph import list_normals, neighbor_lists
 from perception.export.neighbors import Neighbors

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from perception.errors import InputError
 from perception.io.atomic import replacing
 from perception.io.cloud import write_cloud
 from perception.types import PointCloud
@@ -62,7 +63,10 @@ def write_scannet(
     """
     folder = Path(folder)
     masks = folder / "predicted_masks"
-    masks.mkdir(parents=True, exist_ok=True)
+    try:
+        masks.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{masks}: cannot be made ({error.strerror}); choose a place you may write to") from error
     ids = np.unique(labels[labels >= 0]).tolist()
     score = {i: float(instances.get(i, {}).get("score", 1.0)) for i in ids}
     rows = []

@@ -15,6 +15,11 @@ EDITABLE = "instances.json"
 """Users may edit labels in this file by hand, so a changed checksum is reported and not an error."""
 
 
+def damaged(file: Path, what: str) -> InputError:
+    """The error for a file of a map that is not as it was written."""
+    return InputError(f"{file}: {what}; the map is damaged, build it again or copy it anew")
+
+
 def file_facts(folder: Path) -> dict[str, dict[str, Any]]:
     """{name: {"bytes", "sha256"}} of every file in `folder` except the report and map.json, which holds this table."""
     return {file.name: facts_of(file) for file in _files(folder)}
@@ -53,23 +58,16 @@ def check_sizes(folder: Path, info: dict[str, Any]) -> None:
             continue
         file = folder / name
         if not file.is_file():
-            raise InputError(f"{file}: is missing; the map is damaged, build it again or copy it anew")
-        found = file.stat().st_size
-        if found != facts["bytes"]:
-            raise InputError(
-                f"{file}: has {found} bytes, {facts['bytes']} were written; the map is damaged, "
-                "build it again or copy it anew"
-            )
+            raise damaged(file, "is missing")
+        if (found := file.stat().st_size) != facts["bytes"]:
+            raise damaged(file, f"has {found} bytes, {facts['bytes']} were written")
 
 
 def check_file(folder: Path, info: dict[str, Any], name: str) -> None:
     """InputError when the file's SHA-256 is not the one recorded; a file without a record passes."""
     facts = listed(folder, info).get(name)
     if facts is not None and sha256(folder / name) != facts["sha256"]:
-        raise InputError(
-            f"{folder / name}: its bytes are not those that were written (SHA-256 differs); the map is damaged, "
-            "build it again or copy it anew"
-        )
+        raise damaged(folder / name, "its bytes are not those that were written (SHA-256 differs)")
 
 
 def verify(folder: Path, info: dict[str, Any]) -> dict[str, str]:
@@ -105,7 +103,7 @@ def listed(folder: Path, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
         for name, facts in files.items()
     )
     if not good:
-        raise InputError(f"{folder / FACTS}: its list of files cannot be understood; the map is damaged")
+        raise damaged(folder / FACTS, "its list of files cannot be understood")
     return files
 
 

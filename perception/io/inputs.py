@@ -6,13 +6,12 @@ import shutil
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from perception.errors import InputError
 from perception.io.camera_file import read_camera
 from perception.io.ignore_masks import with_checked_masks
-from perception.io.reading import Reading
-from perception.io.start_points import check_seen, start_points
+from perception.io.reading import Reading, check_seen, start_points
 from perception.progress import Progress
 from perception.types import Lens, Scene
 
@@ -45,10 +44,9 @@ def load_scene(
     `ignore_masks`). init_points: cloud in the frame of the input's poses, used instead of sparse points. poses: "auto",
     "keep" or "refine" the given ones (see io.pose_refinement).
     """
-    from perception.io.colmap import is_workspace, read_workspace
-    from perception.io.photo_folder import VIDEO_SUFFIXES
-    from perception.io.recording_layouts import find_recording, refuse_depth_without_poses
-    from perception.io.recordings import recorded_scene
+    from perception.io.colmap import read_workspace
+    from perception.io.recording_layouts import refuse_depth_without_poses
+    from perception.io.recordings import Recording, recorded_scene
     from perception.io.sfm import reconstruct
     from perception.io.transforms import read_transforms
 
@@ -57,12 +55,9 @@ def load_scene(
     started = time.perf_counter()
     if not source.exists():
         raise InputError(f"{source}: no such file or folder; expected {EXPECTED}")
-    file = source / "transforms.json" if source.is_dir() else source
-    workspace = source.is_dir() and is_workspace(source)
-    is_video = file.suffix.lower() in VIDEO_SUFFIXES
-    recording = None if workspace or file.is_file() else find_recording(source)
-    unposed = is_video or (source.is_dir() and not workspace and not file.is_file() and recording is None)
-    if camera_file is not None and not unposed and recording is None:
+    kind = _kind(source)
+    unposed = kind in ("photos", "video")
+    if camera_file is not None and not unposed and not isinstance(kind, Recording):
         raise InputError(f"{camera_file}: a camera file goes with photos or a video; {source} brings its own cameras")
     if init_points is not None and unposed:
         raise InputError(f"{init_points}: a cloud to start from goes with an input that has poses; {source} has none")
@@ -72,26 +67,41 @@ def load_scene(
     cloud = None if init_points is None else start_points(init_points)
     workdir.mkdir(parents=True, exist_ok=True)
     how = Reading(workdir, seed, tell, strict, masks, cloud, poses)
-    if is_video:
+    if kind == "video":
         scene = _scene_of_video(source, frames or workdir / "frames", workdir, lens, seed, tell, masks)
-    elif recording is not None:
-        recording = replace(recording, lens=lens or recording.lens)
-        scene = recorded_scene(recording, how)
-    elif unposed:
+    elif kind == "photos":
         refuse_depth_without_poses(source)
         scene = reconstruct(source, workdir, lens, seed, tell, strict, masks)
-    elif workspace:
+    elif kind == "workspace":
         scene = read_workspace(source, how)
-    elif file.suffix.lower() == ".json":
-        scene = read_transforms(file, how)
+    elif isinstance(kind, Path):
+        scene = read_transforms(kind, how)
     else:
-        raise InputError(f"{source}: expected {EXPECTED}")
+        scene = recorded_scene(replace(kind, lens=lens or kind.lens), how)
     if init_points is not None:
         scene.report["points_from"] = str(init_points)
         check_seen(scene, init_points)
     scene = with_checked_masks(scene, masks)
     scene.report["seconds"]["total"] = time.perf_counter() - started
     return scene
+
+
+def _kind(source: Path) -> Any:
+    """What an input is: "video", "workspace", "photos", its transforms.json, or the Recording in it."""
+    from perception.io.colmap import is_workspace
+    from perception.io.photo_folder import VIDEO_SUFFIXES
+    from perception.io.recording_layouts import find_recording
+
+    if source.is_dir():
+        if is_workspace(source):
+            return "workspace"
+        file = source / "transforms.json"
+        return file if file.is_file() else find_recording(source) or "photos"
+    if source.suffix.lower() in VIDEO_SUFFIXES:
+        return "video"
+    if source.suffix.lower() != ".json":
+        raise InputError(f"{source}: expected {EXPECTED}")
+    return source
 
 
 @dataclass(frozen=True)
@@ -110,32 +120,27 @@ def photo_sizes(source: Path) -> PhotoSizes:
 
     A video counts as the maximum number of frames. InputError where `source` cannot be read.
     """
-    from perception.io.colmap import is_workspace
-    from perception.io.photo_folder import VIDEO_SUFFIXES, list_photos
-    from perception.io.recording_layouts import find_recording
+    from perception.io.photo_folder import list_photos
     from perception.io.recordings import MOST_FRAMES as MOST_RECORDED
+    from perception.io.recordings import Recording
     from perception.io.transforms import listed_photos
     from perception.io.video import MOST_FRAMES, frame_size
 
-    file = source / "transforms.json" if source.is_dir() else source
-    if file.suffix.lower() in VIDEO_SUFFIXES:
+    kind = _kind(source)
+    if kind == "video":
         return PhotoSizes([frame_size(source)] * MOST_FRAMES, False, f"at most {MOST_FRAMES} frames")
-    workspace = source.is_dir() and is_workspace(source)
-    recording = None if workspace or file.is_file() else find_recording(source)
-    if recording is not None and recording.frames:
-        count = len(recording.frames)
-        size = _size(recording.frames[0].photo) or (640, 480)
+    if isinstance(kind, Recording) and kind.frames:
+        count = len(kind.frames)
+        size = _size(kind.frames[0].photo) or (640, 480)
         taken = min(count, MOST_RECORDED)
-        return PhotoSizes([size] * taken, True, f"at most {taken} of {count} frames", bool(recording.frames[0].depth))
+        return PhotoSizes([size] * taken, True, f"at most {taken} of {count} frames", bool(kind.frames[0].depth))
     depth = False
-    if workspace:
-        photos = list_photos(source / "images")
-    elif file.is_file():
-        photos, depth = listed_photos(file)
+    if isinstance(kind, Path):
+        photos, depth = listed_photos(kind)
     else:
-        photos = list_photos(source)
+        photos = list_photos(source / "images" if kind == "workspace" else source)
     sizes = [size for size in map(_size, photos) if size is not None]
-    return PhotoSizes(sizes, workspace or file.is_file(), f"{len(sizes)} photos", depth)
+    return PhotoSizes(sizes, kind != "photos", f"{len(sizes)} photos", depth)
 
 
 def _size(photo: Path) -> tuple[int, int] | None:

@@ -15,7 +15,7 @@ from perception.errors import InputError
 from perception.io import instance_index
 from perception.io.arrays import DAMAGE, map_npy, read_npz
 from perception.io.atomic import standing
-from perception.io.checksums import EDITABLE, FACTS, check_file, check_sizes
+from perception.io.checksums import EDITABLE, FACTS, check_file, check_sizes, damaged
 from perception.io.documents import brief
 from perception.io.instance_index import InstanceIndex, build_index
 from perception.io.map_views import check_names, views_of_facts
@@ -60,7 +60,7 @@ class MapFiles:
         check_sizes(self.path, facts)
         for file in (self.path / name for name in (EDITABLE, "gaussians.ply", *(f"{name}.npy" for name in _ARRAYS))):
             if file.exists() and not file.is_file():  # to open a FIFO would mean to wait for its writer
-                raise InputError(f"{file}: is no file; the map is damaged, build it again or copy it anew")
+                raise damaged(file, "is no file")
         self.facts = facts
         self.info = {key: value for key, value in facts.items() if key != "views"}
         self.instances, raw = _read_instances(self.path / EDITABLE)
@@ -70,27 +70,23 @@ class MapFiles:
             self._arrays = {name: self._map_array(name, sides) for name, sides in _ARRAYS.items()}
             self._archives = {name: _bytes(self.path / f"{name}.npz") for name in ARCHIVES}
         except OSError as error:
-            raise InputError(
-                f"{self.path}: the map is damaged ({error}); build it again with `perception map`"
-            ) from error
+            raise damaged(self.path, str(error)) from error
         for name, array in self._arrays.items():
             if len(array) != len(self._rows):
-                raise InputError(
-                    f"{self.path / name}.npy: holds {len(array)} rows, expected {len(self._rows)} as in "
-                    "gaussians.ply; the map is damaged, build it again"
-                )
+                found = f"holds {len(array)} rows, expected {len(self._rows)} as in gaussians.ply"
+                raise damaged(self.path / f"{name}.npy", found)
 
     def _map_array(self, name: str, sides: int) -> np.ndarray:
         file = self.path / f"{name}.npy"
         try:
             array = map_npy(file)
         except FileNotFoundError as error:
-            raise InputError(f"{file}: is missing; the map is damaged, build it again or copy it anew") from error
+            raise damaged(file, "is missing") from error
         except DAMAGE as error:
-            raise InputError(f"{file}: cannot be read ({brief(error)}); the map is damaged, build it again") from error
+            raise damaged(file, f"cannot be read ({brief(error)})") from error
         kind = "i" if name == "instance_ids" else "f"
         if array.ndim != sides or array.dtype.kind != kind:
-            raise InputError(f"{file}: holds {array.dtype} of shape {list(array.shape)}; the map is damaged")
+            raise damaged(file, f"holds {array.dtype} of shape {list(array.shape)}")
         return array
 
     def read(self, name: str) -> Any:
@@ -112,8 +108,7 @@ class MapFiles:
         try:
             return _OF_PLY[name](self._rows)
         except (KeyError, ValueError) as error:
-            file = self.path / "gaussians.ply"
-            raise InputError(f"{file}: is no 3DGS cloud ({error}); the map is damaged, build it again") from error
+            raise damaged(self.path / "gaussians.ply", f"is no 3DGS cloud ({error})") from error
 
     def _check_contents(self) -> None:
         """Compares the SHA-256 of every file with the one recorded, once; InputError names the first that differs.
@@ -135,7 +130,7 @@ class MapFiles:
             return build_index(_OF_PLY["means"](self._rows), ids)
         index = instance_index.from_arrays(arrays, f"{self.path / 'index.npz'}")
         if len(index.points) != np.count_nonzero(np.asarray(ids) >= 0):
-            raise InputError(f"{self.path / 'index.npz'}: does not fit instance_ids.npy; the map is damaged")
+            raise damaged(self.path / "index.npz", "does not fit instance_ids.npy")
         return index
 
     def _unpack(self, name: str) -> dict[str, np.ndarray]:
@@ -202,7 +197,7 @@ def _read_facts(path: Path) -> tuple[dict[str, Any], bytes]:
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{file}: cannot be read as a map's facts ({error})") from error
     if isinstance(version, bool) or not isinstance(version, int):
-        raise InputError(f"{file}: format_version is {version!r}, expected {FORMAT_VERSION}; the map is damaged")
+        raise damaged(file, f"format_version is {version!r}, expected {FORMAT_VERSION}")
     if version not in READABLE:
         advice = (
             f"it was made by an older perception; build the map again from {info.get('source', 'its photos')}"
@@ -225,9 +220,7 @@ def _read_instances(file: Path) -> tuple[list[dict[str, Any]], bytes]:
             raise ValueError("an id occurs twice")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         problem = f"no {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(
-            f"{file}: cannot be read as instances ({problem}); the map is damaged, build it again or copy it anew"
-        ) from error
+        raise damaged(file, f"cannot be read as instances ({problem})") from error
     return instances, raw
 
 

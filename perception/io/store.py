@@ -19,7 +19,8 @@ import contextlib
 import json
 import math
 import shutil
-from pathlib import Path
+from collections import defaultdict
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ from perception.io.instance_index import build_index
 from perception.io.map import Map
 from perception.io.map_files import FORMAT_VERSION, MapFiles, map_signature, read_info
 from perception.io.map_lock import writing
-from perception.io.map_views import StoredView, moved_record, stored_view, view_json
+from perception.io.map_views import StoredView, moved_record, stored_view, view_from_json, view_json
 from perception.io.ply import write_ply
 from perception.io.safe_names import safe_name
 from perception.types import View
@@ -43,6 +44,7 @@ __all__ = [
     "map_signature",
     "read_info",
     "read_map",
+    "relink",
     "set_labels",
     "verify_map",
     "write_gaussian_ply",
@@ -147,6 +149,40 @@ def write_facts(file: Path, facts: dict[str, Any]) -> None:
     """Writes map.json with its own checksum; the caller holds the write lock."""
     with atomic_file(file) as aside:
         _dump(aside, seal(facts) if "files" in facts else facts)
+
+
+def relink(path: Path, folder: Path) -> dict[str, Any]:
+    """Records for every view of the map at `path` the photo below `folder` with the same name and size.
+
+    A photo is searched by the view name ("a/0001.jpg"), else by the file name alone if that is unique below `folder`.
+    Views without such a photo keep their record. Returns {"linked": count, "missing": names, "differ": names of
+    photos of another size}. InputError when no photo is found, or while the map is locked by another writer.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is no folder; give the one that holds the photos of {path}")
+    by_name: dict[str, list[Path]] = defaultdict(list)
+    for file in sorted(folder.rglob("*")):
+        by_name[file.name].append(file)
+    with writing(path):
+        files = MapFiles(path)
+        entries, linked, missing, differ = [], 0, [], []
+        for entry, view in zip(files.facts.get("views", []), files.read("views"), strict=True):
+            alike = by_name[PurePosixPath(view.name).name]
+            found = next((f for f in (folder / view.name, *(alike if len(alike) == 1 else [])) if f.is_file()), None)
+            if found is None:
+                missing.append(view.name)
+            elif view.photo_bytes not in (None, found.stat().st_size):
+                differ.append(view.name)
+            else:
+                linked += 1
+                record = view_json(stored_view(view_from_json({**entry, "photo": str(found)}), path))
+                entry = {**entry, **{key: record[key] for key in ("photo", "photo_beside", "photo_bytes")}}
+            entries.append(entry)
+        if linked == 0:
+            other = f", {len(differ)} have another size than the photos of the map" if differ else ""
+            raise InputError(f"{folder}: holds none of the {len(entries)} photos of {path}{other}; give their folder")
+        write_facts(path / FACTS, {**files.facts, "views": entries})
+    return {"linked": linked, "missing": missing, "differ": differ}
 
 
 def _with_checksums(info: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -16,9 +16,8 @@ from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.documents import brief, read_json
 from perception.io.ignore_masks import mask_of
 from perception.io.photos import SUFFIXES, photo_size, why_left_out
-from perception.io.reading import Reading
+from perception.io.reading import Cloud, Reading, start_points
 from perception.io.safe_names import safe_name
-from perception.io.start_points import Cloud, start_points
 from perception.io.triangulate import posed_scene
 from perception.io.views import fit_lens, make_view, rigid_pose
 from perception.types import DepthImage, Lens, Scene, View

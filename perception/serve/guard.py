@@ -1,12 +1,10 @@
-"""The checks before every request: host, token, rate, content type, body size, and time to send the body."""
+"""The checks before every request: host, token, content type, body size, and time to send the body."""
 
 from __future__ import annotations
 
 import asyncio
 import hmac
 import time
-from collections import OrderedDict
-from collections.abc import Callable
 from typing import Any
 
 from perception.listening import names_this_machine
@@ -15,7 +13,6 @@ from perception.serve.settings import ServeSettings
 
 OPEN = {"/", "/page.js", "/page.css", "/openapi.json", "/health"}
 """Paths that need no token; without one, /health returns its status only."""
-_MAX_CLIENTS = 4096
 _MAX_DROPPED = 8 << 20
 _HEADERS = [
     (b"x-content-type-options", b"nosniff"),
@@ -39,9 +36,8 @@ class Guard:
     send that only after a preflight request, which is never granted.
     """
 
-    def __init__(self, app: Any, settings: ServeSettings, clock: Callable[[], float] = time.monotonic) -> None:
-        self.app, self.settings, self._clock = app, settings, clock
-        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+    def __init__(self, app: Any, settings: ServeSettings) -> None:
+        self.app, self.settings = app, settings
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] != "http":
@@ -64,10 +60,6 @@ class Guard:
             name = headers.get("host", "")
             if not names_this_machine(name, settings.host):
                 return problem(403, f"Host '{name[:80]}' is not this machine; ask for 127.0.0.1 or localhost")
-        wait = self._wait(scope["client"][0] if scope.get("client") else "")
-        if wait > 0:
-            reason = f"more than {settings.rate:g} requests a second; ask again in {wait:.1f} s"
-            return problem(429, reason, {"Retry-After": str(max(1, round(wait)))})
         if not trusted and scope["path"] not in OPEN:
             why = "the token is wrong" if "authorization" in headers else "a token is needed"
             return problem(401, f"{why}; send it as 'Authorization: Bearer TOKEN'", {"WWW-Authenticate": "Bearer"})
@@ -81,20 +73,6 @@ class Guard:
             return True
         kind, _, given = headers.get("authorization", "").partition(" ")
         return kind.lower() == "bearer" and hmac.compare_digest(given.strip().encode(), self.settings.token.encode())
-
-    def _wait(self, client: str) -> float:
-        """Token bucket by client: seconds until it may send again; 0 takes one from its bucket."""
-        rate = self.settings.rate
-        if rate == 0:
-            return 0.0
-        now, most = self._clock(), max(1.0, 2 * rate)
-        level, before = self._buckets.pop(client, (most, now))
-        level = min(most, level + (now - before) * rate)
-        short = max(0.0, (1 - level) / rate)
-        self._buckets[client] = (level if short else level - 1, now)
-        if len(self._buckets) > _MAX_CLIENTS:
-            self._buckets.popitem(last=False)
-        return short
 
     async def _body(self, receive: Any) -> tuple[Any, Any]:
         """Reads the body within its limits; (rejection, receive) or (None, a receive that returns the body again).

@@ -58,7 +58,7 @@ def serve(
         config = uvicorn.Config(
             connections.watched(build_app(engine, settings)),
             http=connections.protocol_class(),
-            proxy_headers=False,  # a client could forge them to evade its rate limit
+            proxy_headers=False,  # a client could forge them
             log_level="warning",
             lifespan="off",
             server_header=False,

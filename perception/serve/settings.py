@@ -12,9 +12,9 @@ from perception.listening import check_address
 @dataclass(frozen=True)
 class ServeSettings:
     """host, port: where to listen (port 0: any free one). token: what clients must send as `Authorization: Bearer`;
-    None only on this machine. timeout: seconds an answer may take. queue_size, workers: of the engine. rate: requests a
-    second and client, averaged, bursts of twice as many; 0 = no bound. max_body: bytes of a request. watch: seconds
-    between looks at the map's directory, 0 = never. photos: folders whose photos may be shown besides the map's own."""
+    None only on this machine. timeout: seconds an answer may take. queue_size, workers: of the engine. max_body: bytes
+    of a request. watch: seconds between looks at the map's directory, 0 = never. photos: folders whose photos may be
+    shown besides the map's own."""
 
     host: str = "127.0.0.1"
     port: int = 8765
@@ -22,13 +22,12 @@ class ServeSettings:
     timeout: float = 10.0
     workers: int = 2
     queue_size: int = 64
-    rate: float = 100.0
     max_body: int = 64 << 10
     watch: float = 1.0
     photos: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, least in (("timeout", 1e-3), ("workers", 1), ("queue_size", 1), ("rate", 0), ("max_body", 1)):
+        for name, least in (("timeout", 1e-3), ("workers", 1), ("queue_size", 1), ("max_body", 1)):
             if not getattr(self, name) >= least:
                 raise InputError(f"serve: {name} is {getattr(self, name)}, expected at least {least}")
         if not self.watch >= 0:

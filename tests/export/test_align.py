@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from perception.errors import InputError
 from perception.export import align as module
 from perception.export.align import Alignment, align
-from perception.export.align_rotations import _grid
+from perception.export.align_steps import _grid
 from perception.export.depth_views import observe
 from perception.types import PointCloud
 from support import box_rooms

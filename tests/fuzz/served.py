@@ -63,7 +63,7 @@ class HttpTarget:
         self._folder = TemporaryDirectory(prefix="fuzz-")
         path = write_map_of(Path(self._folder.name, "a.gsmap"), gaussians=100)
         engine = QueryEngine(path, watch=None, encoders=encoders, timeout=60)
-        self._app = build_app(engine, ServeSettings(rate=0))
+        self._app = build_app(engine, ServeSettings())
         self._loop = asyncio.new_event_loop()
         self._asked = [seed.partition(b"\n\n") for seed in self.seeds() if seed.startswith(b"POST")]
 

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from perception.report import InstanceRow, QueryRow, ReportData, ViewRow, write_report
-from perception.report.charts import clock, curve, short, ticks
+from perception.report.page import clock, curve, short, ticks
 
 NASTY = "<script>alert('x')</script> & \"quotes\""
 

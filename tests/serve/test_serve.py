@@ -31,7 +31,6 @@ from perception.io.store import read_map
 from perception.listening import is_local, read_token
 from perception.query import QueryEngine, QueryMap
 from perception.serve.app import build_app
-from perception.serve.guard import Guard
 from perception.serve.settings import ServeSettings
 
 TOKEN = "0123456789abcdef0123"
@@ -49,7 +48,7 @@ def engine(path: Path) -> Iterator[QueryEngine]:
 
 
 def client_of(engine: QueryEngine, **settings: Any) -> TestClient:
-    app = build_app(engine, ServeSettings(**{"rate": 0, **settings}))
+    app = build_app(engine, ServeSettings(**settings))
     return TestClient(app, base_url="http://127.0.0.1:8765", raise_server_exceptions=False)
 
 
@@ -316,24 +315,6 @@ def test_other_sites_cannot_ask_through_a_browser_on_this_machine(client: TestCl
     assert preflight.status_code == 405 and "access-control-allow-origin" not in preflight.headers
 
 
-def test_who_asks_too_often_waits(engine: QueryEngine) -> None:
-    """A bucket of 2 · rate drops that fills at the rate: the oracle is arithmetic on a clock of our own."""
-    now = [0.0]
-    guard = Guard(None, ServeSettings(rate=5), clock=lambda: now[0])
-    assert [guard._wait("a") > 0 for _ in range(12)] == [False] * 10 + [True] * 2
-    assert guard._wait("b") == 0  # another client has a bucket of its own
-    now[0] = 0.41  # two drops and a little
-    assert [guard._wait("a") > 0 for _ in range(3)] == [False, False, True]
-    for number in range(10_000):
-        guard._wait(f"client {number}")
-    assert len(guard._buckets) <= 4096
-    client = client_of(engine, rate=1)
-    answers = [client.get("/health") for _ in range(4)]
-    assert [answer.status_code for answer in answers[:2]] == [200, 200]
-    refused(answers[-1], 429, "1 requests a second")
-    assert int(answers[-1].headers["Retry-After"]) >= 1
-
-
 def test_a_full_queue_and_a_slow_answer_are_told(path: Path) -> None:
     with QueryEngine(path, watch=None, workers=1, queue_size=1, timeout=0.2, encoders=encoders) as engine:
         client = client_of(engine)
@@ -403,7 +384,7 @@ def test_a_token_file_must_hold_one_long_word(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "settings",
-    [{"port": -1}, {"port": 70000}, {"timeout": 0}, {"workers": 0}, {"queue_size": 0}, {"rate": -1}, {"watch": -1}],
+    [{"port": -1}, {"port": 70000}, {"timeout": 0}, {"workers": 0}, {"queue_size": 0}, {"watch": -1}],
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(InputError):

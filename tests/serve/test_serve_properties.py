@@ -85,7 +85,7 @@ BODIES = {
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     path: Path = write_map_of(tmp_path_factory.mktemp("serve") / "a.gsmap", gaussians=300)
     with QueryEngine(path, watch=None, encoders=encoders) as engine:
-        app = build_app(engine, ServeSettings(rate=0))
+        app = build_app(engine, ServeSettings())
         yield TestClient(app, base_url="http://127.0.0.1:8765", raise_server_exceptions=False)
 
 
