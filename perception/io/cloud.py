@@ -23,7 +23,7 @@ _NOT_LABELS = {"alpha", "diffuse_alpha", "a", "rgb", "rgba"}
 
 
 def read_cloud(path: str | Path) -> PointCloud:
-    """Read .ply (cloud or mesh), .pcd, .npz, .xyz/.txt/.pts, .las or .laz.
+    """Read .ply (cloud or mesh), .pcd, .npz or .xyz/.txt/.pts.
 
     points are float64 where the file stores doubles, else float32; integer columns besides the colours become
     `labels`; faces of more than three corners are split into fans. NaN and infinite points are kept in place.
@@ -170,26 +170,6 @@ def _read_xyz(path: Path) -> PointCloud:
     return cloud
 
 
-def _read_las(path: Path) -> PointCloud:
-    """points [P, 3] float64 (scale and offset applied); 16-bit colours become 8-bit; `classification` is a label."""
-    try:
-        import laspy
-    except ImportError as error:
-        raise InputError(f"{path}: LAS and LAZ need the package 'laspy'; run: pip install 'laspy[lazrs]'") from error
-    try:
-        las = laspy.read(path)
-    except (laspy.errors.LaspyException, ValueError, OSError) as error:
-        raise InputError(f"{path}: is not a readable LAS/LAZ file ({error})") from error
-    known = {"classification", "instance_id", "semantic_id"} & set(las.point_format.dimension_names)
-    columns = {axis: np.asarray(las[axis], np.float64) for axis in "xyz"} | {n: np.asarray(las[n]) for n in known}
-    if {"red", "green", "blue"} <= set(las.point_format.dimension_names):
-        wide = np.stack([np.asarray(las[name]) for name in _COLORS[0]])
-        # The standard asks for 16 bits, but many writers leave 8-bit values unscaled.
-        eight = (wide >> 8 if wide.max(initial=0) > 255 else wide).astype(np.uint8)
-        columns |= dict(zip(_COLORS[0], eight, strict=True))
-    return _cloud_of(columns, path)
-
-
 def _triangles(faces: np.ndarray, path: Path) -> np.ndarray:
     if faces.dtype != object:
         if faces.ndim != 2:
@@ -234,10 +214,9 @@ _READERS: dict[str, Callable[[Path], PointCloud]] = {
     ".pcd": lambda path: _cloud_of(read_pcd(path), path),
     ".npz": _read_npz,
     **dict.fromkeys((".xyz", ".txt", ".pts"), _read_xyz),
-    **dict.fromkeys((".las", ".laz"), _read_las),
 }
-# Memory to read a file as a multiple of its size, for compressed and text formats.
-_BYTES_PER_BYTE = {".laz": 40, ".xyz": 8, ".txt": 8, ".pts": 8}
+# Memory to read a file as a multiple of its size, for text formats.
+_BYTES_PER_BYTE = {".xyz": 8, ".txt": 8, ".pts": 8}
 _WRITERS: dict[str, Callable[[Path, PointCloud], None]] = {
     ".ply": _write_ply_cloud,
     ".pcd": _write_pcd_cloud,

@@ -192,23 +192,18 @@ def _with_checksums(info: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 def write_gaussian_ply(path: Path, gmap: Map) -> None:
     """The standard 3DGS properties in their usual order; f_rest is channel-major (all R, then G, then B)."""
-    count = len(gmap)
-    rest = gmap.sh[:, 1:].transpose(0, 2, 1).reshape(count, -1)
-    table: dict[str, np.ndarray] = {}
-    for i, name in enumerate("xyz"):
-        table[name] = gmap.means[:, i]
-    for name in ("nx", "ny", "nz"):
-        table[name] = np.zeros(count, np.float32)
-    for i in range(3):
-        table[f"f_dc_{i}"] = gmap.sh[:, 0, i]
-    for i in range(rest.shape[1]):
-        table[f"f_rest_{i}"] = rest[:, i]
-    table["opacity"] = gmap.opacity_logits
-    for i in range(3):
-        table[f"scale_{i}"] = gmap.log_scales[:, i]
-    for i in range(4):
-        table[f"rot_{i}"] = gmap.quats[:, i]
-    write_ply(path, {"vertex": {name: np.ascontiguousarray(column, np.float32) for name, column in table.items()}})
+    rest = gmap.sh[:, 1:].transpose(0, 2, 1).reshape(len(gmap), -1)
+    groups = {
+        "xyz": gmap.means,
+        ("nx", "ny", "nz"): np.zeros((len(gmap), 3)),
+        tuple(f"f_dc_{i}" for i in range(3)): gmap.sh[:, 0],
+        tuple(f"f_rest_{i}" for i in range(rest.shape[1])): rest,
+        ("opacity",): gmap.opacity_logits[:, None],
+        tuple(f"scale_{i}" for i in range(3)): gmap.log_scales,
+        tuple(f"rot_{i}" for i in range(4)): gmap.quats,
+    }
+    columns = {name: values[:, i] for names, values in groups.items() for i, name in enumerate(names)}
+    write_ply(path, {"vertex": {name: np.ascontiguousarray(column, np.float32) for name, column in columns.items()}})
 
 
 def _dump(path: Path, value: Any) -> None:

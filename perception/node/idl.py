@@ -96,8 +96,8 @@ def _annotation(definition: tuple[Any, Any]) -> Any:
         return _nested(detail)
     inner, length = detail
     if kind.name == "ARRAY":
-        return t.array[_annotation(inner), length]
-    return t.sequence[_annotation(inner), length] if length else t.sequence[_annotation(inner)]
+        return t.array[_annotation(inner), length]  # type: ignore[misc]
+    return t.sequence[_annotation(inner), length] if length else t.sequence[_annotation(inner)]  # type: ignore[misc]
 
 
 _BASES: dict[str, Any] = {"bool": bool, "string": str}

@@ -7,40 +7,21 @@ import numpy as np
 from perception.io.store import Map
 
 PIXEL = 0.0015
-"""Angle of a click in radians: about a pixel of a laptop's window. Thinner Gaussians are widened to it."""
+"""Angle of a click in radians: about a pixel of a laptop's window."""
 SEEN = 0.15
-"""Smallest summed weight on the ray, in [0, 1], at which an instance is picked."""
-
-
-def responses(
-    means: np.ndarray, quats: np.ndarray, scales: np.ndarray, origin: np.ndarray, direction: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The ray parameter t [N] where each Gaussian is largest, and its value exp(−½ d²) [N]; 0 behind the origin.
-
-    In the Gaussian's own axes, scaled to a unit ball, the ray o + t d is nearest the centre at t = −o·d / d·d.
-    """
-    from scipy.spatial.transform import Rotation
-
-    direction = direction / np.linalg.norm(direction)
-    away = means - origin
-    width = PIXEL * np.abs(away @ direction)
-    radii = np.sqrt(scales**2 + (width**2)[:, None])
-    world_from_own = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
-    o = np.einsum("nij,ni->nj", world_from_own, -away) / radii
-    d = np.einsum("nij,i->nj", world_from_own, direction) / radii
-    dd = np.einsum("ni,ni->n", d, d)
-    t = -np.einsum("ni,ni->n", o, d) / dd
-    nearest = o + t[:, None] * d
-    strength = np.exp(-0.5 * np.einsum("ni,ni->n", nearest, nearest))
-    return t, np.where(t > 0, strength, 0)
+"""Smallest weight in the picture, in [0, 1], at which an instance is picked."""
 
 
 def pick(gmap: Map, ids: np.ndarray, shown: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> int | None:
     """The instance id that a ray (origin [3], direction [3], map frame) shows, None when it meets none.
 
-    Alpha compositing along the ray, front to back: the instance with the largest summed weight. shown [N] bool:
-    Gaussians that are visible.
+    A pixel is rendered along the ray: the instance with the largest weight in it. shown [N] bool: Gaussians that are
+    visible.
     """
+    import torch
+
+    from perception.gaussians.rasterize import rasterize
+
     origin, direction = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
     if not np.isfinite([origin, direction]).all() or not direction.any():
         return None
@@ -49,21 +30,24 @@ def pick(gmap: Map, ids: np.ndarray, shown: np.ndarray, origin: np.ndarray, dire
     away = gmap.means - origin
     along = away @ unit
     off = np.linalg.norm(away - along[:, None] * unit, axis=1)
-    reach = 4 * (gmap.scales.max(axis=1) + PIXEL * np.abs(along))
-    near = np.flatnonzero(shown & (off < reach))
-    if len(near) == 0:
+    near = np.flatnonzero(shown & (along > 0) & (off < 4 * (gmap.scales.max(axis=1) + PIXEL * along)))
+    found, owner = np.unique(ids[near], return_inverse=True)
+    if not (found >= 0).any():
         return None
-    quats = gmap.quats[near].astype(np.float64)
-    quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1.0, 0, 0, 0])
-    t, strength = responses(gmap.means[near].astype(np.float64), quats, gmap.scales[near], origin, direction)
-    order = np.argsort(t, kind="stable")
-    alpha = np.minimum(gmap.opacities[near] * strength, 0.999)[order]
-    light = np.concatenate([[1.0], np.cumprod(1 - alpha)[:-1]])
-    owners = ids[near][order]
-    totals = np.bincount(owners + 1, weights=alpha * light)[1:]
-    if len(totals) == 0 or totals.max() < SEEN:
-        return None
-    return int(totals.argmax())
+    side = np.cross(unit, np.eye(3)[np.abs(unit).argmin()])
+    axes = np.stack([side, np.cross(unit, side), unit])
+    pose = np.eye(4)
+    pose[:3, :3] = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    pose[:3, 3] = -pose[:3, :3] @ origin
+    K = np.array([[1 / PIXEL, 0, 0.5], [0, 1 / PIXEL, 0.5], [0, 0, 1]])
+    arrays = (gmap.means[near], gmap.quats[near], gmap.scales[near], gmap.opacities[near], pose[None], K[None])
+    means, quats, scales, opacities, camera, lens = (torch.from_numpy(array.astype(np.float32)) for array in arrays)
+    features, colors = torch.nn.functional.one_hot(torch.from_numpy(owner.reshape(-1))).float(), torch.zeros_like(means)
+    with torch.no_grad():
+        out = rasterize(means, quats, scales, opacities, colors, camera, lens, 1, 1, features=features)
+    assert out.features is not None
+    weights = np.where(found >= 0, out.features[0, 0, 0].numpy(), 0)
+    return int(found[weights.argmax()]) if weights.max() >= SEEN else None
 
 
 def covariances(gmap: Map) -> np.ndarray:

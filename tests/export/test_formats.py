@@ -11,7 +11,7 @@ from perception.boxes import oriented_box
 from perception.errors import InputError
 from perception.export.formats import write_export, write_scannet
 from perception.export.transfer import ExportOptions, check_overlap, export_labels
-from perception.io.cloud import read_cloud, write_cloud
+from perception.io.cloud import read_cloud
 from perception.types import PointCloud
 
 
@@ -67,17 +67,6 @@ def test_export_file_and_sidecar(tmp_path):
     assert sidecar["0"] == {"score": 0.25, "label": "mug", "num_points": int((labels == 0).sum())}
 
 
-def test_plyfile_reads_what_is_written(tmp_path):
-    plyfile = pytest.importorskip("plyfile")
-    cloud, labels = scene(200)
-    cloud.faces = np.array([[0, 1, 2], [3, 4, 5]], np.int32)
-    write_export(tmp_path / "out.ply", cloud, labels, {})
-    data = plyfile.PlyData.read(str(tmp_path / "out.ply"))
-    np.testing.assert_array_equal(np.stack([data["vertex"][a] for a in "xyz"], axis=1), cloud.points)
-    np.testing.assert_array_equal(data["vertex"]["instance_id"], labels)
-    assert [list(f) for f in data["face"]["vertex_indices"]] == cloud.faces.tolist()
-
-
 def test_a_cloud_in_another_frame_is_told_with_its_distance():
     cloud, _ = scene()
     assert check_overlap(np.asarray(cloud.points) + 0.5, cloud.points) == pytest.approx(1 / 8, abs=0.05)
@@ -120,23 +109,3 @@ def test_scannet_submission_layout(tmp_path):
     assert [(row[1], float(row[2])) for row in rows] == [("1", 0.9), ("1", 0.5), ("1", 0.2)]
     for row, i in zip(rows, (1, 2, 0), strict=True):
         np.testing.assert_array_equal(np.loadtxt(tmp_path / row[0], dtype=int), labels == i)
-
-
-def test_laz_through_laspy(tmp_path):
-    laspy = pytest.importorskip("laspy")
-    las = laspy.create(point_format=2, file_version="1.2")
-    las.header.offsets, las.header.scales = [4e5, 5e6, 0], [0.001, 0.001, 0.001]
-    xyz = np.array([[400000.125, 5000000.5, 1.25], [400001.0, 5000002.0, 3.0]])
-    las.x, las.y, las.z = xyz.T
-    las.red, las.green, las.blue = np.array([[65535, 256, 0], [0, 65280, 512]]).T
-    las.classification = [2, 6]
-    las.write(str(tmp_path / "a.las"))
-    cloud = read_cloud(tmp_path / "a.las")
-    np.testing.assert_allclose(cloud.points, xyz, atol=1e-9)
-    assert cloud.colors.tolist() == [[255, 1, 0], [0, 255, 2]]
-    assert cloud.labels["classification"].tolist() == [2, 6]
-    write_cloud(tmp_path / "a.ply", cloud)
-    np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply").points, cloud.points)
-    (tmp_path / "b.las").write_bytes(b"nothing")
-    with pytest.raises(InputError, match="LAS"):
-        read_cloud(tmp_path / "b.las")

@@ -266,7 +266,7 @@ class ViewerTarget:
             panel.refresh()
 
         def redraw() -> None:
-            assert session.colors(np.eye(4)).shape == (60, 3) and session.opacities().shape == (60,)
+            assert session.colors().shape == (60, 3) and session.opacities().shape == (60,)
 
         server = SimpleNamespace(gui=gui, get_clients=dict)
         page = SimpleNamespace(session=session, server=server, guarded=guarded, redraw=redraw, overlay=lambda *_: None)

@@ -15,8 +15,7 @@ import perception
 from perception.cli import main
 from perception.errors import InputError
 from perception.io.map import PhotosMoved
-from perception.io.relink import relink
-from perception.io.store import read_map, verify_map, write_map
+from perception.io.store import read_map, relink, verify_map, write_map
 from perception.query.crops import best_crop
 from perception.types import View
 from support.query_maps import write_map_of
