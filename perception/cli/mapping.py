@@ -73,13 +73,17 @@ _SHORTCUTS = {
 """Settings with an option of their own: the last part of their name."""
 
 
+def settings_given(args: argparse.Namespace) -> list[str]:
+    """KEY=VALUE of every setting on the command line, those of --set first."""
+    values = {key: getattr(args, key) for key in _SHORTCUTS}
+    values |= {"photos.strict": args.strict, "frame.keep_world": args.keep_world}
+    return args.pairs + [f"{key}={value}" for key, value in values.items() if value is not None]
+
+
 def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.config import load_config
 
-    values = {key: getattr(args, key) for key in _SHORTCUTS}
-    values |= {"photos.strict": args.strict, "frame.keep_world": args.keep_world}
-    given = [f"{key}={value}" for key, value in values.items() if value is not None]
-    config = load_config(args.config, args.pairs + given, args.preset)
+    config = load_config(args.config, settings_given(args), args.preset)
     from perception.pipeline.mapping import build_map
     from perception.pipeline.summary import map_facts
     from perception.progress import Progress

@@ -23,15 +23,14 @@ from perception.pipeline.reporting import _left_out, rerun_command
 def test_the_command_that_makes_a_map_again_means_the_same_settings(pairs: list[str], preset: str) -> None:
     """The command is given to the program's own parser, and the settings it comes to are compared."""
     from perception.cli import build_parser
-    from perception.cli.mapping import _SHORTCUTS
+    from perception.cli.mapping import settings_given
 
     config = load_config(None, pairs, preset)
     info = {"source": "my photos/", "seed": config.seed, "config": config.to_json()}
     words = shlex.split(rerun_command(info, Path("a b.gsmap")))
     args = build_parser().parse_args(words[1:])
-    given = [f"{key}={getattr(args, name)}" for name, key in _SHORTCUTS.items() if getattr(args, name) is not None]
     assert (str(args.input), args.output) == ("my photos", Path("a b.gsmap"))
-    assert load_config(args.config, args.pairs + given, args.preset) == config
+    assert load_config(args.config, settings_given(args), args.preset) == config
 
 
 def test_photos_that_are_not_in_the_map_are_named_by_reason() -> None:
