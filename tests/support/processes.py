@@ -20,7 +20,7 @@ def hears_ctrl_c() -> None:
 SERVER = (
     "import sys; from pathlib import Path; from support.query_maps import encoders\n"
     "from perception.serve.server import serve; from perception.serve.settings import ServeSettings\n"
-    "serve(Path(sys.argv[1]), ServeSettings(port=int(sys.argv[2]), rate=0, timeout=5), encoders=encoders)\n"
+    "serve(Path(sys.argv[1]), ServeSettings(port=int(sys.argv[2]), timeout=5), encoders=encoders)\n"
 )
 
 
