@@ -65,7 +65,7 @@ def _gradient(image: np.ndarray) -> np.ndarray:
     import cv2
 
     x, y = cv2.Sobel(image, -1, 1, 0) / 8, cv2.Sobel(image, -1, 0, 1) / 8
-    return np.sqrt((x * x + y * y).sum(axis=-1))
+    return np.sqrt(_dot(x, x) + _dot(y, y))
 
 
 def _colour_bins(lab: np.ndarray) -> np.ndarray:
@@ -96,32 +96,38 @@ def _unproject(z: np.ndarray, K: np.ndarray) -> np.ndarray:
 def _tangent(points: np.ndarray, axis: int, reach: int = 3) -> np.ndarray:
     """[h, w, 3] tangent along x (axis 0) or y (axis 1): central difference if smooth, else the smaller side's."""
     along = 1 - axis
-    chord = np.take(points, range(reach, points.shape[along]), along)
-    chord = chord - np.take(points, range(points.shape[along] - reach), along)
+    first, last = (slice(None),) * along + (slice(-reach),), (slice(None),) * along + (slice(reach, None),)
+    chord = points[last] - points[first]
     ahead, behind = (
         np.pad(chord, [side if i == along else (0, 0) for i in range(3)], "edge") for side in ((0, reach), (reach, 0))
     )
-    one_sided = np.where(np.abs(ahead[..., 2:]) <= np.abs(behind[..., 2:]), ahead, behind)
-    smooth = np.abs(ahead[..., 2:] - behind[..., 2:]) < 0.01 * points[..., 2:]
-    return np.where(smooth, (ahead + behind) / 2, one_sided)
+    z_ahead, z_behind = ahead[..., 2], behind[..., 2]
+    share = (np.abs(z_ahead) <= np.abs(z_behind)).astype(np.float32)
+    share[np.abs(z_ahead - z_behind) < 0.01 * points[..., 2]] = 0.5
+    return behind + share[..., None] * (ahead - behind)
 
 
 def _across(points: np.ndarray, normals: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Step and bend over ±_REACH pixels, each [h, w]."""
-    a, b = (_shifted(points, axis, d) for d in (-_REACH, _REACH))
-    normal_a, normal_b = (_shifted(normals, axis, d) for d in (-_REACH, _REACH))
+    a, b = _both_sides(points, axis)
+    normal_a, normal_b = _both_sides(normals, axis)
     chord = b - a
-    off_a, off_b = (np.abs((normal * chord).sum(axis=-1)) for normal in (normal_a, normal_b))
-    bend = ((normal_b - normal_a) * chord).sum(axis=-1) / (np.linalg.norm(chord, axis=-1) + 1e-9)
-    return np.minimum(off_a, off_b) / points[..., 2], bend
+    off_a, off_b = _dot(normal_a, chord), _dot(normal_b, chord)
+    step = np.minimum(np.abs(off_a), np.abs(off_b)) / points[..., 2]
+    return step, (off_b - off_a) / (np.sqrt(_dot(chord, chord)) + 1e-9)
 
 
-def _shifted(image: np.ndarray, axis: int, by: int) -> np.ndarray:
-    """image[y, x + by] (axis 0) or image[y + by, x] (axis 1), with the border replicated."""
-    along = 1 - axis
-    index = np.clip(np.arange(image.shape[along]) + by, 0, image.shape[along] - 1)
-    return np.take(image, index, axis=along)
+def _both_sides(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """The values _REACH pixels before and after each pixel along x (axis 0) or y (axis 1), the border replicated."""
+    h, w = image.shape[:2]
+    padded = np.pad(image, ((_REACH * axis,) * 2, (_REACH * (1 - axis),) * 2, (0, 0)), "edge")
+    return padded[:h, :w], padded[-h:, -w:]
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[h, w] scalar products of vectors [h, w, C]."""
+    return np.asarray(np.einsum("hwc,hwc->hw", a, b))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / (np.linalg.norm(vectors, axis=-1, keepdims=True) + 1e-12)
+    return vectors / (np.sqrt(_dot(vectors, vectors))[..., None] + 1e-12)
