@@ -18,7 +18,7 @@ from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.progress import Progress
 from perception.types import View
 
-VERSION = 8  # increased whenever the label images change, so that cached ones are recomputed
+VERSION = 9  # increased whenever the label images change, so that cached ones are recomputed
 _SMOOTH = 0.03  # relative to the depth: a pixel with a larger depth step is not part of the surface
 _LEAST_VOXELS = 100
 
@@ -62,7 +62,7 @@ class BuiltinSegmentation:
         surface = fuse(found)
         if len(surface) < _LEAST_VOXELS:
             return
-        self._segment = segments(surface_graph(found, surface))
+        self._segment = segments(surface_graph(found, surface))[0]
         self._views = {view.name: view for view in found}
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:

@@ -1,73 +1,156 @@
-"""Merges surface patches into objects: greedy, most likely pair first; then joins large coplanar parts.
+"""Divides the surface into objects: the best cut of a tree of merges; then joins large coplanar parts.
 
-The decision is a logistic regression on the evidence of a pair. The evidence is recomputed after every merge
-(Nunez-Iglesias et al. 2013).
+The most likely pair of neighbours is merged first, and the evidence is recomputed after every merge (Nunez-Iglesias et
+al. 2013), until nothing is left to merge. The cut maximises Σ (p − cost) over its regions, where p is the learned
+probability that a region is an object.
 """
 
 from __future__ import annotations
 
 import heapq
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
+from perception.masks.merge_model import MergeModel, packaged_model
 from perception.masks.surface_graph import SurfaceGraph
 
-# Log odds that two patches belong to one object, in the order of SurfaceGraph.features: a logistic regression on pairs
-# of patches of two rendered scenes with exact ground truth. These are the only learned weights. On the tabletop,
-# weights fitted on the other scene alone give AP 0.526, fitted on both 0.493. The method's spread is 0.1.
-WEIGHTS = np.array(
-    [7.25, -0.91, -0.97, 0.17, -5.47, 0.08, 0.0, -0.39, -0.48, 1.1, 0.23, -2.09,
-     0.69, -0.64, 0.27, -1.92, 1.53, 2.66, 4.16, 4.36, -5.11, -5.43, -1.69, 4.29,
-     0.7, -0.12, 2.58, 1.12, 0.28, 0.0, 0.35, -0.13, -0.01, 0.39, -2.6]
-)  # fmt: skip
-THRESHOLD = 1.2  # log odds; above 0 because merges are final, while a split pair may still be joined
-SMALLEST = 2e-4  # area / (camera distance)² below which a patch always joins a neighbour
+SMALLEST = 2e-4  # area / (camera distance)² below which a patch joins a neighbour before all others do
 _LARGE = 0.1  # area in the same unit, above which a flat segment can be a part of a floor, a wall or a table
 _FLAT = 0.03  # relative to depth: standard deviation of such a segment across its plane, including low objects on it
+_UNKNOWN = 9.0  # largest log odds of a feature, and those of merges inside a patch
 
 
-def segments(graph: SurfaceGraph) -> np.ndarray:
-    """[V] int32 segment of each voxel, numbered from 1 by falling size; 0 for small patches without neighbours."""
-    ends = join_planes(graph, agglomerate(graph))
-    small = np.array([graph.area(end) < SMALLEST for end in ends.tolist()])[graph.patch]
-    _, index, counts = np.unique(ends[graph.patch], return_inverse=True, return_counts=True)
-    rank = np.empty(len(counts), np.int32)
-    rank[np.argsort(-counts, kind="stable")] = np.arange(1, len(counts) + 1)
-    return np.where(small, 0, rank[index]).astype(np.int32)
+def segments(graph: SurfaceGraph, model: MergeModel | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """[V] int32 segment of each voxel, numbered from 1 by falling size; 0 for small patches without neighbours.
 
-
-def agglomerate(graph: SurfaceGraph) -> np.ndarray:
-    """Merges the most likely pair of neighbours until none reaches THRESHOLD. Patches under SMALLEST always merge.
-
-    Returns [R] the final patch that each patch was merged into. The graph is modified.
+    Also [S + 1] float64 per segment: the probability of an IoU above 0.5 with an object. The graph is modified.
     """
-    parent = np.arange(len(graph.sums))
-    version = np.zeros(len(parent), np.int64)  # a queue entry is stale if either patch was merged since
-    queue: list[tuple[float, int, int, int, int]] = []
+    model = model or packaged_model()
+    return divided(graph, tree_by(model, graph), model)
 
-    def offer(a: int, others: list[int]) -> None:
-        scores = graph.features(a, others) @ WEIGHTS
-        for b, score in zip(others, scores.tolist(), strict=True):
-            if score >= THRESHOLD or graph.area(a) < SMALLEST or graph.area(b) < SMALLEST:
-                heapq.heappush(queue, (-score, a, b, int(version[a]), int(version[b])))
 
-    for a, links in enumerate(graph.borders):
-        if later := [b for b in links if b > a]:
-            offer(a, later)
+def tree_by(model: MergeModel, graph: SurfaceGraph) -> MergeTree:
+    """The tree of merges in the order of the model's log odds."""
+    return merge_tree(graph, lambda state, pairs: model.pair(state.features(pairs))[:, 0])
+
+
+def divided(graph: SurfaceGraph, tree: MergeTree, model: MergeModel) -> tuple[np.ndarray, np.ndarray]:
+    """As `segments`, from a tree of the graph."""
+    odds = model.whole(tree.features)
+    slope, offset = model.calibration
+    sure = _probability(slope * odds[:, 0] + offset)
+    regions = tree.cut(_probability(odds).mean(axis=1) - model.cost)
+    ends = join_planes(graph, merged(graph, regions))
+    ends[[graph.area(end) < SMALLEST for end in ends.tolist()]] = -1
+    names, index, counts = np.unique(ends[graph.patch], return_inverse=True, return_counts=True)
+    order = np.lexsort((-counts, names < 0))
+    rank = np.empty(len(names), np.int32)
+    rank[order] = np.arange(1, len(names) + 1)
+    rank[names < 0] = 0
+    probability = np.zeros(int(rank.max()) + 1)
+    np.maximum.at(probability, rank[np.searchsorted(names, ends)], sure[regions])
+    probability[0] = 0
+    return rank[index], probability
+
+
+def _probability(odds: np.ndarray) -> np.ndarray:
+    return np.asarray(1 / (1 + np.exp(-odds.astype(np.float64))))
+
+
+@dataclass(frozen=True)
+class MergeTree:
+    """Leaves 0 … R − 1 are the patches, then one region per merge, in order. children: [M, 2]; features: [R + M, F]."""
+
+    leaves: int
+    children: np.ndarray
+    features: np.ndarray
+
+    def leaf_sums(self, values: np.ndarray) -> np.ndarray:
+        """[R + M, C] sum over the leaves of each region. values: [R, C]."""
+        sums = np.concatenate([values, np.zeros((len(self.children), values.shape[1]), values.dtype)])
+        for k, pair in enumerate(self.children, start=self.leaves):
+            sums[k] = sums[pair[0]] + sums[pair[1]]
+        return sums
+
+    def cut(self, gain: np.ndarray) -> np.ndarray:
+        """[R] the region of each leaf, in the set of disjoint regions with the largest sum of `gain` [R + M]. Where a
+        region and its parts are equal, the region is taken."""
+        best = gain.astype(np.float64)
+        owner = np.arange(len(gain))
+        whole = np.ones(len(gain), bool)
+        for k, (one, two) in enumerate(self.children.tolist(), start=self.leaves):
+            if best[one] + best[two] > best[k]:
+                best[k], whole[k] = best[one] + best[two], False
+        for k in range(len(gain) - 1, self.leaves - 1, -1):
+            if whole[k] or owner[k] != k:
+                owner[self.children[k - self.leaves]] = owner[k]
+        return owner[: self.leaves]
+
+
+def merge_tree(graph: SurfaceGraph, score: Callable[[SurfaceGraph, np.ndarray], np.ndarray]) -> MergeTree:
+    """Merges the most likely pair of neighbours until no neighbours are left; patches under SMALLEST come first.
+
+    score: (graph as merged so far, pairs [M, 2]) -> [M] log odds that the two are one; −inf: never merge.
+    """
+    graph = graph.copy()
+    count = graph.count
+    node = list(range(count))  # of each patch that others were merged into
+    lowest, last, leaves = [_UNKNOWN] * count, [_UNKNOWN] * count, [1] * count
+    features: dict[int, np.ndarray] = {}
+    children: list[tuple[int, int]] = []
+    version = np.zeros(count, np.int64)  # a queue entry is stale if either patch was merged since
+    queue: list[tuple[bool, float, int, int, int, int]] = []
+
+    def offer(pairs: list[tuple[int, int]]) -> None:
+        if not pairs:
+            return
+        for (a, b), odds in zip(pairs, score(graph, np.array(pairs)).tolist(), strict=True):
+            if odds > -np.inf:
+                large = min(graph.area(a), graph.area(b)) >= SMALLEST
+                heapq.heappush(queue, (large, -odds, a, b, int(version[a]), int(version[b])))
+
+    def describe(a: int, sibling: int | None, odds: float) -> None:
+        k = node[a]
+        history = [lowest[k], last[k], np.log(leaves[k]), odds]
+        features[k] = np.concatenate([np.clip(history, -_UNKNOWN, _UNKNOWN), graph.region_features(a, sibling)])
+
+    offer([(a, b) for a, links in enumerate(graph.borders) for b in links if a < b])
     while queue:
-        _, a, b, version_a, version_b = heapq.heappop(queue)
+        _, odds, a, b, version_a, version_b = heapq.heappop(queue)
         if version[a] != version_a or version[b] != version_b:
             continue
         if graph.size(a) < graph.size(b):
             a, b = b, a
+        describe(a, b, -odds)
+        describe(b, a, -odds)
+        lowest.append(min(-odds, lowest[node[a]], lowest[node[b]]))
+        last.append(-odds)
+        leaves.append(leaves[node[a]] + leaves[node[b]])
+        children.append((node[a], node[b]))
         graph.merge(a, b)
-        parent[b] = a
+        node[a], node[b] = len(leaves) - 1, -1
         version[[a, b]] += 1
-        if graph.borders[a]:
-            offer(a, list(graph.borders[a]))
-    while (parent != parent[parent]).any():
-        parent = parent[parent]
-    return parent
+        offer([(a, other) for other in graph.borders[a]])
+    for a in range(count):
+        if node[a] >= 0:
+            describe(a, None, -_UNKNOWN)
+    rows = np.array([features[k] for k in range(len(leaves))], np.float32)
+    return MergeTree(count, np.array(children, np.int64).reshape(-1, 2), rows)
+
+
+def merged(graph: SurfaceGraph, regions: np.ndarray) -> np.ndarray:
+    """Merges the patches of each connected region in `graph`. regions: [R]. Returns [R] the patch each became."""
+    into = np.arange(graph.count)
+    for region in np.unique(regions).tolist():
+        members = set(np.flatnonzero(regions == region).tolist())
+        first = min(members)
+        while near := sorted(members & graph.borders[first].keys()):
+            for b in near:
+                graph.merge(first, b)
+                into[b] = first
+    return into
 
 
 def join_planes(graph: SurfaceGraph, ends: np.ndarray) -> np.ndarray:

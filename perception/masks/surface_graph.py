@@ -7,13 +7,15 @@ longer than either one, the side and the top of a box are not.
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 
 from perception import _core
 from perception.masks.cues import COLOUR_BINS, DepthCues, PhotoCues
 from perception.masks.surface import Surface
 
-FEATURES = 35
+FEATURES = 34
 NEIGHBOURS = 8
 _STEP = 0.012  # relative to depth: minimum size of a step between surfaces
 _STEP_CAP = 0.06
@@ -23,7 +25,8 @@ _SHARP = 12.0  # border gradient above which it counts as an edge
 
 # Columns of the sums over a patch's pixels and voxels, then of the sums over border pixels of two patches.
 _AREA, _LAB, _TEXTURE, _DEPTH = 0, slice(1, 4), 4, 5
-_VOXELS, _NORMAL, _POINT, _SQUARES, _COLOURS = 6, slice(7, 10), slice(10, 13), slice(13, 19), slice(19, None)
+_VOXELS, _NORMAL, _POINT, _SQUARES = 6, slice(7, 10), slice(10, 13), slice(13, 19)
+_COLOURS = slice(19, 19 + COLOUR_BINS)
 _LENGTH, _EDGE, _SHARPS, _STEPS, _BROKEN, _CONCAVE, _CONVEX, _CONTACT = range(8)
 _UPPER = np.triu_indices(3)
 
@@ -64,7 +67,7 @@ class SurfaceGraph:
         local = (surface.points - surface.points.mean(axis=0)).astype(np.float64)
         squares = np.stack([local[:, i] * local[:, j] for i, j in zip(*_UPPER, strict=True)], axis=1)
         maps = [np.ones((len(patch), 1)), surface.normals, local, squares]
-        self.sums = np.zeros((count, _COLOURS.start + COLOUR_BINS))
+        self.sums = np.zeros((count, _COLOURS.stop))
         self.sums[:, _VOXELS : _COLOURS.start] = _sum_by(patch, np.concatenate(maps, axis=1), count)
         ends = patch[edges]
         ends = np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1).astype(np.int64)
@@ -105,25 +108,27 @@ class SurfaceGraph:
                 a, b = divmod(key, self.count)
                 self.borders[a][b] = self.borders[b][a] = row
         self.contacts = np.array([sum(row[_CONTACT] for row in links.values()) for links in self.borders])
+        self.extents = _extents(self.sums / self.sums[:, _VOXELS, None])
 
     def size(self, patch: int) -> float:
         """Number of voxels."""
         return float(self.sums[patch, _VOXELS])
 
-    def features(self, a: int, others: list[int]) -> np.ndarray:
-        """Features [M, FEATURES] for the decision whether `a` and each of `others` are one object."""
-        border = np.stack([self.borders[a][b] for b in others])
+    def features(self, pairs: np.ndarray) -> np.ndarray:
+        """Features [M, FEATURES] for the decision whether the two patches of each pair [M, 2] are one object."""
+        border = np.stack([self.borders[a][b] for a, b in pairs.tolist()])
         length = border[:, _LENGTH]
-        one, two = self.sums[a], self.sums[others]
-        look_a, look_b = one / max(one[_AREA], 1), two / np.maximum(two[:, _AREA], 1)[:, None]
-        shape_a, shape_b = one / one[_VOXELS], two / two[:, _VOXELS, None]
-        depth = (one[_DEPTH] + two[:, _DEPTH]) / np.maximum(one[_AREA] + two[:, _AREA], 1)
+        one, two = self.sums[pairs[:, 0]], self.sums[pairs[:, 1]]
+        look_a, look_b = (sums / np.maximum(sums[:, _AREA, None], 1) for sums in (one, two))
+        shape_a, shape_b = (sums / sums[:, _VOXELS, None] for sums in (one, two))
+        depth = (one[:, _DEPTH] + two[:, _DEPTH]) / np.maximum(one[:, _AREA] + two[:, _AREA], 1)
         depth = np.maximum(depth, 1e-9)
-        colour = (look_b[:, _LAB] - look_a[_LAB]) ** 2 @ np.array([0.5, 2.0, 2.0])
-        smaller, larger = (f(one[_VOXELS], two[:, _VOXELS]) * self.unit / depth**2 for f in (np.minimum, np.maximum))
+        colour = (look_b[:, _LAB] - look_a[:, _LAB]) ** 2 @ np.array([0.5, 2.0, 2.0])
+        size = one[:, _VOXELS], two[:, _VOXELS]
+        smaller, larger = (f(*size) * self.unit / depth**2 for f in (np.minimum, np.maximum))
         turn, offset, concave, convex, same_plane = _surface_features(shape_a, shape_b, depth)
-        a_is_larger = one[_VOXELS] > two[:, _VOXELS]
-        extents = _extents(shape_a[None]), _extents(shape_b)
+        a_is_larger = size[0] > size[1]
+        extents = self.extents[pairs[:, 0]], self.extents[pairs[:, 1]]
         flat = [np.exp(-extent[:, 0] / (0.01 * depth)) for extent in extents]
         flat_of_larger = np.where(a_is_larger, *flat)
         sharp, broken = border[:, _SHARPS] / length, border[:, _BROKEN] / length
@@ -131,16 +136,15 @@ class SurfaceGraph:
         grand = np.log(larger) + 2
         return np.stack(
             [
-                np.ones(len(others)),
                 np.log1p(border[:, _EDGE] / length),
                 sharp,
                 np.log1p(np.sqrt(colour)),
-                1 - np.minimum(look_a[_COLOURS], look_b[:, _COLOURS]).sum(axis=1),
-                np.abs(look_a[_TEXTURE] - look_b[:, _TEXTURE]),
-                np.minimum(look_a[_TEXTURE], look_b[:, _TEXTURE]),
+                1 - np.minimum(look_a[:, _COLOURS], look_b[:, _COLOURS]).sum(axis=1),
+                np.abs(look_a[:, _TEXTURE] - look_b[:, _TEXTURE]),
+                np.minimum(look_a[:, _TEXTURE], look_b[:, _TEXTURE]),
                 np.log(smaller) + 6,
                 grand,
-                border[:, _CONTACT] / np.minimum(self.contacts[a], self.contacts[others]),
+                border[:, _CONTACT] / self.contacts[pairs].min(axis=1),
                 np.log(border[:, _CONTACT] * self._scale / depth) + 2,
                 border[:, _STEPS] / length,
                 broken,
@@ -160,6 +164,33 @@ class SurfaceGraph:
             axis=1,
         )
 
+    def region_features(self, a: int, sibling: int | None) -> np.ndarray:
+        """[18] features for the decision whether `a` is a whole object: area and extents, all its borders together,
+        texture and variety of colour, and size and contact of the neighbour that it would be merged with next."""
+        sums, links = self.sums[a], self.borders[a]
+        voxels, pixels, depth = sums[_VOXELS], max(sums[_AREA], 1), max(self.depth(a), 1e-9)
+        border = sum(links.values(), np.zeros(_CONTACT + 1))
+        length = max(border[_LENGTH], 1)
+        colours = sums[_COLOURS] / pixels
+        extents = np.maximum(self.extents[a] / depth, 1e-3)
+        beside = [0.0, 0.0]
+        if sibling is not None:
+            other = self.size(sibling)
+            beside = [np.log(other / voxels), np.log1p(links[sibling][_CONTACT]) - np.log(min(other, voxels)) / 2]
+        return np.array(
+            [
+                np.log(max(self.area(a), 1e-7)),
+                *np.log(extents),
+                *border[_EDGE:_CONTACT] / length,
+                np.log1p(border[_CONTACT]) - np.log(voxels) / 2,
+                len(links),
+                sums[_TEXTURE] / pixels,
+                -(colours * np.log(colours + 1e-9)).sum(),
+                *beside,
+                np.log(pixels / voxels),
+            ]
+        )
+
     def depth(self, a: int) -> float:
         """Mean depth over the pixels that show the patch."""
         return float(self.sums[a, _DEPTH] / max(self.sums[a, _AREA], 1))
@@ -170,27 +201,31 @@ class SurfaceGraph:
 
     def flatness(self, a: int) -> float:
         """Standard deviation across the patch's plane, relative to its depth."""
-        return float(_extents(self.sums[a][None] / self.sums[a, _VOXELS])[0, 0] / max(self.depth(a), 1e-9))
+        return float(self.extents[a, 0] / max(self.depth(a), 1e-9))
 
     def one_plane(self, a: int, b: int) -> bool:
-        """Whether the two patches are parts of one plane. They must be coplanar. If they touch, there must be no edge
-        between them (unlike a picture on its wall); if they do not touch, their colours must agree."""
-        shape_a, shape_b = (self.sums[i] / self.sums[i, _VOXELS] for i in (a, b))
-        normal_a, normal_b = _direction(shape_a), _direction(shape_b)
-        chord = shape_b[_POINT] - shape_a[_POINT]
-        offset = max(abs(float(chord @ normal)) for normal in (normal_a, normal_b))
-        if 1 - abs(float(normal_a @ normal_b)) > _TURN or offset > _OFFSET * (self.depth(a) + self.depth(b)) / 2:
-            return False
-        border = self.borders[a].get(b)
-        if border is not None:
-            return bool(border[_SHARPS] < 0.5 * border[_LENGTH])
+        """Whether two patches that do not touch are parts of one plane: coplanar, with colours that agree."""
+        shapes = (self.sums[[i]] / self.sums[i, _VOXELS] for i in (a, b))
+        (point_a, normal_a), (point_b, normal_b) = (
+            (s[0, _POINT], np.linalg.eigh(_covariance(s)[0])[1][:, 0]) for s in shapes
+        )
+        offset = max(abs(float((point_b - point_a) @ normal)) for normal in (normal_a, normal_b))
+        turned = 1 - abs(float(normal_a @ normal_b)) > _TURN or offset > _OFFSET * (self.depth(a) + self.depth(b)) / 2
         words = (self.sums[i, _COLOURS] / max(self.sums[i, _AREA], 1) for i in (a, b))
-        return bool(np.minimum(*words).sum() > _ALIKE)
+        return b not in self.borders[a] and not turned and bool(np.minimum(*words).sum() > _ALIKE)
+
+    def copy(self) -> SurfaceGraph:
+        """A graph that can be merged without changing this one."""
+        other = copy.copy(self)
+        other.sums, other.contacts, other.extents = self.sums.copy(), self.contacts.copy(), self.extents.copy()
+        other.borders = [dict(links) for links in self.borders]  # their rows are never written to
+        return other
 
     def merge(self, a: int, b: int) -> None:
         """Merges patch b into patch a: the sums and borders of b are added to those of a, in place."""
         self.contacts[a] += self.contacts[b] - 2 * self.borders[a].pop(b)[_CONTACT]
         self.sums[a] += self.sums[b]
+        self.extents[a] = _extents(self.sums[a : a + 1] / self.sums[a, _VOXELS])
         for other, row in self.borders[b].items():
             if other != a:
                 del self.borders[other][b]
@@ -206,11 +241,11 @@ def neighbours(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _surface_features(shape_a: np.ndarray, shape_b: np.ndarray, depth: np.ndarray) -> list[np.ndarray]:
     """Geometric relation of two patches. Each is approximated by a plane through its mean point."""
-    normal_a = shape_a[_NORMAL] / (np.linalg.norm(shape_a[_NORMAL]) + 1e-9)
-    normal_b = shape_b[:, _NORMAL] / (np.linalg.norm(shape_b[:, _NORMAL], axis=1, keepdims=True) + 1e-9)
-    chord = shape_b[:, _POINT] - shape_a[_POINT]
-    turn = np.minimum(1 - normal_b @ normal_a, 1.0)
-    offset = np.maximum(np.abs(chord @ normal_a), np.abs((chord * normal_b).sum(axis=1))) / depth
+    normals = (shape[:, _NORMAL] for shape in (shape_a, shape_b))
+    normal_a, normal_b = (n / (np.linalg.norm(n, axis=1, keepdims=True) + 1e-9) for n in normals)
+    chord = shape_b[:, _POINT] - shape_a[:, _POINT]
+    turn = np.minimum(1 - (normal_b * normal_a).sum(axis=1), 1.0)
+    offset = np.maximum(*(np.abs((chord * normal).sum(axis=1)) for normal in (normal_a, normal_b))) / depth
     bend = ((normal_b - normal_a) * chord).sum(axis=1) / (np.linalg.norm(chord, axis=1) + 1e-9)
     same_plane = np.exp(-offset / 0.01 - turn / 0.05)
     return [turn, 5 * np.minimum(offset, 0.2), np.maximum(-bend, 0), np.maximum(bend, 0), same_plane]
@@ -228,27 +263,21 @@ def _growth_features(
 
     Distance of the patches in units of both extents along it. For each axis: extent of the union over that of the
     larger patch; extents of the larger and of the smaller patch over the depth. Volume of the union over both. All but
-    the first are logarithms. one: [C] sums of a patch; two: [M, C] of its neighbours; extents: [1, 3] and [M, 3]
-    of these. least: lower limit of an extent, so that logarithms are finite.
+    the first are logarithms. one, two: [M, C] sums of the patches; extents: [M, 3] of each. least: lower limit of an
+    extent, so that logarithms are finite.
     """
-    shape_a, shape_b, union = (sums / sums[:, _VOXELS, None] for sums in (one[None], two, one + two))
+    shape_a, shape_b, union = (sums / sums[:, _VOXELS, None] for sums in (one, two, one + two))
     chord = shape_b[:, _POINT] - shape_a[:, _POINT]
     distance = np.maximum(np.linalg.norm(chord, axis=1), least)
     chord = chord / distance[:, None]
     along = np.zeros(len(two))
     for shape in (shape_a, shape_b):
-        covariance = np.broadcast_to(_covariance(shape), (len(two), 3, 3))
-        along += np.sqrt(np.maximum(np.einsum("mi,mij,mj->m", chord, covariance, chord), least**2))
+        along += np.sqrt(np.maximum(np.einsum("mi,mij,mj->m", chord, _covariance(shape), chord), least**2))
     a, b, whole = (np.maximum(extent, least) for extent in (*extents, _extents(union)))
     larger, smaller = (np.where(choice[:, None], a, b) for choice in (one_is_larger, ~one_is_larger))
     volume = np.log(whole.prod(axis=1) / (a.prod(axis=1) + b.prod(axis=1)))
     logs = [np.log(whole / larger), np.log(larger / depth[:, None]), np.log(smaller / depth[:, None])]
     return np.concatenate([(distance / along)[None], *(log.T for log in logs), volume[None]])
-
-
-def _direction(shape: np.ndarray) -> np.ndarray:
-    """[3] normal (sign arbitrary) of the plane through a patch, from its mean point and squares [C]."""
-    return np.asarray(np.linalg.eigh(_covariance(shape[None])[0])[1][:, 0])
 
 
 def _covariance(shape: np.ndarray) -> np.ndarray:

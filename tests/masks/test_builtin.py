@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from perception.errors import InputError
 from perception.masks import GeometryMaskSource, compute_masks, load_labels, make_source
 from perception.masks.builtin import fuse, surface_graph
 from perception.masks.cues import depth_cues
+from perception.masks.merge_model import packaged_model
+from perception.masks.merging import MergeTree, segments, tree_by
 from perception.masks.stereo import confirmed, homographies, measure_depths, plane_depths
 from perception.masks.stereo_views import StereoView, make_stereo_view
 from perception.masks.surface import pack_voxels, to_world, unpack_voxels, voxel_keys
@@ -210,8 +213,8 @@ def test_merging_patches_keeps_the_evidence_exact():
     compared = 0
     for i, a in enumerate(kept):
         for j in fresh.borders[i]:
-            old, new = (g.features(*pair)[0] for g, pair in ((first, (int(a), [int(kept[j])])), (fresh, (i, [j]))))
-            contact = [9, 10]  # contacts that no photo shows are forgotten
+            old, new = (g.features(np.array([pair]))[0] for g, pair in ((first, (a, kept[j])), (fresh, (i, j))))
+            contact = [8, 9]  # contacts that no photo shows are forgotten
             np.testing.assert_allclose(np.delete(old, contact), np.delete(new, contact), atol=1e-6)
             np.testing.assert_allclose(old[contact], new[contact], atol=0.1)
             compared += 1
@@ -249,7 +252,9 @@ def test_growth_of_a_union_against_its_voxels():
                 *np.log(small / depth),
                 np.log(union.prod() / (big.prod() + small.prod())),
             ]
-            np.testing.assert_allclose(graph.features(a, [b])[0, -11:], expected, atol=1e-4)  # points are float32
+            np.testing.assert_allclose(
+                graph.features(np.array([[a, b]]))[0, -11:], expected, atol=1e-4
+            )  # points are float32
             compared += 1
     assert compared > 20
 
@@ -331,3 +336,95 @@ def test_normals_and_creases_of_known_surfaces():
     box = np.flatnonzero(ids[:, 80] == 3)[8:-8]
     bent = box[np.abs(cues.bend[1, box, 80]) > 0.5]
     assert len(bent) and (cues.bend[1, bent, 80] > 0).all()  # top and front of the box, convex
+
+
+def random_tree(rng: np.random.Generator, leaves: int) -> MergeTree:
+    """One or more trees over the leaves, merged in random order."""
+    alive, children, roots = list(range(leaves)), [], int(rng.integers(1, 4))
+    while len(alive) > roots:
+        children.append([alive.pop(int(rng.integers(len(alive)))) for _ in range(2)])
+        alive.append(leaves + len(children) - 1)
+    return MergeTree(leaves, np.array(children), np.zeros((leaves + len(children), 1)))
+
+
+def test_the_cut_of_a_tree_against_all_cuts():
+    rng = np.random.default_rng(4)
+    for _ in range(30):
+        tree = random_tree(rng, 7)
+        members = tree.leaf_sums(np.eye(7, dtype=int)) > 0
+
+        def cuts(left: frozenset[int], members: np.ndarray = members) -> Iterator[tuple[int, ...]]:
+            """All sets of regions that divide the leaves left."""
+            if not left:
+                yield ()
+            for k in range(len(members)):
+                leaves = frozenset(np.flatnonzero(members[k]).tolist())
+                if left and min(left) in leaves and leaves <= left:
+                    yield from ((k, *rest) for rest in cuts(left - leaves))
+
+        gain = rng.normal(0, 1, len(members))
+        best = max(gain[list(cut)].sum() for cut in cuts(frozenset(range(7))))
+        owner = tree.cut(gain)
+        assert all((owner[members[k]] == k).all() and not (owner[~members[k]] == k).any() for k in owner)
+        np.testing.assert_allclose(gain[np.unique(owner)].sum(), best)
+
+
+def test_regions_of_the_tree_are_sums_of_their_patches():
+    seen = true_views()[:3]
+    surface = fuse(seen)
+    graph = surface_graph(seen, surface)
+    tree = tree_by(packaged_model(), graph)
+    sums = tree.leaf_sums(graph.sums)
+    area = sums[:, 6] * surface.size**2 / (sums[:, 5] / np.maximum(sums[:, 0], 1)).clip(1e-9) ** 2
+    np.testing.assert_allclose(tree.features[:, 4], np.log(area), atol=1e-4)
+    np.testing.assert_allclose(np.exp(tree.features[:, 2]), tree.leaf_sums(np.ones((graph.count, 1)))[:, 0], rtol=1e-5)
+
+
+def test_networks_give_the_same_bits_for_any_batch():
+    network = packaged_model().pair
+    x = np.random.default_rng(0).normal(0, 2, (50, 34)) * network.parts[1] + network.parts[0]
+    whole = network(x)
+    np.testing.assert_array_equal(whole, np.concatenate([network(row[None]) for row in x]))
+    mean, scale, *layers = (part.astype(np.float64) for part in network.parts)
+    expected = []
+    for k in range(3):
+        h = np.clip((x - mean) / scale, -5, 5)
+        for weight, bias in zip(layers[::2], layers[1::2], strict=True):
+            h = (h if weight is layers[0] else np.maximum(h, 0)) @ weight[k].T + bias[k]
+        expected.append(h)
+    np.testing.assert_allclose(whole, np.mean(expected, axis=0), atol=1e-4)
+
+
+def test_segments_do_not_depend_on_the_order_of_patches():
+    seen = true_views()
+    surface = fuse(seen)
+    first = surface_graph(seen, surface)
+    order = np.random.default_rng(3).permutation(first.count).astype(np.int32)
+    second = SurfaceGraph(surface, order[first.patch], voxel_edges(surface))
+    for shown in seen:
+        photo, depth = shown.cues()
+        voxel = surface.voxel_of(to_world(depth.points, shown.world_from_camera))
+        second.add(np.where(voxel >= 0, second.patch[voxel], -1), photo, depth)
+    second.link()
+    (labels, probability), (others, _) = segments(first), segments(second)
+    np.testing.assert_array_equal(labels, others)
+    inside = np.all((surface.points > LOW - 0.02) & (surface.points < HIGH + 0.02), axis=1) & (
+        surface.points[:, 2] > 0.03
+    )
+    box = np.bincount(labels[inside]).argmax()
+    assert (inside & (labels == box)).sum() / (inside | (labels == box)).sum() > 0.7 and probability[box] > 0.5
+
+
+def test_noise_on_a_bare_wall_is_no_thing():
+    rng, views = np.random.default_rng(6), []
+    y, x = np.mgrid[:120, :160] + 0.5
+    for eye in EYES:
+        pose = camera_from_world(np.array(eye))
+        rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1) @ pose[:3, :3]
+        depth = (WALL - eye[1]) / rays[..., 1] * rng.normal(1, 0.004, x.shape)
+        photo = rng.normal(128, 3, (120, 160, 3)).astype(np.uint8)
+        views.append(make_stereo_view(View("", Path("x.jpg"), K, 160, 120, pose), photo, depth))
+    surface = fuse(views)
+    labels, probability = segments(surface_graph(views, surface))
+    small = np.bincount(labels, minlength=len(probability)) < 0.5 * len(labels)
+    assert (probability[small] < 0.5).all()
