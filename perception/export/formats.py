@@ -66,7 +66,7 @@ def write_scannet(
     try:
         masks.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{masks}: cannot be made ({error.strerror}); choose a place you may write to") from error
+        raise InputError(f"{masks}: cannot be written ({error.strerror}); choose a place you may write to") from error
     ids = np.unique(labels[labels >= 0]).tolist()
     score = {i: float(instances.get(i, {}).get("score", 1.0)) for i in ids}
     rows = []

@@ -198,6 +198,10 @@ def test_the_viewer_sees_labels_written_by_hand_and_into_old_maps(gmap: Path) ->
     text = (gmap / "instances.json").read_text()
     (gmap / "instances.json").write_text(text.replace('"label": null', '"label": "by hand"', 1))
     assert editor.outdated
+    with pytest.raises(InputError, match="another program"):
+        editor.save()
+    editor.reopen()
+    editor.rename(1, "by the editor")
     editor.save()
     assert [entry["label"] for entry in read_map(gmap).instances[:2]] == ["by hand", "by the editor"]
 

@@ -165,11 +165,11 @@ class Exporting(Case):
     def work(self, place: Path, trial: int) -> int:
         return self.export(place)
 
-    def export(self, place: Path) -> int:
+    def export(self, place: Path, *more: object) -> int:
         """One export into the folder `out`; the exit code."""
         out = place / "out"
         words = ["export", place / "m.gsmap", "--points", self.cloud, "-o", out / "cloud.ply", "--color", "instance"]
-        return command(*words, "--scannet", out / "scannet")
+        return command(*words, "--scannet", out / "scannet", *more)
 
     def after_kill(self, place: Path, trial: int) -> str:
         assert tree(place / "m.gsmap") == tree(self.gmap), "the exported map changed"
