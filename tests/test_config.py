@@ -35,7 +35,7 @@ def test_the_papers_preset_is_the_published_method() -> None:
     }
     assert found == {
         "train": {
-            "iterations": 30_000, "time_limit": None, "stop_psnr": None, "exchange_db": 0, "budget": 10**8,
+            "iterations": 30_000, "time_limit": None, "stop_psnr": None, "exchange_db": 0, "budget": 2_000_000,
             "transients": False, "sh_degree": 3,
         },
         "densify": {"every": 100, "grad_threshold": 3.5e-4},

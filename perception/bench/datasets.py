@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from perception.bench.output import bench_parser, finish
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory, atomic_file
 from perception.io.store import Map, read_map
 from perception.pipeline.mapping import build_map
-from perception.pipeline.record import versions
 from perception.pipeline.rendering import as_gaussians, map_views
 from perception.progress import Progress
 from perception.query import QueryMap
@@ -66,20 +66,14 @@ class DatasetBench(ABC):
     @classmethod
     def main(cls, arguments: Sequence[str] | None = None) -> None:
         """Command line entry point; prints the table or JSON, and writes WORK/NAME.json."""
-        parser = argparse.ArgumentParser(prog=f"perception bench {cls.name}", description=cls.__doc__)
+        parser = bench_parser(cls.name, cls.__doc__)
         parser.add_argument("dataset", type=Path, metavar="DIR", help="the dataset as downloaded")
-        parser.add_argument(
-            "-o", "--output", type=Path, required=True, metavar="WORK", help="maps, predictions, result"
-        )
         parser.add_argument("--maps", type=Path, metavar="DIR", help="finished maps <scene>.gsmap (default WORK/maps)")
         parser.add_argument("--scenes", type=lambda text: text.split(","), metavar="A,B", help="only these")
-        parser.add_argument(
-            "--masks", default="auto", metavar="SOURCE", help="of the mapper; {scene} is the scene's name"
-        )
+        parser.add_argument("--masks", default="auto", metavar="SOURCE", help="as of `map`; {scene}: the scene's name")
         parser.add_argument("--preset", default="default")
         parser.add_argument("--config", type=Path, metavar="FILE.toml")
         parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
-        parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
         cls.add_arguments(parser)
         bench = cls(parser.parse_args(arguments))
         found = bench.scenes()
@@ -92,28 +86,33 @@ class DatasetBench(ABC):
         scenes = {name: folder for name, folder in found.items() if name in wanted}
         failed = bench._predict_all(scenes)
         (bench.work / "predictions").mkdir(parents=True, exist_ok=True)
-        bench._report(*bench.score(scenes), failed, scenes)
+        result, table = bench.score(scenes)
+        maps = {name: _map_facts(bench.maps / f"{name}.gsmap") for name in scenes}
+        lines = [table] + [f"{name} failed and scores 0: {why}" for name, why in failed.items()]
+        facts = {"failed": failed, "maps": maps, "result": result}
+        finish(cls.name.replace("-", "_"), bench.args, facts, "\n".join(lines))
 
     def config(self, scene: str, more: Sequence[str] = ()) -> MapConfig:
         """The settings of a scene's map."""
-        pairs = [*self.args.pairs, f"masks={self.args.masks.replace('{scene}', scene)}", *more]
+        pairs = [*more, f"masks={self.args.masks.replace('{scene}', scene)}", *self.args.pairs]
         return load_config(self.args.config, pairs, self.args.preset)
 
-    def map(self, scene: str, source: Path, held_out: Sequence[str] | None = None) -> Map:
+    def map(self, scene: str, source: Path, held_out: Sequence[str] | None = None, settings: Sequence[str] = ()) -> Map:
         """The scene's map: read from `maps` if it is there, else built. An interrupted build is resumed.
 
-        held_out: names of photos excluded from training. They have no effect on a map that already exists.
+        held_out: names of photos excluded from training. settings: KEY=VALUE pairs of the data set, which --set
+        overrides. Neither has an effect on a map that already exists.
         """
         path = self.maps / f"{scene}.gsmap"
         if path.exists():
             self.progress.log(f"{scene}: using {path}")
             return read_map(path)
-        more = []
+        more = list(settings)
         if held_out is not None:
             listed = self.work / "held_out" / f"{scene}.txt"
             with atomic_file(listed) as aside:
                 aside.write_text("".join(f"{name}\n" for name in held_out), encoding="utf-8")
-            more = [f"photos.held_out={listed}"]
+            more.append(f"photos.held_out={listed}")
         path.parent.mkdir(parents=True, exist_ok=True)
         self.progress.log(f"{scene}: mapping {source}")
         return build_map(source, path, self.config(scene, more), resume=True, progress=self.progress)
@@ -133,21 +132,6 @@ class DatasetBench(ABC):
                 failed[name] = str(error)
                 self.progress.log(f"warning: {name} failed and scores 0: {error}")
         return failed
-
-    def _report(self, result: dict[str, Any], table: str, failed: dict[str, str], scenes: Mapping[str, Path]) -> None:
-        name = self.name.replace("-", "_")
-        facts = {
-            "bench": name,
-            "arguments": {key: str(value) for key, value in vars(self.args).items()},
-            "versions": versions(),
-            "failed": failed,
-            "maps": {scene: _map_facts(self.maps / f"{scene}.gsmap") for scene in scenes},
-            "result": result,
-        }
-        with atomic_file(self.work / f"{name}.json") as aside:
-            aside.write_text(json.dumps(facts, indent=1, default=str) + "\n", encoding="utf-8")
-        lines = [table] + [f"{scene} failed and scores 0: {why}" for scene, why in failed.items()]
-        print(json.dumps(facts, default=str) if self.args.json else "\n".join(lines))
 
     def chosen_truth(self, folders: Mapping[str, Path]) -> Path:
         """The download, or with --scenes a folder of links to the truth of these: `folders`, {path in it: folder}."""
@@ -237,18 +221,24 @@ class InstanceViews:
         return out.colors[0, ..., 0].numpy()
 
 
-def by_words(gmap: Map, prompt: str, rule: str) -> list[int]:
-    """Ids of the instances that a prompt selects by the map's own text query. The "present" threshold is not applied.
+def by_words(gmap: Map, prompt: str, rule: str, scoring: str = "calibrated") -> list[int]:
+    """Ids of the instances that a prompt selects by the map's own embeddings, whether or not it is present.
 
-    rule: "top-1", or "relative": all instances with (score − minimum) ≥ 0.85 (maximum − minimum).
+    rule: "top-1", or "relative": all instances with (score − minimum) ≥ 0.85 (maximum − minimum). scoring: the scores
+    are those of `query`, or with "cosine" the similarities of prompt and instance, for which the rules were published.
     """
-    hits = QueryMap.of(gmap).query(prompt, top_k=max(len(gmap.instances), 1), min_score=0.0)
-    if not hits:
+    opened, count = QueryMap.of(gmap), len(gmap.instances)
+    if not count:
         return []
-    if rule == "top-1":
-        return [hits[0].instance_id]
-    least, best = min(hit.score for hit in hits), hits[0].score
-    return [hit.instance_id for hit in hits if hit.score - least >= 0.85 * (best - least)]
+    if scoring == "cosine":
+        found = zip(opened.ranker.similarity([prompt])[0].tolist(), gmap.instances, opened.ranker.seen, strict=True)
+        ranked = sorted(((score, entry["id"]) for score, entry, seen in found if seen), key=lambda pair: -pair[0])
+    else:
+        ranked = [(hit.score, hit.instance_id) for hit in opened.query(prompt, top_k=count, min_score=0.0)]
+    if rule == "top-1" or not ranked:
+        return [i for _, i in ranked[:1]]
+    best, least = ranked[0][0], ranked[-1][0]
+    return [i for score, i in ranked if score - least >= 0.85 * (best - least)]
 
 
 def by_reference(ids: np.ndarray, reference: np.ndarray, share: float = 0.7) -> list[int]:

@@ -12,9 +12,10 @@ from perception.errors import InputError
 from perception.evaluate.layouts import read_lerf_polygons, run_lerf_ovs
 
 SELECTION = {
-    "top-1": "top-1 by the map's own words: best instance whether or not it says present",
-    "relative": "relative by the map's own words: all instances >= .85 of the best score after shifting the least to 0",
+    "top-1": "top-1: best instance whether or not the map says present",
+    "relative": "relative: all instances >= .85 of the best score after shifting the least to 0",
 }
+SCORING = {"calibrated": "the scores of query", "cosine": "cosine of prompt and instance"}
 
 
 class LerfOvs(DatasetBench):
@@ -27,6 +28,7 @@ class LerfOvs(DatasetBench):
     @classmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
         parser.add_argument("--select", choices=tuple(SELECTION), default="top-1")
+        parser.add_argument("--scoring", choices=tuple(SCORING), default="calibrated", help="of instances for a prompt")
         parser.add_argument("--occlusion", action="store_true", help="render with the other Gaussians in front")
         parser.add_argument("--train-on-test", action="store_true", help="labelled frames are trained on, as LangSplat")
 
@@ -41,7 +43,8 @@ class LerfOvs(DatasetBench):
         truths = read_lerf_polygons(scene)
         frames = sorted({frame for frame, _ in truths})
         shown = InstanceViews(self.map(name, source, [] if self.args.train_on_test else frames))
-        selected = {text: by_words(shown.gmap, text, self.args.select) for text in sorted({text for _, text in truths})}
+        how = (self.args.select, self.args.scoring)
+        selected = {text: by_words(shown.gmap, text, *how) for text in sorted({text for _, text in truths})}
         masks = {}
         for frame, text in truths:
             view = shown.find(frame)
@@ -51,7 +54,7 @@ class LerfOvs(DatasetBench):
 
     def score(self, scenes: Mapping[str, Path]) -> tuple[dict[str, Any], str]:
         switches = {
-            "selection": SELECTION[self.args.select],
+            "selection": f"{SELECTION[self.args.select]}, by {SCORING[self.args.scoring]}",
             "occlusion": "on" if self.args.occlusion else "off",
             "test_views": "trained on" if self.args.train_on_test else HELD_OUT,
         }

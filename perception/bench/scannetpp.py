@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +16,18 @@ import numpy as np
 
 from perception.bench.datasets import DatasetBench, link
 from perception.errors import InputError
+from perception.evaluate.labelled_clouds import instances_table
 from perception.evaluate.layouts import run_scannet
 from perception.export import ExportOptions, export_labels
 from perception.export.formats import write_scannet
 from perception.io.atomic import atomic_file
-from perception.io.cloud import read_cloud
+from perception.io.cloud import read_cloud, write_cloud
+from perception.io.photos import photo_size
+from perception.query import QueryMap
+from perception.types import PointCloud
 
 MESH = "mesh_aligned_0.05"
+FRAMES, POINTS = 300, 750_000  # of a scene, in the paper
 IGNORED = -2
 """Truth id of vertices that the mask file lists."""
 SEVERAL = 3
@@ -41,8 +48,10 @@ class ScanNetPP(DatasetBench):
     """DIR (or DIR/data)/<scene>: dslr/resized_images, dslr/colmap (in the mesh's frame), dslr/train_test_lists.json,
     scans/mesh_aligned_0.05.ply, segments.json, segments_anno.json and, where there, mesh_aligned_0.05_mask.txt
     (vertices to be ignored); DIR/metadata/semantic_benchmark/top100.txt, top100_instance.txt and map_benchmark.csv:
-    classes, and the class of each raw label; DIR/splits/<split>.txt. Every scene is mapped, the mesh's vertices are
-    labelled, and a submission in ScanNet's layout is scored against the truth. A scene that fails scores 0."""
+    classes, and the class of each raw label; DIR/splits/<split>.txt. Every scene is mapped as in the paper, unless
+    --set says otherwise: 300 photos at half resolution, from up to 750 000 vertices of the mesh; pixels that are black
+    in dslr/resized_anon_masks are ignored. The vertices are labelled, and a submission in ScanNet's layout is scored,
+    without classes and, if the maps describe their instances, by class. A scene that fails scores 0."""
 
     name, expected = "scannetpp", f"data/<scene>/scans/{MESH}.ply"
 
@@ -72,34 +81,75 @@ class ScanNetPP(DatasetBench):
         return path.read_text(encoding="utf-8").split() if path.is_file() else None
 
     def predict(self, name: str, scene: Path, target: Path) -> None:
-        """Maps a scene from its DSLR photos and writes the labelled vertices as a submission."""
-        source = self.work / "inputs" / name
-        for part, called in (("resized_images", "images"), ("colmap", "sparse")):
-            if not (scene / "dslr" / part).is_dir():
-                raise InputError(f"{scene / 'dslr' / part}: no such folder; download the scene's DSLR photos and poses")
-            link(scene / "dslr" / part, source / called)
-        tests = [] if self.args.train_on_test else _read(scene / "dslr" / "train_test_lists.json", "test")
-        gmap = self.map(name, source, list(map(str, tests)))
+        """Maps a scene from its DSLR photos; writes the labelled vertices as a submission, and classes.json: the class
+        of each instance, where the map describes them."""
+        named = None if self.args.truth == "all" else self.classes.names
+        photos, tests = self._link_photos(name, scene / "dslr")
         mesh = read_cloud(scene / "scans" / f"{MESH}.ply")
+        gmap = self.map(name, photos[0].parent.parent, tests, self._settings(name, scene, photos[0], mesh))
         segments = scene / "scans" / "segments.json"
         options = ExportOptions(max_distance=self.args.max_distance, smooth=self.args.smooth, segments=segments)
         labels = export_labels(gmap.means, gmap.instance_ids, mesh, options)
-        write_scannet(target, name, labels, {entry["id"]: entry for entry in gmap.instances})
+        classes = None
+        if named is not None and gmap.instances and (opened := QueryMap.of(gmap)).problem is None:
+            best = opened.ranker.similarity(named).argmax(axis=0).tolist()
+            classes = {entry["id"]: index for entry, index in zip(gmap.instances, best, strict=True)}
+            (target / "classes.json").write_text(json.dumps({i: named[index] for i, index in classes.items()}))
+        write_scannet(target, name, labels, {entry["id"]: entry for entry in gmap.instances}, classes)
+
+    def _link_photos(self, name: str, dslr: Path) -> tuple[list[Path], list[str]]:
+        """The photos to map, FRAMES of them evenly chosen by name, in a new COLMAP workspace; the names held out."""
+        for part in ("resized_images", "colmap"):
+            if not (dslr / part).is_dir() or not any((dslr / part).iterdir()):
+                raise InputError(f"{dslr / part}: missing or empty; download the scene's DSLR photos and poses")
+        tests = [] if self.args.train_on_test else list(map(str, _read(dslr / "train_test_lists.json", "test")))
+        trained = sorted(path for path in (dslr / "resized_images").iterdir() if path.name not in tests)
+        even = np.linspace(0, len(trained) - 1, min(FRAMES, len(trained))).round().astype(int)
+        source = self.work / "workspaces" / name
+        shutil.rmtree(source, ignore_errors=True)  # another choice
+        link(dslr / "colmap", source / "sparse")
+        photos = [trained[i] for i in even] + [dslr / "resized_images" / test for test in tests]
+        for photo in photos:
+            link(photo, source / "images" / photo.name)
+        return [source / "images" / photo.name for photo in photos], tests
+
+    def _settings(self, name: str, scene: Path, photo: Path, mesh: PointCloud) -> list[str]:
+        """The paper's for this data set: half resolution, up to POINTS vertices to start from, no anonymised pixels."""
+        start = scene / "scans" / f"{MESH}.ply"
+        if len(mesh.points) > POINTS:
+            rows = np.sort(np.random.default_rng(0).choice(len(mesh.points), POINTS, replace=False))
+            start = self.work / "points" / f"{name}.ply"
+            start.parent.mkdir(parents=True, exist_ok=True)
+            write_cloud(start, PointCloud(mesh.points[rows], None if mesh.colors is None else mesh.colors[rows]))
+        masks = scene / "dslr" / "resized_anon_masks"
+        given = [f"photos.ignore_masks={masks}"] if any(masks.glob("*.png")) else []
+        return [*given, f"photos.max_side={max(photo_size(photo)) // 2}", f"photos.init_points={start}"]
+
+    @cached_property
+    def classes(self) -> Classes:
+        return read_classes(self.args.dataset)
 
     def score(self, scenes: Mapping[str, Path]) -> tuple[dict[str, Any], str]:
-        whole = self.args.truth == "all"
+        classes = None if self.args.truth == "all" else self.classes
         truth, submission = self.work / "truth" / self.args.truth, self.work / "submission"
-        classes = None if whole else read_classes(self.args.dataset)
         for stale in (*truth.glob("*.txt"), *submission.glob("*.txt")):  # of other scenes
             stale.unlink()
         submission.mkdir(parents=True, exist_ok=True)
-        for name, scene in scenes.items():
+        parts = [self.work / "predictions" / name for name in scenes]
+        for part, (name, scene) in zip(parts, scenes.items(), strict=True):
             with atomic_file(truth / f"{name}.txt") as aside:
                 np.savetxt(aside, vertex_truth(scene, classes), fmt="%d")
-            part = self.work / "predictions" / name
             for file in (*part.glob(f"{name}.txt"), *part.glob("predicted_masks/*.txt")):
                 link(file, submission / file.relative_to(part))
         result, table = run_scannet(submission, truth, self.args.protocol)
+        if classes is not None and all((part / "classes.json").is_file() for part in parts if part.is_dir()):
+            valid = tuple(index for index, name in enumerate(classes.names) if name in classes.instance)
+            named, _ = run_scannet(submission, truth, self.args.protocol, by_class=True, valid_classes=valid)
+            named["classes"] = {classes.names[int(index)]: row for index, row in named["classes"].items()}
+            result["open_vocabulary"] = named
+            table += "\n\nby class, each instance the most similar of the class names (cosine):\n" + instances_table(
+                named
+            )
         switches = {
             "truth": "all annotations; the last one holds a vertex (Segment3D)"
             if classes is None

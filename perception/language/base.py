@@ -32,13 +32,15 @@ class Reading:
 
     parts: slices of its embeddings; empty: one part. margin: required distance above the map's probe scores, in their
     standard deviations. canonical: generic phrases that a prompt must exceed (LERF); empty for encoders whose sentence
-    embeddings do not describe images in general. zooms: best number of crops per view (3 in the paper).
+    embeddings do not describe images in general. zooms: best number of crops per view (3 in the paper). colors: it
+    knows colours, so that colour words stay in the prompt.
     """
 
     parts: tuple[Part, ...] = ()
     margin: float = 0.0
     zooms: int = 3
     canonical: tuple[str, ...] = ()
+    colors: bool = False
 
 
 def reading_of(encoder: Encoder) -> Reading:

@@ -33,7 +33,7 @@ class ClipEncoder:
     """Image and text towers of a CLIP, open_clip, MobileCLIP or SigLIP export. Both are opened and checked at once."""
 
     # LERF's canonical phrases. No package ships trained weights to tune with: margin and zooms are the defaults.
-    reading = Reading(canonical=("object", "things", "stuff", "texture"))
+    reading = Reading(canonical=("object", "things", "stuff", "texture"), colors=True)
     templates: tuple[str, ...] = ("an image of {}", "a photo of a {}", "{}")
 
     def __init__(self, image: Path, text: Path) -> None:

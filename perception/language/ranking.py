@@ -124,8 +124,9 @@ class Ranker:
 
     def _scores(self, text: str, quoted: str | None = None, gain: np.ndarray | float = 0.0) -> np.ndarray:
         """Scores [I] for a prompt; quoted: what must be printed on the instance; gain: added to z."""
-        colors = color_words(text)
-        row = self._encode([without_color_words(text)])
+        kept = self._reading.colors  # "a duck with a red hat" is not a red thing
+        colors = color_words(text.partition(" with ")[0] if kept else text)
+        row = self._encode([text if kept else without_color_words(text)])
         relevancy = self._relevancy(row)[0]
         middle, spread = self._null
         z = (relevancy - middle) / spread - self._reading.margin + self._shape_bonus(text) + gain
@@ -170,6 +171,10 @@ class Ranker:
             same = self._names[i] == _words(text)
             scores[i] = 1.0 if same else max(scores[i], _phi(float(z[n]) - LABEL_MARGIN))
         return scores
+
+    def similarity(self, texts: Sequence[str]) -> np.ndarray:
+        """Cosine of each text's embedding with each instance's [T, I] in [−1, 1], as in the paper; −1 if unseen."""
+        return np.where(self.seen, self._encode(texts) @ self._plain.T, -1.0)
 
     def relevancy(self, texts: Sequence[str]) -> np.ndarray:
         """Relevancy of each text for each instance [T, I], without colours, shapes and labels."""

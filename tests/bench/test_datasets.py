@@ -12,11 +12,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perception.bench import instances, lerf_mask, lerf_ovs, queries, scannetpp
-from perception.bench.datasets import by_reference
+from perception.bench.datasets import by_reference, by_words
 from perception.cli import main
 from perception.errors import InputError
-from perception.io.cloud import write_cloud
-from perception.io.store import read_info
+from perception.io.cloud import read_cloud, write_cloud
+from perception.io.store import read_info, read_map
+from perception.language.ranking import Ranker
+from perception.query import load_map
 from perception.types import PointCloud
 from support.demo_truth import labels_of, load_truth, things
 
@@ -128,6 +130,17 @@ def test_lerf_ovs_from_download_to_table(ovs_run: Path, downloads: Path, capsys:
     assert "occlusion: off" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("rule", "chosen"), [("top-1", [2]), ("relative", [2, 1])])
+def test_published_rules_apply_to_cosines(
+    rule: str, chosen: list[int], ovs_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gmap = read_map(ovs_run / "maps" / "table.gsmap")
+    cosines = np.full(len(gmap.instances), 0.2)
+    cosines[1:4] = 0.29, 0.3, 0.28  # (.285 − .2) is .85 of (.3 − .2)
+    monkeypatch.setattr(Ranker, "similarity", lambda *_: cosines[None])
+    assert by_words(gmap, "ball", rule, "cosine") == [gmap.instances[i]["id"] for i in chosen]
+
+
 def test_a_made_scene_is_a_truth_scene(ovs_run: Path, small_scene: Path, tmp_path: Path) -> None:
     """bench instances and bench queries on the generator's truth and a map in its frame."""
     scene, gmap = str(small_scene / "truth"), str(ovs_run / "maps" / "table.gsmap")
@@ -171,7 +184,11 @@ def test_lerf_mask_from_download_to_table(
 
 
 def test_scannetpp_from_download_to_table(
-    small_scene: Path, truth, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    small_scene: Path,
+    truth,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     scene = tmp_path / "spp" / "data" / "0a1b"
     shutil.copytree(small_scene / "images", scene / "dslr" / "resized_images")
@@ -181,29 +198,66 @@ def test_scannetpp_from_download_to_table(
     rows = np.arange(0, len(truth.points), 2)
     write_cloud(scene / "scans" / "mesh_aligned_0.05.ply", PointCloud(truth.points[rows], truth.colors[rows]))
     ids = truth.instance_ids[rows]
-    names = {thing.id: thing.name for thing in truth.instances}
+    names_of = {thing.id: thing.name for thing in truth.instances}
     (scene / "scans" / "segments.json").write_text(json.dumps({"segIndices": (10 * ids).tolist()}))
-    groups = [{"label": names[i], "objectId": i, "segments": [10 * i]} for i in np.unique(ids).tolist() if i in names]
+    groups = [
+        {"label": names_of[i], "objectId": i, "segments": [10 * i]} for i in np.unique(ids).tolist() if i in names_of
+    ]
     everything = {"label": "floor", "objectId": 999, "segments": (10 * np.unique(ids)).tolist()}  # larger: loses
     (scene / "scans" / "segments_anno.json").write_text(json.dumps({"segGroups": [everything, *groups]}))
     write_metadata(tmp_path / "spp", ["wall", "floor", *sorted({group["label"] for group in groups} - {"wall"})])
     (scene / "scans" / "mesh_aligned_0.05_mask.txt").write_text("0\n1\n2\n")
 
+    (scene / "dslr" / "resized_anon_masks").mkdir()
+    cv2.imwrite(str(scene / "dslr" / "resized_anon_masks" / "001.png"), np.full((96, 128), 255, np.uint8))
+    monkeypatch.setattr(scannetpp, "POINTS", 3000)
+    monkeypatch.setattr(scannetpp, "FRAMES", 8)
+
     labels = f"labels:{small_scene / 'labels'}"
-    quick = ["--set", "language.encoder=none", *QUICK]
-    scannetpp.main([str(tmp_path / "spp"), "-o", str(tmp_path / "w"), "--masks", labels, "--no-train-on-test", *quick])
+    quick = ["--set", "language.views=1", "--set", "language.zooms=1", "--set", "photos.max_side=128", *QUICK]
+    words = [str(tmp_path / "spp"), "-o", str(tmp_path / "w"), "--masks", labels, "--no-train-on-test", *quick]
+    scannetpp.main(words)
     facts = json.loads((tmp_path / "w" / "scannetpp.json").read_text())
     assert facts["result"]["ap50"] > 0.3
+    photos = facts["maps"]["0a1b"]["config"]["photos"]
+    assert photos["max_side"] == 128 and photos["ignore_masks"].endswith("resized_anon_masks")  # --set, not half of it
+    assert len(read_cloud(photos["init_points"]).points) == 3000
+    trained = sorted(set(truth.names) - set(TESTS))
+    even = {trained[i] for i in np.linspace(0, len(trained) - 1, 8).round().astype(int)}
+    assert {path.name for path in (tmp_path / "w/workspaces/0a1b/images").iterdir()} == even | set(TESTS)
     assert facts["result"]["protocol"]["test_photos"] == "held out"
     assert "smallest object" in facts["result"]["protocol"]["truth"]
     assert "protocol scannetpp" in capsys.readouterr().out
+
+    # Every instance has the class of the largest cosine; with the right classes the scores by class are good.
+    names = (tmp_path / "spp/metadata/semantic_benchmark/top100.txt").read_text().split("\n")
+    gmap = load_map(tmp_path / "w/maps/0a1b.gsmap")
+    cosines = gmap.ranker.similarity(names)
+    given = json.loads((tmp_path / "w/predictions/0a1b/classes.json").read_text())
+    assert given == {str(e["id"]): names[k] for e, k in zip(gmap.instances, cosines.argmax(axis=0), strict=True)}
+    predicted = (tmp_path / "w/predictions/0a1b/0a1b.txt").read_text().split("\n")[:-1]
+    assert {int(row.split()[1]) for row in predicted} <= set(range(len(names)))
+    for right in (True, False):
+        lines = []
+        for row in predicted:
+            mask, _, score = row.split()
+            inside = ids[np.loadtxt(tmp_path / "w/predictions/0a1b" / mask) > 0]
+            name = names_of.get(int(np.bincount(inside[inside >= 0], minlength=1).argmax()), "wall")
+            lines.append(f"{mask} {names.index(name) if right else 0} {score}\n")
+        (tmp_path / "w/predictions/0a1b/0a1b.txt").write_text("".join(lines))
+        shutil.rmtree(tmp_path / "w/submission")
+        scannetpp.main(words)
+        found = json.loads((tmp_path / "w" / "scannetpp.json").read_text())["result"]
+        assert found["ap50"] == facts["result"]["ap50"]
+        assert (found["open_vocabulary"]["ap50"] > 0.2) == right
+        assert set(found["open_vocabulary"]["classes"]) <= set(names) - {"wall", "floor", "ceiling"}
 
     written = np.loadtxt(tmp_path / "w" / "truth" / "instance-classes" / "0a1b.txt", dtype=int)
     assert (written[:3] == -2).all() and len(written) == len(rows)
     for i in np.unique(ids[3:]).tolist():
         values = np.unique(written[3:][ids[3:] == i])
         assert len(values) == 1  # one truth id an object, whatever lies around it
-        assert (values[0] > 0) == (i in names and names[i] not in ("wall", "floor", "ceiling"))
+        assert (values[0] > 0) == (i in names_of and names_of[i] not in ("wall", "floor", "ceiling"))
 
 
 def write_metadata(dataset: Path, names: list[str], mapped: str = "") -> None:

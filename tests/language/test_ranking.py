@@ -13,6 +13,7 @@ from scipy.stats import norm
 
 from perception.errors import InputError
 from perception.language.base import Part, Reading
+from perception.language.clip import ClipEncoder
 from perception.language.colors import (
     color_match,
     color_share,
@@ -91,6 +92,24 @@ def test_color_words_choose_between_equals(scene: tuple[Table, list[InstanceDesc
     assert ranker.rank("red mug").hits[0][0] == 0
     assert ranker.rank("blue mug").hits[0][0] == 1
     assert ranker.rank("mug").hits[0][1] == pytest.approx(ranker.rank("mug").hits[1][1])
+
+
+def test_an_encoder_that_knows_colours_reads_the_whole_prompt() -> None:
+    """ "rubber duck with red hat" must not become "rubber duck with hat", nor a red thing its answer."""
+    axes = np.eye(DIM)
+    things = [_thing(axes[0], (200, 30, 30)), _thing(axes[1], (240, 210, 40)), _thing(axes[2], (30, 60, 200))]
+    encoder = Table({"rubber duck with red hat": axes[1], "rubber duck with hat": axes[2]})
+    assert rank("rubber duck with red hat", things, encoder).hits[0][0] == 2
+    encoder.reading = Reading(colors=True)  # type: ignore[attr-defined]
+    assert rank("rubber duck with red hat", things, encoder).hits[0][0] == 1
+    assert ClipEncoder.reading.colors
+
+
+def test_similarity_is_the_plain_cosine() -> None:
+    axes = np.eye(DIM)
+    things = [_thing(axes[0]), _thing((axes[0] + axes[1]) / np.sqrt(2)), unseen(DIM)]
+    found = Ranker(things, Table({"mug": axes[0], "red mug": axes[1]})).similarity(["mug", "red mug"])
+    np.testing.assert_allclose(found, [[1, np.sqrt(0.5), -1], [0, np.sqrt(0.5), -1]], atol=1e-6)
 
 
 def test_absent_things_are_not_present(scene: tuple[Table, list[InstanceDescription]]) -> None:
