@@ -160,6 +160,7 @@ class MapConfig(Settings):
 
 
 PAPER: dict[str, Any] = {
+    "sam.skip_covered": False,
     "photos.max_side": 1600,
     "photos.poses": "keep",
     "train.iterations": 30_000,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -51,19 +52,29 @@ def check_file(file: str) -> dict[str, Any]:
         raise InputError(f"{file}: no such file, folder or stored model; {known_names()}")
     found = [describe_graph(graph) for graph in graphs]
     family, purpose, problem = judge(found)
-    warnings = [text for text in (*(entry.pop("warning") for entry in found), problem) if text]
+    told = [text for text in (*(entry.pop("warning") for entry in found), problem) if text]
     if not problem:
-        warnings += _opened(purpose, str(path))
+        told += _opened(purpose, str(path))
     unused = [str(graph) for graph in left_out]
     about = {"model": str(path), "family": family, "purpose": purpose, "files": found, "left_out": unused}
-    return {**about, "warnings": list(dict.fromkeys(warnings))}
+    return {**about, "warnings": list(dict.fromkeys(told))}
 
 
 def _opened(purpose: str | None, spec: str) -> list[str]:
     """Warnings of the model when it is opened as for use, where towers or encoder and decoder must fit together."""
+    from perception.language.clip import ClipEncoder
     from perception.masks.sam_models import open_sam
 
-    return open_sam(spec).warnings if purpose == "sam" else []
+    if purpose == "sam":
+        return open_sam(spec).warnings
+    if purpose == "clip":
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the providers, which every file tells
+            try:
+                ClipEncoder.from_spec(spec)
+            except InputError as error:
+                return [f"cannot be used: {error}"]
+    return []
 
 
 def describe_graph(path: Path) -> dict[str, Any]:
@@ -98,7 +109,8 @@ def recognise(graph: Any) -> tuple[str | None, str | None]:
     tokens = any(len(value.shape) == 2 and "int" in value.type and "mask" not in value.name for value in inputs)
     if rows and (pixels or tokens):
         role = "both towers" if pixels and tokens else "image tower" if pixels else "text tower"
-        return {"siglip": "SigLIP", "mobileclip": "MobileCLIP", "clip": "CLIP"}[family_of(graph.path)], role
+        family = family_of(graph.path)
+        return family.name if family else "CLIP-like", role
     return (encoder_family(graph), "encoder") if graph.is_encoder else (None, None)
 
 

@@ -231,12 +231,14 @@ def test_check_names_family_roles_and_providers(sam: tuple[Path, Path], tmp_path
     assert check_file(str(sam[1]))["warnings"] == ["the encoder is missing; both are needed"]
 
     rows = np.zeros((1, 8), np.float32)
-    write_onnx(tmp_path / "siglip_text.onnx", {"input_ids": (("n", 64), INT64)}, {"text_embeds": rows})
+    (tmp_path / "text").mkdir()
+    (tmp_path / "text/config.json").write_text('{"model_type": "siglip"}')
+    write_onnx(tmp_path / "text/text.onnx", {"input_ids": (("n", 64), INT64)}, {"text_embeds": rows})
     write_onnx(tmp_path / "vision.onnx", {"pixel_values": IMAGE}, {"image_embeds": rows})
     write_onnx(tmp_path / "other.onnx", {"audio": ((1, 5), FLOAT)}, {"sound": np.zeros((5,), np.float32)})
-    text, vision, other = (check_file(str(tmp_path / f"{n}.onnx")) for n in ("siglip_text", "vision", "other"))
+    text, vision, other = (check_file(str(tmp_path / f"{n}.onnx")) for n in ("text/text", "vision", "other"))
     assert (text["family"], text["files"][0]["role"]) == ("SigLIP", "text tower")
-    assert (vision["family"], vision["files"][0]["role"]) == ("CLIP", "image tower")
+    assert (vision["family"], vision["files"][0]["role"]) == ("CLIP-like", "image tower")
     assert other["family"] is None and "unknown" in other["warnings"][0]
 
 

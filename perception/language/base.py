@@ -33,7 +33,9 @@ class Reading:
     parts: slices of its embeddings; empty: one part. margin: required distance above the map's probe scores, in their
     standard deviations. canonical: generic phrases that a prompt must exceed (LERF); empty for encoders whose sentence
     embeddings do not describe images in general. zooms: best number of crops per view (3 in the paper). colors: it
-    knows colours, so that colour words stay in the prompt.
+    knows colours, so that colour words stay in the prompt. scale: factor of a cosine in the model's log-odds (CLIP's
+    and SigLIP's logit_scale). even: cosine at which a text and a picture are as likely to belong together as not; None:
+    not known.
     """
 
     parts: tuple[Part, ...] = ()
@@ -41,6 +43,8 @@ class Reading:
     zooms: int = 3
     canonical: tuple[str, ...] = ()
     colors: bool = False
+    scale: float = 10.0
+    even: float | None = None
 
 
 def reading_of(encoder: Encoder) -> Reading:

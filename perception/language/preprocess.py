@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.onnx_sessions import read_config
 
 Triple = tuple[float, float, float]
 
@@ -54,71 +54,95 @@ SIGLIP = Preprocess(mode="squash", mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5))
 MOBILECLIP = Preprocess(size=256, resample="bilinear", mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0))
 
 
+@dataclass(frozen=True)
+class Family:
+    """A family of models. preprocess: that of all its models; None: it must stand in a file beside the model.
+
+    canonical: texts are lower case without punctuation (SigLIP). pooled: `pooler_output` is the embedding; for CLIP it
+    is the state before the projection.
+    """
+
+    name: str
+    preprocess: Preprocess | None = None
+    canonical: bool = False
+    pooled: bool = False
+
+
+CLIP_FAMILY = Family("CLIP")
+# What `config.json` says of the model (`model_type` of transformers, names of timm in open_clip's) -> family.
+FAMILIES = {
+    "siglip": Family("SigLIP", SIGLIP, canonical=True, pooled=True),
+    "fastvit_mci": Family("MobileCLIP", MOBILECLIP),
+    "mobileclip": Family("MobileCLIP", MOBILECLIP),
+    "pe_core": Family("PE-Core"),
+    "clip": CLIP_FAMILY,
+}
+_HINT = "preprocessor_config.json, preprocess_cfg.json or open_clip_config.json"
+
+
 def find_preprocess(model: Path, input_side: int | None) -> Preprocess:
-    """Preprocessing from config files next to a model, else from its name. input_side: the model's, if fixed."""
-    found = _from_configs(model) or _from_name(model)
+    """Preprocessing from the config files beside a model, else its family's. input_side: the model's, if fixed.
+
+    InputError if neither is known: guessed normalisation gives embeddings that look right and are not.
+    """
+    family = family_of(model)
+    found = _from_configs(model) or (family and family.preprocess)
+    if not found:
+        raise InputError(
+            f"{model}: its preprocessing is not known; put the model's own {_HINT} beside it or into the folder above"
+        )
     return replace(found, size=input_side) if input_side else found
 
 
-def family_of(model: Path) -> str:
-    """ "siglip", "mobileclip" or "clip", from the names of the file and its two parent folders, or from config.json."""
-    names = " ".join([model.name, *(parent.name for parent in list(model.parents)[:2])]).lower()
-    config = read_config(model, "config.json")
-    names += " " + str(config.get("model_type", "")).lower()
-    if "siglip" in names:
-        return "siglip"
-    return "mobileclip" if "mobileclip" in names.replace("-", "").replace("_", "") else "clip"
-
-
-def read_config(model: Path, name: str) -> dict[str, Any]:
-    """A JSON file in the model's folder or its parent (exports often lie in `onnx/`); {} if there is none."""
-    for folder in (model.parent, model.parent.parent):
-        path = folder / name
-        if path.is_file():
-            try:
-                known = json.loads(path.read_text(encoding="utf-8"))
-            except ValueError as error:
-                raise InputError(f"{path}: not valid JSON ({error})") from error
-            return known if isinstance(known, dict) else {}
-    return {}
-
-
-def _from_name(model: Path) -> Preprocess:
-    return {"siglip": SIGLIP, "mobileclip": MOBILECLIP, "clip": CLIP}[family_of(model)]
+def family_of(model: Path) -> Family | None:
+    """The family that the config files beside a model name; None if they name none. Names of folders do not count."""
+    known = {**read_config(model, "config.json"), **read_config(model, "open_clip_config.json").get("model_cfg", {})}
+    vision, text = known.get("vision_cfg") or {}, known.get("text_cfg") or {}
+    named = [vision.get("timm_model_name"), known.get("model_type"), text.get("hf_tokenizer_name")]
+    told = " ".join(str(name) for name in named if name).lower()
+    if vision and not vision.get("timm_model_name"):
+        told += " clip"  # open_clip's own vision transformers and ResNets
+    return next((family for key, family in FAMILIES.items() if key in told), CLIP_FAMILY if vision else None)
 
 
 def _from_configs(model: Path) -> Preprocess | None:
+    """From transformers' `preprocessor_config.json` or open_clip's `preprocess_cfg` (own file, or in the config)."""
     hugging = read_config(model, "preprocessor_config.json")
     if "image_mean" in hugging or "size" in hugging:
-        return _from_transformers(hugging)
-    described = read_config(model, "open_clip_config.json").get("preprocess_cfg")
-    if described is not None:
-        base = _from_name(model)
-        size = described.get("size", base.size)
-        return Preprocess(
-            size=int(size[0] if isinstance(size, list) else size),
-            mode="squash" if described.get("resize_mode", base.mode) == "squash" else "shortest",
-            resample="bilinear" if described.get("interpolation", base.resample) == "bilinear" else "bicubic",
-            mean=_triple(described.get("mean", base.mean)),
-            std=_triple(described.get("std", base.std)),
-        )
-    return None
-
-
-def _from_transformers(config: dict[str, Any]) -> Preprocess:
-    size = config.get("crop_size") if config.get("do_center_crop") else None
-    size = size or config.get("size", 224)
-    squash = isinstance(config.get("size"), dict) and "height" in config["size"] and not config.get("do_center_crop")
-    if isinstance(size, dict):
-        size = size.get("height") or size.get("shortest_edge") or 224
-    normalise = config.get("do_normalize", True)
-    return Preprocess(
-        size=int(size),
-        mode="squash" if squash else "shortest",
-        resample="bilinear" if config.get("resample", 3) == 2 else "bicubic",
-        mean=_triple(config.get("image_mean", CLIP.mean)) if normalise else (0.0, 0.0, 0.0),
-        std=_triple(config.get("image_std", CLIP.std)) if normalise else (1.0, 1.0, 1.0),
+        return _from_transformers(model, hugging)
+    described = read_config(model, "preprocess_cfg.json") or read_config(model, "open_clip_config.json").get(
+        "preprocess_cfg", {}
     )
+    if not {"size", "mean", "std"} <= set(described):
+        return None
+    size = described["size"]
+    sides = set(size) if isinstance(size, list) else {size}
+    mode, filtering = described.get("resize_mode", "shortest"), described.get("interpolation", "bicubic")
+    return _checked(model, sides, mode, filtering, described["mean"], described["std"])
+
+
+def _from_transformers(model: Path, config: dict[str, Any]) -> Preprocess:
+    crop = config.get("crop_size") if config.get("do_center_crop") else None
+    size = crop or config.get("size", 224)
+    squash = isinstance(config.get("size"), dict) and "height" in config["size"] and not config.get("do_center_crop")
+    sides = (
+        {size[key] for key in ("height", "width", "shortest_edge") if key in size} if isinstance(size, dict) else {size}
+    )
+    plain = not config.get("do_normalize", True)
+    mean, std = config.get("image_mean", CLIP.mean), config.get("image_std", CLIP.std)
+    filtering = {2: "bilinear", 3: "bicubic"}.get(config.get("resample", 3), str(config.get("resample")))
+    mode = "squash" if squash else "shortest"
+    return _checked(model, sides, mode, filtering, (0, 0, 0) if plain else mean, (1, 1, 1) if plain else std)
+
+
+def _checked(model: Path, sides: set[Any], mode: Any, filtering: Any, mean: Any, std: Any) -> Preprocess:
+    """InputError for what is not done here: pictures that are not square, other filters, padding."""
+    if len(sides) != 1 or mode not in ("shortest", "squash") or filtering not in ("bicubic", "bilinear"):
+        raise InputError(
+            f"{model}: its preprocessing is sides {sorted(sides)}, resize '{mode}', filter '{filtering}'; "
+            "supported are squares, shortest or squash, and bicubic or bilinear"
+        )
+    return Preprocess(int(sides.pop()), mode, filtering, _triple(mean), _triple(std))
 
 
 def _triple(values: Any) -> Triple:

@@ -10,7 +10,8 @@ list of objects that are rarely in a scene. Their best relevancies in this map a
     score_ti = Φ((x_ti − m) / s − margin),   m: their median,   s: chosen so that their 80 % quantile scores .8.
 Without margin, .8 means "fits better than four of five probes". `margin` is a property of the encoder: absent objects
 that resemble a present one (a laptop, a book) score above the probes. For encoders with canonical phrases, the prompt
-must also be more likely than each phrase (LERF's relevancy, temperature 10). Colour words are matched with measured
+must also be more likely than each phrase (LERF's relevancy, with the scale at which the model was trained in place of
+LERF's 10) and, where the model has a bias (SigLIP), likelier than not. Colour words are matched with measured
 colours, shape words (floor, wall, picture, ball: see `shape_words`) also with the measured shape, and all words with
 the texts printed on an instance (see `printed`; a quoted text must be there). In a metric map
 household things have their usual size (see `household`). A label set by the user counts as a name of the instance.
@@ -39,7 +40,6 @@ QUANTILE, NORMAL_QUANTILE = 0.8, 0.8416  # Φ(.8416) = .8
 BETA = 0.5  # fraction of the map's mean embedding that is subtracted
 SHAPE_WEIGHT = 6.0  # difference in z between no and full match of shape, for kinds that geometry alone decides
 SHAPE_HINT = 2.0  # added to z for a full match of the kinds in HINTS, where shape is only supporting evidence
-TEMPERATURE = 10.0  # LERF's
 COLOR_WEIGHT = 3.0  # difference in z between no and full match of colour: separates two objects of one kind
 QUOTED_WEIGHT = 10.0  # difference in z between an instance that bears the quoted text and one that does not
 PRINTED_WEIGHT = 4.0  # added to z if all words of the prompt are printed on the instance
@@ -160,7 +160,9 @@ class Ranker:
     def _against_canonical(self, row: np.ndarray) -> np.ndarray:
         """LERF's relevancy [I]: probability of the prompt [1, D] against the best-matching canonical phrase."""
         rival = (self._plain @ self._canonical.T).max(axis=1)
-        return 1.0 / (1.0 + np.exp(TEMPERATURE * (rival - self._plain @ row[0])))
+        if self._reading.even is not None:
+            rival = np.maximum(rival, self._reading.even)
+        return 1.0 / (1.0 + np.exp(self._reading.scale * (rival - self._plain @ row[0])))
 
     def _with_labels(self, scores: np.ndarray, text: str) -> np.ndarray:
         """Combines image score and label: 1 if the label equals the prompt, else max(score, Φ(z − LABEL_MARGIN))."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import string
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,29 +11,40 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError, missing_extra
-from perception.language.preprocess import family_of, read_config
+from perception.io.onnx_sessions import read_config
+from perception.language.preprocess import family_of
+
+_GEMMA = 200_000  # words that SigLIP 2's vocabulary exceeds; it is trained on lower case with punctuation
+_PUNCTUATION = str.maketrans("", "", string.punctuation)
 
 
 class Tokenizer:
     """Texts → ids and attention mask of one fixed length."""
 
-    def __init__(self, backend: Any, length: int, pad: int, end: int | None) -> None:
-        """backend: a `tokenizers.Tokenizer`; end: id placed last if a text is cut at `length`, None: it is only cut."""
-        self._backend, self.length, self.pad, self._end = backend, length, pad, end
+    def __init__(self, backend: Any, length: int, pad: int, clean: str = "", left: bool = False) -> None:
+        """backend: a `tokenizers.Tokenizer`. clean: "", "lower" or "canonicalize" (also without punctuation), applied
+        to a text first. left: padding comes before the text.
+        """
+        self._backend, self.length, self.pad, self.clean, self._left = backend, length, pad, clean, left
         backend.no_padding()
         backend.no_truncation()
 
     def __call__(self, texts: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """ids [n, length] int64, mask [n, length] int64 (1 = token, 0 = padding)."""
+        """ids [n, length] int64, mask [n, length] int64 (1 = token, 0 = padding). A text that is cut keeps its end."""
         ids = np.full((len(texts), self.length), self.pad, np.int64)
         mask = np.zeros((len(texts), self.length), np.int64)
-        for row, encoding in enumerate(self._backend.encode_batch(list(texts))):
+        for row, encoding in enumerate(self._backend.encode_batch([self._cleaned(text) for text in texts])):
             tokens = encoding.ids[: self.length]
-            if len(encoding.ids) > self.length and self._end is not None:
-                tokens[-1] = self._end
-            ids[row, : len(tokens)] = tokens
-            mask[row, : len(tokens)] = 1
+            if len(encoding.ids) > self.length and encoding.special_tokens_mask[-1]:
+                tokens[-1] = encoding.ids[-1]
+            place = slice(self.length - len(tokens), None) if self._left else slice(len(tokens))
+            ids[row, place], mask[row, place] = tokens, 1
         return ids, mask
+
+    def _cleaned(self, text: str) -> str:
+        if self.clean == "canonicalize":  # as in big_vision, with which SigLIP was trained
+            text = re.sub(r"\s+", " ", text.replace("_", " ").translate(_PUNCTUATION)).strip()
+        return text.lower() if self.clean else text
 
 
 def find_tokenizer(model: Path, length: int | None) -> Tokenizer:
@@ -51,10 +64,14 @@ def find_tokenizer(model: Path, length: int | None) -> Tokenizer:
         backend = tokenizers.Tokenizer.from_file(str(file))
     except Exception as error:  # tokenizers raises bare Exception on a malformed file
         raise InputError(f"{file}: not a tokenizer ({error})") from error
-    end = backend.token_to_id("<|endoftext|>")
-    end = backend.token_to_id("</s>") if end is None else end
-    length = length or _configured_length(model) or (64 if family_of(model) == "siglip" else 77)
-    return Tokenizer(backend, length, _padding_id(backend, model), end)
+    family = family_of(model)
+    canonical = family is not None and family.canonical
+    length = length or _configured_length(model) or (64 if canonical else 77)
+    wanted = _text_config(model).get("tokenizer_kwargs", {}).get("clean")
+    usual = "" if not canonical else "lower" if backend.get_vocab_size() > _GEMMA else "canonicalize"
+    left = read_config(model, "tokenizer_config.json").get("padding_side") == "left"
+    clean = wanted if wanted in ("lower", "canonicalize") else usual
+    return Tokenizer(backend, length, _padding_id(backend, model), clean, left)
 
 
 def _padding_id(backend: Any, model: Path) -> int:
@@ -67,6 +84,11 @@ def _padding_id(backend: Any, model: Path) -> int:
 
 def _configured_length(model: Path) -> int | None:
     text = read_config(model, "config.json").get("text_config", {})
-    described = read_config(model, "open_clip_config.json").get("model_cfg", {}).get("text_cfg", {})
-    found = text.get("max_position_embeddings") or described.get("context_length")
+    found = text.get("max_position_embeddings") or _text_config(model).get("context_length")
     return int(found) if found else None
+
+
+def _text_config(model: Path) -> dict[str, Any]:
+    """open_clip's `text_cfg`, from its own file or from the `config.json` of immich's exports."""
+    described = read_config(model, "open_clip_config.json").get("model_cfg") or read_config(model, "config.json")
+    return described.get("text_cfg") or {}
