@@ -204,7 +204,7 @@ def _good_masks(model: SamModel, embedding: Any, points: np.ndarray, settings: S
         stable = stability(logits)
         if stable >= np.float32(settings.stability):  # compared in float32, as published; false for NaN
             mask = logits > 0
-            shape, area = (mask.shape[0], mask.shape[1]), np.count_nonzero(mask)
+            shape, area = (mask.shape[0], mask.shape[1]), int(np.count_nonzero(mask))
             scores = pred_iou[point, which], stable
             good[point].append(SamMask(_pack(mask), shape, area, mask_box(mask), *scores, points[point]))
     return good

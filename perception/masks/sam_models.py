@@ -170,7 +170,7 @@ class SamModel:
         fixed = shape_of(self.decoder.inputs["points"])[axis]
         if None in {size for shape in shapes.values() for size in shape[1:]}:
             return fixed is None
-        tensors = {role: np.zeros([shape[0] or 1, *shape[1:]]) for role, shape in shapes.items()}
+        tensors = {role: np.zeros([n or 1 for n in shape]) for role, shape in shapes.items()}
         side = 16 * tensors["embedding"].shape[-1]
         empty = Encoded(tensors, (side, side), (1.0, 1.0), (side, side), (side, side))
         points = np.full((2, 2), side / 2.0)
