@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -15,8 +14,9 @@ import numpy as np
 from perception.bench.output import bench_parser, finish
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
+from perception.evaluate.masks import Masks
 from perception.io.atomic import atomic_directory, atomic_file
-from perception.io.store import Map, read_map
+from perception.io.store import Map, read_info, read_map
 from perception.pipeline.mapping import build_map
 from perception.pipeline.rendering import as_gaussians, map_views
 from perception.progress import Progress
@@ -143,33 +143,20 @@ class DatasetBench(ABC):
         return root
 
 
-def write_masks(folder: Path, masks: Mapping[tuple[str, str], np.ndarray]) -> None:
-    """<folder>/<view>/<prompt>.png, 255 × the mask or silhouette."""
-    import cv2
-
-    for (view, prompt), mask in masks.items():
-        path = folder / view / f"{prompt}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        values = np.clip(np.round(np.asarray(mask, np.float32) * 255), 0, 255).astype(np.uint8)
-        if not cv2.imwrite(str(path), values):
-            raise InputError(f"{path}: cannot be written; choose a writable -o")
-
-
-def _map_facts(path: Path) -> dict[str, Any] | None:
-    if not (path / "map.json").is_file():
-        return None
-    info = json.loads((path / "map.json").read_text(encoding="utf-8"))
-    kept = ("num_gaussians", "num_instances", "seed", "config", "seconds", "masks")
-    facts = {key: info.get(key) for key in kept}
-    facts["quality"] = {k: v for k, v in info.get("quality", {}).items() if k != "views"}
-    return facts
+def _map_facts(path: Path) -> dict[str, Any]:
+    info = read_info(path) if (path / "map.json").is_file() else {}
+    kept = ("num_gaussians", "num_instances", "seed", "config", "seconds", "masks", "quality")
+    return {key: info[key] for key in kept if key in info}
 
 
 class InstanceViews:
-    """Renders a map's instances as masks in the map's own views."""
+    """Renders a map's instances as silhouettes in the map's own views, or as masks where they exceed `threshold`.
 
-    def __init__(self, gmap: Map) -> None:
-        self.gmap = gmap
+    occlusion: the other Gaussians of the map can hide them; without it the instances are rendered alone.
+    """
+
+    def __init__(self, gmap: Map, occlusion: bool, threshold: float | None = None) -> None:
+        self.gmap, self.occlusion, self.threshold = gmap, occlusion, threshold
         self.gaussians = as_gaussians(gmap)
         self.views = {view.name: view for view in map_views(gmap, held_out=False)}
 
@@ -192,18 +179,15 @@ class InstanceViews:
         K = torch.from_numpy(view.K.astype(np.float32))
         return render_silhouettes(self.gaussians, self.gmap.instance_ids, pose, K, view.width, view.height).ids
 
-    def silhouette(self, instances: list[int], view: View, occlusion: bool) -> np.ndarray:
-        """Accumulated rendering weight [H, W] float32 in [0, 1] of the instances' Gaussians.
-
-        occlusion: the other Gaussians of the map can hide them; without it the instances are rendered alone.
-        """
+    def silhouette(self, instances: list[int], view: View) -> np.ndarray:
+        """Accumulated rendering weight [H, W] float32 in [0, 1] of the instances' Gaussians, or the bool mask."""
         import torch
 
         from perception.gaussians.rasterize import rasterize
 
         own = torch.from_numpy(np.isin(self.gmap.instance_ids, instances))
         g = self.gaussians
-        used = torch.ones_like(own) if occlusion else own
+        used = torch.ones_like(own) if self.occlusion else own
         if not own.any():
             return np.zeros((view.height, view.width), np.float32)
         with torch.no_grad():
@@ -218,7 +202,21 @@ class InstanceViews:
                 view.width,
                 view.height,
             )
-        return out.colors[0, ..., 0].numpy()
+        weight: np.ndarray = out.colors[0, ..., 0].numpy()
+        return weight if self.threshold is None else weight > self.threshold
+
+    def write(self, target: Path, truths: Masks, photos: Mapping[str, str], chosen: Mapping[str, list[int]]) -> None:
+        """<target>/<view>/<prompt>.png for each (view, prompt) of `truths` whose photo is registered: 255 × the
+        silhouette, or mask, of the instances `chosen` for the prompt. photos: photo name by view."""
+        import cv2
+
+        for label, prompt in truths:
+            if (view := self.find(photos[label])) is not None:
+                image = np.clip(np.round(self.silhouette(chosen[prompt], view) * 255.0), 0, 255).astype(np.uint8)
+                path = target / label / f"{prompt}.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                if not cv2.imwrite(str(path), image):
+                    raise InputError(f"{path}: cannot be written; choose a writable -o")
 
 
 def by_words(gmap: Map, prompt: str, rule: str, scoring: str = "calibrated") -> list[int]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import cv2
 
-from perception.bench.datasets import HELD_OUT, DatasetBench, InstanceViews, by_reference, by_words, write_masks
+from perception.bench.datasets import HELD_OUT, DatasetBench, InstanceViews, by_reference, by_words
 from perception.errors import InputError
 from perception.evaluate.layouts import read_mask_folder, run_lerf_mask
 
@@ -51,25 +51,22 @@ class LerfMask(DatasetBench):
         """A bool mask of each prompt in each test view that has a registered pose."""
         truths = read_mask_folder(scene / "test_mask")
         tests = test_photos(scene, sorted({view for view, _ in truths}))
-        shown = InstanceViews(self.map(name, scene, sorted(tests.values())))
-        views = {label: shown.find(photo) for label, photo in tests.items()}
-        first = next(((label, view) for label, view in sorted(views.items()) if view is not None), None)
+        shown = InstanceViews(self.map(name, scene, sorted(tests.values())), True, RENDERED)
+        found = ((label, shown.find(photo)) for label, photo in sorted(tests.items()))
+        first = next(((label, view) for label, view in found if view is not None), None)
         if first is None:
             raise InputError(f"{scene}: none of its test views {sorted(tests.values())} is registered in the map")
         ids = shown.ids(first[1]) if self.select != "query" else None
-        masks = {}
+        chosen = {}
         for prompt in sorted({prompt for _, prompt in truths}):
             if ids is None:
-                chosen = by_words(shown.gmap, prompt, "top-1")
+                chosen[prompt] = by_words(shown.gmap, prompt, "top-1")
             else:
                 reference: Any = truths.get((first[0], prompt))
                 if self.references:
                     reference = cv2.imread(str(Path(self.references) / name / f"{prompt}.png"), cv2.IMREAD_GRAYSCALE)
-                chosen = [] if reference is None else by_reference(ids, reference > 128, SHARE)
-            for label, view in views.items():
-                if view is not None and (label, prompt) in truths:
-                    masks[label, prompt] = shown.silhouette(chosen, view, occlusion=True) > RENDERED
-        write_masks(target, masks)
+                chosen[prompt] = [] if reference is None else by_reference(ids, reference > 128, SHARE)
+        shown.write(target, truths, tests, chosen)
 
     def score(self, scenes: Mapping[str, Path]) -> tuple[dict[str, Any], str]:
         switches = {

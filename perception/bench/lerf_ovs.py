@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from perception.bench.datasets import HELD_OUT, DatasetBench, InstanceViews, by_words, write_masks
+from perception.bench.datasets import HELD_OUT, DatasetBench, InstanceViews, by_words
 from perception.errors import InputError
 from perception.evaluate.layouts import read_lerf_polygons, run_lerf_ovs
 
@@ -42,15 +42,10 @@ class LerfOvs(DatasetBench):
             raise InputError(f"{source}: no such folder; expected the scene's images/ and sparse/ there")
         truths = read_lerf_polygons(scene)
         frames = sorted({frame for frame, _ in truths})
-        shown = InstanceViews(self.map(name, source, [] if self.args.train_on_test else frames))
+        shown = InstanceViews(self.map(name, source, [] if self.args.train_on_test else frames), self.args.occlusion)
         how = (self.args.select, self.args.scoring)
         selected = {text: by_words(shown.gmap, text, *how) for text in sorted({text for _, text in truths})}
-        masks = {}
-        for frame, text in truths:
-            view = shown.find(frame)
-            if view is not None:
-                masks[frame, text] = shown.silhouette(selected[text], view, self.args.occlusion)
-        write_masks(target, masks)
+        shown.write(target, truths, dict(zip(frames, frames, strict=True)), selected)
 
     def score(self, scenes: Mapping[str, Path]) -> tuple[dict[str, Any], str]:
         switches = {
