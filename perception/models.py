@@ -12,6 +12,7 @@ from urllib.parse import unquote, urlparse
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory
+from perception.io.catalogue import entry_of, hub_files
 from perception.io.checksums import facts_of, sha256
 from perception.io.download import download, is_url
 from perception.io.model_store import (
@@ -159,13 +160,41 @@ def add_model(
     sha256: expected digests, as many as sources or none. A URL that is already stored under that name is not downloaded
     again. default: `--masks auto` uses this model from now on.
     """
+    return _stored(name, sources, _expected(sources, sha256), {}, default, progress)
+
+
+def get_model(name: str, *, default: bool = False, progress: Progress | None = None) -> StoredModel:
+    """Fetches an entry of the catalogue into the store under its name, resumed and verified by size and digest.
+
+    What is fetched is told before. InputError when the hub's files are not those of the catalogue.
+    """
+    entry = entry_of(name)
+    files = hub_files(entry)
+    sizes = {url: size for url, (size, _) in files.items() if size is not None}
+    if progress is not None:
+        progress.log(
+            f"{name}: {len(files)} files, {sum(sizes.values()) / 1e6:.1f} MB, of {entry.repository} at "
+            f"{entry.revision[:12]}, licence {entry.licence}, to {models_folder() / name}"
+        )
+    digests = {url: digest for url, (_, digest) in files.items() if digest is not None}
+    return _stored(name, list(files), digests, sizes, default, progress)
+
+
+def _stored(
+    name: str,
+    sources: Sequence[str],
+    expected: dict[str, str],
+    sizes: dict[str, int],
+    default: bool,
+    progress: Progress | None,
+) -> StoredModel:
+    """The model of these sources, fetched unless it is there. expected, sizes: sha256 and bytes of a source."""
     check_name(name)
-    expected = _expected(sources, sha256)
     known = find_model(name)
     if known is None or not _same(known, sources, expected):
         parts = models_folder() / _PARTS
-        files = [file for source in sources for file in _local(source, expected.get(source), parts, progress)]
-        _install(name, files, expected)
+        files = [file for source in sources for file in _local(source, expected, sizes, parts, progress)]
+        _install(name, files)
         known = find_model(name)
         _forget(parts, sources)
     assert known is not None  # just written
@@ -191,16 +220,21 @@ def _same(model: StoredModel, sources: Sequence[str], expected: dict[str, str]) 
     return whole and all(expected.get(f["source"], f["sha256"]) == f["sha256"] for f in model.files)
 
 
-def _local(source: str, expected: str | None, parts: Path, progress: Progress | None) -> list[tuple[str, Path, str]]:
+def _local(
+    source: str, digests: dict[str, str], sizes: dict[str, int], parts: Path, progress: Progress | None
+) -> list[tuple[str, Path, str]]:
     """(file name, current path, source) of a download, a file with its side files, or the files of a folder."""
+    expected = digests.get(source)
     if is_url(source):
         file_name = Path(unquote(urlparse(source).path)).name.lstrip(".") or "model.onnx"
         part = _part(parts, source)
         download(source, part, progress, file_name)
-        if expected is not None and sha256(part) != expected:
-            found = sha256(part)
-            part.unlink()
-            raise InputError(f"{source}: sha256 is {found}, expected {expected}; what was fetched is thrown away")
+        wrong = [("bytes", part.stat().st_size, sizes[source])] if source in sizes else []
+        wrong += [("sha256", sha256(part), expected)] if expected is not None else []
+        for what, found, wanted in wrong:
+            if found != wanted:
+                part.unlink()
+                raise InputError(f"{source}: {what} is {found}, expected {wanted}; what was fetched is thrown away")
         return [(file_name, part, source)]
     path = Path(source).expanduser()
     if path.is_dir():
@@ -216,7 +250,7 @@ def _local(source: str, expected: str | None, parts: Path, progress: Progress | 
     return [(str(p.relative_to(path.parent)), p, str(p)) for p in [path, *beside] if p.is_file()]
 
 
-def _install(name: str, files: Sequence[tuple[str, Path, str]], expected: dict[str, str]) -> None:
+def _install(name: str, files: Sequence[tuple[str, Path, str]]) -> None:
     names = [file_name for file_name, _, _ in files]
     twice = {n for n in names if names.count(n) > 1}
     if twice:

@@ -11,7 +11,7 @@ from perception.cli.parser import Parser, command
 
 def register(commands: Any) -> None:
     """Adds this module's subcommands."""
-    parser = commands.add_parser("models", help="the ONNX models of this user: list, check, add")
+    parser = commands.add_parser("models", help="the ONNX models of this user: list, check, add, get")
     kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True, parser_class=Parser)
     command(kinds, "list", _list, "the models in the store")
     p = command(kinds, "check", _check, "family, inputs, outputs and providers really in use of an ONNX file")
@@ -20,6 +20,9 @@ def register(commands: Any) -> None:
     p.add_argument("name", metavar="NAME", help="use it as --masks sam:NAME or language.encoder=clip:NAME")
     p.add_argument("source", nargs="+", metavar="FILE-or-URL", help="encoder and decoder, or a folder")
     p.add_argument("--sha256", action="append", default=[], metavar="HEX", help="expected digest, one a source")
+    p.add_argument("--default", action="store_true", help="--masks auto takes this model from now on")
+    p = command(kinds, "get", _get, "fetch a model of the catalogue from the Hugging Face hub, or list the catalogue")
+    p.add_argument("name", metavar="NAME", nargs="?", help="an entry of the catalogue; none: list it")
     p.add_argument("--default", action="store_true", help="--masks auto takes this model from now on")
 
 
@@ -50,8 +53,20 @@ def _check(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     return found, "\n".join(lines + [f"warning: {text}" for text in found["warnings"]])
 
 
+def _get(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.io.catalogue import CATALOGUE
+    from perception.models import get_model
+    from perception.progress import Progress
+
+    if args.name is not None:
+        return _told(get_model(args.name, default=args.default, progress=Progress()))
+    lines = [f"{n:16} {e.purpose:5} {e.licence:12} {e.repository} at {e.revision[:12]}" for n, e in CATALOGUE.items()]
+    entries = [{"name": n, "purpose": e.purpose, "repository": e.repository} for n, e in CATALOGUE.items()]
+    return {"catalogue": entries}, "\n".join(lines)
+
+
 def _add(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.models import add_model, check_file
+    from perception.models import add_model
     from perception.progress import Progress
 
     model = add_model(
@@ -61,6 +76,12 @@ def _add(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         default=args.default,
         progress=Progress(quiet=args.json),
     )
+    return _told(model)
+
+
+def _told(model: Any) -> tuple[dict[str, Any], str]:
+    from perception.models import check_file
+
     warnings = check_file(str(model.folder))["warnings"]
     use = {"sam": f"--masks sam:{model.name}", "clip": f"--set language.encoder=clip:{model.name}"}
     lines = [f"{model.folder}: {model.family or 'unknown family'}"]

@@ -173,7 +173,7 @@ def test_combined_export_equals_the_pair(clip_folder: tuple[Path, Any], tmp_path
     assert np.allclose(both.encode_texts(TEXTS), pair.encode_texts(TEXTS), atol=1e-5)
     assert np.allclose(both.encode_images(_pictures()), pair.encode_images(_pictures()), atol=1e-5)
     assert both.reading.scale == pytest.approx(model.logit_scale.exp().item(), rel=1e-3) and both.reading.even is None
-    assert pair.reading.scale == 100 and check_file(str(tmp_path))["warnings"] == []
+    assert pair.reading.colors and pair.reading.scale == 100 and check_file(str(tmp_path))["warnings"] == []
 
 
 class _Joint(torch.nn.Module):

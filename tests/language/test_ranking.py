@@ -13,7 +13,6 @@ from scipy.stats import norm
 
 from perception.errors import InputError
 from perception.language.base import Part, Reading
-from perception.language.clip import ClipEncoder
 from perception.language.colors import (
     color_match,
     color_share,
@@ -102,7 +101,6 @@ def test_an_encoder_that_knows_colours_reads_the_whole_prompt() -> None:
     assert rank("rubber duck with red hat", things, encoder).hits[0][0] == 2
     encoder.reading = Reading(colors=True)  # type: ignore[attr-defined]
     assert rank("rubber duck with red hat", things, encoder).hits[0][0] == 1
-    assert ClipEncoder.reading.colors
 
 
 def test_similarity_is_the_plain_cosine() -> None:
