@@ -12,7 +12,7 @@ from urllib.parse import unquote, urlparse
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory
-from perception.io.catalogue import entry_of, hub_files
+from perception.io.catalogue import catalogue, hub_files
 from perception.io.checksums import facts_of, sha256
 from perception.io.download import download, is_url
 from perception.io.model_store import (
@@ -134,15 +134,10 @@ def judge(found: Sequence[dict[str, Any]]) -> tuple[str | None, str | None, str]
 
 def list_models() -> list[dict[str, Any]]:
     """Name, family, purpose, bytes and folder of each stored model."""
+    fields = ("name", "family", "purpose", "files")
     return [
-        {
-            "name": model.name,
-            "family": model.family,
-            "purpose": model.purpose,
-            "bytes": sum(int(entry["bytes"]) for entry in model.files),
-            "files": model.files,
-            "folder": str(model.folder),
-        }
+        {field: getattr(model, field) for field in fields}
+        | {"bytes": sum(int(entry["bytes"]) for entry in model.files), "folder": str(model.folder)}
         for model in stored_models()
     ]
 
@@ -160,7 +155,7 @@ def add_model(
     sha256: expected digests, as many as sources or none. A URL that is already stored under that name is not downloaded
     again. default: `--masks auto` uses this model from now on.
     """
-    return _stored(name, sources, _expected(sources, sha256), {}, default, progress)
+    return _stored(name, list(sources), _expected(sources, sha256), {}, default, progress)
 
 
 def get_model(name: str, *, default: bool = False, progress: Progress | None = None) -> StoredModel:
@@ -168,33 +163,27 @@ def get_model(name: str, *, default: bool = False, progress: Progress | None = N
 
     What is fetched is told before. InputError when the hub's files are not those of the catalogue.
     """
-    entry = entry_of(name)
+    entry = catalogue().get(name)
+    if entry is None:
+        raise InputError(f"models get {name}: not in the catalogue; it holds {', '.join(catalogue())}")
     files = hub_files(entry)
     sizes = {url: size for url, (size, _) in files.items() if size is not None}
     if progress is not None:
-        progress.log(
-            f"{name}: {len(files)} files, {sum(sizes.values()) / 1e6:.1f} MB, of {entry.repository} at "
-            f"{entry.revision[:12]}, licence {entry.licence}, to {models_folder() / name}"
-        )
+        told = f"{len(files)} files, {sum(sizes.values()) / 1e6:.1f} MB, of {entry.repository} at {entry.revision[:12]}"
+        progress.log(f"{name}: {told}, licence {entry.licence}, to {models_folder() / name}")
     digests = {url: digest for url, (_, digest) in files.items() if digest is not None}
     return _stored(name, list(files), digests, sizes, default, progress)
 
 
 def _stored(
-    name: str,
-    sources: Sequence[str],
-    expected: dict[str, str],
-    sizes: dict[str, int],
-    default: bool,
-    progress: Progress | None,
+    name: str, sources: list[str], expected: dict[str, str], sizes: dict[str, int], default: bool, told: Progress | None
 ) -> StoredModel:
     """The model of these sources, fetched unless it is there. expected, sizes: sha256 and bytes of a source."""
     check_name(name)
     known = find_model(name)
     if known is None or not _same(known, sources, expected):
         parts = models_folder() / _PARTS
-        files = [file for source in sources for file in _local(source, expected, sizes, parts, progress)]
-        _install(name, files)
+        _install(name, [file for source in sources for file in _local(source, expected, sizes, parts, told)])
         known = find_model(name)
         _forget(parts, sources)
     assert known is not None  # just written
@@ -229,10 +218,9 @@ def _local(
         file_name = Path(unquote(urlparse(source).path)).name.lstrip(".") or "model.onnx"
         part = _part(parts, source)
         download(source, part, progress, file_name)
-        wrong = [("bytes", part.stat().st_size, sizes[source])] if source in sizes else []
-        wrong += [("sha256", sha256(part), expected)] if expected is not None else []
-        for what, found, wanted in wrong:
-            if found != wanted:
+        size = part.stat().st_size
+        for what, found, wanted in (("bytes", size, sizes.get(source)), ("sha256", sha256(part), expected)):
+            if wanted not in (None, found):
                 part.unlink()
                 raise InputError(f"{source}: {what} is {found}, expected {wanted}; what was fetched is thrown away")
         return [(file_name, part, source)]

@@ -14,7 +14,7 @@ import pytest
 
 from perception.cli import main
 from perception.errors import InputError
-from perception.io.catalogue import CATALOGUE, Entry
+from perception.io.catalogue import Entry, catalogue
 from perception.io.download import download
 from perception.io.model_store import find_model, models_folder
 from perception.masks import make_source
@@ -232,8 +232,9 @@ def hub(server: Server, sam: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch)
     """A hub with one model, as the catalogue's "tiny": path -> (bytes, sha256)."""
     files = {f"onnx/{file.name}": file.read_bytes() for file in sam} | {"config.json": b"{}"}
     facts = {path: (len(body), hashlib.sha256(body).hexdigest()) for path, body in files.items()}
-    known = {path: (None, None) if path == "config.json" else fact for path, fact in facts.items()}
-    monkeypatch.setitem(CATALOGUE, "tiny", Entry("sam", "org/tiny-ONNX", "abc123", "MIT", known))
+    known = {path: [None, None] if path == "config.json" else list(fact) for path, fact in facts.items()}
+    held = catalogue() | {"tiny": Entry("sam", "org/tiny-ONNX", "abc123", "MIT", known)}
+    monkeypatch.setattr("perception.models.catalogue", lambda: held)
     monkeypatch.setenv("HF_ENDPOINT", f"{server.url}/")
     listed = [
         {"rfilename": path, "size": size} | ({"lfs": {"sha256": digest}} if ".onnx" in path else {})

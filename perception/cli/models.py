@@ -54,15 +54,14 @@ def _check(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _get(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.catalogue import CATALOGUE
+    from perception.io.catalogue import catalogue
     from perception.models import get_model
     from perception.progress import Progress
 
     if args.name is not None:
         return _told(get_model(args.name, default=args.default, progress=Progress()))
-    lines = [f"{n:16} {e.purpose:5} {e.licence:12} {e.repository} at {e.revision[:12]}" for n, e in CATALOGUE.items()]
-    entries = [{"name": n, "purpose": e.purpose, "repository": e.repository} for n, e in CATALOGUE.items()]
-    return {"catalogue": entries}, "\n".join(lines)
+    lines = [f"{n:16} {e.purpose:5} {e.licence:12} {e.repository} at {e.revision[:12]}" for n, e in catalogue().items()]
+    return {"catalogue": list(catalogue())}, "\n".join(lines)
 
 
 def _add(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

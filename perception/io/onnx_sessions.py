@@ -31,8 +31,7 @@ _EDGE = 1 << 20
 
 def model_root(folder: Path) -> Path:
     """The folder itself, or of an entry of the Hugging Face cache the revision that was fetched last."""
-    revisions = [path for path in folder.glob("snapshots/*") if path.is_dir()]
-    return max(revisions, key=lambda path: path.stat().st_mtime, default=folder)
+    return max(folder.glob("snapshots/*/"), key=lambda path: path.stat().st_mtime, default=folder)
 
 
 def model_graphs(folder: Path) -> tuple[list[Path], list[Path]]:
@@ -41,9 +40,8 @@ def model_graphs(folder: Path) -> tuple[list[Path], list[Path]]:
     Of files that differ only in precision (`model.onnx`, `model_fp16.onnx`, `model_quantized.onnx`) the most precise
     one is the model's.
     """
-    root = model_root(folder)
-    found = sorted([*root.glob("*.onnx"), *root.glob("*/*.onnx")], key=_precision)
-    best: dict[tuple[Path, str], Path] = {}
+    root, best = model_root(folder), dict[tuple[Path, str], Path]()
+    found = sorted([*root.glob("*.onnx"), *root.glob("*/*.onnx")], key=lambda path: _PRECISIONS.index(_precision(path)))
     for path in found:
         best.setdefault((path.parent, graph_name(path)), path)
     return sorted(best.values()), [path for path in found if path not in best.values()]
@@ -51,11 +49,11 @@ def model_graphs(folder: Path) -> tuple[list[Path], list[Path]]:
 
 def graph_name(path: Path) -> str:
     """The file name without suffix and precision."""
-    return path.stem.removesuffix(_PRECISIONS[_precision(path)])
+    return path.stem.removesuffix(_precision(path))
 
 
-def _precision(path: Path) -> int:
-    return next((n for n, suffix in enumerate(_PRECISIONS) if n and path.stem.endswith(suffix)), 0)
+def _precision(path: Path) -> str:
+    return next((suffix for suffix in _PRECISIONS[1:] if path.stem.endswith(suffix)), "")
 
 
 def side_files(path: Path) -> list[Path]:

@@ -130,9 +130,8 @@ def _without_duplicates(masks: list[SamMask], scores: np.ndarray) -> list[SamMas
 
 def _cut(mask: SamMask, crop: Box, shape: tuple[int, int]) -> bool:
     """Whether the mask of a crop ends at an edge of the crop that is none of the photo [h, w]."""
-    of_photo = (0, 0, shape[1], shape[0])
-    box = mask.box + np.array([crop[0], crop[1]] * 2)
-    near, end = (np.abs(box - np.array(edges)) <= EDGE for edges in (crop, of_photo))
+    box = mask.box + np.array([*crop[:2], *crop[:2]])
+    near, end = (np.abs(box - np.array(edges)) <= EDGE for edges in (crop, (0, 0, shape[1], shape[0])))
     return bool((near & ~end).any())
 
 
@@ -140,8 +139,8 @@ def _placed(mask: SamMask, crop: Box, shape: tuple[int, int]) -> SamMask:
     """The mask of a crop in the photo [h, w]."""
     whole = np.zeros(shape, bool)
     whole[crop[1] : crop[3], crop[0] : crop[2]] = mask.pixels()
-    corner = np.array(crop[:2])
-    return replace(mask, packed=_pack(whole), shape=shape, box=mask_box(whole), point=mask.point + corner)
+    place = {"box": mask_box(whole), "point": mask.point + np.array(crop[:2])}
+    return replace(mask, packed=_pack(whole), shape=shape, **place)
 
 
 def paint(masks: list[SamMask], shape: tuple[int, int]) -> np.ndarray:

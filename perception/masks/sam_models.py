@@ -226,30 +226,20 @@ class SamModel:
         if self.kind.pads:
             scaled = np.concatenate([scaled, np.zeros_like(scaled)], axis=1)
             labels = np.concatenate([labels, -labels], axis=1)
-        has_mask = self.decoder.inputs.get("has_mask")
-        whole = self.kind.fit != "pad" or self._whole_photo(embedding)
+        shapes = {role: shape_of(x) for role, x in self.decoder.inputs.items()}
+        side = 4 * embedding.tensors["embedding"].shape[-1]
+        prior = shapes.get("mask_input", [None, 1, None, None])
+        # SAM's graph assumes that the long side fills the square. Encoders with a fixed non-square input differ.
+        fills = max(embedding.used) == _square(embedding) == max(embedding.canvas)
         return {
             "points": scaled[None] if self.kind.nested else scaled,
             "labels": labels[None] if self.kind.nested else labels,
-            "boxes": np.zeros((1, 0, 4), np.float32),
-            "mask_input": np.zeros(self._mask_shape(len(points), 4 * embedding.tensors["embedding"].shape[-1])),
+            "boxes": np.zeros((1, 0, 4)),
+            "mask_input": np.zeros((prior[0] or len(points), 1, prior[2] or side, prior[3] or side)),
             # One flag for all prompts: exporters multiply by it as if it were a scalar.
-            "has_mask": np.zeros((shape_of(has_mask)[0] if has_mask else None) or 1),
-            "size": np.array(embedding.size if whole else embedding.canvas),
+            "has_mask": np.zeros(shapes.get("has_mask", [None])[0] or 1),
+            "size": np.array(embedding.size if fills or self.kind.fit != "pad" else embedding.canvas),
         }
-
-    def _mask_shape(self, points: int, side: int) -> tuple[int, int, int, int]:
-        """Shape of the empty mask prompt: one row, or one row per point if the axis is dynamic."""
-        argument = self.decoder.inputs.get("mask_input")
-        shape = [1, 1, side, side] if argument is None else shape_of(argument)
-        return shape[0] or points, 1, shape[2] or side, shape[3] or side
-
-    def _whole_photo(self, embedding: Encoded) -> bool:
-        """Whether the decoder may upscale to the photo's size itself, i.e. whether its scaling equals that of `encode`.
-
-        SAM's graph assumes that the long side fills the square. Encoders with a fixed non-square input differ.
-        """
-        return max(embedding.used) == _square(embedding) and max(embedding.canvas) == max(embedding.used)
 
     def upscale(self, embedding: Encoded, raw: np.ndarray) -> np.ndarray:
         """raw: one mask as output by the graph. Returns logits [h, w] float32 at the photo's size."""
