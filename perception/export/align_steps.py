@@ -17,7 +17,7 @@ FACING = 0.7
 """Least cosine of the normals of points that are matched."""
 LEAST_GAIN = 0.2
 """Views whose brightness goes less than this with the scan's are left out of a step."""
-COUNT, KEPT, APART = 12_000, 40, 12.0
+COUNT, KEPT, APART = 12_000, 64, 12.0
 """Rotations tried, which leave none farther than about 8° away; kept, at least APART degrees from one another."""
 SHARPNESS = 25.0
 """Concentration of the kernel about each normal: a standard deviation of 8°."""
