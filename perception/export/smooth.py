@@ -57,7 +57,7 @@ def segment_cloud(cloud: PointCloud, color_weight: float | None = None, scannet:
     """
     points, meshed = cloud.points, cloud.faces is not None and len(cloud.faces) > 0
     if scannet and not meshed:
-        raise InputError("cloud: has no faces; ScanNet's segments are those of a mesh")
+        raise InputError("cloud: has no faces, as ScanNet's segments need; leave out --segments scannet or give a mesh")
     require_memory(_BYTES_PER_POINT * len(points), "smoothing", "export without it (--no-smooth) or split the cloud")
     lists = None if meshed else neighbor_lists(points, NORMAL_NEIGHBORS)
     if cloud.faces is not None and meshed:
