@@ -20,12 +20,10 @@ from perception.io.depth import load_depth
 from perception.io.recentre import moved_scene
 from perception.types import Scene, View
 
-UNIT_IS_METRE = 0.03
-"""Largest deviation from 1, and largest standard error, at which a measured unit is taken as the metre as it is."""
-UNIT_OF_DEPTH = 0.4
-"""Deviation of the unit as depth images measure it from the metre that the input states, up to which both are right."""
-SAMPLED = 200
-"""Views whose depth images are read for the planes that tell gravity."""
+UNIT_IS_METRE, UNIT_OF_DEPTH = 0.03, 0.4
+"""Largest deviation from 1, and largest standard error, at which a measured unit is taken as the metre as it is; the
+largest one, by depth images, from the metre that the input states at which those are used as they are."""
+SAMPLED = 200  # views whose depth images are read for the planes that tell gravity
 STATED = {"metres_per_unit": 1.0, "source": "the input, which states it", "standard_error": None}
 
 

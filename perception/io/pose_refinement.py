@@ -105,8 +105,7 @@ def refine(features: Features, given: Poses) -> Poses:
 def moved_back(poses: Poses, given: Poses, distance: float) -> Poses:
     """`poses` moved as a whole to where what the cameras see, at `distance`, lies as by the given ones.
 
-    Least sum of the displacements of five places ahead of each camera, by reweighting. The priors of the adjustment
-    hold the world frame loosely: in kitchen_rgbd it had moved by 4 cm and turned by 0.5°.
+    Least sum of the displacements of five places ahead of each camera, by reweighting: the priors hold them loosely.
     """
     ahead = distance * np.array([[0, 0, 1], [0.4, 0, 1], [-0.4, 0, 1], [0, 0.4, 1], [0, -0.4, 1]])
     a, b = ((np.einsum("nji,kj->nki", p.rotation, ahead) + p.center[:, None]).reshape(-1, 3) for p in (poses, given))
