@@ -62,7 +62,7 @@ class BuiltinSegmentation:
         surface = fuse(found)
         if len(surface) < _LEAST_VOXELS:
             return
-        self._segment = segments(surface_graph(found, surface))[0]
+        self._segment = segments(surface_graph(found, surface))
         self._views = {view.name: view for view in found}
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:

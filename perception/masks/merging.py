@@ -22,13 +22,9 @@ _FLAT = 0.03  # relative to depth: standard deviation of such a segment across i
 _UNKNOWN = 9.0  # largest log odds of a feature, and those of merges inside a patch
 
 
-def segments(graph: SurfaceGraph, model: MergeModel | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """[V] int32 segment of each voxel, numbered from 1 by falling size; 0 for small patches without neighbours.
-
-    Also [S + 1] float64 per segment: the probability of an IoU above 0.5 with an object. The graph is modified.
-    """
-    model = model or packaged_model()
-    return divided(graph, tree_by(model, graph), model)
+def segments(graph: SurfaceGraph) -> np.ndarray:
+    """[V] int32 segment of each voxel, numbered from 1 by falling size; 0 for small patches without neighbours."""
+    return divided(graph, tree_by(packaged_model(), graph), packaged_model())[0]
 
 
 def tree_by(model: MergeModel, graph: SurfaceGraph) -> MergeTree:
@@ -37,26 +33,28 @@ def tree_by(model: MergeModel, graph: SurfaceGraph) -> MergeTree:
 
 
 def divided(graph: SurfaceGraph, tree: MergeTree, model: MergeModel) -> tuple[np.ndarray, np.ndarray]:
-    """As `segments`, from a tree of the graph."""
-    odds = model.whole(tree.features)
-    slope, offset = model.calibration
-    sure = _probability(slope * odds[:, 0] + offset)
-    regions = tree.cut(_probability(odds).mean(axis=1) - model.cost)
-    ends = join_planes(graph, merged(graph, regions))
+    """As `segments`, from a tree of the graph; and [S + 1] the probability of each that its IoU with an object exceeds
+    0.5."""
+    odds = model.whole(tree.features).astype(np.float64)
+    sure = _logistic(model.calibration[0] * odds[:, 0] + model.calibration[1])
+    regions = tree.cut(_logistic(odds).mean(axis=1) - model.cost)
+    graph, patch = graph.copy(), list(range(tree.leaves))
+    for k, (one, two) in enumerate(tree.children.tolist(), start=tree.leaves):
+        patch.append(patch[one])
+        if regions[patch[one]] >= k:  # a merge within a region of the cut
+            graph.merge(patch[one], patch[two])
+    ends = join_planes(graph, np.array(patch)[regions])
     ends[[graph.area(end) < SMALLEST for end in ends.tolist()]] = -1
     names, index, counts = np.unique(ends[graph.patch], return_inverse=True, return_counts=True)
-    order = np.lexsort((-counts, names < 0))
-    rank = np.empty(len(names), np.int32)
-    rank[order] = np.arange(1, len(names) + 1)
-    rank[names < 0] = 0
+    order = np.argsort(np.where(names < 0, -np.inf, -counts), kind="stable")
+    rank = np.argsort(order).astype(np.int32) + np.int32(names[0] >= 0)
     probability = np.zeros(int(rank.max()) + 1)
-    np.maximum.at(probability, rank[np.searchsorted(names, ends)], sure[regions])
-    probability[0] = 0
+    probability[rank] = [0 if name < 0 else sure[regions[ends == name]].max() for name in names]
     return rank[index], probability
 
 
-def _probability(odds: np.ndarray) -> np.ndarray:
-    return np.asarray(1 / (1 + np.exp(-odds.astype(np.float64))))
+def _logistic(odds: np.ndarray) -> np.ndarray:
+    return np.asarray(1 / (1 + np.exp(-odds)))
 
 
 @dataclass(frozen=True)
@@ -140,26 +138,14 @@ def merge_tree(graph: SurfaceGraph, score: Callable[[SurfaceGraph, np.ndarray], 
     return MergeTree(count, np.array(children, np.int64).reshape(-1, 2), rows)
 
 
-def merged(graph: SurfaceGraph, regions: np.ndarray) -> np.ndarray:
-    """Merges the patches of each connected region in `graph`. regions: [R]. Returns [R] the patch each became."""
-    into = np.arange(graph.count)
-    for region in np.unique(regions).tolist():
-        members = set(np.flatnonzero(regions == region).tolist())
-        first = min(members)
-        while near := sorted(members & graph.borders[first].keys()):
-            for b in near:
-                graph.merge(first, b)
-                into[b] = first
-    return into
-
-
 def join_planes(graph: SurfaceGraph, ends: np.ndarray) -> np.ndarray:
     """Joins large flat segments that are coplanar and similar in colour, such as floors and tables split by objects.
 
     ends: [R] the segment of each patch. Returns [R] with one number for each set of joined segments.
     """
-    names = np.unique(ends)
-    large = [int(i) for i in names if graph.area(int(i)) > _LARGE and graph.flatness(int(i)) < _FLAT]
+    large = [
+        i for i in np.unique(ends).tolist() if graph.area(i) > _LARGE and graph.extents[i, 0] < _FLAT * graph.depth(i)
+    ]
     joined = np.arange(graph.count)
     for place, a in enumerate(large):
         for b in large[place + 1 :]:

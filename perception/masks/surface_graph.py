@@ -199,10 +199,6 @@ class SurfaceGraph:
         """Area divided by the squared mean depth (no unit)."""
         return float(self.sums[a, _VOXELS] * self.unit / max(self.depth(a), 1e-9) ** 2)
 
-    def flatness(self, a: int) -> float:
-        """Standard deviation across the patch's plane, relative to its depth."""
-        return float(self.extents[a, 0] / max(self.depth(a), 1e-9))
-
     def one_plane(self, a: int, b: int) -> bool:
         """Whether two patches that do not touch are parts of one plane: coplanar, with colours that agree."""
         shapes = (self.sums[[i]] / self.sums[i, _VOXELS] for i in (a, b))

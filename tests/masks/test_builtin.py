@@ -15,7 +15,7 @@ from perception.masks import GeometryMaskSource, compute_masks, load_labels, mak
 from perception.masks.builtin import fuse, surface_graph
 from perception.masks.cues import depth_cues
 from perception.masks.merge_model import packaged_model
-from perception.masks.merging import MergeTree, segments, tree_by
+from perception.masks.merging import MergeTree, divided, tree_by
 from perception.masks.stereo import confirmed, homographies, measure_depths, plane_depths
 from perception.masks.stereo_views import StereoView, make_stereo_view
 from perception.masks.surface import pack_voxels, to_world, unpack_voxels, voxel_keys
@@ -406,7 +406,9 @@ def test_segments_do_not_depend_on_the_order_of_patches():
         voxel = surface.voxel_of(to_world(depth.points, shown.world_from_camera))
         second.add(np.where(voxel >= 0, second.patch[voxel], -1), photo, depth)
     second.link()
-    (labels, probability), (others, _) = segments(first), segments(second)
+    (labels, probability), (others, _) = (
+        divided(g, tree_by(packaged_model(), g), packaged_model()) for g in (first, second)
+    )
     np.testing.assert_array_equal(labels, others)
     inside = np.all((surface.points > LOW - 0.02) & (surface.points < HIGH + 0.02), axis=1) & (
         surface.points[:, 2] > 0.03
@@ -425,6 +427,7 @@ def test_noise_on_a_bare_wall_is_no_thing():
         photo = rng.normal(128, 3, (120, 160, 3)).astype(np.uint8)
         views.append(make_stereo_view(View("", Path("x.jpg"), K, 160, 120, pose), photo, depth))
     surface = fuse(views)
-    labels, probability = segments(surface_graph(views, surface))
+    graph = surface_graph(views, surface)
+    labels, probability = divided(graph, tree_by(packaged_model(), graph), packaged_model())
     small = np.bincount(labels, minlength=len(probability)) < 0.5 * len(labels)
     assert (probability[small] < 0.5).all()

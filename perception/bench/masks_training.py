@@ -1,0 +1,269 @@
+"""Trains the merge model of the built-in masks on rendered worlds: `python -m perception.bench.masks_training WORK`.
+
+Worlds are clutter, rooms and tabletops by seed; of ten, one chooses the cost and the calibration, one is for testing.
+Their depth is true but noisy, in every third world as stereo finds it, else as a depth camera. Pairs of patches are
+gathered along merges that the truth permits, in the order of a plain rule, then of the model so far (Nunez-Iglesias et
+al. 2013). WORK keeps the worlds, so that a run that was stopped goes on. A world takes 20 s of a core, learning 8 min.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import pickle
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.bench.output import Column, table
+from perception.masks.merge_model import WEIGHTS, MergeModel, Network
+from perception.masks.merging import SMALLEST, MergeTree, divided, merge_tree, tree_by
+from perception.masks.surface_graph import SurfaceGraph
+
+SCENES = (("clutter", 3100, 2), ("clutter", 3101, 2), ("room", 2000, 1), ("tabletop", 1000, 1))  # first seed, step
+SHARES = {"training": range(8), "validation": range(8, 9), "test": range(9, 10)}  # last digit of a world's number
+PAIRS, LEAST = 8000, 20  # pairs of one world and round; voxels of a region that is learned from
+COSTS = (0.05, 0.1, 0.15, 0.2, 0.3)
+NOISE, NEARER = 0.1, 0.3  # standard deviations: of inputs, relative to theirs; of the logarithm of the size of things
+PAIR_SIZE = {6: 2, 7: 2, 9: 1, **dict.fromkeys(range(27, 33), 1)}  # power of that size in SurfaceGraph.features
+WHOLE_SIZE = {4: 2, 5: 1, 6: 1, 7: 1}  # and in MergeTree.features
+COLUMNS: tuple[Column, ...] = tuple((name, name.lower(), ".3f") for name in ("AP", "AP50", "AP25", "ECE"))
+Samples = tuple[np.ndarray, ...]  # inputs [P, F], targets [P, O], weights [P]
+
+
+@dataclass
+class World:
+    """graph: of R patches; truth: [V] id of each voxel, 0 = unknown; votes: [R, T] voxels of each patch by id."""
+
+    graph: SurfaceGraph
+    truth: np.ndarray
+
+    def __post_init__(self) -> None:
+        self.votes = np.zeros((self.graph.count, int(self.truth.max()) + 1))
+        np.add.at(self.votes, (self.graph.patch, self.truth), 1)
+
+
+def read_world(folder: Path, stereo: bool, seed: int = 0, skip: int = -1) -> World:
+    """A scene in the format of docs/benchmarks.md. seed: of the noise. skip: a photo to leave out."""
+    import cv2
+
+    from perception.io.photos import read_photo
+    from perception.masks.builtin import fuse, surface_graph
+    from perception.masks.stereo import measure_depths
+    from perception.masks.stereo_views import make_stereo_view
+    from perception.types import View
+
+    about = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
+    K = np.array([[about["fl_x"], 0, about["cx"]], [0, about["fl_y"], about["cy"]], [0, 0, 1]])
+    rng = np.random.default_rng([seed, *folder.name.encode()])
+    views, ids = [], []
+    for k, frame in enumerate(about["frames"]):
+        photo = folder / frame["file_path"]
+        files = (str(folder / kind / f"{photo.stem}.png") for kind in ("depth", "masks_gt"))
+        depth, truth = (np.asarray(cv2.imread(file, cv2.IMREAD_UNCHANGED)) for file in files)
+        pose = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1.0, -1, -1, 1]))
+        noisy = _noisy(depth.astype(np.float32) / 1000, stereo, rng)
+        made = make_stereo_view(
+            View(photo.stem, photo, K, depth.shape[1], depth.shape[0], pose), read_photo(photo), noisy
+        )
+        if made is not None and k != skip:
+            views.append(made)
+            ids.append(cv2.resize(truth, made.grey.shape[::-1], interpolation=cv2.INTER_NEAREST))
+    if stereo:
+        measure_depths(views)
+    surface = fuse(views)
+    graph = surface_graph(views, surface)
+    votes = np.zeros((len(surface), int(max(image.max() for image in ids)) + 1), np.int32)
+    for view, image in zip(views, ids, strict=True):
+        np.add.at(votes, (view.voxel[view.voxel >= 0], image[view.voxel >= 0]), 1)
+    return World(graph, votes.argmax(axis=1))
+
+
+def _noisy(depth: np.ndarray, stereo: bool, rng: np.random.Generator) -> np.ndarray:
+    """Depth [h, w] as a map in training renders it, smooth and wrong by 3 % in waves; or as a depth camera measures it:
+    noise grows with the square of the depth (Khoshelham & Elberink 2012), and most pixels at steps are unknown."""
+    import cv2
+
+    if stereo:
+        waves = cv2.resize(rng.normal(1, 0.03, (5, 7)), depth.shape[::-1], interpolation=cv2.INTER_CUBIC)
+        return np.where(depth > 0, cv2.GaussianBlur(depth, (0, 0), depth.shape[1] / 40) * waves, 0)
+    noise = cv2.GaussianBlur(rng.normal(0, 1, depth.shape), (0, 0), 0.8)
+    kernel = np.ones((5, 5), np.uint8)
+    step = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel) > 0.04 * depth
+    unknown = (depth == 0) | step & (rng.random(depth.shape) < 0.7)
+    return np.where(unknown, 0, depth + (0.0024 + 0.0038 * (depth - 0.4) ** 2) * noise)
+
+
+def make_world(folder: Path, stereo: bool) -> World:
+    """The scene SCENE_SEED, rendered unless it is there. The tabletop's three walls count as three."""
+    from perception.demo.scene import make_photos
+
+    file = folder.with_suffix(".stereo" if stereo else ".sensor")
+    if not file.is_file():
+        scene, seed = folder.name.split("_")
+        if not (folder / "scene.json").is_file():
+            size = {"width": 320, "height": 240, "views": 26 if scene == "room" else 20, "light_samples": 6}
+            make_photos(folder / "images", scene=scene, seed=int(seed), truth_folder=folder, **size)
+        world, names = read_world(folder, stereo), json.loads((folder / "scene.json").read_text("utf-8"))["instances"]
+        for wall in [entry["id"] for entry in names if entry["name"] == "wall"] if scene == "tabletop" else []:
+            across = world.graph.surface.points[:, 0] * (world.truth == wall)
+            world = World(world.graph, world.truth + len(names) * (np.abs(across) > 1.5) + (across > 1.5))
+        file.with_suffix(".part").write_bytes(pickle.dumps(world))
+        file.with_suffix(".part").replace(file)
+    found: World = pickle.loads(file.read_bytes())
+    return found
+
+
+def plain_rule(features: np.ndarray) -> np.ndarray:
+    """Alike in colour, without an edge, on one plane: the order of the merges that are first learned from."""
+    return np.asarray(2 - features[:, [0, 2, 14]].sum(axis=1, keepdims=True) + 2 * features[:, 18:19])
+
+
+def pairs_of(world: World, policy: Callable[[np.ndarray], np.ndarray], seed: int) -> Samples:
+    """Pairs along merges in the policy's order, and whether they are one object. Patches of different objects never
+    merge, and impure ones are not learned from."""
+    graph = world.graph.copy()
+    columns = graph.sums.shape[1]
+    graph.sums = np.concatenate([graph.sums, world.votes], axis=1)  # so that `merge` adds up the votes too
+    found: list[Samples] = []
+
+    def score(state: SurfaceGraph, pairs: np.ndarray) -> np.ndarray:
+        features = state.features(pairs)
+        votes = state.sums[pairs, columns:]
+        size, top = votes.sum(axis=-1), votes.argmax(axis=-1)
+        sure = (votes[..., 1:].sum(axis=-1) > 10) & (votes.max(axis=-1) > 0.7 * size)
+        same, use = top[:, 0] == top[:, 1], sure.all(axis=1)
+        found.append((features[use], same[use, None], np.log1p(size.min(axis=1))[use]))
+        small = [min(state.area(a), state.area(b)) < SMALLEST for a, b in pairs.tolist()]
+        return np.where(same | small, policy(features)[:, 0], -np.inf)
+
+    merge_tree(graph, score)
+    some = np.random.default_rng(seed).permutation(sum(len(part[0]) for part in found))[:PAIRS]
+    return tuple(np.concatenate(column)[some] for column in zip(*found, strict=True))
+
+
+def regions_of(world: World, pair: Network) -> Samples:
+    """Regions of a tree, and whether their IoU with an object exceeds 0.5 and 0.75."""
+    tree = tree_by(MergeModel(pair, pair, 0), world.graph)
+    votes = tree.leaf_sums(world.votes)
+    size = votes.sum(axis=1)
+    best = (votes / (size[:, None] + world.votes.sum(axis=0) - votes))[:, 1:].max(axis=1)[size >= LEAST]
+    return tree.features[size >= LEAST], np.stack([best > 0.5, best > 0.75], axis=1), np.ones(len(best))
+
+
+def fit(samples: list[Samples], size: dict[int, int], epochs: int, seed: int) -> Network:
+    """Three networks with 24 and 12 hidden units, by AdamW on the weighted cross entropy. size: features that grow with
+    the size of things, and their power of it. Inputs are varied by other sizes and by noise, for stability."""
+    import torch
+
+    torch.manual_seed(seed)
+    x, y, weight = (np.concatenate(column) for column in zip(*samples, strict=True))
+    mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-3)
+    inputs = torch.from_numpy(np.clip((x - mean) / scale, -5, 5).astype(np.float32))
+    target, weights = (torch.from_numpy(a.astype(np.float32)) for a in (y, weight[:, None] / weight.mean()))
+    nearer = torch.tensor([NEARER * size.get(k, 0) / float(scale[k]) for k in range(len(scale))])
+    sizes = [x.shape[1], 24, 12, y.shape[1]]
+    layers = [(torch.randn(3, b, a) * (2 / a) ** 0.5).requires_grad_() for a, b in pairwise(sizes)]
+    offsets = [torch.zeros(3, 1, b, requires_grad=True) for b in sizes[1:]]
+    steps = epochs * len(x) // 1024
+    optimiser = torch.optim.AdamW([*layers, *offsets], lr=4e-3, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    for _ in range(steps):
+        some = torch.randint(len(x), (3, 1024))
+        h = inputs[some] + NOISE * torch.randn(3, 1024, x.shape[1]) + torch.randn(3, 1024, 1) * nearer
+        for k, (layer, offset) in enumerate(zip(layers, offsets, strict=True)):
+            h = torch.baddbmm(offset, h.relu() if k else h, layer.transpose(1, 2))
+        optimiser.zero_grad()
+        torch.nn.functional.binary_cross_entropy_with_logits(h, target[some], weights[some]).backward()
+        optimiser.step()
+        schedule.step()
+    learned = (part.detach().numpy() for pair in zip(layers, offsets, strict=True) for part in pair)
+    return Network((mean.astype(np.float32), scale.astype(np.float32), *learned))
+
+
+def learn(worlds: list[World], seed: int = 0) -> MergeModel:
+    """Both networks, with a cost and a calibration yet to be tuned."""
+    samples = [pairs_of(world, plain_rule, seed) for world in worlds]
+    first = fit(samples, PAIR_SIZE, 6, seed)
+    pair = fit(samples + [pairs_of(world, first, seed + 1) for world in worlds], PAIR_SIZE, 6, seed)
+    return MergeModel(pair, fit([regions_of(world, pair) for world in worlds], WHOLE_SIZE, 40, seed), COSTS[0])
+
+
+def scores(world: World, tree: MergeTree, model: MergeModel) -> dict[str, Any]:
+    """AP of all instances of a world, and of each segment of ≥ 100 voxels its probability and whether it is right."""
+    from perception.evaluate.instances import evaluate
+
+    labels, probability = divided(world.graph, tree, model)
+    both = np.zeros((len(probability), world.votes.shape[1]))
+    np.add.at(both, (labels, world.truth), 1)
+    sizes = both.sum(axis=1)
+    best = (both / (sizes[:, None] + both.sum(axis=0) - both + 1e-9))[:, 1:].max(axis=1)
+    large = (sizes >= 100) & (np.arange(len(best)) > 0)
+    result = evaluate(labels - 1, dict(enumerate(probability[1:])), world.truth)
+    return result | {"p": probability[large], "right": best[large] > 0.5}
+
+
+def _mean(model: MergeModel, cases: list[tuple[World, MergeTree]]) -> dict[str, Any]:
+    """Mean AP, AP50, AP25; p and right of all segments; expected calibration error in ten bins (Guo et al. 2017)."""
+    found = [scores(*case, model) for case in cases]
+    p, right = (np.concatenate([row[key] for row in found]) for key in ("p", "right"))
+    error = np.abs(np.bincount(np.minimum((p * 10).astype(int), 9), p - right)).sum() / len(p)
+    return {k: float(np.mean([row[k] for row in found])) for k in ("ap", "ap50", "ap25")} | {
+        "p": p, "right": right, "ece": error}  # fmt: skip
+
+
+def tuned(model: MergeModel, worlds: list[World]) -> MergeModel:
+    """The cost with the best mean AP on `worlds`, and the calibration of the segments found with it."""
+    from scipy.optimize import minimize
+
+    cases = [(world, tree_by(model, world.graph)) for world in worlds]
+    runs = {cost: _mean(replace(model, cost=cost), cases) for cost in COSTS}
+    cost = max(COSTS, key=lambda c: runs[c]["ap"])
+    p, sign = runs[cost]["p"].clip(1e-6, 1 - 1e-6), np.where(runs[cost]["right"], -1, 1)
+    odds = np.log(p / (1 - p))
+    found = minimize(lambda ab: np.logaddexp(0, sign * (ab[0] * odds + ab[1])).mean(), [1.0, 0.0])
+    return replace(model, cost=cost, calibration=tuple(found.x.tolist()))
+
+
+def report(model: MergeModel, groups: dict[str, list[World]]) -> str:
+    """One row for each group of worlds."""
+    rows = []
+    for name, worlds in groups.items():
+        cases = [(world, tree_by(model, world.graph)) for world in worlds]
+        rows.append({"worlds": f"{name} ({len(worlds)})", **_mean(model, cases)})
+    return table(rows, COLUMNS, ("worlds",))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m perception.bench.masks_training", description=__doc__)
+    parser.add_argument("work", type=Path, metavar="WORK", help="folder of the worlds")
+    parser.add_argument("--worlds", type=int, default=25, metavar="N", help="sets of four (default 25)")
+    parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="SCENE", help="more scenes to test on")
+    parser.add_argument("-o", "--output", type=Path, default=WEIGHTS, metavar="NPZ", help="default: the package's file")
+    options = parser.parse_args(arguments)
+    options.work.mkdir(parents=True, exist_ok=True)
+    jobs = [
+        (k, options.work / f"{name}_{first + step * k}") for k in range(options.worlds) for name, first, step in SCENES
+    ]
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        stereo = ((k + number) % 3 == 1 for number, (k, _) in enumerate(jobs))
+        worlds = list(pool.map(make_world, (folder for _, folder in jobs), stereo))
+    groups = {
+        name: [world for (k, _), world in zip(jobs, worlds, strict=True) if k % 10 in digits]
+        for name, digits in SHARES.items()
+    }
+    for scene in options.scenes:
+        groups |= {f"{scene.name}, {kind}": [read_world(scene, kind == "stereo")] for kind in ("sensor", "stereo")}
+    model = tuned(learn(groups["training"]), groups["validation"])
+    model.save(options.output)
+    print(report(model, groups))
+
+
+if __name__ == "__main__":
+    main()
