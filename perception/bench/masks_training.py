@@ -74,7 +74,8 @@ def read_world(folder: Path, stereo: bool, seed: int = 0, skip: int = -1) -> Wor
         )
         if made is not None and k != skip:
             views.append(made)
-            ids.append(cv2.resize(truth, made.grey.shape[::-1], interpolation=cv2.INTER_NEAREST))
+            shown = cv2.resize(truth, made.grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            ids.append(shown.astype(np.int64))
     if stereo:
         measure_depths(views)
     surface = fuse(views)
@@ -114,10 +115,9 @@ def make_world(folder: Path, stereo: bool) -> World:
         for wall in [entry["id"] for entry in names if entry["name"] == "wall"] if scene == "tabletop" else []:
             across = world.graph.surface.points[:, 0] * (world.truth == wall)
             world = World(world.graph, world.truth + len(names) * (np.abs(across) > 1.5) + (across > 1.5))
-        file.with_suffix(".part").write_bytes(pickle.dumps(world))
+        file.with_suffix(".part").write_bytes(pickle.dumps((world.graph, world.truth)))
         file.with_suffix(".part").replace(file)
-    found: World = pickle.loads(file.read_bytes())
-    return found
+    return World(*pickle.loads(file.read_bytes()))
 
 
 def plain_rule(features: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The learned part of the built-in masks: small neural networks whose weights come with the package.
 
-They were trained on rendered worlds alone.
+`python -m perception.bench.masks_training` makes the weights file from rendered worlds alone.
 """
 
 from __future__ import annotations
