@@ -134,6 +134,7 @@ def test_masks_and_scores_are_those_of_transformers(make: Any, tmp_path: Path) -
         )
     np.testing.assert_allclose(masks, expected.pred_masks[0].numpy(), atol=2e-3 * expected.pred_masks.std().item())
     np.testing.assert_allclose(scores, expected.iou_scores[0].numpy(), rtol=1e-3, atol=1e-3)
-    assert np.ptp(scores, axis=0).max() > 1e-4  # the prompts matter
+    apart = np.abs(masks - expected.pred_masks[0].numpy()).max()
+    assert np.ptp(masks, axis=0).max() > 20 * apart  # prompts differ by far more than the two programs
     upscaled = ours.upscale(embedding, masks[0, 0])
     assert upscaled.shape == (60, 90)

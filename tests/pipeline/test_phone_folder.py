@@ -76,7 +76,7 @@ def test_a_phones_folder_becomes_a_map(
     out = tmp_path / "photos" / "m.gsmap"  # beside the photos, as people do
     assert main(["map", str(tmp_path / "photos"), "-o", str(out), *[f"--set={s}" for s in SETTINGS]]) == 0
     told = capsys.readouterr().err
-    assert "about" in told and "on two cores" in told
+    assert "trained at up to 120 pixels: about" in told and "GiB" in told
     assert "1 videos beside the photos are not read, 1 of them belong to Live Photos" in told
     gmap = read_map(out)
     found = {view.name: view.camera_from_world for view in gmap.views}
