@@ -34,6 +34,10 @@ NEIGHBORS = 4
 COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS = 256, 4, 0.7, 6
 """Preemptive matching. The strict ratio rejects pairs that share repeated textures only; these give wrong models.
 Every photo keeps its PARTNERS best pairs, so that the match graph stays connected."""
+POSED_PARTNERS = 12
+"""With given poses no model has to be found: each photo is matched with this many photos at most, the best pairs."""
+AT_ONCE = 64
+"""Photos per matrix product. With one product per pair, threads waited for each other 10 times as long as they ran."""
 
 
 class FeatureStore:
@@ -57,19 +61,22 @@ def build_features(
     seed: int,
     progress: Progress,
     masks: list[Path | None] | None = None,
+    posed: bool = False,
 ) -> FeatureStore:
     """Extracts and matches features, unless `workdir` holds the result of the same photos, lenses, seed and options.
 
     lenses: known intrinsics per photo, or None to let structure from motion find them. Photos share one camera when
     size, EXIF camera and known lens agree. masks: of pixels without features, per photo (see `ignore_masks`).
+    posed: the poses are known, so fewer pairs are matched (POSED_PARTNERS).
     """
     masks = masks if masks and any(masks) else None
-    folder = workdir / f"features-{_key(photos, lenses, seed, masks)}"
+    most = POSED_PARTNERS if posed else len(photos)
+    folder = workdir / f"features-{_key(photos, lenses, (seed, most), masks)}"
     recover(folder)
     facts_file = folder / "facts.json"
     if not facts_file.exists():
         with atomic_directory(folder) as new:
-            facts = _build(new, photos, lenses, masks, seed, progress)
+            facts = _build(new, photos, lenses, masks, seed, most, progress)
             (new / "facts.json").write_text(json.dumps(facts))
     facts = json.loads(facts_file.read_text())
     return FeatureStore(folder, facts.pop("names"), facts)
@@ -81,6 +88,7 @@ def _build(
     lenses: list[Lens | None],
     masks: list[Path | None] | None,
     seed: int,
+    most: int,
     progress: Progress,
 ) -> dict[str, Any]:
     pycolmap = load_pycolmap()
@@ -92,7 +100,7 @@ def _build(
     database = folder / "database.db"
     _extract(database, folder / "photos", photos, names, lenses, progress)
     extracted = time.perf_counter()
-    count, total = _match(database, folder / "pairs.txt", names, seed, progress)
+    count, total = _match(database, folder / "pairs.txt", names, seed, most, progress)
     return {
         "names": names,
         "pairs_matched": count,
@@ -160,9 +168,11 @@ def _camera_key(photo: Path) -> tuple[Any, ...]:
     return (*photo_size(photo), exif.get(0x010F), exif.get(0x0110), details.get(0x920A), details.get(0xA404))
 
 
-def _match(database: Path, pair_file: Path, names: list[str], seed: int, progress: Progress) -> tuple[int, int]:
+def _match(
+    database: Path, pair_file: Path, names: list[str], seed: int, most: int, progress: Progress
+) -> tuple[int, int]:
     pycolmap = load_pycolmap()
-    pairs = _select_pairs(database, names)
+    pairs = _select_pairs(database, names, most)
     pair_file.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs))
     progress.update("poses: matching", 0, 1)
     matching = pycolmap.FeatureMatchingOptions()
@@ -183,8 +193,9 @@ def _match(database: Path, pair_file: Path, names: list[str], seed: int, progres
     return len(pairs), len(names) * (len(names) - 1) // 2
 
 
-def _select_pairs(database: Path, names: list[str]) -> list[tuple[int, int]]:
-    """All pairs of a small set; else neighbours by name and pairs whose largest features match.
+def _select_pairs(database: Path, names: list[str], most: int) -> list[tuple[int, int]]:
+    """All pairs of a small set; else neighbours by name and pairs whose largest features match, of these the `most`
+    best pairs of each photo.
 
     Preemptive matching (Wu, "Towards Linear-time Incremental Structure from Motion", 3DV 2013, section 3): the
     few largest-scale features predict whether a pair overlaps. This also finds loop closures without a vocabulary.
@@ -194,12 +205,9 @@ def _select_pairs(database: Path, names: list[str]) -> list[tuple[int, int]]:
     if count < EXHAUSTIVE_BELOW:
         return every
     descriptors = _largest_features(database, names)
-    votes = np.zeros((count, count), np.int64)
-    for i, j in every:
-        votes[i, j] = votes[j, i] = _mutual_matches(descriptors[i], descriptors[j])
-    keep = votes >= COARSE_MIN_MATCHES
-    best = np.argsort(-votes, axis=1, kind="stable")[:, :PARTNERS]
-    np.put_along_axis(keep, best, np.take_along_axis(votes, best, axis=1) > 0, axis=1)
+    votes = _coarse_votes(descriptors)
+    rank = np.argsort(np.argsort(-votes, axis=1, kind="stable"), axis=1)
+    keep = (rank < most) & (votes >= np.where(rank < PARTNERS, 1, COARSE_MIN_MATCHES))
     return [(i, j) for i, j in every if j - i <= NEIGHBORS or keep[i, j] or keep[j, i]]
 
 
@@ -220,21 +228,36 @@ def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
     return result
 
 
-def _mutual_matches(a: np.ndarray, b: np.ndarray, ratio: float = COARSE_RATIO) -> int:
-    """Number of mutual nearest neighbours that pass Lowe's ratio test (distances of unit descriptors)."""
-    if min(len(a), len(b)) < 2:
+def _coarse_votes(descriptors: list[np.ndarray]) -> np.ndarray:
+    """[n, n] number of matches of each pair of photos, from unit descriptors [F, 128] of each."""
+    votes = np.zeros((len(descriptors), len(descriptors)), np.int64)
+    for i, mine in enumerate(descriptors):
+        for first in range(i + 1, len(descriptors), AT_ONCE):
+            others = descriptors[first : first + AT_ONCE]
+            similarity = mine @ np.concatenate(others).T
+            blocks = np.split(similarity, np.cumsum([len(other) for other in others])[:-1], axis=1)
+            votes[i, first : first + AT_ONCE] = [_mutual_matches(block) for block in blocks]
+    return votes + votes.T
+
+
+def _mutual_matches(similarity: np.ndarray) -> int:
+    """Number of mutual nearest neighbours that pass Lowe's ratio test; [F, G] dot products of unit descriptors.
+
+    The largest value of each row is overwritten.
+    """
+    if min(similarity.shape) < 2:
         return 0
-    similarity = a @ b.T
+    rows = np.arange(len(similarity))
     best = similarity.argmax(1)
-    mutual = similarity.argmax(0)[best] == np.arange(len(a))
-    second, first = np.partition(similarity, -2, axis=1)[:, -2:].T
-    distinct = (1 - first) <= ratio**2 * (1 - second)
-    return int((mutual & distinct).sum())
+    mutual = similarity.argmax(0)[best] == rows
+    first = similarity[rows, best]
+    similarity[rows, best] = -1
+    return int((mutual & (1 - first <= COARSE_RATIO**2 * (1 - similarity.max(1)))).sum())
 
 
-def _key(photos: list[Path], lenses: list[Lens | None], seed: int, masks: list[Path | None] | None) -> str:
+def _key(photos: list[Path], lenses: list[Lens | None], how: tuple[int, int], masks: list[Path | None] | None) -> str:
     paths = [*photos, *(mask for mask in masks or () if mask is not None)]
     files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
     extraction = (MAX_IMAGE_SIDE, MAX_FEATURES, MIN_FEATURES, PEAK_THRESHOLD)
     pairing = (EXHAUSTIVE_BELOW, NEIGHBORS, COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS, MIN_INLIERS)
-    return hashlib.sha256(repr((files, lenses, extraction, pairing, seed)).encode()).hexdigest()[:12]
+    return hashlib.sha256(repr((files, lenses, extraction, pairing, how)).encode()).hexdigest()[:12]

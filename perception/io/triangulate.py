@@ -39,10 +39,8 @@ def posed_scene(
     few = len(points) < least
     check = how.poses == "refine" or (how.poses == "auto" and (few or any(view.depth is not None for view in views)))
     if few or check:
-        masks = [v.mask for v in views]
-        store = build_features(
-            [v.photo for v in views], [view_lens(v) for v in views], how.workdir, how.seed, how.progress, masks
-        )
+        photos, lenses, masks = zip(*((view.photo, view_lens(view), view.mask) for view in views), strict=True)
+        store = build_features(list(photos), list(lenses), how.workdir, how.seed, how.progress, list(masks), posed=True)
         report["seconds"] = store.facts["seconds"]
         features = features_of(views, store)
         if check:

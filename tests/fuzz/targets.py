@@ -238,7 +238,7 @@ def _without_photos() -> None:
         return (*triangulate.random_cloud(views, seed), {"warnings": []})
 
     triangulate.triangulated_cloud = random
-    triangulate.build_features = lambda *_: SimpleNamespace(facts={"seconds": {}})  # type: ignore[assignment, return-value]
+    triangulate.build_features = lambda *_, **__: SimpleNamespace(facts={"seconds": {}})  # type: ignore[assignment, return-value]
     triangulate.features_of = triangulate.tracks_of = lambda *_: SimpleNamespace(pairs=None)  # type: ignore[assignment]
     triangulate.checked_poses = lambda views, *_: (views, {"poses": {}, "notes": [], "warnings": []})
     triangulate.with_gains = lambda views, *_: (views, {})

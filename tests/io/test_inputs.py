@@ -233,7 +233,7 @@ def test_mutual_matches_count_the_planted_ones():
     b = rng.normal(size=(40, 128)).astype(np.float32)
     b[:7] = a[10:17]
     unit = [x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b)]
-    assert features._mutual_matches(*unit) == 7
+    assert features._coarse_votes(unit).tolist() == [[0, 7], [7, 0]]
 
 
 def test_atomic_writes_leave_old_or_new(tmp_path):
