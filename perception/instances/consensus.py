@@ -98,14 +98,18 @@ class _Affinities:
 
     def _row(self, i: int) -> np.ndarray:
         """a_ij [S] of segment i with every j."""
-        masks = np.flatnonzero(self.unit[:, i] > 0)
-        c = np.zeros_like(self.s)
+        shows = self.s[:, i] > LEAST_SHARE  # w is 0 in the other views
+        masks = np.flatnonzero((self.unit[:, i] > 0) & shows[self.view])
+        s = self.s[shows]
+        c = np.zeros_like(s)
         if len(masks):
             views, first = np.unique(self.view[masks], return_index=True)
-            c[views] = np.add.reduceat(self.unit[masks] * self.unit[masks, i][:, None], first, axis=0)
-        w = np.minimum(self.s, self.s[:, i][:, None])
-        w = np.where(w > LEAST_SHARE, w, 0)
-        l_i, l_j = 1 - self.unlabelled[:, i][:, None], 1 - self.unlabelled
+            row = np.cumsum(shows)[views] - 1
+            c[row] = np.add.reduceat(self.unit[masks] * self.unit[masks, i][:, None], first, axis=0)
+        w = np.minimum(s, s[:, i][:, None])
+        w[w <= LEAST_SHARE] = 0
+        l_j = 1 - self.unlabelled[shows]
+        l_i = l_j[:, i][:, None]
         both, one = l_i * l_j, l_i + l_j - 2 * l_i * l_j
         p = np.clip(1 - ((self.z - self.z[i]) ** 2).sum(axis=1), 0, 1) * self.near[i]
         agreement, weight = (w * both * c).sum(axis=0), (w * (both + ONE_SIDED * one)).sum(axis=0)

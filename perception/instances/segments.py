@@ -6,7 +6,7 @@ import numpy as np
 
 ROUNDS = 12  # iterations of Lloyd's algorithm; groups are merged later, so convergence is not needed
 SAMPLE = 50_000  # rows from which the centres are computed; all rows are then assigned to the nearest centre
-CHUNK = 1 << 15
+CHUNK = 1 << 11  # rows; their distances to all centres stay in the cache
 
 
 def over_segment(means: np.ndarray, features: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
@@ -31,8 +31,11 @@ def over_segment(means: np.ndarray, features: np.ndarray, count: int, seed: int 
 
 def _nearest(rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
     half = 0.5 * (centres**2).sum(axis=1)
-    parts = [(half - rows[begin : begin + CHUNK] @ centres.T).argmin(axis=1) for begin in range(0, len(rows), CHUNK)]
-    return np.concatenate(parts) if parts else np.zeros(0, np.int64)
+    owner = np.zeros(len(rows), np.int64)
+    for begin in range(0, len(rows), CHUNK):
+        product = rows[begin : begin + CHUNK] @ centres.T
+        owner[begin : begin + CHUNK] = np.subtract(half, product, out=product).argmin(axis=1)
+    return owner
 
 
 def touching(means: np.ndarray, groups: np.ndarray, count: int, neighbours: int = 7, least: int = 3) -> np.ndarray:

@@ -126,7 +126,8 @@ def _of_view(gaussians: Gaussians, view: TrainingView) -> tuple[sparse.csr_matri
     )
     settings = Settings(width, height, variance=False, depth=False, eps2d=view.eps2d)
     forward = rasterize_forward(inputs, None, settings)
-    columns = []
+    seen = forward.visible[0].numpy().nonzero()[0]
+    found: list[tuple[np.ndarray, ...]] = []
     for first in range(0, len(masks), BLOCK):
         block = masks[first : first + BLOCK]
         inside = torch.zeros(1, height, width, BLOCK)
@@ -135,6 +136,9 @@ def _of_view(gaussians: Gaussians, view: TrainingView) -> tuple[sparse.csr_matri
         wanted = tuple(name == 5 for name in range(7))  # the gradient of features, and no other
         gradients, _ = rasterize_backward(inputs, None, settings, forward, (None, None, None, inside, None), wanted)
         assert gradients[5] is not None  # wanted
-        weights = gradients[5][:, : len(block)].numpy()
-        columns.append(sparse.csr_matrix(np.where(weights > FAINTEST, weights, 0)))
-    return sparse.hstack(columns, format="csr"), np.bincount(dense.reshape(-1)[:-1], minlength=len(names)).astype(float)
+        weights = gradients[5].numpy()[seen]
+        row, column = np.nonzero(weights > FAINTEST)
+        found.append((weights[row, column], seen[row], column + first))
+    weights, row, column = map(np.concatenate, zip(*found, strict=True))
+    table = sparse.csr_matrix((weights, (row, column)), shape=(len(gaussians), len(names)))
+    return table, np.bincount(dense.reshape(-1)[:-1], minlength=len(names)).astype(float)
