@@ -33,29 +33,35 @@ def render_silhouettes(
     width: int,
     height: int,
     threshold: float = 0.2,
+    eps2d: float = 0.3,
 ) -> Silhouettes:
     """Renders each instance in white, with all other Gaussians in black as occluders; takes the maximum per pixel.
 
-    ids [N] int32, −1 = none. camera_from_world [4, 4], K [3, 3] float32.
+    ids [N] int32, −1 = none. camera_from_world [4, 4], K [3, 3] float32. eps2d: see `rasterize`.
     """
     count = int(ids.max(initial=-1)) + 1
     owner = torch.from_numpy(ids.astype(np.int64))
     best = torch.full((height, width), float(threshold))
     image = torch.full((height, width), -1, dtype=torch.int32)
-    seen = torch.zeros(len(gaussians), dtype=torch.bool)
-    for first in range(0, max(count, 1), BLOCK):
-        inside = (owner >= first) & (owner < first + BLOCK)
+    blocks = [torch.arange(min(count, BLOCK))]
+    for block in blocks:
+        column = torch.full((count + 1,), -1)  # the last entry is for id −1
+        column[block] = torch.arange(len(block))
+        inside = torch.nonzero(column[owner] >= 0)[:, 0]
         white = torch.zeros(len(gaussians), BLOCK)
-        white[inside, owner[inside] - first] = 1.0
-        out = render(gaussians, camera_from_world, K, width, height, features=white, variance=False, depth=False)
-        seen = out.visible[0]
+        white[inside, column[owner[inside]]] = 1.0
+        out = render(
+            gaussians, camera_from_world, K, width, height, features=white, variance=False, depth=False, eps2d=eps2d
+        )
+        shown = owner[out.visible[0] & (owner >= 0)]
+        if len(blocks) == 1:  # which Gaussians are visible does not depend on the block
+            blocks += torch.unique(shown[shown >= BLOCK]).split(BLOCK) if count > BLOCK else ()
         assert out.features is not None  # features were given
-        value, index = out.features[0].max(dim=2)
+        value, index = out.features[0, ..., : max(len(block), 1)].max(dim=2)
         wins = value > best
         best[wins] = value[wins]
-        image[wins] = (index[wins] + first).to(torch.int32)
+        image[wins] = block[index[wins]].to(torch.int32)
     labels = image.numpy()
-    shown = owner[seen & (owner >= 0)]
     return Silhouettes(
         labels,
         np.bincount(labels[labels >= 0], minlength=count),

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import torch
 
 from perception.boxes import oriented_box
 from perception.config import LanguageConfig, MapConfig
@@ -23,6 +24,8 @@ from perception.progress import Progress
 
 BOX_TRIM = 0.01
 """Share of an instance's Gaussians left out of its oriented box at either end of each axis, as outliers."""
+HALVED_FROM = 480
+"""Long side in pixels from which silhouettes are rendered at half the resolution, at a third of the time."""
 
 
 @dataclass
@@ -78,8 +81,8 @@ def describe(
     if encoder is not None and grouped.count:
         found.language = _embed(encoder, grouped.ids, seen, views, words.views, words.zooms, progress)
     if reader is not None and grouped.count:
-        choices = _best_views(grouped.ids, seen, views, words.views)
-        texts = read_texts(reader, choices, lambda n: (views[n].photo.numpy(), seen[n].ids), progress)
+        choices = _best_views(grouped.ids, seen, words.views)
+        texts = read_texts(reader, choices, lambda n: _shown(views[n], seen[n]), progress)
         store_texts(found.instances, texts)
     if grouped.parents:
         local = np.where(grouped.part_ids >= 0, grouped.part_ids - grouped.count, -1).astype(np.int32)
@@ -105,9 +108,24 @@ def _silhouettes(
     seen = []
     for done, view in enumerate(views, start=1):
         height, width = view.photo.shape[:2]
-        seen.append(render_silhouettes(gaussians, ids, view.camera_from_world, view.K, width, height))
+        K, eps2d = view.K, view.eps2d
+        if max(height, width) >= HALVED_FROM:  # as in `TrainingView.halved`
+            height, width, K, eps2d = (
+                height // 2,
+                width // 2,
+                K * torch.tensor([[0.5], [0.5], [1.0]]),
+                (eps2d + 0.25) / 4,
+            )
+        seen.append(render_silhouettes(gaussians, ids, view.camera_from_world, K, width, height, eps2d=eps2d))
         progress.update(what, done, len(views))
     return seen
+
+
+def _shown(view: TrainingView, seen: Silhouettes) -> tuple[np.ndarray, np.ndarray]:
+    """photo [H, W, 3] uint8 and instance image [H, W] int32; each pixel of halved silhouettes fills 2 × 2."""
+    photo = view.photo.numpy()
+    y, x = (np.arange(side) * small // side for side, small in zip(photo.shape[:2], seen.ids.shape, strict=True))
+    return photo, seen.ids[y[:, None], x]
 
 
 def _entries(grouped: Grouping, gaussians: Gaussians, seen: list[Silhouettes]) -> list[dict[str, Any]]:
@@ -155,8 +173,8 @@ def _embed(
     """
     descriptions = describe_instances(
         encoder,
-        _best_views(ids, seen, views, best),
-        lambda index: (views[index].photo.numpy(), seen[index].ids),
+        _best_views(ids, seen, best),
+        lambda index: _shown(views[index], seen[index]),
         [view.name for view in views],
         levels=zooms or reading_of(encoder).zooms,
         progress=progress,
@@ -164,10 +182,10 @@ def _embed(
     return to_arrays(descriptions, encoder.identity)
 
 
-def _best_views(ids: np.ndarray, seen: list[Silhouettes], views: list[TrainingView], best: int) -> list[np.ndarray]:
+def _best_views(ids: np.ndarray, seen: list[Silhouettes], best: int) -> list[np.ndarray]:
     """The `best` views of each instance (eq. 10), see `crops.choose_views`."""
     pixels = np.stack([view.pixels for view in seen], axis=1)
     total = np.maximum(np.bincount(ids[ids >= 0], minlength=len(pixels)), 1)
     visible = np.stack([view.visible for view in seen], axis=1) / total[:, None]
-    sizes = np.array([view.photo.shape[0] * view.photo.shape[1] for view in views])
+    sizes = np.array([view.ids.size for view in seen])
     return choose_views(view_scores(pixels, sizes, visible), best)
