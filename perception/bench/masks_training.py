@@ -29,7 +29,8 @@ from perception.masks.surface_graph import SurfaceGraph
 SCENES = (("clutter", 3100, 2), ("clutter", 3101, 2), ("room", 2000, 1), ("tabletop", 1000, 1))  # first seed, step
 SHARES = {"training": range(8), "validation": range(8, 9), "test": range(9, 10)}  # last digit of a world's number
 PAIRS, LEAST = 8000, 20  # pairs of one world and round; voxels of a region that is learned from
-COSTS = (0.05, 0.1, 0.15, 0.2, 0.3)
+MEMBERS = 3  # networks of an ensemble
+COSTS = (0.05, 0.1, 0.15, 0.2)  # higher ones join things in scenes unlike the worlds
 NOISE, NEARER = 0.1, 0.3  # standard deviations: of inputs, relative to theirs; of the logarithm of the size of things
 PAIR_SIZE = {6: 2, 7: 2, 9: 1, **dict.fromkeys(range(27, 33), 1)}  # power of that size in SurfaceGraph.features
 WHOLE_SIZE = {4: 2, 5: 1, 6: 1, 7: 1}  # and in MergeTree.features
@@ -158,7 +159,7 @@ def regions_of(world: World, pair: Network) -> Samples:
 
 
 def fit(samples: list[Samples], size: dict[int, int], epochs: int, seed: int) -> Network:
-    """Three networks with 24 and 12 hidden units, by AdamW on the weighted cross entropy. size: features that grow with
+    """Networks with 24 and 12 hidden units, by AdamW on the weighted cross entropy. size: features that grow with
     the size of things, and their power of it. Inputs are varied by other sizes and by noise, for stability."""
     import torch
 
@@ -169,14 +170,14 @@ def fit(samples: list[Samples], size: dict[int, int], epochs: int, seed: int) ->
     target, weights = (torch.from_numpy(a.astype(np.float32)) for a in (y, weight[:, None] / weight.mean()))
     nearer = torch.tensor([NEARER * size.get(k, 0) / float(scale[k]) for k in range(len(scale))])
     sizes = [x.shape[1], 24, 12, y.shape[1]]
-    layers = [(torch.randn(3, b, a) * (2 / a) ** 0.5).requires_grad_() for a, b in pairwise(sizes)]
-    offsets = [torch.zeros(3, 1, b, requires_grad=True) for b in sizes[1:]]
+    layers = [(torch.randn(MEMBERS, b, a) * (2 / a) ** 0.5).requires_grad_() for a, b in pairwise(sizes)]
+    offsets = [torch.zeros(MEMBERS, 1, b, requires_grad=True) for b in sizes[1:]]
     steps = epochs * len(x) // 1024
     optimiser = torch.optim.AdamW([*layers, *offsets], lr=4e-3, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     for _ in range(steps):
-        some = torch.randint(len(x), (3, 1024))
-        h = inputs[some] + NOISE * torch.randn(3, 1024, x.shape[1]) + torch.randn(3, 1024, 1) * nearer
+        some = torch.randint(len(x), (MEMBERS, 1024))
+        h = inputs[some] + NOISE * torch.randn(MEMBERS, 1024, x.shape[1]) + torch.randn(MEMBERS, 1024, 1) * nearer
         for k, (layer, offset) in enumerate(zip(layers, offsets, strict=True)):
             h = torch.baddbmm(offset, h.relu() if k else h, layer.transpose(1, 2))
         optimiser.zero_grad()
@@ -219,12 +220,12 @@ def _mean(model: MergeModel, cases: list[tuple[World, MergeTree]]) -> dict[str, 
 
 
 def tuned(model: MergeModel, worlds: list[World]) -> MergeModel:
-    """The cost with the best mean AP on `worlds`, and the calibration of the segments found with it."""
+    """The cost with the best mean of AP, AP50 and AP25, and the calibration of the segments found with it."""
     from scipy.optimize import minimize
 
     cases = [(world, tree_by(model, world.graph)) for world in worlds]
     runs = {cost: _mean(replace(model, cost=cost), cases) for cost in COSTS}
-    cost = max(COSTS, key=lambda c: runs[c]["ap"])
+    cost = max(COSTS, key=lambda c: runs[c]["ap"] + runs[c]["ap50"] + runs[c]["ap25"])
     p, sign = runs[cost]["p"].clip(1e-6, 1 - 1e-6), np.where(runs[cost]["right"], -1, 1)
     odds = np.log(p / (1 - p))
     found = minimize(lambda ab: np.logaddexp(0, sign * (ab[0] * odds + ab[1])).mean(), [1.0, 0.0])

@@ -1,0 +1,35 @@
+"""Worlds that the built-in masks are trained on, and what is learned from them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from perception.bench.masks_training import fit, make_world, pairs_of, plain_rule
+from perception.demo.scene import make_photos
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stereo", [False, True])
+def test_truth_of_a_worlds_voxels_against_the_true_points(tmp_path, stereo):
+    home = tmp_path / "clutter_5"
+    made = make_photos(home / "images", scene="clutter", views=8, width=160, height=120, seed=5, light_samples=2,
+                       truth_folder=home)  # fmt: skip
+    world = make_world(home, stereo)
+    distance, near = cKDTree(made.points).query(world.graph.surface.points)
+    close = (distance < world.graph.surface.size) & (world.truth > 0)
+    assert close.mean() > 0.2  # the cloud of true points is thin on walls
+    assert (world.truth[close] == made.instance_ids[near[close]]).mean() > 0.85
+    features, one, weights = pairs_of(world, plain_rule, 0)
+    assert len(features) == len(one) == len(weights) > 50 and 0.1 < one.mean() < 0.95
+    again = make_world(home, stereo)  # from its file
+    np.testing.assert_array_equal(again.graph.sums, world.graph.sums)
+
+
+def test_networks_learn_a_rule_that_is_not_linear():
+    rng = np.random.default_rng(2)
+    x = rng.normal(3, 2, (6000, 4))
+    y = (np.abs(x[:, :1] - 3) > 1.5) != (x[:, 1:2] > 3)
+    network = fit([(x[:5000], y[:5000], np.ones(5000))], {}, 60, 0)
+    assert ((network(x[5000:]) > 0) == y[5000:]).mean() > 0.9
