@@ -255,9 +255,7 @@ class Editor:
             known = np.unique(own[np.isin(own, [part["id"] for part in entry["parts"]])])
             return np.where(np.isin(own, known), np.searchsorted(known, own), -1)
         finer = InstanceConfig(min_cluster_size=max(8, len(rows) // 20), min_samples=8)
-        return cluster_gaussians(
-            gmap.means[rows], gmap.scales[rows], gmap.opacities[rows], gmap.features[rows], finer
-        ).ids
+        return cluster_gaussians(gmap.means[rows], gmap.scales[rows], gmap.opacities[rows], gmap.features[rows], finer)
 
     def _next_id(self) -> int:
         entries = [entry for state in (*self._past, *self._future) for entry in state.instances]

@@ -5,8 +5,6 @@ HDBSCAN (Campello et al. 2013) as in the paper (§3.2.1). It finds the number of
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from perception.config import InstanceConfig
@@ -17,18 +15,6 @@ MAX_CLUSTERED = 60_000
 """Maximum number of rows for exact HDBSCAN, whose time and memory grow faster than linearly."""
 
 
-@dataclass(frozen=True)
-class Clusters:
-    """ids [N] int32: −1 = noise, 0 … M − 1 by falling size; membership [N] float32 in [0, 1], 0 for noise."""
-
-    ids: np.ndarray
-    membership: np.ndarray
-
-    @property
-    def count(self) -> int:
-        return int(self.ids.max(initial=-1)) + 1
-
-
 def cluster_gaussians(
     means: np.ndarray,
     scales: np.ndarray,
@@ -36,34 +22,32 @@ def cluster_gaussians(
     features: np.ndarray,
     config: InstanceConfig,
     seed: int = 0,
-) -> Clusters:
-    """Instance ids of N Gaussians.
+) -> np.ndarray:
+    """Instance ids [N] int32 of N Gaussians: −1 = noise, 0 … M − 1 by falling size.
 
     means [N, 3], scales [N, 3], opacities [N], features [N, D] float. Gaussians with non-finite features are not
     clustered and stay noise. So do those fainter than MIN_OPACITY, unless nothing settles them later (`config.settle`).
     """
     count = len(means)
     ids = np.full(count, -1, np.int32)
-    membership = np.zeros(count, np.float32)
     least = MIN_OPACITY if config.settle else 0.0
     solid = np.flatnonzero((opacities >= least) & np.isfinite(features).all(axis=1))
     if len(solid) < config.min_cluster_size:
-        return Clusters(ids, membership)
-    found, strength = cluster_features(features[solid], config, seed)
+        return ids
+    found = cluster_features(features[solid], config, seed)
     if config.split:
         found = split_disconnected(means[solid], scales[solid], found, config.min_cluster_size)
     ids[solid] = by_falling_size(found)
-    membership[solid] = np.where(ids[solid] >= 0, strength, 0)
-    return Clusters(ids, membership)
+    return ids
 
 
-def cluster_features(features: np.ndarray, config: InstanceConfig, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Labels and membership strengths of rows [N, D]. Above MAX_CLUSTERED rows, HDBSCAN runs on a random sample."""
+def cluster_features(features: np.ndarray, config: InstanceConfig, seed: int = 0) -> np.ndarray:
+    """Labels of rows [N, D]. Above MAX_CLUSTERED rows, HDBSCAN runs on a random sample."""
     import hdbscan
 
     # Equal rows have distance 0, which HDBSCAN turns into infinite density. All features equal: one cluster.
     if np.ptp(features, axis=0).max() < 1e-6:
-        return np.zeros(len(features), np.int64), np.ones(len(features), np.float32)
+        return np.zeros(len(features), np.int64)
     chosen = np.arange(len(features))
     if len(features) > MAX_CLUSTERED:
         chosen = np.sort(np.random.default_rng(seed).choice(len(features), MAX_CLUSTERED, replace=False))
@@ -75,17 +59,15 @@ def cluster_features(features: np.ndarray, config: InstanceConfig, seed: int = 0
         approx_min_span_tree=False,
         allow_single_cluster=False,
     ).fit(features[chosen].astype(np.float64))
-    labels, strengths = model.labels_, model.probabilities_
+    labels = model.labels_
     if labels.max(initial=-1) < 0:  # no cluster found: treat all rows as one object
-        labels, strengths = np.zeros(len(chosen), np.int64), np.ones(len(chosen))
+        labels = np.zeros(len(chosen), np.int64)
     if len(chosen) < len(features):
-        labels, strengths = _spread(features, chosen, labels, strengths, config.min_samples)
-    return labels, strengths.astype(np.float32)
+        labels = _spread(features, chosen, labels, config.min_samples)
+    return np.asarray(labels)
 
 
-def _spread(
-    features: np.ndarray, chosen: np.ndarray, labels: np.ndarray, strengths: np.ndarray, samples: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _spread(features: np.ndarray, chosen: np.ndarray, labels: np.ndarray, samples: int) -> np.ndarray:
     """Extends the labels of the rows `chosen` [S] to all rows [N, D] with HDBSCAN's density criterion.
 
     A row's core distance is its distance to the `samples`-th nearest sampled row. A row joins the cluster of its
@@ -103,7 +85,7 @@ def _spread(
     first = (labels[nearest] >= 0).argmax(axis=1)
     source = nearest[np.arange(len(features)), first]
     joins = (labels[source] >= 0) & (core <= limit[labels[source]])
-    return np.where(joins, labels[source], -1), np.where(joins, strengths[source], 0)
+    return np.where(joins, labels[source], -1)
 
 
 def split_disconnected(means: np.ndarray, scales: np.ndarray, ids: np.ndarray, smallest: int) -> np.ndarray:

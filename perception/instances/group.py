@@ -67,7 +67,7 @@ def group(
     """
     features = np.where(np.isfinite(features), features, 0) / np.sqrt(margin)
     if config.method == "hdbscan":
-        ids = cluster_gaussians(means, scales, opacities, features, config, seed).ids
+        ids = cluster_gaussians(means, scales, opacities, features, config, seed)
         parts = np.full(len(ids), -1, np.int64)
         parents = np.zeros(0, np.int64)
     else:

@@ -20,7 +20,7 @@ def blobs(centres: np.ndarray, feature: np.ndarray, each: int, rng: np.random.Ge
 
 def run(means: np.ndarray, features: np.ndarray, **changes: int) -> np.ndarray:
     scales, opacities = np.full((len(means), 3), 0.02), np.full(len(means), 0.9)
-    return cluster_gaussians(means, scales, opacities, features, InstanceConfig(**changes)).ids
+    return cluster_gaussians(means, scales, opacities, features, InstanceConfig(**changes))
 
 
 @pytest.mark.parametrize("width", [1, 8, 32])
