@@ -203,7 +203,7 @@ alone. β, λ_inst2d, the growth of the crops (.3) and the threshold of silhouet
 - Harmonics gain a degree every 5 % after growth (3DGS: every 1000 iterations), and degrees worth under .05 dB are cut.
 - Exposure that differs between the photos is compensated.
 - Above 60 000 Gaussians HDBSCAN runs on a sample, and the others join by its density criterion.
-- A pixel where two silhouettes exceed the threshold belongs to the heavier one alone.
+- Silhouettes of large photos are rendered at half their size; a pixel of two belongs to the heavier one alone.
 - An instance's score is the calibrated agreement with the masks; `--protocol segment3d` gives AP with constant ones.
 - `query` calibrates similarities; the plain cosine is `bench lerf-ovs --scoring cosine` and `bench scannetpp`.
 """
