@@ -18,7 +18,7 @@ from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.progress import Progress
 from perception.types import View
 
-VERSION = 11  # increased whenever the label images change, so that cached ones are recomputed
+VERSION = 12  # increased whenever the label images change, so that cached ones are recomputed
 _SMOOTH = 0.03  # relative to the depth: a pixel with a larger depth step is not part of the surface
 _LEAST_VOXELS = 100
 
