@@ -95,7 +95,8 @@ class TrainingObserver:
         now = time.monotonic()
         self.loss = loss if self.loss is None else 0.95 * self.loss + 0.05 * loss
         self.first = self.first or (now, trainer.iteration)
-        if now - self.drawn > DRAWN_SECONDS or trainer.progress >= 1:
+        timed = trainer.iteration > self.first[1]  # the first iteration alone gives no rate
+        if (timed and now - self.drawn > DRAWN_SECONDS) or trainer.progress >= 1:
             self.drawn = now
             self._draw(trainer, now)
         if not self.entered and trainer.progress >= self.masks_enter:
