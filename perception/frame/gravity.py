@@ -24,7 +24,7 @@ TILT, SHARED_ROLL, PITCH, BEND = np.radians([1.2, 1.0, 20.0, 0.8])
 shared roll; of the cameras' mean y axis from down; of the reconstruction's bend, which all planes have in common."""
 BEFORE, CLUTTER = 3.0, 1.5
 """Planes whose spread TILT is taken to be, beside those found. Standard error of a plane that has as many points on its
-sides as in it, in half thicknesses over its width: a slab of clutter has any direction. As kitchen_rgbd needs it."""
+sides as in it, in half thicknesses over its width: a slab of clutter has any direction. Chosen on a real kitchen."""
 CONFIDENT = 3.0
 """Largest standard error in degrees at which a map is turned by its gravity."""
 

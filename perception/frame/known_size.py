@@ -111,8 +111,8 @@ def scale_of_sightings(
 ) -> Measurement:
     """Metres per unit from things of known size; pixel_error: least standard deviation of their pixels.
 
-    The standard error is the larger of two: the effect of random pixel noise, and the spread when one view at a time is
-    left out (jackknife), since the error of a view's pose moves all its corners.
+    The standard error is the larger of two. One is the effect of random pixel noise. The other is the jackknife's, the
+    spread of the scales computed without each view: a wrong pose moves all corners of its view together.
     InputError when the corners do not have the shape.
     """
     poses = np.stack([view.camera_from_world for view in views])

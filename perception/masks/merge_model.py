@@ -1,6 +1,7 @@
 """The learned part of the built-in masks: small neural networks whose weights come with the package.
 
-`python -m perception.bench.masks_training` makes the weights file from rendered worlds alone.
+`python -m perception.bench.masks_training` makes such a file from rendered worlds alone. The packaged one comes from an
+earlier run on other worlds, see docs/masks.md.
 """
 
 from __future__ import annotations
