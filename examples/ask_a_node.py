@@ -1,33 +1,37 @@
-"""Asks a running query node over DDS, without ROS 2: python examples/ask_a_node.py "red mug" (extra: ros)
-
-ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE choose the network, as for ROS 2.
-"""
+"""Asks a running query node through ROS 2: python examples/ask_a_node.py "red mug" [NAMESPACE]"""
 
 import json
 import sys
 import time
 import uuid
 
-from perception.io.cdr import deserialize, serialize
-from perception.node.channels import ANSWER, PROMPT
-from perception.node.config import NodeConfig
-from perception.node.participant import Participant
+import rclpy
+from std_msgs.msg import String
 
-config = NodeConfig(namespace=sys.argv[2] if len(sys.argv) > 2 else "perception")
-participant = Participant(config.domain_id)
-answers = participant.reader(f"rt/{ANSWER.path(config.namespace)}", ANSWER.kind)
-prompts = participant.writer(f"rt/{PROMPT.path(config.namespace)}", PROMPT.kind)
+namespace = sys.argv[2] if len(sys.argv) > 2 else "perception"
 mine = uuid.uuid4().hex
-question = serialize(PROMPT.kind, {"data": json.dumps({"text": sys.argv[1], "id": mine})})
-
+question = String(data=json.dumps({"text": sys.argv[1], "id": mine}))
 received: list[dict] = []
-for _ in range(20):  # a message sent before node and client have discovered each other is lost: asked again
-    prompts.write(question)
-    time.sleep(0.5)
-    told = [json.loads(deserialize(ANSWER.kind, data)["data"]) for data, _header in answers.take()]
-    received = [answer for answer in told if answer["id"] == mine]
-    if received:
-        print(json.dumps(received[0], indent=1))
-        break
-participant.close()
-sys.exit(0 if received else f"no node serves '{config.namespace}' on domain {config.domain_id}")
+
+
+def hear(message: String) -> None:
+    """Keeps the answer to our own question; other clients' answers come on the same topic."""
+    answer = json.loads(message.data)
+    if answer["id"] == mine:
+        received.append(answer)
+
+
+rclpy.init()
+node = rclpy.create_node("asker")
+prompts = node.create_publisher(String, f"/{namespace}/prompt", 10)
+node.create_subscription(String, f"/{namespace}/answer", hear, 10)
+end, again = time.monotonic() + 10, 0.0
+while not received and time.monotonic() < end:
+    if time.monotonic() >= again:  # a message sent before node and client have discovered each other is lost
+        prompts.publish(question)
+        again = time.monotonic() + 0.5
+    rclpy.spin_once(node, timeout_sec=0.1)
+node.destroy_node()
+rclpy.shutdown()
+print(json.dumps(received[0], indent=1) if received else f"no node serves '{namespace}'")
+sys.exit(0 if received else 1)

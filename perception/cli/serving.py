@@ -58,12 +58,10 @@ def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _add_node(commands: Any) -> None:
-    p = command(commands, "node", _node, "serve a map on DDS or ROS 2: prompts in; points, boxes and markers out")
+    p = command(commands, "node", _node, "serve a map on ROS 2 (rclpy): prompts in; points, boxes and markers out")
     p.add_argument("map", type=Path, metavar="MAP")
-    p.add_argument("--transport", help="dds, rclpy or auto: rclpy where ROS 2 is, else dds")
     p.add_argument("--namespace", metavar="NAME", help="before all topics; default: perception")
-    p.add_argument("--domain", metavar="N", help="DDS domain; default: ROS_DOMAIN_ID or 0")
-    p.add_argument("--network", metavar="NET", help="localhost, or an interface such as eth0 (dds only)")
+    p.add_argument("--domain", metavar="N", help="ROS domain; default: ROS_DOMAIN_ID or 0")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs", help="further settings")
 
 
@@ -72,7 +70,7 @@ def _node(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.node.config import node_config
 
     values = read_pairs(args.pairs)
-    for name in ("transport", "namespace", "domain", "network"):
+    for name in ("namespace", "domain"):
         if getattr(args, name) is not None:
             values[name] = getattr(args, name)
     config = node_config(values)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import Field
 
@@ -21,13 +21,7 @@ class NodeConfig(Settings):
         title="names of letters, digits and _, joined by /",
         description="stands before every topic and service",
     )
-    transport: Literal["auto", "dds", "rclpy"] = Field(
-        "auto", description="dds: CycloneDDS; rclpy: this machine's ROS 2; auto: rclpy where it can be imported"
-    )
-    domain: int | None = Field(None, ge=0, le=232, description="DDS domain; none: ROS_DOMAIN_ID or 0")
-    network: str | None = Field(
-        None, description='dds only: "localhost" or an interface; none: as ROS_AUTOMATIC_DISCOVERY_RANGE says'
-    )
+    domain: int | None = Field(None, ge=0, le=232, description="ROS domain; none: ROS_DOMAIN_ID or 0")
     workers: int = Field(2, ge=1, le=64, description="queries answered at the same time")
     queue_size: int = Field(64, ge=1, le=10_000, description="requests that may wait")
     timeout: float = Field(10.0, gt=0, le=3600, description="seconds until a request is given up")
@@ -42,7 +36,7 @@ class NodeConfig(Settings):
 
     @property
     def domain_id(self) -> int:
-        """The DDS domain; InputError when ROS_DOMAIN_ID is no number."""
+        """The ROS domain; InputError when ROS_DOMAIN_ID is no number."""
         if self.domain is not None:
             return self.domain
         text = os.environ.get("ROS_DOMAIN_ID", "") or "0"

@@ -25,8 +25,8 @@ _MOST_NAMES = 32
 
 
 class Transport(Protocol):
-    """The interface of DDS or rclpy that the core uses. `publish` is called from any thread and does not raise for a
-    slow or absent reader. The health message contains `warnings` (present problems) and `figures` (counts)."""
+    """What the core uses of `ros.RosTransport`. `publish` is called from any thread and does not raise for a slow or
+    absent reader. The health message contains `warnings` (present problems) and `figures` (counts)."""
 
     def publish(self, topic: channels.Topic, message: Message) -> None: ...
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from perception.errors import InputError
 from perception.node import channels
 from perception.node.channels import DEPTH, Topic
 from perception.node.config import NodeConfig
@@ -27,8 +26,6 @@ class RosTransport:
     """Publishers, subscription and services of one rclpy node. `serve` blocks."""
 
     def __init__(self, config: NodeConfig) -> None:
-        if config.network is not None:
-            raise InputError("node.network: only for --transport dds; with rclpy set ROS_AUTOMATIC_DISCOVERY_RANGE")
         import rclpy
         from rclpy.signals import SignalHandlerOptions
 

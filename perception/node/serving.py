@@ -10,9 +10,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from perception.errors import InputError, missing_extra
+from perception.errors import InputError
 from perception.node.config import NodeConfig
 from perception.node.core import Core
+from perception.node.ros import RosTransport
 from perception.query import QueryEngine
 
 if TYPE_CHECKING:
@@ -28,11 +29,12 @@ def serve_node(
 ) -> dict[str, Any]:
     """Serves the map at `path` until `stop` is set; returns the engine's health figures.
 
-    InputError when the map or the network cannot be used, or when another node of this name is running.
+    InputError when the map cannot be used, rclpy cannot be imported, or another node of this name is running.
     encoders: see QueryEngine.
     """
-    kind = transport_kind(config)
-    with contextlib.closing(_make(kind, config)) as transport, _engine(path, config, encoders) as engine:
+    if importlib.util.find_spec("rclpy") is None:
+        raise InputError("node: rclpy cannot be imported; install ROS 2 and source its setup file")
+    with contextlib.closing(RosTransport(config)) as transport, _engine(path, config, encoders) as engine:
         others = transport.others()
         if others:
             raise InputError(
@@ -44,8 +46,8 @@ def serve_node(
         core.start()
         held = engine.current
         log(
-            f"serving {path} (map {held.map_id}, {len(held.instances)} instances) by {kind}, domain "
-            f"{config.domain_id}, as /{config.namespace}"
+            f"serving {path} (map {held.map_id}, {len(held.instances)} instances) on domain {config.domain_id}, "
+            f"as /{config.namespace}"
         )
         transport.serve(core, stop)
         return engine.health()
@@ -80,25 +82,3 @@ def stop_on_signals() -> Iterator[threading.Event]:
             signal.signal(number, handler)
     if interrupted.is_set():
         raise KeyboardInterrupt
-
-
-def transport_kind(config: NodeConfig) -> str:
-    """The transport, dds or rclpy. InputError with the remedy when it is not installed."""
-    if config.transport != "dds" and importlib.util.find_spec("rclpy") is not None:
-        return "rclpy"
-    if config.transport == "rclpy":
-        raise InputError("node: rclpy cannot be imported; source ROS 2's setup file, or take --transport dds")
-    for package in ("cyclonedds", "rosbags"):
-        if importlib.util.find_spec(package) is None:
-            raise missing_extra(package, "ros")
-    return "dds"
-
-
-def _make(kind: str, config: NodeConfig) -> Any:
-    if kind == "rclpy":
-        from perception.node.ros import RosTransport
-
-        return RosTransport(config)
-    from perception.node.dds import DdsTransport
-
-    return DdsTransport(config)

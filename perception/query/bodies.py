@@ -1,4 +1,4 @@
-"""The JSON request bodies of the HTTP and DDS servers as pydantic models, and their conversion to query types.
+"""The JSON request bodies of the HTTP server and the ROS node as pydantic models, and their conversion to query types.
 
 Numbers are finite and at most MAX_NUMBER in absolute value, so that squares and products of lengths stay finite. Texts
 are Unicode without lone surrogates. A field that is null counts as absent.

@@ -1,6 +1,6 @@
 """The query engine of all servers: one map, worker threads, a bounded request queue, reload of a changed map.
 
-Servers (HTTP, DDS, ROS) only convert messages. Queueing, rejection, time-outs and reloading are implemented here.
+Servers (HTTP, ROS) only convert messages. Queueing, rejection, time-outs and reloading are implemented here.
 """
 
 from __future__ import annotations

@@ -75,21 +75,19 @@ for text in texts:
         [[m.pose.position.x, m.pose.orientation.w, m.scale.x, m.color.g, m.type, m.id] for m in marks]
     )
 
-# rmw_fastrtps and rmw_cyclonedds do not speak each other's services (ROS 2's own limit), so only rclpy's node here.
-if space == "by_rclpy":
-    query = node.create_client(GetParameters, f"/{space}/query")
-    reload = node.create_client(Trigger, f"/{space}/reload")
-    spin_until(lambda: query.service_is_ready() and reload.service_is_ready())
-    for text in texts:
-        asked = query.call_async(GetParameters.Request(names=[text, json.dumps({"text": text, "want": "points"}), ""]))
-        spin_until(asked.done)
-        told = asked.result().values
-        found[f"{text}/service"] = told[0].string_value
-        found[f"{text}/service points"] = np.array(told[1].double_array_value)
-        found["empty/service"] = told[2].string_value
-    asked = reload.call_async(Trigger.Request())
+query = node.create_client(GetParameters, f"/{space}/query")
+reload = node.create_client(Trigger, f"/{space}/reload")
+spin_until(lambda: query.service_is_ready() and reload.service_is_ready())
+for text in texts:
+    asked = query.call_async(GetParameters.Request(names=[text, json.dumps({"text": text, "want": "points"}), ""]))
     spin_until(asked.done)
-    found["reload"] = asked.result().message
+    told = asked.result().values
+    found[f"{text}/service"] = told[0].string_value
+    found[f"{text}/service points"] = np.array(told[1].double_array_value)
+    found["empty/service"] = told[2].string_value
+asked = reload.call_async(Trigger.Request())
+spin_until(asked.done)
+found["reload"] = asked.result().message
 np.savez(out, **found)
 node.destroy_node()
 rclpy.shutdown()

@@ -1,14 +1,12 @@
-"""Serialises ROS 2 messages to and from CDR with the optional package `rosbags`."""
+"""Serialises ROS 2 messages, given as dicts of their fields, to CDR with `rosbags`."""
 
 from __future__ import annotations
 
-import dataclasses
 from functools import cache
 from typing import Any
 
 import numpy as np
-
-from perception.errors import missing_extra
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 # Types missing in rosbags: vision_msgs 4 (ROS 2 Humble and later) and the two services the node offers.
 _MORE = {
@@ -32,10 +30,6 @@ _MORE = {
 @cache
 def typestore() -> Any:
     """The ROS 2 Jazzy types of rosbags with those above added."""
-    try:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    except ImportError as error:
-        raise missing_extra("rosbags", "ros") from error
     store = get_typestore(Stores.ROS2_JAZZY)
     types: dict[str, Any] = {}
     for name, definition in _MORE.items():
@@ -47,31 +41,6 @@ def typestore() -> Any:
 def serialize(kind: str, message: dict[str, Any]) -> bytes:
     """A message, given as a dict of its fields, as little-endian CDR with the four-byte header."""
     return bytes(typestore().serialize_cdr(build(kind, message), kind))
-
-
-def deserialize(kind: str, data: bytes) -> dict[str, Any]:
-    """The fields of a message. Raises ValueError unless `data` is exactly one such message."""
-    if len(data) < 4 or data[0] != 0 or data[1] > 1:
-        raise ValueError(f"{kind}: no CDR head")
-    try:
-        message = typestore().deserialize_cdr(data, kind)
-    except Exception as error:  # the generated code raises various exceptions on malformed bytes
-        raise ValueError(f"{kind}: {error}") from error
-    return plain(message)
-
-
-def plain(message: Any) -> dict[str, Any]:
-    """A rosbags message as the dict of its fields."""
-    names = [field.name for field in dataclasses.fields(message) if not field.name.startswith("__")]
-    return {name: _plain(getattr(message, name)) for name in names}
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
-        return plain(value)
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    return value
 
 
 def build(kind: str, message: dict[str, Any]) -> Any:
