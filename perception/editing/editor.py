@@ -18,8 +18,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from perception.boxes import oriented_box
-from perception.config import InstanceConfig
+from perception.config import FrameConfig, InstanceConfig
 from perception.errors import InputError
+from perception.frame.moved_map import scale_map
 from perception.io.map import Map
 from perception.io.map_lock import writing
 from perception.io.store import map_signature, read_info, read_map, write_map
@@ -237,6 +238,20 @@ class Editor:
             write_map(self.path, self.current(), keep_report=True)
             self._signature = map_signature(self.path)
         self._saved = self._now
+
+    @_step
+    def set_scale(self, known_length: str) -> dict[str, Any]:
+        """Writes the map in metres by `scale_map`, whose result is returned, and opens it anew without history.
+
+        InputError as `save`, with unsaved edits, or when the map's own scale is more certain.
+        """
+        with writing(self.path):
+            if self.dirty or self.outdated:
+                found = "unsaved corrections; save them" if self.dirty else "changes by another program; open it"
+                raise InputError(f"{self.path}: has {found} first, then set the scale")
+            facts = scale_map(self.path, None, FrameConfig(known_length=known_length), improve=True)
+            self.reopen()
+        return facts
 
     @_step
     def reopen(self) -> None:

@@ -27,11 +27,14 @@ chosen point in median sizes of a Gaussian."""
 SOLID = 0.5  # least opacity of the Gaussians whose means are surface points
 
 
-def scale_map(path: Path, output: Path | None, options: FrameConfig, level: bool = False) -> dict[str, Any]:
+def scale_map(
+    path: Path, output: Path | None, options: FrameConfig, level: bool = False, improve: bool = False
+) -> dict[str, Any]:
     """Writes the map at `path` in metres to `output` (None: in place); level: also turned z up, as `placed_scene`.
 
     The unit is measured by `options` (a known length also between instances or points) and by GPS of the photos.
-    Returns {"map", "factor", "scale", "gravity", "notes"}. InputError when nothing tells the unit or the vertical.
+    Returns {"map", "factor", "scale", "gravity", "notes"}. InputError when nothing tells the unit or the vertical;
+    with `improve` also when the map is in metres already with a smaller standard error, or without any stated.
     """
     target = output or path
     if output is not None and output.exists():
@@ -39,10 +42,17 @@ def scale_map(path: Path, output: Path | None, options: FrameConfig, level: bool
     with writing(target):
         gmap = read_map(path)
         scale, notes = _measured(gmap, options)
-        factor = scale.metres
+        factor, error = scale.metres, scale.standard_error / scale.metres
+        stated = (gmap.info.get("scale") or {}).get("standard_error")
+        if improve and gmap.metric and (stated is None or stated <= error):
+            known = "as its input states" if stated is None else f"within ± {stated:.1%}"
+            raise InputError(
+                f"{path}: is in metres already, {known}, and this length only within ± {error:.1%}; `perception scale` "
+                "replaces the unit all the same"
+            )
         b_from_a = np.diag([factor, factor, factor, 1.0])
         info = {**gmap.info, "metric": True}
-        info["scale"] = Measurement(1.0, scale.standard_error / factor, scale.source).to_json()
+        info["scale"] = Measurement(1.0, error, scale.source).to_json()
         if level:
             solid = gmap.means[gmap.opacities >= SOLID].astype(np.float64)
             gravity = gravity_of_scene(gmap.poses, solid)

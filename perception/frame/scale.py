@@ -132,7 +132,7 @@ def known_length(text: str) -> KnownLength:
         if entries and all(entries):
             return KnownLength(metres, pixels={e[1]: _finite([e[2], e[3]]) for e in entries if e})
     except ValueError as error:
-        raise InputError(f"known length: found '{text}', {expected}") from error
+        raise InputError(f"known length: found '{text}', {expected} ({error})") from error
     names = [name.strip() for name in rest.split(",")]
     if len(names) != 2 or not all(names) or ";" in rest:
         raise InputError(f"known length: found '{text}', {expected}")
@@ -142,5 +142,5 @@ def known_length(text: str) -> KnownLength:
 def _finite(places: list[str]) -> np.ndarray:
     values = np.array([[float(x) for x in place.split(",")] for place in places])
     if not np.isfinite(values).all() or np.array_equal(values[0], values[1]):
-        raise ValueError("two different places of finite numbers")
+        raise ValueError("its ends must be two different places of finite numbers")
     return values

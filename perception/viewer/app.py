@@ -18,6 +18,7 @@ import numpy as np
 from perception.errors import InputError, missing_extra
 from perception.listening import check_address, is_local, listen, url_host
 from perception.viewer.guard import Guard, guarded_server
+from perception.viewer.paint import HIGHLIGHT
 from perception.viewer.panel import Panel
 from perception.viewer.session import Session
 from perception.viewer.splats import Splats
@@ -47,8 +48,8 @@ class Viewer:
         self.address = f"http://{shown}:{sock.getsockname()[1]}"
         self.url = f"{self.address}/?token={quote(token, safe='')}"
         self._one = threading.RLock()  # the actions of all browsers run one at a time
-        self._overlays: dict[str, list[Any]] = {"boxes": [], "names": []}
-        self._overlays_on = dict.fromkeys(self._overlays, False)
+        self._overlays: dict[str, list[Any]] = {"boxes": [], "names": [], "length": []}
+        self._overlays_on = {"boxes": False, "names": False, "length": True}
         self._frame_map()
         self._drawn = self.session.editor.original
         self._splats = Splats(self._drawn, self.scale)
@@ -124,7 +125,7 @@ class Viewer:
     def _draw(self, kind: str) -> None:
         for handle in self._overlays[kind]:
             handle.remove()
-        draw = {"boxes": self._boxes, "names": self._names}[kind]
+        draw = {"boxes": self._boxes, "names": self._names, "length": self._length}[kind]
         self._overlays[kind] = draw() if self._overlays_on[kind] else []
 
     def _visible_entries(self) -> list[dict[str, Any]]:
@@ -151,14 +152,19 @@ class Viewer:
         return handles
 
     def _names(self) -> list[Any]:
-        add = self.server.scene.add_label
+        add, name = self.server.scene.add_label, self.session.name
         return [
-            add(
-                f"/map/names/{entry['id']}",
-                self.session.name(entry),
-                position=tuple(np.array(entry["centroid"]) * self.scale),
-            )
-            for entry in self._visible_entries()
+            add(f"/map/names/{e['id']}", name(e), position=tuple(np.array(e["centroid"]) * self.scale))
+            for e in self._visible_entries()
+        ]
+
+    def _length(self) -> list[Any]:
+        scene, points = self.server.scene, (np.array(self.session.ends) * self.scale).astype(np.float32)
+        if len(points) < 2:
+            return []
+        return [
+            scene.add_line_segments("/map/length/line", points[None], tuple(HIGHLIGHT.tolist()), thickness=0.02),
+            scene.add_label("/map/length/text", self.session.length, position=tuple(points.mean(axis=0))),
         ]
 
     # ------------------------------------------------------------------- events

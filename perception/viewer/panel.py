@@ -1,31 +1,18 @@
-"""The viewer's control panel: queries, display, selection, corrections."""
+"""The viewer's control panel: queries, display, selection, corrections, a known length."""
 
 from __future__ import annotations
 
 import re
 import string
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
+from perception.pipeline.summary import frame_lines
 from perception.query.hit import printed_texts
 from perception.viewer.paint import MODES
-from perception.viewer.session import Session
 
-
-class Page(Protocol):
-    """The interface of the page that the panel uses."""
-
-    session: Session
-    server: Any
-
-    def guarded(self, action: Callable[[], object], client: Any = None, edited: bool = False) -> None:
-        """Runs an action of a control; shows an InputError, redraws."""
-
-    def redraw(self) -> None:
-        """Sends colours and opacities anew."""
-
-    def overlay(self, kind: str, on: bool) -> None:
-        """Shows or hides "boxes" or "names"."""
+if TYPE_CHECKING:
+    from perception.viewer.app import Viewer
 
 
 def escaped(text: str) -> str:
@@ -41,7 +28,7 @@ def escaped(text: str) -> str:
 class Panel:
     """Builds viser's controls and updates their texts."""
 
-    def __init__(self, viewer: Page):
+    def __init__(self, viewer: Viewer):
         self.viewer = viewer
         self.session = viewer.session
         self.gui = viewer.server.gui
@@ -51,6 +38,7 @@ class Panel:
         self._build_show()
         self._build_selection()
         self._build_history()
+        self._build_measure()
         self.refresh()
 
     # ----------------------------------------------------------------- building
@@ -132,6 +120,16 @@ class Panel:
             self._renew.on_click(lambda event: self.viewer.guarded(lambda: session.reopen(), event.client, edited=True))
             self._history = self.gui.add_markdown("")
 
+    def _build_measure(self) -> None:
+        session, guarded = self.session, self.viewer.guarded
+        with self.gui.add_folder("Measure", expand_by_default=False):
+            start = self.gui.add_button("Two points", hint="then click both ends of a length on the map")
+            self._measured = self.gui.add_markdown("")
+            metres = self.gui.add_number("true length (m)", 0.0, min=0.0, step=0.001)
+            scale = self.gui.add_button("Set scale", hint="writes the map in metres, by this length")
+        start.on_click(lambda event: guarded(session.measure, event.client))
+        scale.on_click(lambda event: guarded(lambda: session.set_scale(metres.value), event.client, edited=True))
+
     def _unhide(self) -> None:
         for entry in self.session.editor.instances:
             if entry.get("hidden"):
@@ -152,7 +150,7 @@ class Panel:
     def refresh(self) -> None:
         """Updates all texts of the panel from the session's state."""
         session, editor = self.session, self.session.editor
-        unit = "m" if editor.original.info.get("metric") else "map units"
+        unit = "m" if editor.original.metric else "map units"
         self._facts.content = f"**{len(editor.ids):,} Gaussians · instances: {len(editor.instances)}**"
         self._refresh_answer()
         if not session.selected:
@@ -176,6 +174,9 @@ class Panel:
                 self._named = named
                 self._name.value = entry.get("label") or ""
             self._show_photo(session.crop(entry["id"]))
+        wanted = f"click end {len(session.ends) + 1} of 2" if session.measuring else session.length
+        lines = [wanted, *frame_lines(editor.original.info), *session.notes]
+        self._measured.content = "  \n".join(escaped(line) for line in lines)
         last = editor.history[-3:]
         unsaved = "unsaved changes" if editor.dirty else "all saved"
         self._history.content = f"*{unsaved}*" + "".join(f"  \n{escaped(what)}" for what in reversed(last))

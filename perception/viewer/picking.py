@@ -1,4 +1,4 @@
-"""Picking: the instance that a ray through the map shows."""
+"""Picking: the instance, and the point, that a ray through the map shows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from perception.io.store import Map
 PIXEL = 0.0015
 """Angle of a click in radians: about a pixel of a laptop's window."""
 SEEN = 0.15
-"""Smallest weight in the picture, in [0, 1], at which an instance is picked."""
+"""Smallest weight in the picture, in [0, 1], at which an instance or a point is picked."""
 
 
 def pick(gmap: Map, ids: np.ndarray, shown: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> int | None:
@@ -18,22 +18,51 @@ def pick(gmap: Map, ids: np.ndarray, shown: np.ndarray, origin: np.ndarray, dire
     A pixel is rendered along the ray: the instance with the largest weight in it. shown [N] bool: Gaussians that are
     visible.
     """
+    rows, weights = _weights(gmap, shown, origin, direction)
+    found, owner = np.unique(ids[rows], return_inverse=True)
+    total = np.where(found >= 0, np.bincount(owner.reshape(-1), weights, len(found)), 0)
+    return int(found[total.argmax()]) if total.max(initial=0) >= SEEN else None
+
+
+def pick_point(gmap: Map, shown: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
+    """The point [3] float64 of the surface that a ray shows, as `pick`; None when it meets none.
+
+    A Gaussian is densest on o + t d at t = dᵀ Σ⁻¹ (μ − o) / dᵀ Σ⁻¹ d: there the ray crosses a flat one. The median of t
+    by weight in the pixel is used; at an edge the mean lies between the surfaces.
+    """
+    from scipy.spatial.transform import Rotation
+
+    rows, weights = _weights(gmap, shown, origin, direction)
+    if weights.sum() < SEEN:
+        return None
+    rows, weights = rows[weights > 0], weights[weights > 0]
+    xyzw = gmap.quats[rows][:, [1, 2, 3, 0]] + [0, 0, 0, 1e-30]  # one of zeros is no rotation, as in `covariances`
+    turns = Rotation.from_quat(xyzw).as_matrix()
+    inverse = np.exp(-gmap.log_scales[rows].astype(np.float64))  # Σ⁻¹ = A Aᵀ with A = R S⁻¹
+    along = np.einsum("nij,i->nj", turns, direction) * inverse
+    away = np.einsum("nij,ni->nj", turns, gmap.means[rows] - np.asarray(origin)) * inverse
+    t = (along * away).sum(axis=1) / (along**2).sum(axis=1)
+    order = np.argsort(t)
+    middle = order[np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)]
+    return np.asarray(origin + t[middle] * direction)
+
+
+def _weights(gmap: Map, shown: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the Gaussians near a ray, and the weight of each in the pixel rendered along it; empty for none."""
     import torch
 
     from perception.gaussians.rasterize import rasterize
 
     origin, direction = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
-    if not np.isfinite([origin, direction]).all() or not direction.any():
-        return None
+    usable = np.isfinite([origin, direction]).all() and direction.any()
     # A cheap test first: only Gaussians within four radii of the ray contribute.
-    unit = direction / np.linalg.norm(direction)
+    unit = direction / np.linalg.norm(direction) if usable else np.full(3, np.nan)
     away = gmap.means - origin
     along = away @ unit
     off = np.linalg.norm(away - along[:, None] * unit, axis=1)
     near = np.flatnonzero(shown & (along > 0) & (off < 4 * (gmap.scales.max(axis=1) + PIXEL * along)))
-    found, owner = np.unique(ids[near], return_inverse=True)
-    if not (found >= 0).any():
-        return None
+    if not len(near):
+        return near, np.empty(0)
     side = np.cross(unit, np.eye(3)[np.abs(unit).argmin()])
     axes = np.stack([side, np.cross(unit, side), unit])
     pose = np.eye(4)
@@ -42,12 +71,10 @@ def pick(gmap: Map, ids: np.ndarray, shown: np.ndarray, origin: np.ndarray, dire
     K = np.array([[1 / PIXEL, 0, 0.5], [0, 1 / PIXEL, 0.5], [0, 0, 1]])
     arrays = (gmap.means[near], gmap.quats[near], gmap.scales[near], gmap.opacities[near], pose[None], K[None])
     means, quats, scales, opacities, camera, lens = (torch.from_numpy(array.astype(np.float32)) for array in arrays)
-    features, colors = torch.nn.functional.one_hot(torch.from_numpy(owner.reshape(-1))).float(), torch.zeros_like(means)
-    with torch.no_grad():
-        out = rasterize(means, quats, scales, opacities, colors, camera, lens, 1, 1, features=features)
-    assert out.features is not None
-    weights = np.where(found >= 0, out.features[0, 0, 0].numpy(), 0)
-    return int(found[weights.argmax()]) if weights.max() >= SEEN else None
+    colors = torch.zeros_like(means, requires_grad=True)
+    out = rasterize(means, quats, scales, opacities, colors, camera, lens, 1, 1, depth=False)
+    (weights,) = torch.autograd.grad(out.colors[..., 0].sum(), colors)  # colour = Σ weight · colour of each
+    return near, weights[:, 0].numpy().astype(np.float64)
 
 
 def covariances(gmap: Map) -> np.ndarray:

@@ -14,7 +14,7 @@ from perception.errors import InputError
 from perception.query import Hit, PartsMap, QueryMap
 from perception.query.crops import best_crop
 from perception.viewer.paint import highlight, paint
-from perception.viewer.picking import pick
+from perception.viewer.picking import pick, pick_point
 
 CROP_SIDE = 320
 """Pixels of the longer side of the photo shown beside a selected instance."""
@@ -32,6 +32,7 @@ class Session:
         self.part: int | None = None
         self.question = ""
         self.hits: list[Hit] = []
+        self.measuring, self.ends, self.notes = False, list[np.ndarray](), list[str]()
         self._lock = threading.RLock()
         self._opened: tuple[int, QueryMap] | None = None
         self._edits = 0
@@ -64,7 +65,7 @@ class Session:
         self.select(_whole(hit))
         self.part = hit.instance_id if hit.parent is not None else None
 
-    # --------------------------------------------------------------- selecting
+    # -------------------------------------------------- selecting and measuring
 
     def select(self, instance: int | None, add: bool = False) -> None:
         """Selects an instance, or with `add` toggles it in the selection. None clears the selection, unless `add`."""
@@ -80,7 +81,17 @@ class Session:
                 self.selected = [*self.selected, instance]
 
     def pick(self, origin: np.ndarray, direction: np.ndarray, add: bool = False) -> int | None:
-        """Selects the instance that a ray in the map frame shows, and returns its id."""
+        """Selects the instance that a ray in the map frame shows, and returns its id.
+
+        After `measure`, the point that it shows becomes an end of the length; InputError when it shows none.
+        """
+        if self.measuring:
+            end = pick_point(self.editor.original, self.shown(), origin, direction)
+            if end is None:
+                raise InputError("measure: there is nothing at that place; click on the map")
+            self.ends.append(end)
+            self.measuring = len(self.ends) < 2
+            return None
         instance = pick(self.editor.original, self.editor.ids, self.shown(), origin, direction)
         self.select(instance, add)
         return instance
@@ -90,6 +101,24 @@ class Session:
         if len(self.selected) != 1:
             raise InputError(f"{len(self.selected)} instances are selected; click exactly one")
         return self.selected[0]
+
+    def measure(self) -> None:
+        """Makes the next two clicks the ends of a length."""
+        self.measuring, self.ends, self.notes = True, [], []
+
+    @property
+    def length(self) -> str:
+        """The distance of the two ends as text, with the map's unit; empty before both are there."""
+        unit = "m" if self.editor.original.metric else "map units"
+        return f"{np.linalg.norm(self.ends[1] - self.ends[0]):.4g} {unit}" if len(self.ends) == 2 else ""
+
+    def set_scale(self, metres: float) -> None:
+        """Writes the map in metres, by the true distance of the two ends (`Editor.set_scale`); fills `notes`."""
+        if len(self.ends) < 2:
+            raise InputError("measure: press Two points, then click both ends of a length that you know")
+        ends = " ".join(",".join(repr(float(x)) for x in end) for end in self.ends)
+        facts = self.editor.set_scale(f"{float(metres)!r}: {ends}")
+        self.ends, self.notes = [facts["factor"] * end for end in self.ends], facts["notes"]
 
     # ----------------------------------------------------------------- editing
 
@@ -107,6 +136,7 @@ class Session:
         """Opens the map that another program changed; unsaved edits are dropped."""
         with self._lock:
             self.editor.reopen()
+            self.measuring, self.ends, self.notes = False, [], []
             self.edited()
 
     # ----------------------------------------------------------------- showing
