@@ -17,7 +17,6 @@ from perception.query.crops import best_crop
 from perception.query.engine import QueryEngine
 from perception.query.frames import Frame
 from perception.query.query_map import QueryMap, UnknownInstance
-from perception.serve import answers
 from perception.serve.crops import Crops
 from perception.serve.errors import HANDLERS, OtherMap
 from perception.serve.guard import Guard
@@ -29,7 +28,8 @@ MapId = Annotated[str | None, Query(description="answer only from this very map,
 Id = Annotated[int, Path(alias="id", ge=0, lt=10**9)]
 _ABOUT = (
     "Text prompts and places in, 3D instances of a map out. Lengths are in the unit of the map's frame, metres when "
-    "`metric`. With `frame`, everything in a request and its answer is in that frame."
+    "`metric`. With `frame`, everything in a request and its answer is in that frame. An error is one JSON object, "
+    '{"error": line, "status": code}. Points and photos are bytes; the header X-Map-Id names their map.'
 )
 _PAGE = {"/": "html", "/page.js": "javascript", "/page.css": "css"}
 """The files of the web page: path → subtype of the media type text."""
@@ -44,23 +44,22 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
         docs_url=None,  # these pages load scripts from other servers
         redoc_url=None,
         redirect_slashes=False,
-        responses={"default": {"model": answers.Problem}},
         exception_handlers=HANDLERS,
     )
     app.add_middleware(Guard, settings=settings)
     for path, kind in _PAGE.items():
         app.add_api_route(path, _static(path[1:] or "page.html", f"text/{kind}"), include_in_schema=False)
     routes = _Routes(engine, settings)
-    app.get("/health", response_model=answers.Health)(routes.health)
-    app.post("/query", response_model=answers.Results)(routes.query)
-    app.post("/find", response_model=answers.Hits)(routes.find)
-    app.post("/nearest", response_model=answers.Hits)(routes.nearest)
-    app.post("/at", response_model=answers.Hits)(routes.at)
-    app.post("/reload", response_model=answers.Reload)(routes.reload)
-    app.get("/instances", response_model=answers.Hits)(routes.instances)
-    app.get("/instances/{id}", response_model=answers.Description)(routes.describe)
-    app.get("/instances/{id}/points", response_class=Response, responses=_binary(*FORMATS.values()))(routes.points)
-    app.get("/instances/{id}/crop.jpg", response_class=Response, responses=_binary("image/jpeg"))(routes.crop)
+    app.get("/health")(routes.health)
+    app.post("/query")(routes.query)
+    app.post("/find")(routes.find)
+    app.post("/nearest")(routes.nearest)
+    app.post("/at")(routes.at)
+    app.post("/reload")(routes.reload)
+    app.get("/instances")(routes.instances)
+    app.get("/instances/{id}")(routes.describe)
+    app.get("/instances/{id}/points", response_class=Response)(routes.points)
+    app.get("/instances/{id}/crop.jpg", response_class=Response)(routes.crop)
     return app
 
 
@@ -172,10 +171,6 @@ def _check_map(gmap: QueryMap, wanted: str | None) -> None:
 
 def _source(gmap: QueryMap, frame: Frame | None) -> dict[str, Any]:
     return {"frame": frame.name if frame else gmap.frame, "metric": gmap.metric, "map_id": gmap.map_id}
-
-
-def _binary(*kinds: str) -> dict[int | str, dict[str, Any]]:
-    return {200: {"description": "bytes; the header X-Map-Id names the map", "content": {kind: {} for kind in kinds}}}
 
 
 def _static(name: str, kind: str) -> Any:
