@@ -7,7 +7,6 @@ import importlib.util
 import io
 import secrets
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,11 +19,9 @@ from perception.listening import check_address, is_local, listen, url_host
 from perception.viewer.guard import Guard, guarded_server
 from perception.viewer.paint import HIGHLIGHT
 from perception.viewer.panel import Panel
+from perception.viewer.picking import covariances
 from perception.viewer.session import Session
-from perception.viewer.splats import Splats
 
-FIRST_LOOK = 1.0
-"""Seconds between the coarse picture in a new browser and the whole map."""
 WATCH = 1.0
 """Seconds between checks whether another program changed the map."""
 
@@ -51,13 +48,10 @@ class Viewer:
         self._overlays: dict[str, list[Any]] = {"boxes": [], "names": [], "length": []}
         self._overlays_on = {"boxes": False, "names": False, "length": True}
         self._frame_map()
-        self._drawn = self.session.editor.original
-        self._splats = Splats(self._drawn, self.scale)
-        self.panel = Panel(self)
+        self.panel = Panel(self)  # before the Gaussians, which take their time on a slow connection
+        self._splats = self.server.scene.add_gaussian_splats("/map/splats", *self._gaussians())
         self._stopped = threading.Event()
         self._problem = ""
-        self.server.on_client_connect(self._welcome)
-        self.server.on_client_disconnect(lambda client: self._splats.forget(client))
         self.server.scene.on_click()(lambda event: self._clicked(event, add=False))
         self.server.scene.on_click(modifier="shift")(lambda event: self._clicked(event, add=True))
         threading.Thread(target=self._watch, daemon=True).start()
@@ -72,9 +66,10 @@ class Viewer:
 
     def _frame_map(self) -> None:
         """Sets up direction, first camera and scale. The page uses half precision, so the map is scaled to size 10."""
-        gmap = self.session.editor.original
+        self._drawn = gmap = self.session.editor.original
         low, high = np.percentile(gmap.means, [5, 95], axis=0) if len(gmap) else (np.zeros(3), np.ones(3))
         self.scale = 10 / max(float(np.linalg.norm(high - low)), 1e-9)
+        self._covariances = covariances(gmap) * np.float32(self.scale**2)
         poses = gmap.poses
         if len(poses) == 0:
             return
@@ -86,32 +81,17 @@ class Viewer:
         camera.position = tuple(eye * self.scale)
         camera.look_at = tuple((eye + pose[2, :3] * max(float(depth), 1e-6)) * self.scale)
 
-    def _welcome(self, client: Any) -> None:
-        """Draws the map in a new browser: the coarse picture, and the whole map FIRST_LOOK seconds later."""
-        with self._one:
-            self._show(client)
-        if self._splats.coarse:
-            time.sleep(FIRST_LOOK)
-            with self._one:
-                self._show(client)
-
-    def _show(self, client: Any) -> None:
-        if client.client_id not in self.server.get_clients():
-            return  # it disconnected in the meantime
-        self._splats.show(client, self.session.colors(), self.session.opacities())
+    def _gaussians(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Centres [N, 3], covariances [N, 3, 3], colours [N, 3] uint8 and opacities [N, 1] as the page shows them."""
+        centers = (self._drawn.means * np.float32(self.scale)).astype(np.float32)
+        return centers, self._covariances, self.session.colors(), self.session.opacities()[:, None]
 
     def redraw(self) -> None:
-        """Sends colours and opacities to every browser, in one message each, and redraws the visible overlays."""
+        """Sends the Gaussians to every browser, in one message, and redraws the visible overlays."""
         with self._one:
-            clients = self.server.get_clients().values()
             if self._drawn is not self.session.editor.original:
                 self._frame_map()
-                self._drawn = self.session.editor.original
-                self._splats = Splats(self._drawn, self.scale)
-                for client in clients:
-                    self._show(client)  # the coarse picture, which makes room for the whole one
-            for client in clients:
-                self._show(client)
+            self._splats.set_gaussians(*self._gaussians())
             for kind, on in self._overlays_on.items():
                 if on:
                     self._draw(kind)
