@@ -12,7 +12,6 @@ import torch
 
 from perception.config import MapConfig, flat
 from perception.errors import InputError
-from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
 from perception.gaussians.train import TrainingView, render_view
 from perception.instances.crops import expand_box, mask_box
@@ -22,11 +21,9 @@ from perception.io.store import Map
 from perception.pictures import features_to_rgb, outline, overlay, titled_row
 from perception.pipeline.rendering import as_gaussians
 from perception.pipeline.summary import depth_text
-from perception.pipeline.view_coverage import weak_coverage
 from perception.query import QueryMap
 from perception.query.hit import printed_texts
 from perception.report import InstanceRow, QueryRow, ReportData, ViewRow, write_report
-from perception.types import View
 
 SHOWN = ("worst", "middle", "best")
 """Held-out views shown beside their photos, by PSNR."""
@@ -49,7 +46,7 @@ def write_map_report(opened: QueryMap, path: Path, queries: list[str]) -> Path:
         instances=_instance_rows(opened, album),
         metric=opened.metric,
         queries=[_query_row(opened, text, album) for text in queries],
-        warnings=_warnings(info, album.gaussians, list(album.views.values())),
+        warnings=_warnings(info),
         settings=dict(flat(info["config"])),
         command=rerun_command(info, opened.path or Path("MAP")),
     )
@@ -71,7 +68,7 @@ def rerun_command(info: dict[str, Any], path: Path) -> str:
     return shlex.join(words)
 
 
-def _warnings(info: dict[str, Any], gaussians: Gaussians, views: list[View]) -> list[str]:
+def _warnings(info: dict[str, Any]) -> list[str]:
     """Warnings on the quality of the map, most severe first."""
     scored = info["quality"].get("views", {})
     mean = info["quality"].get("psnr")
@@ -81,8 +78,7 @@ def _warnings(info: dict[str, Any], gaussians: Gaussians, views: list[View]) -> 
         lines.append(f"{skipped} gradients were not finite and were skipped")
     if bad:
         lines.append(f"held-out views far below the mean of {mean:.1f} dB: {', '.join(bad)}")
-    weak = weak_coverage(gaussians, views)
-    return lines if weak is None else [*lines, weak]
+    return lines
 
 
 def _left_out(scene: dict[str, Any], most: int = 12) -> list[str]:
