@@ -12,12 +12,12 @@ from urllib.parse import unquote, urlparse
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory
-from perception.io.catalogue import catalogue, hub_files
 from perception.io.checksums import facts_of, sha256
 from perception.io.download import download, is_url
 from perception.io.model_store import (
     RECORD,
     StoredModel,
+    catalogue,
     check_name,
     find_model,
     known_names,
@@ -29,7 +29,6 @@ from perception.io.model_store import (
 from perception.io.onnx_sessions import model_graphs, model_root, side_files
 from perception.progress import Progress
 
-_PARTS = ".parts"
 _KEPT = (".json", ".txt")  # of a folder, beside graphs and their weights: configurations and tokenizers
 _PURPOSES = {"encoder": "sam", "decoder": "sam", "image tower": "clip", "text tower": "clip", "both towers": "clip"}
 
@@ -146,7 +145,7 @@ def add_model(
     name: str,
     sources: Sequence[str],
     *,
-    sha256: Sequence[str] = (),
+    sha256: Sequence[str | None] = (),
     default: bool = False,
     progress: Progress | None = None,
 ) -> StoredModel:
@@ -155,50 +154,39 @@ def add_model(
     sha256: expected digests, as many as sources or none. A URL that is already stored under that name is not downloaded
     again. default: `--masks auto` uses this model from now on.
     """
-    return _stored(name, list(sources), _expected(sources, sha256), {}, default, progress)
-
-
-def get_model(name: str, *, default: bool = False, progress: Progress | None = None) -> StoredModel:
-    """Fetches an entry of the catalogue into the store under its name, resumed and verified by size and digest.
-
-    What is fetched is told before. InputError when the hub's files are not those of the catalogue.
-    """
-    entry = catalogue().get(name)
-    if entry is None:
-        raise InputError(f"models get {name}: not in the catalogue; it holds {', '.join(catalogue())}")
-    files = hub_files(entry)
-    sizes = {url: size for url, (size, _) in files.items() if size is not None}
-    if progress is not None:
-        told = f"{len(files)} files, {sum(sizes.values()) / 1e6:.1f} MB, of {entry.repository} at {entry.revision[:12]}"
-        progress.log(f"{name}: {told}, licence {entry.licence}, to {models_folder() / name}")
-    digests = {url: digest for url, (_, digest) in files.items() if digest is not None}
-    return _stored(name, list(files), digests, sizes, default, progress)
-
-
-def _stored(
-    name: str, sources: list[str], expected: dict[str, str], sizes: dict[str, int], default: bool, told: Progress | None
-) -> StoredModel:
-    """The model of these sources, fetched unless it is there. expected, sizes: sha256 and bytes of a source."""
     check_name(name)
+    if sha256 and len(sha256) != len(sources):
+        raise InputError(f"--sha256: {len(sha256)} digests for {len(sources)} files; give one for each, in order")
+    expected = {source: digest.lower() for source, digest in zip(sources, sha256, strict=False) if digest is not None}
+    for digest in expected.values():
+        if len(digest) != 64 or set(digest) - set("0123456789abcdef"):
+            raise InputError(f"--sha256 {digest[:70]}: expected 64 hexadecimal digits")
     known = find_model(name)
     if known is None or not _same(known, sources, expected):
-        parts = models_folder() / _PARTS
-        _install(name, [file for source in sources for file in _local(source, expected, sizes, parts, told)])
-        known = find_model(name)
-        _forget(parts, sources)
-    assert known is not None  # just written
+        files = [file for source in sources for file in _local(source, expected.get(source), progress)]
+        known = _install(name, files)
+        for source in sources:
+            _part(source).unlink(missing_ok=True)
     if default:
         set_default(known)
     return known
 
 
-def _expected(sources: Sequence[str], sha256: Sequence[str]) -> dict[str, str]:
-    if sha256 and len(sha256) != len(sources):
-        raise InputError(f"--sha256: {len(sha256)} digests for {len(sources)} files; give one for each, in order")
-    for digest in sha256:
-        if len(digest) != 64 or set(digest.lower()) - set("0123456789abcdef"):
-            raise InputError(f"--sha256 {digest[:70]}: expected 64 hexadecimal digits")
-    return dict(zip(sources, (digest.lower() for digest in sha256), strict=False))
+def get_model(name: str, *, default: bool = False, progress: Progress | None = None) -> StoredModel:
+    """Fetches an entry of the catalogue into the store under its name, resumed and verified by size and digest.
+
+    What is fetched is told before.
+    """
+    entry = catalogue().get(name)
+    if entry is None:
+        raise InputError(f"models get {name}: not in the catalogue; it holds {', '.join(catalogue())}")
+    if progress is not None:
+        sizes = [size for size, _ in entry.files.values()]
+        size = f", {sum(sizes) / 1e6:.1f} MB" if None not in sizes else ""
+        told = f"{len(sizes)} files{size}, of {entry.repository} at {entry.revision[:12]}"
+        progress.log(f"{name}: {told}, licence {entry.licence}, to {models_folder() / name}")
+    digests = entry.addresses()
+    return add_model(name, list(digests), sha256=list(digests.values()), default=default, progress=progress)
 
 
 def _same(model: StoredModel, sources: Sequence[str], expected: dict[str, str]) -> bool:
@@ -209,20 +197,14 @@ def _same(model: StoredModel, sources: Sequence[str], expected: dict[str, str]) 
     return whole and all(expected.get(f["source"], f["sha256"]) == f["sha256"] for f in model.files)
 
 
-def _local(
-    source: str, digests: dict[str, str], sizes: dict[str, int], parts: Path, progress: Progress | None
-) -> list[tuple[str, Path, str]]:
+def _local(source: str, expected: str | None, progress: Progress | None) -> list[tuple[str, Path, str]]:
     """(file name, current path, source) of a download, a file with its side files, or the files of a folder."""
-    expected = digests.get(source)
     if is_url(source):
         file_name = Path(unquote(urlparse(source).path)).name.lstrip(".") or "model.onnx"
-        part = _part(parts, source)
-        download(source, part, progress, file_name)
-        size = part.stat().st_size
-        for what, found, wanted in (("bytes", size, sizes.get(source)), ("sha256", sha256(part), expected)):
-            if wanted not in (None, found):
-                part.unlink()
-                raise InputError(f"{source}: {what} is {found}, expected {wanted}; what was fetched is thrown away")
+        part = download(source, _part(source), progress, file_name)
+        if expected not in (None, found := sha256(part)):
+            part.unlink()
+            raise InputError(f"{source}: sha256 is {found}, expected {expected}; what was fetched is thrown away")
         return [(file_name, part, source)]
     path = Path(source).expanduser()
     if path.is_dir():
@@ -232,13 +214,13 @@ def _local(
         return [(str(f.relative_to(root)), f, str(f)) for f in files]
     if not path.is_file():
         raise InputError(f"{source}: no such file or folder, and no http(s) address")
-    if expected is not None and sha256(path) != expected:
-        raise InputError(f"{source}: sha256 is {sha256(path)}, expected {expected}; is it the right file?")
+    if expected not in (None, found := sha256(path)):
+        raise InputError(f"{source}: sha256 is {found}, expected {expected}; is it the right file?")
     beside = side_files(path) if path.suffix == ".onnx" else []
     return [(str(p.relative_to(path.parent)), p, str(p)) for p in [path, *beside] if p.is_file()]
 
 
-def _install(name: str, files: Sequence[tuple[str, Path, str]]) -> None:
+def _install(name: str, files: Sequence[tuple[str, Path, str]]) -> StoredModel:
     names = [file_name for file_name, _, _ in files]
     twice = {n for n in names if names.count(n) > 1}
     if twice:
@@ -254,12 +236,8 @@ def _install(name: str, files: Sequence[tuple[str, Path, str]]) -> None:
             entries.append({"name": file_name, "source": source, **facts_of(target)})
         family, purpose, _ = judge([describe_graph(graph) for graph in sorted(folder.rglob("*.onnx"))])
         write_record(folder, family, purpose, entries)
+    return StoredModel(name, models_folder() / name, family, purpose, entries)
 
 
-def _part(parts: Path, source: str) -> Path:
-    return parts / f"{hashlib.sha256(source.encode()).hexdigest()[:24]}.part"
-
-
-def _forget(parts: Path, sources: Sequence[str]) -> None:
-    for source in sources:
-        _part(parts, source).unlink(missing_ok=True)
+def _part(source: str) -> Path:
+    return models_folder() / ".parts" / f"{hashlib.sha256(source.encode()).hexdigest()[:24]}.part"

@@ -34,7 +34,6 @@ def register(commands: Any) -> None:
     )
     p.add_argument("--tag-size", metavar="M", help="side of the AprilTags or ArUco markers in the photos")
     p.add_argument("--board", metavar="TEXT", help="a calibration board in the photos, such as charuco:8x11:0.02")
-    p.add_argument("--level", action="store_true", help="turn z up and put the origin on the floor, too")
 
 
 def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -76,12 +75,12 @@ def _transfer(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _scale(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.config import FrameConfig, settings_from
-    from perception.frame.moved_map import scale_map
+    from perception.frame.scaled_map import scale_map
     from perception.pipeline.summary import frame_lines
 
     names = ("known_length", "tag_size", "board")
     given = {n: (getattr(args, n), f"--{n.replace('_', '-')}") for n in names if getattr(args, n) is not None}
-    facts = scale_map(args.map, args.output, settings_from(FrameConfig, given), args.level)
+    facts = scale_map(args.map, args.output, settings_from(FrameConfig, given))
     lines = [f"{facts['map']}: lengths times {facts['factor']:.6g}", *frame_lines({**facts, "metric": True})]
     return facts, "\n".join([*lines, *(f"warning: {note}" for note in facts["notes"])])
 

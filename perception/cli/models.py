@@ -54,7 +54,7 @@ def _check(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _get(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.catalogue import catalogue
+    from perception.io.model_store import catalogue
     from perception.models import get_model
     from perception.progress import Progress
 

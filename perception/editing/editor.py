@@ -20,7 +20,7 @@ import numpy as np
 from perception.boxes import oriented_box
 from perception.config import FrameConfig, InstanceConfig
 from perception.errors import InputError
-from perception.frame.moved_map import scale_map
+from perception.frame.scaled_map import scale_map
 from perception.io.map import Map
 from perception.io.map_lock import writing
 from perception.io.store import map_signature, read_info, read_map, write_map

@@ -13,7 +13,6 @@ from perception.io.arrays import read_npz
 from perception.io.atomic import replacing
 from perception.io.cloud_memory import require_memory
 from perception.io.cloud_pcd import read_pcd, write_pcd
-from perception.io.documents import brief
 from perception.io.ply import read_ply, write_ply
 from perception.types import PointCloud
 
@@ -23,7 +22,7 @@ _NOT_LABELS = {"alpha", "diffuse_alpha", "a", "rgb", "rgba"}
 
 
 def read_cloud(path: str | Path) -> PointCloud:
-    """Read .ply (cloud or mesh), .pcd, .npz or .xyz/.txt/.pts.
+    """Read .ply (cloud or mesh), .pcd or .npz.
 
     points are float64 where the file stores doubles, else float32; integer columns besides the colours become
     `labels`; faces of more than three corners are split into fans. NaN and infinite points are kept in place.
@@ -34,8 +33,7 @@ def read_cloud(path: str | Path) -> PointCloud:
         raise InputError(f"{path}: unknown point cloud format '{path.suffix}'; expected {', '.join(_READERS)}")
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; expected a point cloud")
-    needed = _BYTES_PER_BYTE.get(path.suffix.lower(), 4) * path.stat().st_size
-    require_memory(needed, str(path), "split the cloud, or use a machine with more memory")
+    require_memory(4 * path.stat().st_size, str(path), "split the cloud, or use a machine with more memory")
     cloud = reader(path)
     if len(cloud.points) == 0:
         raise InputError(f"{path}: holds no points")
@@ -144,32 +142,6 @@ def _write_pcd_cloud(path: Path, cloud: PointCloud) -> None:
     write_pcd(path, columns | {name: values.astype(np.int32) for name, values in cloud.labels.items()})
 
 
-def _read_xyz(path: Path) -> PointCloud:
-    """Rows of x y z, then optionally r g b (all whole numbers in 0..255) and/or a normal; separators: blank , ;
-
-    Lines starting with # or // and a leading count line (.pts) are skipped. points [P, 3] float64.
-    """
-    text = path.read_text(encoding="utf-8", errors="replace").replace(",", " ").replace(";", " ")
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith(("#", "//"))]
-    if len(lines) > 1 and len(lines[0].split()) == 1:  # a .pts file begins with the number of points
-        del lines[0]
-    try:
-        rows = np.loadtxt(lines, ndmin=2) if lines else np.empty((0, 3))
-    except ValueError as error:
-        raise InputError(f"{path}: expected rows of as many numbers each ({brief(error)})") from error
-    if rows.shape[1] < 3:
-        raise InputError(f"{path}: rows have {rows.shape[1]} columns; expected x y z at least")
-    cloud = PointCloud(np.ascontiguousarray(rows[:, :3]))
-    rest = rows[:, 4:] if rows.shape[1] in (7, 10) else rows[:, 3:]  # an intensity column precedes the colour
-    for triple in (rest[:, i : i + 3] for i in range(0, rest.shape[1] - 2, 3)):
-        whole = bool((triple == np.floor(triple)).all()) and triple.min() >= 0 and 1 < triple.max() <= 255
-        if cloud.colors is None and whole:
-            cloud.colors = triple.astype(np.uint8)
-        elif cloud.normals is None:
-            cloud.normals = triple.astype(np.float32)
-    return cloud
-
-
 def _triangles(faces: np.ndarray, path: Path) -> np.ndarray:
     if faces.dtype != object:
         if faces.ndim != 2:
@@ -213,10 +185,7 @@ _READERS: dict[str, Callable[[Path], PointCloud]] = {
     ".ply": _read_ply_cloud,
     ".pcd": lambda path: _cloud_of(read_pcd(path), path),
     ".npz": _read_npz,
-    **dict.fromkeys((".xyz", ".txt", ".pts"), _read_xyz),
 }
-# Memory to read a file as a multiple of its size, for text formats.
-_BYTES_PER_BYTE = {".xyz": 8, ".txt": 8, ".pts": 8}
 _WRITERS: dict[str, Callable[[Path, PointCloud], None]] = {
     ".ply": _write_ply_cloud,
     ".pcd": _write_pcd_cloud,

@@ -1,8 +1,4 @@
-"""HTTP downloads that resume after broken connections; received bytes are kept in a `.part` file.
-
-A `Range` request fetches the remaining bytes; with `If-Range` the server sends the whole file if it has changed.
-Servers without range support also send the whole file, which then replaces the partial one.
-"""
+"""HTTP downloads that resume after broken connections; received bytes are kept in a `.part` file."""
 
 from __future__ import annotations
 
@@ -12,7 +8,6 @@ import urllib.request
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from perception.errors import InputError
 from perception.progress import Progress
@@ -20,8 +15,6 @@ from perception.progress import Progress
 CHUNK = 1 << 20
 TIMEOUT = 30.0  # seconds without received data
 ATTEMPTS = 4  # consecutive connections without new data
-
-Show = Callable[[int, int], object]
 
 
 def is_url(source: str) -> bool:
@@ -32,8 +25,8 @@ def is_url(source: str) -> bool:
 def download(url: str, part: Path, progress: Progress | None = None, name: str = "") -> Path:
     """Downloads `url` to `part`, after the bytes of `url` already there; returns `part` when complete.
 
-    part: the sibling `*.part.version` names the version of the file. name: stage name of the progress display, in
-    bytes. InputError when the server refuses, or after ATTEMPTS connections without new data; `part` is then kept.
+    name: stage name of the progress display, in bytes. InputError when the server refuses, or after ATTEMPTS
+    connections without new data; `part` is then kept.
     """
     part.parent.mkdir(parents=True, exist_ok=True)
     fruitless = 0
@@ -41,32 +34,40 @@ def download(url: str, part: Path, progress: Progress | None = None, name: str =
         before = _size(part)
         problem = _attempt(url, part, None if progress is None else partial(progress.update, name or part.name))
         if problem is None:
-            _version_file(part).unlink(missing_ok=True)
+            _version(part).unlink(missing_ok=True)
             return part
         fruitless = fruitless + 1 if _size(part) <= before else 0
         if fruitless >= ATTEMPTS:
             raise InputError(f"{url}: {problem}; {_size(part)} bytes are kept, run the command again to go on")
 
 
-def _attempt(url: str, part: Path, show: Show | None) -> str | None:
-    """One connection: None when the file is complete, else a description of the error."""
-    have = _size(part)
+def _attempt(url: str, part: Path, show: Callable[[int, int], object] | None) -> str | None:
+    """One connection: None when the file is complete, else a description of the error.
+
+    `Range` asks for the remaining bytes of the version (ETag or date) that was begun; if the server has another one, or
+    knows no ranges, it sends the whole file.
+    """
     headers = {"User-Agent": "perception", "Accept-Encoding": "identity"}
-    if have and _version_file(part).is_file():
-        version = _version_file(part).read_text(encoding="utf-8")
-        headers |= {"Range": f"bytes={have}-"} | ({"If-Range": version} if version else {})
+    if _size(part) and _version(part).is_file() and (begun := _version(part).read_text(encoding="utf-8")):
+        headers |= {"Range": f"bytes={_size(part)}-", "If-Range": begun}
     try:
         with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=TIMEOUT) as answer:
-            return _receive(answer, part, have if answer.status == 206 else 0, show)
+            sent, length = answer.headers, answer.headers.get("Content-Length") or ""
+            with part.open("ab" if answer.status == 206 else "wb") as file:
+                _version(part).write_text(sent.get("ETag") or sent.get("Last-Modified") or "", encoding="utf-8")
+                total = file.tell() + int(length) if length.isdigit() else None
+                while chunk := answer.read(CHUNK):
+                    file.write(chunk)
+                    if show:
+                        show(file.tell(), total or file.tell())
+                done = file.tell()
+        return None if total is None or done >= total else f"the connection broke at {done} of {total} bytes"
     except urllib.error.HTTPError as error:
-        if error.code == 416 and have:  # range not satisfiable: file complete, or changed
-            if str(error.headers.get("Content-Range", "")).endswith(f"/{have}"):
-                return None
-            part.unlink()
-            return "the file has changed on the server"
-        if error.code in (408, 425, 429) or error.code >= 500:
-            return f"the server answers {error.code} {error.reason}"
-        raise InputError(f"{url}: the server answers {error.code} {error.reason}; check the address") from error
+        if error.code == 416:  # nothing remains of this version
+            part.unlink(missing_ok=True)
+        elif error.code not in (408, 425, 429) and error.code < 500:
+            raise InputError(f"{url}: the server answers {error.code} {error.reason}; check the address") from error
+        return f"the server answers {error.code} {error.reason}"
     except urllib.error.URLError as error:
         return f"no connection ({error.reason})"
     except (http.client.HTTPException, ConnectionError, TimeoutError) as error:
@@ -75,30 +76,7 @@ def _attempt(url: str, part: Path, show: Show | None) -> str | None:
         raise InputError(f"{url}: not a web address ({error})") from error
 
 
-def _receive(answer: Any, part: Path, start: int, show: Show | None) -> str | None:
-    """Writes the body of a response from byte `start` on, with the file's strong ETag or date as its version."""
-    sent = str(answer.headers.get("Content-Range", ""))
-    if start and not sent.startswith(f"bytes {start}-"):
-        return f"the server sent '{sent}', asked for the bytes from {start} on"
-    tag, length = answer.headers.get("ETag") or "W/", answer.headers.get("Content-Length") or ""
-    version = answer.headers.get("Last-Modified") or "" if tag.startswith("W/") else tag
-    _version_file(part).write_text(version, encoding="utf-8")
-    total = start + int(length) if length.isdigit() else None
-    with part.open("r+b" if start else "wb") as file:
-        file.seek(start)
-        file.truncate()
-        done = start
-        while chunk := answer.read(CHUNK):
-            file.write(chunk)
-            done += len(chunk)
-            if show:
-                show(done, total or done)
-    if total is not None and done < total:
-        return f"the connection broke at {done} of {total} bytes"
-    return None
-
-
-def _version_file(part: Path) -> Path:
+def _version(part: Path) -> Path:
     return part.with_name(part.name + ".version")
 
 

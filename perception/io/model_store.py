@@ -1,5 +1,5 @@
 """The user's model store: one folder per model in the cache, `models/NAME/`, with the model files and
-`perception.json`, which records the source of each file.
+`perception.json`, which records the source of each file. And the catalogue of public exports that `models get` fetches.
 """
 
 from __future__ import annotations
@@ -10,11 +10,13 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
 
 RECORD = "perception.json"
+HUB = "https://huggingface.co"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _DEFAULTS = "defaults.json"
 
@@ -28,6 +30,32 @@ class StoredModel:
     family: str | None = None
     purpose: str | None = None
     files: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A model on the Hugging Face hub. files: path in the repository -> [bytes, sha256], None where not known.
+
+    revision: a commit, so that the files cannot change. Digests are those that several public projects pin for it.
+    """
+
+    purpose: str
+    repository: str
+    revision: str
+    licence: str
+    files: dict[str, list[Any]]
+
+    def addresses(self) -> dict[str, str | None]:
+        """Address of each file -> its sha256 if known. HF_ENDPOINT names a mirror of the hub."""
+        home = (os.environ.get("HF_ENDPOINT") or HUB).rstrip("/")
+        base = f"{home}/{self.repository}/resolve/{self.revision}"
+        return {f"{base}/{quote(path)}": digest for path, (_, digest) in self.files.items()}
+
+
+def catalogue() -> dict[str, Entry]:
+    """Name -> entry, of catalogue.json: permissively licensed; none of the files was downloaded by this project."""
+    text = (Path(__file__).parent / "catalogue.json").read_text(encoding="utf-8")
+    return {name: Entry(**about) for name, about in json.loads(text).items()}
 
 
 def cache_folder() -> Path:

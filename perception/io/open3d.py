@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from perception.errors import InputError, missing_extra
+from perception.io.atomic import replacing
 
 Shot = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """camera_from_world [4, 4], K [3, 3], depth [H, W] (0 = none) and colors [H, W, 3] in [0, 1], float32."""
@@ -64,6 +67,16 @@ def fuse_depth(shots: Iterable[Shot], voxel: float) -> tuple[np.ndarray, np.ndar
         raise InputError(f"no surface is found with voxels of {voxel:g}; choose another --voxel-size")
     colors = (mesh.vertex.colors.numpy().clip(0, 1) * 255 + 0.5).astype(np.uint8)
     return _sorted(mesh.vertex.positions.numpy(), colors, mesh.triangle.indices.numpy())
+
+
+def write_glb(path: Path, points: np.ndarray, colors: np.ndarray, faces: np.ndarray) -> None:
+    """Binary glTF of points [V, 3], colors [V, 3] uint8 sRGB and faces [F, 3]; colours become linear, as glTF's are."""
+    o3d = load_open3d()
+    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(points), o3d.utility.Vector3iVector(faces))
+    mesh.vertex_colors = o3d.utility.Vector3dVector((colors / 255) ** 2.2)
+    with TemporaryDirectory() as folder, replacing(path) as file:
+        o3d.io.write_triangle_mesh(f"{folder}/mesh.glb", mesh)
+        file.write(Path(folder, "mesh.glb").read_bytes())
 
 
 def _sorted(points: np.ndarray, colors: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,12 +11,11 @@ from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
 from perception.export.assign import nearest_gaussian
 from perception.export.depth_views import DepthView
-from perception.export.glb import write_glb
 from perception.export.transfer import ExportOptions, export_labels
 from perception.export.volume import FREE, OCCUPIED, closed_body, grid_shape, occupancy, signed_distance
 from perception.io.atomic import replacing
 from perception.io.cloud import write_cloud
-from perception.io.open3d import fuse_depth
+from perception.io.open3d import fuse_depth, write_glb
 from perception.io.recentre import map_from_input
 from perception.io.store import Map
 from perception.pipeline.placing import rendered_depth
@@ -39,7 +38,9 @@ def check_outputs(mesh: Path | None, voxels: Path | None, voxel_size: float | No
 def export_mesh(
     gmap: Map, output: Path, instance: int | None, voxel: float | None, color: str
 ) -> tuple[dict[str, Any], str]:
-    """Writes the map's surface, or the closed body of one instance, with colours and `instance_id` by vertex.
+    """Writes the map's surface, or the closed body of one instance, with colours by vertex.
+
+    A .ply has `instance_id` by vertex, too, and the input's coordinates, a .glb those of the map.
 
     The surface: rendered depth fused in a truncated signed distance field (`io.open3d.fuse_depth`), labelled as a scan
     is. One instance: `volume.closed_body`. voxel: None = two pixels at the median depth; of an instance
@@ -66,10 +67,10 @@ def export_mesh(
         labels = np.full(len(points), instance, np.int32)
         method = "space carving by rendered depth"
     colors = instance_palette(labels) if color == "instance" else colors
-    origin = _origin(gmap)
     if output.suffix.lower() == ".glb":
-        write_glb(output, points, colors, faces, labels, origin)
+        write_glb(output, points, colors, faces)
     else:
+        origin = _origin(gmap)
         placed = points + origin if origin.any() else points
         write_cloud(output, PointCloud(placed, colors, None, faces, {"instance_id": labels}))
     facts = {"vertices": len(points), "faces": len(faces), "voxel_size": size, "method": method, "unit": _unit(gmap)}

@@ -175,8 +175,6 @@ def _cloud() -> Target:
         ("a.pcd", same, _PCD + b"DATA binary\n" + bytes(64)),
         ("a.npz", same, archive_of({f"{k}.npy": npy(v) for k, v in arrays.items()})),
         *(("a.npz", member(name, arrays), npy(value)) for name, value in arrays.items()),
-        ("a.xyz", same, b"# x y z r g b\n0 1 2 3 4 255\n1;2;3;255;0;0\n"),
-        ("a.pts", same, b"2\n0 1 2 9 3 4 255 0 0 1\n1 2 3 9 255 0 0 0 0 1\n"),
     ]
 
     def read(folder: Path, name: str) -> None:

@@ -19,7 +19,7 @@ from perception.config import load_config
 from perception.errors import InputError
 from perception.io.arrays import map_npy, read_npz
 from perception.io.camera_file import read_camera
-from perception.io.cloud import read_cloud
+from perception.io.cloud import read_cloud, write_cloud
 from perception.io.colmap import read_workspace
 from perception.io.inputs import load_scene
 from perception.io.photos import photo_size, read_photo
@@ -29,7 +29,7 @@ from perception.io.transforms import read_frames, read_transforms
 from perception.io.views import rigid_pose
 from perception.masks.label_images import load_labels, stored_key
 from perception.progress import Progress
-from perception.types import View
+from perception.types import PointCloud, View
 
 
 def refused(reader: Any, *arguments: Any, match: str) -> None:
@@ -330,8 +330,8 @@ IDENTITY = np.eye(4).tolist()
 )
 def test_transforms_that_no_camera_wrote(tmp_path: Path, change: dict[str, Any]) -> None:
     Image.new("RGB", (8, 6)).save(tmp_path / "a.png")
-    (tmp_path / "c.xyz").write_text("0 0 1\n0 1 2\n")
-    good = {"w": 8, "h": 6, "fl_x": 7, "ply_file_path": "c.xyz"}
+    write_cloud(tmp_path / "c.ply", PointCloud(np.array([[0, 0, 1], [0, 1, 2.0]])))
+    good = {"w": 8, "h": 6, "fl_x": 7, "ply_file_path": "c.ply"}
     good["frames"] = [{"file_path": "a.png", "transform_matrix": IDENTITY}]
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps(good))

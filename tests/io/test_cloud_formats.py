@@ -134,15 +134,6 @@ def test_pcd_ascii_with_packed_colour(tmp_path):
     assert cloud.labels["label"].tolist() == [5, 6]
 
 
-def test_xyz_with_commas_comments_and_colours(tmp_path):
-    (tmp_path / "x.xyz").write_text("# x,y,z,r,g,b\n0.5, 1, 2, 255, 0, 1\n3;4;5;0;128;9\n")
-    cloud = read_cloud(tmp_path / "x.xyz")
-    assert cloud.points.tolist() == [[0.5, 1, 2], [3, 4, 5]]
-    assert cloud.colors.tolist() == [[255, 0, 1], [0, 128, 9]]
-    (tmp_path / "x.pts").write_text("2\n0 0 0\n1 1 1\n")
-    assert len(read_cloud(tmp_path / "x.pts").points) == 2
-
-
 GOOD = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
 
 
@@ -174,10 +165,6 @@ GOOD = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty flo
         ("a.pcd", pcd("x y z", "4 4", "F F F", 3, "ascii"), "cannot be understood"),
         ("a.pcd", pcd("x y z", "4 4 4", "F F F", 1, "binary_compressed"), "pcl_convert"),
         ("a.npz", b"nonsense", "NPZ"),
-        ("a.xyz", b"1 2 3\n4 5\n", "from 3 to 2"),
-        ("a.xyz", b"", "no points"),
-        ("a.xyz", b"1 2\n", "x y z"),
-        ("a.xyz", b"1 2 b\n", "numbers"),
         ("a.stl", b"", "unknown point cloud format"),
     ],
 )
