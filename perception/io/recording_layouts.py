@@ -22,7 +22,7 @@ TUM_APART, TUM_GAP = 0.02, 0.1
 _TUM_LENSES = {  # fx fy cx cy k1 k2 p1 p2 k3, from the data set's page on calibration
     "freiburg1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
     "freiburg2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
-    "freiburg3": (535.4, 539.2, 320.1, 247.6, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6),
 }
 _PRIMESENSE = (525.0, 525.0, 319.5, 239.5)  # the intrinsics that Redwood and Open3D assume for 640 × 480 pixels
 _KINECT_DEPTH, _KINECT_COLOR = (585.0, 585.0, 320.0, 240.0), (525.0, 525.0, 320.0, 240.0)
@@ -32,19 +32,15 @@ _COLOR_FOLDERS = ("color", "image", "rgb")
 
 def find_recording(source: Path) -> Recording | None:
     """The recording in folder `source`, or None when it has none of the layouts. InputError for one that is damaged."""
-    reader = _reader(source) if source.is_dir() else None
-    return None if reader is None else reader(source)
-
-
-def _reader(source: Path) -> Callable[[Path], Recording] | None:
     if (source / "rgb.txt").is_file() and (source / "depth.txt").is_file():
-        return _tum
+        return _tum(source)
     if (source / "color").is_dir() and (source / "pose").is_dir():
-        return _scannet
+        return _scannet(source)
     if any(source.glob("frame-*.color.*")) or any(source.glob("seq*/frame-*.color.*")):
-        return _seven_scenes
-    if _color_folder(source) and (source / "depth").is_dir() and any(source.glob("*.log")):
-        return _redwood
+        return _seven_scenes(source)
+    color = next((source / name for name in _COLOR_FOLDERS if (source / name).is_dir()), None)
+    if color is not None and (source / "depth").is_dir() and any(source.glob("*.log")):
+        return _redwood(source, color)
     return None
 
 
@@ -62,16 +58,19 @@ def refuse_depth_without_poses(source: Path) -> None:
         )
 
 
-# ---------------------------------------------------------------------- TUM RGB-D
-
-
 def _tum(source: Path) -> Recording:
     """Lists of "time file" for photos and depth, "time tx ty tz qx qy qz qw" for poses; 5000 units of depth a metre."""
     truth = source / "groundtruth.txt"
     if not truth.is_file():
         raise InputError(f"{truth}: missing, so depth has no poses; expected lines 'time tx ty tz qx qy qz qw'")
     (at, photos), (depth_at, depths) = (_listed(source / name) for name in ("rgb.txt", "depth.txt"))
-    times, poses = _tum_poses(truth)
+    rows = _numbers(truth, 8)
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    if (np.linalg.norm(rows[:, 4:], axis=1) < 1e-6).any():
+        raise InputError(f"{truth}: a quaternion is zero; expected lines 'time tx ty tz qx qy qz qw'")
+    times, poses = rows[:, 0], np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = [rotation_from_quaternion(row[[7, 4, 5, 6]]) for row in rows]
+    poses[:, :3, 3] = rows[:, 1:4]
     nearest = np.abs(depth_at[None] - at[:, None]).argmin(axis=1)
     apart = np.abs(depth_at[nearest] - at)
     if apart.min() > TUM_APART:
@@ -89,72 +88,45 @@ def _tum(source: Path) -> Recording:
             f"{source}: no photo lies between two poses; photos are from {at.min():.3f} to {at.max():.3f} s, poses "
             f"from {times.min():.3f} to {times.max():.3f} s"
         )
-    name = next((name for name in _TUM_LENSES if name in source.resolve().name), None)
-    lens = None if name is None else _lens(_TUM_LENSES[name], _SIZE)
+    lens = next((_lens(k, _SIZE) for name, k in _TUM_LENSES.items() if name in source.resolve().name), None)
     notes = _missing(len(photos) - len(frames), len(photos), "a pose")
     notes += _missing(sum(frame.depth is None for frame in frames), len(frames), f"depth within {TUM_APART} s")
     return Recording(source, "TUM RGB-D", frames, lens, 5000.0, None, notes)
 
 
 def _listed(file: Path) -> tuple[np.ndarray, list[str]]:
-    rows = [line.split() for line in _lines(file)]
+    """Times [N] in ascending order, and the files."""
     try:
-        rows.sort(key=lambda row: float(row[0]))
-        return np.array([float(row[0]) for row in rows]), [row[1] for row in rows]
+        rows = sorted(((float(row[0]), row[1]) for row in _rows(file)), key=lambda row: row[0])
     except (ValueError, IndexError) as error:
         raise InputError(f"{file}: expected lines 'time file' ({error})") from error
-
-
-def _tum_poses(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    rows = _numbers(file, 8)
-    rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    if (np.linalg.norm(rows[:, 4:], axis=1) < 1e-6).any():
-        raise InputError(f"{file}: a quaternion is zero; expected lines 'time tx ty tz qx qy qz qw'")
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = [rotation_from_quaternion(row[[7, 4, 5, 6]]) for row in rows]
-    poses[:, :3, 3] = rows[:, 1:4]
-    return rows[:, 0], poses
-
-
-# ------------------------------------------------------- folders of numbered files
+    return np.array([time for time, _ in rows]), [name for _, name in rows]
 
 
 def _scannet(source: Path) -> Recording:
     """Exported frames: color/, depth/ in mm, pose/ world_from_camera, infinite where tracking was lost."""
     photos = _images(source / "color")
-    frames = []
-    for photo in photos:
-        depth, pose = source / "depth" / f"{photo.stem}.png", source / "pose" / f"{photo.stem}.txt"
-        matrix = _matrix(pose) if pose.is_file() else None
-        if matrix is not None:
-            frames.append(Frame(f"color/{photo.name}", photo, depth if depth.is_file() else None, matrix))
-    size = photo_size(photos[0])
-    lens = _matrix_lens(source / "intrinsic" / "intrinsic_color.txt", size)
-    depths = [frame.depth for frame in frames if frame.depth is not None]
-    own = _matrix_lens(source / "intrinsic" / "intrinsic_depth.txt", photo_size(depths[0])) if depths else None
+    frames = _posed(source, photos, lambda photo, kind: source / kind / photo.stem)
+    intrinsics = source / "intrinsic"
+    depth = next((frame.depth for frame in frames if frame.depth is not None), None)
+    own = None if depth is None else _matrix_lens(intrinsics / "intrinsic_depth.txt", photo_size(depth))
     notes = _missing(len(photos) - len(frames), len(photos), "a pose (tracking was lost)")
+    lens = _matrix_lens(intrinsics / "intrinsic_color.txt", photo_size(photos[0]))
     return Recording(source, "ScanNet", frames, lens, 1000.0, own, notes)
 
 
 def _seven_scenes(source: Path) -> Recording:
     """frame-*.color.png, .depth.png in mm and .pose.txt, in the folder or in seq-*; 3DMatch adds the intrinsics."""
     photos = sorted(source.glob("frame-*.color.*")) or sorted(source.glob("seq*/frame-*.color.*"))
-    frames = []
-    for photo in photos:
-        stem = photo.name.partition(".")[0]
-        depth, pose = photo.with_name(f"{stem}.depth.png"), photo.with_name(f"{stem}.pose.txt")
-        matrix = _matrix(pose) if pose.is_file() else None
-        if matrix is not None:
-            name = photo.relative_to(source).as_posix()
-            frames.append(Frame(name, photo, depth if depth.is_file() else None, matrix))
+    frames = _posed(source, photos, lambda photo, kind: photo.with_name(f"{photo.name.partition('.')[0]}.{kind}"))
     notes = _missing(len(photos) - len(frames), len(photos), "a pose")
-    size = photo_size(photos[0])
-    for file in (source / "camera-intrinsics.txt", source.parent / "camera-intrinsics.txt"):
-        if file.is_file():
+    for folder in (source, source.parent):
+        lens = _matrix_lens(folder / "camera-intrinsics.txt", photo_size(photos[0]))
+        if lens is not None:
             folders = {photo.parent for photo in photos}
             if len(folders) > 1:
                 raise InputError(f"{source}: {len(folders)} sequences, each with a world of its own; give one of them")
-            return Recording(source, "3DMatch", frames, _matrix_lens(file, size), 1000.0, None, notes)
+            return Recording(source, "3DMatch", frames, lens, 1000.0, None, notes)
     warning = (
         f"{source}: 7-Scenes does not register depth to the photos; the nominal lenses are used (focal length "
         f"{_KINECT_COLOR[0]:g} and {_KINECT_DEPTH[0]:g} pixels), and the 2 to 3 cm between the cameras are neglected"
@@ -163,10 +135,25 @@ def _seven_scenes(source: Path) -> Recording:
     return Recording(source, "7-Scenes", frames, color, 1000.0, depth_lens, notes, [warning])
 
 
-def _redwood(source: Path) -> Recording:
+def _posed(source: Path, photos: list[Path], beside: Callable[[Path, str], Path]) -> list[Frame]:
+    """The photos with a pose, a file of world_from_camera that is neither infinite nor all zero (tracking was lost).
+
+    beside: the photo's file of kind "depth" (.png) or "pose" (.txt), without suffix.
+    """
+    frames = []
+    for photo in photos:
+        depth, pose = (Path(f"{beside(photo, kind)}{suffix}") for kind, suffix in (("depth", ".png"), ("pose", ".txt")))
+        matrix = _numbers(pose, 4) if pose.is_file() else np.zeros((4, 4))
+        if matrix.shape != (4, 4):
+            raise InputError(f"{pose}: {len(matrix)} rows, expected a 4×4 matrix world_from_camera")
+        if np.isfinite(matrix).all() and matrix[:3, :3].any():
+            name = photo.relative_to(source).as_posix()
+            frames.append(Frame(name, photo, depth if depth.is_file() else None, matrix))
+    return frames
+
+
+def _redwood(source: Path, folder: Path) -> Recording:
     """color/ (or image/, rgb/) and depth/ in mm in equal order, and a .log of world_from_camera matrices."""
-    folder = _color_folder(source)
-    assert folder is not None
     photos, depths = _images(folder), _images(source / "depth")
     if len(photos) != len(depths):
         raise InputError(
@@ -178,11 +165,11 @@ def _redwood(source: Path) -> Recording:
         raise InputError(f"{source}: several trajectories ({', '.join(log.name for log in logs)}); keep one of them")
     poses = _trajectory(named[0], len(photos))
     frames = [Frame(f"{folder.name}/{photos[i].name}", photos[i], depths[i], pose) for i, pose in poses.items()]
-    size, lens, notes = photo_size(photos[0]), None, _missing(len(photos) - len(poses), len(photos), "a pose")
+    lens, notes = None, _missing(len(photos) - len(poses), len(photos), "a pose")
     cameras = sorted(source.glob("*intrinsic*.json")) + sorted(source.glob("camera*.json"))
     if cameras:
         lens = _open3d_lens(cameras[0])
-    elif size == _SIZE:
+    elif photo_size(photos[0]) == _SIZE:
         lens = _lens(_PRIMESENSE, _SIZE)
         notes.append(f"{source}: no intrinsics, those of PrimeSense are used ({_PRIMESENSE[0]:g} pixels)")
     return Recording(source, "Redwood / Open3D", frames, lens, 1000.0, None, notes)
@@ -190,26 +177,17 @@ def _redwood(source: Path) -> Recording:
 
 def _trajectory(file: Path, photos: int) -> dict[int, np.ndarray]:
     """Blocks of a line of three whole numbers, the first the number of the photo from 0, and four rows of a matrix."""
-    lines = _lines(file)
+    rows = _rows(file)
     try:
-        numbers = [int(line.split()[0]) for line in lines[::5]]
-        rows = [line for index, line in enumerate(lines) if index % 5]
-        matrices = np.array([line.split() for line in rows], np.float64).reshape(-1, 4, 4)
-    except (ValueError, IndexError) as error:
+        numbers = [int(row[0]) for row in rows[::5]]
+        matrices = np.array([row for index, row in enumerate(rows) if index % 5], np.float64).reshape(-1, 4, 4)
+        places = list(range(photos)) if len(numbers) == photos else numbers
+        poses = dict(zip(places, matrices, strict=True))
+    except ValueError as error:
         raise InputError(f"{file}: expected blocks of a line 'i i i+1' and four rows of four numbers") from error
-    if len(matrices) != len(numbers):
-        raise InputError(f"{file}: ends within a block; expected a line 'i i i+1' and four rows of four numbers")
-    places = list(range(photos)) if len(numbers) == photos else numbers
     if min(places) < 0 or max(places) >= photos:
         raise InputError(f"{file}: tells the pose of photo {max(places)} (counted from 0), there are {photos} photos")
-    return dict(zip(places, matrices, strict=True))
-
-
-# ------------------------------------------------------------------------ helpers
-
-
-def _color_folder(source: Path) -> Path | None:
-    return next((source / name for name in _COLOR_FOLDERS if (source / name).is_dir()), None)
+    return poses
 
 
 def _images(folder: Path) -> list[Path]:
@@ -220,34 +198,28 @@ def _images(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: (len(path.stem), path.name))
 
 
-def _matrix(file: Path) -> np.ndarray | None:
-    """world_from_camera [4, 4]; None where tracking was lost: not finite, or all zero."""
-    matrix = _numbers(file, 4)
-    if matrix.shape != (4, 4):
-        raise InputError(f"{file}: {len(matrix)} rows, expected a 4×4 matrix world_from_camera")
-    return matrix if np.isfinite(matrix).all() and matrix[:3, :3].any() else None
-
-
 def _numbers(file: Path, columns: int) -> np.ndarray:
-    rows = [line.split() for line in _lines(file)]
+    """[N, at least `columns`] float64."""
     try:
-        table = np.array(rows, np.float64)
+        table = np.array(_rows(file), np.float64)
+        if table.shape[1] < columns:
+            raise ValueError(f"found {table.shape[1]}")
     except ValueError as error:
-        raise InputError(f"{file}: expected lines of {columns} numbers ({brief(str(error))})") from error
-    if table.ndim != 2 or table.shape[1] < columns:
-        raise InputError(f"{file}: expected lines of {columns} numbers")
+        raise InputError(f"{file}: expected lines of {columns} numbers ({brief(error)})") from error
     return table
 
 
-def _lines(file: Path) -> list[str]:
+def _rows(file: Path) -> list[list[str]]:
+    """The words of each line that is not empty and no comment; InputError where there is none."""
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{file}: cannot be read as text") from error
-    lines = [line.replace(",", " ") for line in lines if line.strip() and not line.lstrip().startswith("#")]
-    if not lines:
+    rows = [line.replace(",", " ").split() for line in lines if not line.lstrip().startswith("#")]
+    rows = [row for row in rows if row]
+    if not rows:
         raise InputError(f"{file}: is empty")
-    return lines
+    return rows
 
 
 def _matrix_lens(file: Path, size: tuple[int, int]) -> Lens | None:
@@ -277,7 +249,7 @@ def _open3d_lens(file: Path) -> Lens:
 def _lens(values: tuple[float, ...], size: tuple[int, int]) -> Lens:
     fx, fy, cx, cy, *k = (float(value) for value in values)
     centred = (fx, fy, cx + 0.5, cy + 0.5)
-    return Lens("FULL_OPENCV", (*centred, *k, 0.0, 0.0, 0.0), *size) if any(k) else Lens("PINHOLE", centred, *size)
+    return Lens("FULL_OPENCV", (*centred, *k, 0.0, 0.0, 0.0), *size) if k else Lens("PINHOLE", centred, *size)
 
 
 def _missing(count: int, total: int, what: str) -> list[str]:
