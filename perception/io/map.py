@@ -72,16 +72,15 @@ class Map:
         """`gmap` as an instance of this class, with `changes` to its fields; arrays are shared, not read."""
         made = cls.__new__(cls)
         made.path, made._files = gmap.path, gmap._files
-        made.__dict__.update({name: value for name, value in vars(gmap).items() if name in _FIELDS} | changes)
-        if changes.keys() & {"means", "instance_ids"}:
-            made.index = build_index(made.means, made.instance_ids)
+        shared = _FIELDS if changes.keys() & {"means", "instance_ids"} else (*_FIELDS, "index")
+        made.__dict__.update({name: value for name, value in vars(gmap).items() if name in shared} | changes)
         return made
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
             """Reads a field at its first use; concurrent threads get the same value."""
-            if name == "index" and self._files is None:
+            if name == "index":
                 value = build_index(self.means, self.instance_ids)
             elif name in _FIELDS and self._files is not None:
                 value = self._files.read(name)
@@ -169,4 +168,4 @@ class Map:
         return found
 
 
-_FIELDS = (*GAUSSIANS, "instances", "info", "views", "language", "parts", "index")
+_FIELDS = (*GAUSSIANS, "instances", "info", "views", "language", "parts")

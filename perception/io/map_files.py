@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io import instance_index
 from perception.io.arrays import DAMAGE, map_npy, read_npz
 from perception.io.atomic import standing
 from perception.io.checksums import EDITABLE, FACTS, check_file, check_sizes, damaged
 from perception.io.documents import brief
-from perception.io.instance_index import InstanceIndex, build_index
 from perception.io.map_views import check_names, views_of_facts
 from perception.io.ply import map_ply
 
@@ -25,7 +23,7 @@ FORMAT_VERSION = 2
 READABLE = (1, 2)
 """Readable format versions. 1 stores the views in map.json and as arrays in cameras.npz, 2 in map.json only."""
 _ARRAYS = {"features": 2, "instance_ids": 1, "membership": 1}
-ARCHIVES = ("cameras", "language", "index", "parts")
+ARCHIVES = ("cameras", "language", "parts")
 _TRIES = 5
 
 Signature = tuple[tuple[int, int, int], ...]
@@ -98,8 +96,6 @@ class MapFiles:
             return getattr(self, name)
         if name == "views":
             return views_of_facts(self.facts, self.path / FACTS, self._unpack("cameras"))
-        if name == "index":
-            return self._index()
         if name in ("language", "parts"):
             return self._unpack(name)
         self._check_contents()
@@ -122,16 +118,6 @@ class MapFiles:
                 if name != EDITABLE:
                     check_file(self.path, self.info, name)
             self._checked = True
-
-    def _index(self) -> InstanceIndex:
-        """The points of each instance; computed from the Gaussians for older maps without a stored index."""
-        arrays, ids = self._unpack("index"), self._arrays["instance_ids"]
-        if not arrays:
-            return build_index(_OF_PLY["means"](self._rows), ids)
-        index = instance_index.from_arrays(arrays, f"{self.path / 'index.npz'}")
-        if len(index.points) != np.count_nonzero(np.asarray(ids) >= 0):
-            raise damaged(self.path / "index.npz", "does not fit instance_ids.npy")
-        return index
 
     def _unpack(self, name: str) -> dict[str, np.ndarray]:
         """The arrays of an .npz, {} if it does not exist; InputError when a CRC-32 differs."""

@@ -9,7 +9,6 @@ features.npy    [N, D] float32      instance_ids.npy  [N] int32 (−1 = none)   
 language.npz    embeddings of each instance, with the identity of the encoder (absent without an encoder)
 parts.npz       ids [N] int32: the part each Gaussian belongs to (−1 = none; absent without parts). With an encoder also
                 language_*: as language.npz, one row per part in ascending id
-index.npz       points grouped by instance (see instance_index), for queries
 map.json also lists size and SHA-256 of the other files (`files`) and its own (`sha256`); see checksums.
 """
 
@@ -28,7 +27,6 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory, atomic_file
 from perception.io.checksums import EDITABLE, FACTS, REPORT, facts_of, file_facts, seal, verify
-from perception.io.instance_index import build_index
 from perception.io.map import Map
 from perception.io.map_files import FORMAT_VERSION, MapFiles, map_signature, read_info
 from perception.io.map_lock import writing
@@ -71,8 +69,6 @@ def write_map(path: Path, gmap: Map, keep_report: bool = False) -> None:
         np.save(folder / "features.npy", gmap.features.astype(np.float32))
         np.save(folder / "instance_ids.npy", gmap.instance_ids.astype(np.int32))
         np.save(folder / "membership.npy", gmap.membership.astype(np.float32))
-        index = build_index(gmap.means, gmap.instance_ids)
-        np.savez(folder / "index.npz", **index.to_arrays())  # type: ignore[arg-type]
         if gmap.language:
             np.savez_compressed(folder / "language.npz", **gmap.language)  # type: ignore[arg-type]
         if gmap.parts:
@@ -101,10 +97,7 @@ def read_map(path: Path) -> Map:
 
 def verify_map(path: Path) -> dict[str, str]:
     """Reads every byte: {file: "ok", "edited" or "no checksum"}; InputError naming the first damaged file."""
-    files = MapFiles(path)
-    states = verify(path, files.facts)
-    files.read("index")
-    return states
+    return verify(path, MapFiles(path).facts)
 
 
 def set_labels(path: Path, labels: dict[int, str | None]) -> dict[int, str | None]:
