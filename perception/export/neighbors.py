@@ -1,4 +1,5 @@
-"""Nearest neighbours in 3D with the compiled k-d tree, exact in float32 relative to a common centre."""
+"""Nearest neighbours in 3D with the compiled k-d tree, exact in float32 relative to a common centre; the Gaussian with
+the nearest mean (OpenSplat3D), in chunks for clouds of any size."""
 
 from __future__ import annotations
 
@@ -7,6 +8,8 @@ import numpy as np
 from perception import _core
 from perception.errors import InputError
 from perception.io.cloud_memory import cores
+
+CHUNK = 1 << 20  # points at a time: 24 MiB of working memory
 
 
 class Neighbors:
@@ -47,3 +50,49 @@ class Neighbors:
         with np.errstate(over="ignore", invalid="ignore"):
             self._tree.knn(self.local(queries), indices, squared, float(max_distance), self.threads)
         return indices, np.sqrt(squared, out=squared)
+
+
+def nearest_gaussian(
+    points: np.ndarray, means: np.ndarray, *, chunk: int = CHUNK, max_distance: float | None = None
+) -> np.ndarray:
+    """Index [P] int64 of the nearest of means [N, 3] for each of points [P, 3].
+
+    −1 for points that are not finite or farther than max_distance from every mean. Equal distances go to the smaller
+    index. Means that are not finite are ignored.
+    """
+    points = _checked(points, "points")
+    means = _checked(means, "means")
+    finite = np.flatnonzero(np.isfinite(means).all(axis=1))
+    result = np.full(len(points), -1, np.int64)
+    if len(finite) == 0:
+        return result
+    if max_distance is not None and not max_distance >= 0:
+        raise InputError(f"max_distance is {max_distance}; expected a length that is not negative")
+    tree = Neighbors(means if len(finite) == len(means) else means[finite])
+    for begin in range(0, len(points), chunk):
+        found = tree.query(points[begin : begin + chunk], 1, np.inf if max_distance is None else max_distance)[0][:, 0]
+        result[begin : begin + chunk] = np.where(found >= 0, finite[found], -1)
+    return result
+
+
+def auto_distance(means: np.ndarray) -> float | None:
+    """Distance limit from the map itself: twice the 99th percentile of the spacing of neighbouring means [N, 3].
+
+    Even in sparse regions a point on the mapped surface is within half that spacing of a mean; the limit is four times
+    this. Points beyond it were not mapped. None (no limit) for fewer than two distinct means.
+    """
+    means = _checked(means, "means")
+    means = means[np.isfinite(means).all(axis=1)]
+    if len(means) < 2:
+        return None
+    chosen = means[:: max(len(means) // 50_000, 1)]
+    gaps = Neighbors(means).query(chosen, 2)[1][:, 1]
+    gaps = gaps[gaps > 0]
+    return 2 * float(np.quantile(gaps, 0.99)) if len(gaps) else None
+
+
+def _checked(points: np.ndarray, name: str) -> np.ndarray:
+    points = np.asarray(points)
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
+        raise InputError(f"{name}: expected floats [N, 3], found {points.dtype} {list(points.shape)}")
+    return points

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.errors import InputError
-from perception.export.assign import auto_distance, nearest_gaussian
+from perception.export.neighbors import auto_distance, nearest_gaussian
 from perception.export.smooth import read_segments, segment_cloud, vote
 from perception.types import PointCloud
 

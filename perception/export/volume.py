@@ -8,8 +8,8 @@ import numpy as np
 from scipy import ndimage
 
 from perception.errors import InputError
-from perception.export.assign import nearest_gaussian
 from perception.export.depth_views import DepthView, observe
+from perception.export.neighbors import nearest_gaussian
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 MOST_VOXELS = 200_000_000

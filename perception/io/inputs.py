@@ -6,13 +6,12 @@ import shutil
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from perception.errors import InputError
 from perception.io.camera_file import read_camera
 from perception.io.ignore_masks import with_checked_masks
 from perception.io.reading import Reading, check_seen, start_points
-from perception.progress import Progress
 from perception.types import Lens, Scene
 
 EXPECTED = (
@@ -21,28 +20,11 @@ EXPECTED = (
 )
 
 
-def load_scene(
-    source: Path,
-    workdir: Path,
-    *,
-    camera_file: Path | None = None,
-    progress: Progress | None = None,
-    seed: int = 0,
-    strict: bool = False,
-    frames: Path | None = None,
-    masks: Path | None = None,
-    init_points: Path | None = None,
-    poses: Literal["auto", "keep", "refine"] = "auto",
-) -> Scene:
+def load_scene(source: Path, how: Reading) -> Scene:
     """Posed views of `source`, sorted by name, with a sparse cloud.
 
     A folder is read as a COLMAP workspace if it is one, else by its transforms.json if it has one, else as an RGB-D
-    recording if it has the layout of one, else as photos, with poses from structure from motion. `workdir` caches
-    features and models for later calls. camera_file: ROS camera_info with the intrinsics of all photos, for photos,
-    videos and recordings. strict: a damaged photo is an InputError, else it is left out. frames: folder for the frames
-    of a video (None: workdir/frames), which the map needs later. masks: folder of masks of pixels to ignore (see
-    `ignore_masks`). init_points: cloud in the frame of the input's poses, used instead of sparse points. poses: "auto",
-    "keep" or "refine" the given ones (see io.pose_refinement).
+    recording if it has the layout of one, else as photos, with poses from structure from motion.
     """
     from perception.io.colmap import read_workspace
     from perception.io.recording_layouts import refuse_depth_without_poses
@@ -50,38 +32,36 @@ def load_scene(
     from perception.io.sfm import reconstruct
     from perception.io.transforms import read_transforms
 
-    source, workdir = Path(source), Path(workdir)
-    tell = progress or Progress(quiet=True)
     started = time.perf_counter()
     if not source.exists():
         raise InputError(f"{source}: no such file or folder; expected {EXPECTED}")
     kind = _kind(source)
     unposed = kind in ("photos", "video")
-    if camera_file is not None and not unposed and not isinstance(kind, Recording):
-        raise InputError(f"{camera_file}: a camera file goes with photos or a video; {source} brings its own cameras")
-    if init_points is not None and unposed:
-        raise InputError(f"{init_points}: a cloud to start from goes with an input that has poses; {source} has none")
-    if masks is not None and not masks.is_dir():
-        raise InputError(f"{masks}: no such folder of masks")
-    lens = None if camera_file is None else read_camera(camera_file)
-    cloud = None if init_points is None else start_points(init_points)
-    workdir.mkdir(parents=True, exist_ok=True)
-    how = Reading(workdir, seed, tell, strict, masks, cloud, poses)
+    if how.camera is not None and not unposed and not isinstance(kind, Recording):
+        raise InputError(f"{how.camera}: a camera file goes with photos or a video; {source} brings its own cameras")
+    if how.init_points is not None and unposed:
+        what = "a cloud to start from goes with an input that has poses"
+        raise InputError(f"{how.init_points}: {what}; {source} has none")
+    if how.masks is not None and not how.masks.is_dir():
+        raise InputError(f"{how.masks}: no such folder of masks")
+    lens = None if how.camera is None else read_camera(how.camera)
+    how = replace(how, cloud=None if how.init_points is None else start_points(how.init_points))
+    how.workdir.mkdir(parents=True, exist_ok=True)
     if kind == "video":
-        scene = _scene_of_video(source, frames or workdir / "frames", workdir, lens, seed, tell, masks)
+        scene = _scene_of_video(source, lens, how)
     elif kind == "photos":
         refuse_depth_without_poses(source)
-        scene = reconstruct(source, workdir, lens, seed, tell, strict, masks)
+        scene = reconstruct(source, lens, how)
     elif kind == "workspace":
         scene = read_workspace(source, how)
     elif isinstance(kind, Path):
         scene = read_transforms(kind, how)
     else:
         scene = recorded_scene(replace(kind, lens=lens or kind.lens), how)
-    if init_points is not None:
-        scene.report["points_from"] = str(init_points)
-        check_seen(scene, init_points)
-    scene = with_checked_masks(scene, masks)
+    if how.init_points is not None:
+        scene.report["points_from"] = str(how.init_points)
+        check_seen(scene, how.init_points)
+    scene = with_checked_masks(scene, how.masks)
     scene.report["seconds"]["total"] = time.perf_counter() - started
     return scene
 
@@ -152,16 +132,15 @@ def _size(photo: Path) -> tuple[int, int] | None:
         return None
 
 
-def _scene_of_video(
-    video: Path, folder: Path, workdir: Path, lens: Lens | None, seed: int, progress: Progress, masks: Path | None
-) -> Scene:
+def _scene_of_video(video: Path, lens: Lens | None, how: Reading) -> Scene:
     from perception.io.sfm import reconstruct
     from perception.io.video import video_frames
 
+    folder = how.frames or how.workdir / "frames"
     new = not folder.exists()
-    record = video_frames(video, folder, progress)
+    record = video_frames(video, folder, how.progress)
     try:
-        scene = reconstruct(folder, workdir, lens, seed, progress, masks=masks)
+        scene = reconstruct(folder, lens, how)
     except InputError:
         if new:
             shutil.rmtree(folder, ignore_errors=True)

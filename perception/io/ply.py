@@ -66,7 +66,7 @@ def read_ply(path: str | Path) -> dict[str, Element]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); expected a PLY file") from error
     try:
-        source = _Binary(body, order) if order else _Text(body)
+        source = _Body(body, order)
     except ValueError as error:
         raise InputError(f"{path}: holds text where numbers are expected ({error})") from error
     return {table.name: _read_element(source, table, path) for table in tables}
@@ -145,17 +145,19 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_Table]]:
     return order, tables
 
 
-class _Binary:
-    """Values of a binary body, taken one after another."""
+class _Body:
+    """Values of a body, taken one after another. The numbers of a text are float64, whatever the header says."""
 
     def __init__(self, body: bytes, order: str):
-        self.body, self.order, self.at = body, order, 0
+        self.order, self.text, self.at = order, not order, 0
+        self.body = body if order else np.fromstring(body, dtype=np.float64, sep=" ").tobytes()
 
     def take(self, kind: str, count: int) -> np.ndarray:
         """The next `count` values; ValueError if they are not there."""
         if count < 0:
             raise ValueError("a list of negative length")
-        found = np.frombuffer(self.body, self.order + kind, count, self.at) if count else np.empty(0, kind)
+        dtype = self._stored(kind)
+        found = np.frombuffer(self.body, dtype, count, self.at) if count else np.empty(0, dtype)
         self.at += found.nbytes
         return found
 
@@ -163,8 +165,8 @@ class _Binary:
         """All rows if they have lists of these lengths, else None; the number of such rows that fit into the body."""
         fields: list[tuple] = []
         for p in table.properties:
-            fields += [(f"{p.name}\0count", self.order + p.count)] if p.count else []
-            fields.append((p.name, self.order + p.kind, *([(lengths[p.name],)] if p.count else [])))
+            fields += [(f"{p.name}\0count", self._stored(p.count))] if p.count else []
+            fields.append((p.name, self._stored(p.kind), *([(lengths[p.name],)] if p.count else [])))
         dtype = np.dtype(fields)
         found = (len(self.body) - self.at) // dtype.itemsize
         if found < table.rows:
@@ -173,34 +175,18 @@ class _Binary:
         if not all((rows[f"{name}\0count"] == n).all() for name, n in lengths.items()):
             return None, found
         self.at += rows.nbytes
-        return {p.name: rows[p.name].astype(p.kind) for p in table.properties}, found
+        return {p.name: _cast(rows[p.name], p.kind) for p in table.properties}, found
+
+    def _stored(self, kind: str) -> str:
+        return "f8" if self.text else self.order + kind
 
 
-class _Text:
-    """The same for an ASCII body, whose values are all numbers."""
-
-    def __init__(self, body: bytes):
-        self.numbers, self.at = np.fromstring(body, dtype=np.float64, sep=" "), 0
-
-    def take(self, kind: str, count: int) -> np.ndarray:
-        found = self.numbers[self.at : self.at + count]
-        if count < 0 or len(found) < count:
-            raise ValueError("the numbers end")
-        self.at += count
-        return found
-
-    def block(self, table: _Table, lengths: dict[str, int]) -> tuple[Element | None, int]:
-        found = (len(self.numbers) - self.at) // len(table.properties)
-        if lengths or found < table.rows:
-            return None, found
-        size = table.rows * len(table.properties)
-        rows = self.numbers[self.at : self.at + size].reshape(table.rows, len(table.properties))
-        self.at += size
-        with np.errstate(invalid="ignore"):
-            return {p.name: rows[:, i].astype(p.kind) for i, p in enumerate(table.properties)}, found
+def _cast(values: np.ndarray, kind: str) -> np.ndarray:
+    with np.errstate(invalid="ignore"):  # a text may hold nan where the header says int
+        return values.astype(kind)
 
 
-def _read_element(source: _Binary | _Text, table: _Table, path: Path) -> Element:
+def _read_element(source: _Body, table: _Table, path: Path) -> Element:
     """One element, as a table if all lists of a property are as long as the first, else value by value."""
     start, listed = source.at, [p.name for p in table.properties if p.count]
     try:
@@ -219,17 +205,17 @@ def _read_element(source: _Binary | _Text, table: _Table, path: Path) -> Element
     return {p.name: _column([row[p.name] for row in each], p) for p in table.properties}
 
 
-def _take_row(source: _Binary | _Text, table: _Table) -> Element:
+def _take_row(source: _Body, table: _Table) -> Element:
     return {p.name: source.take(p.kind, int(source.take(p.count, 1)[0]) if p.count else 1) for p in table.properties}
 
 
 def _column(values: list[np.ndarray], p: _Property) -> np.ndarray:
     if p.count is None:
-        return np.concatenate(values).astype(p.kind)
+        return _cast(np.concatenate(values), p.kind)
     if len({len(v) for v in values}) == 1:
-        return np.array(values, p.kind)
+        return _cast(np.array(values), p.kind)
     ragged = np.empty(len(values), object)
-    ragged[:] = [v.astype(p.kind) for v in values]
+    ragged[:] = [_cast(v, p.kind) for v in values]
     return ragged
 
 

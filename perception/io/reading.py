@@ -26,11 +26,13 @@ def _quiet() -> Progress:
 
 @dataclass(frozen=True)
 class Reading:
-    """workdir: caches features and models. strict: a damaged photo is an InputError, else it is left out and reported.
+    """workdir: caches features and models for later calls. strict: a damaged photo is an InputError, else left out.
 
-    masks: folder of masks of pixels to ignore, which precede those that the input names. cloud: points and colours used
-    instead of the input's. poses: "keep", "refine", or "auto": checked where features are matched anyway or views have
-    depth, and refined where they are wrong (see io.pose_refinement).
+    masks: folder of masks of pixels to ignore (see `ignore_masks`), which precede those that the input names. camera:
+    ROS camera_info with the intrinsics of all photos, for photos, videos and recordings. frames: folder for the frames
+    of a video (None: workdir/frames), which the map needs later. init_points: cloud in the frame of the input's poses,
+    read as `cloud` and used instead of sparse points. poses: "keep", "refine", or "auto": checked where features are
+    matched anyway or views have depth, and refined where they are wrong (see io.pose_refinement).
     """
 
     workdir: Path
@@ -38,6 +40,9 @@ class Reading:
     progress: Progress = field(default_factory=_quiet)
     strict: bool = False
     masks: Path | None = None
+    camera: Path | None = None
+    frames: Path | None = None
+    init_points: Path | None = None
     cloud: Cloud | None = None
     poses: Literal["auto", "keep", "refine"] = "auto"
 

@@ -22,31 +22,23 @@ from perception.io.incremental_sfm import map_photos
 from perception.io.lens import lens_from_camera, lens_text, load_pycolmap
 from perception.io.photo_folder import PhotoSet, choose_photos
 from perception.io.photos import photo_size
+from perception.io.reading import Reading
 from perception.io.sfm_checks import model_warnings
 from perception.io.tracks import tracks_of_model
 from perception.io.triangulate import cloud_of
-from perception.progress import Progress
 from perception.types import Lens, Scene
 
 MIN_PHOTOS = 3
 
 
-def reconstruct(
-    folder: Path,
-    workdir: Path,
-    lens: Lens | None,
-    seed: int,
-    progress: Progress,
-    strict: bool = False,
-    masks: Path | None = None,
-) -> Scene:
+def reconstruct(folder: Path, lens: Lens | None, how: Reading) -> Scene:
     """Poses and a sparse cloud of the photos in `folder`, from the largest model; unit and orientation are arbitrary.
 
     lens: known intrinsics shared by all photos, kept fixed; None estimates focal length and radial distortion.
-    Results in `workdir` are reused for unchanged photos, lens and seed. `choose_photos` decides which photos are left
-    out. strict: damaged photos raise InputError. masks: folder of masks of pixels to ignore.
+    Results in the workdir are reused for unchanged photos, lens and seed. `choose_photos` decides which photos are left
+    out.
     """
-    chosen = choose_photos(folder, strict, progress)
+    chosen = choose_photos(folder, how.strict, how.progress)
     photos = chosen.photos
     if len(photos) < MIN_PHOTOS:
         raise _too_few(folder, chosen)
@@ -54,14 +46,14 @@ def reconstruct(
         if lens and photo_size(photo) != (lens.width, lens.height):
             found = "×".join(map(str, photo_size(photo)))
             raise InputError(f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}")
-    ignored = [mask_of(masks, name) for name in chosen.names]
-    store = build_features(photos, [lens] * len(photos), workdir, seed, progress, ignored)
-    model, report = _map(store, chosen, folder, lens is not None, seed, progress)
+    ignored = [mask_of(how.masks, name) for name in chosen.names]
+    store = build_features(photos, [lens] * len(photos), how.workdir, how.seed, how.progress, ignored)
+    model, report = _map(store, chosen, folder, lens is not None, how)
     number = {name: index for index, name in enumerate(store.names)}
     indices = {image_id: number[model.images[image_id].name] for image_id in model.reg_image_ids()}
     located = {image_id: (chosen.names[index], photos[index]) for image_id, index in indices.items()}
-    views, _, _ = views_of_model(model, located, folder, strict)
-    views = [replace(view, mask=mask_of(masks, view.name)) for view in views]
+    views, _, _ = views_of_model(model, located, folder, how.strict)
+    views = [replace(view, mask=mask_of(how.masks, view.name)) for view in views]
     names = {image_id: name for image_id, (name, _) in located.items()}
     views, exposure = with_gains(views, tracks_of_model(model, views, names))
     points, colors = cloud_of(model)
@@ -79,15 +71,13 @@ def _too_few(folder: Path, chosen: PhotoSet) -> InputError:
     return InputError(f"{found}; at least {MIN_PHOTOS} are needed, 20 or more give good maps")
 
 
-def _map(
-    store: FeatureStore, chosen: PhotoSet, folder: Path, fixed: bool, seed: int, progress: Progress
-) -> tuple[Any, dict[str, Any]]:
+def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, fixed: bool, how: Reading) -> tuple[Any, dict[str, Any]]:
     pycolmap = load_pycolmap()
     done = store.folder / "model"
     recover(done)
     if not done.is_dir():
         started = time.perf_counter()
-        models, contradicted = map_photos(store, fixed, seed, len(chosen.photos), progress)
+        models, contradicted = map_photos(store, fixed, how.seed, len(chosen.photos), how.progress)
         if not models:
             raise InputError(
                 f"{folder}: none of the {len(chosen.photos)} photos could be registered; take sharp, overlapping "

@@ -24,6 +24,7 @@ from perception.instances.label_transfer import transfer_labels, transfer_text
 from perception.io.inputs import load_scene
 from perception.io.map_views import stored_view
 from perception.io.photos import load_photo
+from perception.io.reading import Reading
 from perception.io.recentre import recentred
 from perception.io.scene_cache import load_saved_scene, save_scene
 from perception.io.store import Map, read_info, read_map, write_map
@@ -169,18 +170,12 @@ def _scene(source: Path, output: Path, work: Path, config: MapConfig, progress: 
     scene = load_saved_scene(kept)
     if scene is None:
         log_estimate(source, config, progress.log)
-        scene = load_scene(
-            source,
-            work / "sfm",
-            camera_file=Path(config.photos.camera) if config.photos.camera else None,
-            progress=progress,
-            seed=config.seed,
-            strict=config.photos.strict,
-            frames=frames_folder(output),
-            masks=Path(config.photos.ignore_masks) if config.photos.ignore_masks else None,
-            init_points=Path(config.photos.init_points) if config.photos.init_points else None,
-            poses=config.photos.poses,
+        photos = config.photos
+        masks, camera, cloud = (
+            Path(p) if p else None for p in (photos.ignore_masks, photos.camera, photos.init_points)
         )
+        how = Reading(work / "sfm", config.seed, progress, photos.strict, masks, camera, poses=photos.poses)
+        scene = load_scene(source, replace(how, frames=frames_folder(output), init_points=cloud))
         save_scene(kept, scene := placed_scene(recentred(scene), config.frame, config.seed))
     if config.losses.depth_weight == 0:
         return replace(scene, views=[replace(view, depth=None) for view in scene.views])

@@ -9,8 +9,8 @@ import numpy as np
 
 from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
-from perception.export.assign import nearest_gaussian
 from perception.export.depth_views import DepthView
+from perception.export.neighbors import nearest_gaussian
 from perception.export.transfer import ExportOptions, export_labels
 from perception.export.volume import FREE, OCCUPIED, closed_body, grid_shape, occupancy, signed_distance
 from perception.io.atomic import replacing

@@ -10,7 +10,7 @@ import pytest
 
 from perception.cli import main
 from perception.errors import InputError
-from perception.export.assign import auto_distance
+from perception.export.neighbors import auto_distance
 from perception.export.transfer import ExportOptions, export_labels
 from perception.io.cloud import read_cloud, write_cloud
 from perception.types import PointCloud

@@ -10,7 +10,6 @@ import pytest
 from scipy.spatial import Delaunay
 
 from perception.errors import InputError
-from perception.export.assign import nearest_gaussian
 from perception.export.graph import (
     list_edges,
     list_normals,
@@ -20,7 +19,7 @@ from perception.export.graph import (
     scannet_weights,
     step_weights,
 )
-from perception.export.neighbors import Neighbors
+from perception.export.neighbors import Neighbors, nearest_gaussian
 from perception.export.smooth import felzenszwalb, read_segments, segment_cloud, vote
 from perception.types import PointCloud
 

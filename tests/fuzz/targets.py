@@ -538,7 +538,7 @@ def map_store() -> Target:
     ]
     variants += [("sealed/map.json", same, sealed["map.json"]), ("sealed/features.npy", same, sealed["features.npy"])]
     variants += [("old/map.json", same, old["map.json"])]
-    for folder, name in (("loose", "index"), ("loose", "language"), ("loose", "parts"), ("old", "cameras")):
+    for folder, name in (("loose", "language"), ("loose", "parts"), ("old", "cameras")):
         with np.load(io.BytesIO(files[f"{folder}/{name}.npz"])) as arrays:
             held = {key: arrays[key] for key in arrays.files}
         variants += [(f"{folder}/{name}.npz", member(key, held), npy(value)) for key, value in held.items()]

@@ -451,5 +451,5 @@ def test_damaged_label_images_of_an_earlier_run(tmp_path: Path) -> None:
 def test_an_error_is_one_line_whatever_a_file_is_called(tmp_path: Path) -> None:
     frame = {"file_path": "a\nb\x1b[31m\u2028.png", "transform_matrix": np.eye(4).tolist()}
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 7, "w": 8, "h": 6, "frames": [frame]}))
-    refused(load_scene, tmp_path, tmp_path / "work", match=r"a\\nb\\x1b\[31m\\u2028\.png")
+    refused(load_scene, tmp_path, Reading(tmp_path / "work"), match=r"a\\nb\\x1b\[31m\\u2028\.png")
     assert str(InputError("grand-mère’s 杯子 🍵")) == "grand-mère’s 杯子 🍵"

@@ -22,6 +22,7 @@ from perception.io.inputs import load_scene
 from perception.io.lens import load_pycolmap
 from perception.io.photo_folder import choose_photos, list_photos, view_name
 from perception.io.photos import photo_damage, photo_size, read_photo
+from perception.io.reading import Reading
 from perception.io.safe_names import safe_name
 from perception.io.views import fit_lens
 from perception.types import Lens
@@ -233,7 +234,7 @@ def test_heic_without_its_reader_names_the_line_that_installs_it(
     for index in range(3):
         (tmp_path / f"{index}.jpg").unlink()
     with pytest.raises(InputError, match=r'pip install "\.\[heic\]"'):
-        load_scene(tmp_path, tmp_path / "work")
+        load_scene(tmp_path, Reading(tmp_path / "work"))
 
 
 @pytest.mark.parametrize("name", ["../outside.png", "/outside.png", "a/../../outside.png"])
@@ -248,7 +249,7 @@ def test_a_colmap_image_name_that_leaves_the_folder_is_refused(tmp_path: Path, n
     (sparse / "images.txt").write_text(f"1 1 0 0 0 0 0 3 1 {path}\n\n2 1 0 0 0 1 0 3 1 a/x.png\n\n")
     (sparse / "points3D.txt").write_text("")
     with pytest.raises(InputError, match="outside"):
-        load_scene(tmp_path / "scene", tmp_path / "work")
+        load_scene(tmp_path / "scene", Reading(tmp_path / "work"))
 
 
 def test_transforms_names_stay_below_the_folder_that_holds_all_photos(tmp_path: Path) -> None:
@@ -260,7 +261,7 @@ def test_transforms_names_stay_below_the_folder_that_holds_all_photos(tmp_path: 
         frames.append({"file_path": str(Path(place).relative_to("scene")), "transform_matrix": pose.tolist()})
     file = tmp_path / "scene" / "transforms.json"
     file.write_text(json.dumps({"fl_x": 100, "w": 160, "h": 120, "frames": frames}))
-    scene = load_scene(file, tmp_path / "work")
+    scene = load_scene(file, Reading(tmp_path / "work"))
     assert sorted(view.name for view in scene.views) == ["outside/b.png", "scene/a.png", "scene/x/c.png"]
 
 
@@ -272,11 +273,11 @@ def test_damaged_photos_with_given_poses_are_left_out(tmp_path: Path) -> None:
         frames.append({"file_path": f"{index}.png", "transform_matrix": pose.tolist()})
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 100, "w": 160, "h": 120, "frames": frames}))
     (tmp_path / "1.png").write_bytes((tmp_path / "1.png").read_bytes()[:900])
-    scene = load_scene(tmp_path, tmp_path / "work")
+    scene = load_scene(tmp_path, Reading(tmp_path / "work"))
     assert [view.name for view in scene.views] == ["0.png", "2.png"]
     assert [entry["name"] for entry in scene.report["left_out"]] == ["1.png"]
     with pytest.raises(InputError, match=r"1\.png: the photo is truncated"):
-        load_scene(tmp_path, tmp_path / "strict", strict=True)
+        load_scene(tmp_path, Reading(tmp_path / "strict", strict=True))
 
 
 def test_a_fifo_is_no_photo(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from perception.io.cloud import write_cloud
 from perception.io.depth import load_depth
 from perception.io.inputs import load_scene, photo_sizes
 from perception.io.lens import camera_from_lens
+from perception.io.reading import Reading
 from perception.io.recording_layouts import find_recording
 from perception.types import PointCloud, Scene
 from support.rgbd_folders import COUNT, NAMED, SLOPE, pose, wall_depth, write_recording
@@ -34,7 +35,7 @@ def loaded(source: Path, folder: Path, camera: Path | None = None) -> Scene:
     """The scene, started from a cloud on the wall so that no features are needed."""
     x, y = np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9))
     write_cloud(folder / "c.ply", PointCloud(np.stack([x, y, 2 + SLOPE * x], axis=-1).reshape(-1, 3)))
-    return load_scene(source, folder / "work", init_points=folder / "c.ply", camera_file=camera, poses="keep")
+    return load_scene(source, Reading(folder / "work", init_points=folder / "c.ply", camera=camera, poses="keep"))
 
 
 def number(name: str, layout: str) -> int:
@@ -135,7 +136,7 @@ def test_bad_recordings_are_one_line(layout: str, damage, words: str, tmp_path: 
     damage(source)
     with pytest.raises(InputError, match=words) as caught:
         if words == "has depth images but no poses":
-            load_scene(source, tmp_path / "work")
+            load_scene(source, Reading(tmp_path / "work"))
         loaded(source, tmp_path)
     assert "\n" not in str(caught.value)
 

@@ -17,6 +17,7 @@ from perception.io import features, sfm_checks
 from perception.io.features import build_features
 from perception.io.inputs import load_scene
 from perception.io.lens import load_pycolmap
+from perception.io.reading import Reading
 from perception.io.sfm_checks import Pair
 from support.progress import Told
 
@@ -68,7 +69,7 @@ def corner(tmp_path_factory):
 def run(corner, tmp_path_factory):
     told = Told()
     workdir = tmp_path_factory.mktemp("work")
-    return load_scene(corner[0], workdir, progress=told), told.updates, workdir
+    return load_scene(corner[0], Reading(workdir, progress=told)), told.updates, workdir
 
 
 def errors(scene, truth):
@@ -101,7 +102,7 @@ def test_poses_are_the_true_ones(corner, run):
 def test_finished_work_is_used_again(corner, run):
     scene, _, workdir = run
     told = Told()
-    again = load_scene(corner[0], workdir, progress=told)
+    again = load_scene(corner[0], Reading(workdir, progress=told))
     assert {stage for stage, *_ in told.updates} == {"poses: photos"}  # looked at again, nothing else
     for a, b in zip(scene.views, again.views, strict=True):
         np.testing.assert_array_equal(a.camera_from_world, b.camera_from_world)
@@ -114,7 +115,7 @@ def test_known_intrinsics_are_kept(corner, tmp_path):
         f"camera_matrix: {{data: [{FOCAL}, 0, {WIDTH / 2 - 0.5}, 0, {FOCAL}, {HEIGHT / 2 - 0.5}, 0, 0, 1]}}\n"
         "distortion_coefficients: {data: [0, 0, 0, 0, 0]}\n"
     )
-    scene = load_scene(corner[0], tmp_path / "work", camera_file=camera)
+    scene = load_scene(corner[0], Reading(tmp_path / "work", camera=camera))
     assert len(scene.views) == VIEWS
     assert scene.views[0].K.tolist() == [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
     center, turned = errors(scene, corner[1])
@@ -122,7 +123,7 @@ def test_known_intrinsics_are_kept(corner, tmp_path):
 
 
 def test_a_seed_repeats(corner, run, tmp_path):
-    again = load_scene(corner[0], tmp_path)
+    again = load_scene(corner[0], Reading(tmp_path))
     for a, b in zip(run[0].views, again.views, strict=True):
         np.testing.assert_array_equal(a.camera_from_world, b.camera_from_world)
 
@@ -198,7 +199,7 @@ def test_equal_posters_do_not_fold_the_tabletop(tmp_path):
         name = Path(frame["file_path"]).name
         (tmp_path / "photos" / name).symlink_to(root / "images" / name)
         truth[name] = inverse_se3(np.array(frame["transform_matrix"]) @ np.diag([1.0, -1, -1, 1]))
-    scene = load_scene(tmp_path / "photos", tmp_path / "work")
+    scene = load_scene(tmp_path / "photos", Reading(tmp_path / "work"))
     assert len(scene.views) == 36 and not scene.report["warnings"]
     center, turned = errors(scene, truth)
     assert center < 0.08 and turned < 1.5
