@@ -177,7 +177,7 @@ def _step(problem: _Problem, poses: Poses, points: np.ndarray, damping: float) -
     U = bsr_matrix((U, np.arange(count), np.arange(count + 1)), shape=(6 * count, 6 * count))
     reduced = (U + prior_H - eliminate @ W.T).tocsr()
     reduced.setdiag(reduced.diagonal() * (1 + damping))
-    delta = conjugate_gradients(reduced, g_pose.ravel() + prior_g - eliminate @ g_point.ravel(), 6)
+    delta = _solved(reduced, g_pose.ravel() + prior_g - eliminate @ g_point.ravel())
     shift = np.einsum("pij,pj->pi", V_inverse, g_point - (W.T @ delta).reshape(size, 3))
     return delta.reshape(count, 6), shift
 
@@ -216,24 +216,14 @@ def _prior_system(delta: np.ndarray, prior: tuple[float, float]) -> tuple[Any, n
     return A.T @ diags(weight.ravel()) @ A, -(A.T @ (weight * rows).ravel())
 
 
-def conjugate_gradients(A: Any, b: np.ndarray, size: int) -> np.ndarray:
-    """x of A x = b, A sparse, symmetric and positive; the inverses of its diagonal blocks [size, size] precondition."""
-    blocks = np.stack([A[i : i + size, i : i + size].toarray() for i in range(0, len(b), size)])
-    inverse = np.linalg.inv(blocks)
-    x, r = np.zeros_like(b), b.copy()
-    z = np.einsum("nij,nj->ni", inverse, r.reshape(-1, size)).ravel()
-    p, rz = z, (r * z).sum()
-    first = rz
-    for _ in range(10 * len(b)):
-        if rz <= 1e-10 * first:
-            break
-        Ap = A @ p
-        step = rz / (p * Ap).sum()
-        x, r = x + step * p, r - step * Ap
-        z = np.einsum("nij,nj->ni", inverse, r.reshape(-1, size)).ravel()
-        before, rz = rz, (r * z).sum()
-        p = z + rz / before * p
-    return x
+def _solved(A: Any, b: np.ndarray) -> np.ndarray:
+    """x of A x = b, A [6N, 6N] sparse, symmetric and positive, preconditioned by its diagonal blocks [6, 6]."""
+    from scipy.sparse import bsr_matrix
+    from scipy.sparse.linalg import cg
+
+    blocks = np.stack([A[i : i + 6, i : i + 6].toarray() for i in range(0, len(b), 6)])
+    inverse = bsr_matrix((np.linalg.inv(blocks), np.arange(len(blocks)), np.arange(len(blocks) + 1)), shape=A.shape)
+    return np.asarray(cg(A, b, rtol=1e-6, M=inverse, maxiter=10 * len(b))[0])
 
 
 def _cross(v: np.ndarray) -> np.ndarray:

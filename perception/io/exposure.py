@@ -8,7 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from perception.io.bundle_adjustment import conjugate_gradients
 from perception.io.photos import load_photo, scaled_K
 from perception.io.tracks import Tracks
 from perception.types import View
@@ -58,6 +57,7 @@ def photo_gains(logs: np.ndarray, usable: np.ndarray, tracks: Tracks, count: int
     which is convex, and in the second half of the rounds the Cauchy loss. usable: [O] mask of observations.
     """
     from scipy.sparse import csr_matrix, diags
+    from scipy.sparse.linalg import spsolve
 
     gains, albedo = np.zeros((count, 3)), np.zeros((tracks.size, 3))
     weight = usable.astype(np.float64)
@@ -67,7 +67,7 @@ def photo_gains(logs: np.ndarray, usable: np.ndarray, tracks: Tracks, count: int
         system = diags(np.asarray(W.sum(axis=1)).ravel() + TIED) - W @ diags(1 / total) @ W.T
         means = np.stack([np.bincount(tracks.point, weight * c, tracks.size) for c in logs.T], axis=1) / total[:, None]
         right = np.stack([np.bincount(tracks.view, weight * c, count) for c in logs.T], axis=1) - W @ means
-        gains = np.stack([conjugate_gradients(system.tocsr(), b, 1) for b in right.T], axis=1)
+        gains = spsolve(system.tocsc(), right).reshape(count, 3)
         albedo = means - W.T @ gains / total[:, None]
         distance = np.linalg.norm(logs - albedo[tracks.point] - gains[tracks.view], axis=1)
         noise = max(float(np.median(distance[usable])), LEAST_NOISE) if usable.any() else 1.0

@@ -54,6 +54,16 @@ class FeatureStore:
         return self.folder / "database.db"
 
 
+def verified_matches(database: Path) -> dict[tuple[int, int], np.ndarray]:
+    """Verified matches [M, 2] of each pair of image ids, in order of the ids."""
+    pycolmap = load_pycolmap()
+    db = pycolmap.Database.open(database)
+    keys, geometries = db.read_two_view_geometries()
+    db.close()
+    found = zip(map(pycolmap.pair_id_to_image_pair, keys), geometries, strict=True)
+    return {pair: geometry.inlier_matches for pair, geometry in sorted(found, key=lambda item: item[0])}
+
+
 def build_features(
     photos: list[Path],
     lenses: list[Lens | None],

@@ -16,7 +16,7 @@ from perception.errors import InputError
 from perception.io.atomic import atomic_directory, recover
 from perception.io.colmap import views_of_model
 from perception.io.exposure import with_gains
-from perception.io.features import FeatureStore, build_features
+from perception.io.features import FeatureStore, build_features, verified_matches
 from perception.io.ignore_masks import mask_of
 from perception.io.incremental_sfm import map_photos
 from perception.io.lens import lens_from_camera, lens_text, load_pycolmap
@@ -100,7 +100,7 @@ def _report(
 ) -> dict[str, Any]:
     best = models[0]
     inside = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
-    matches = _verified_matches(store)
+    matches = _best_partners(store)
     left_out = []
     for name, photo in zip(store.names, shown, strict=True):
         if name not in inside[0]:
@@ -122,19 +122,18 @@ def _report(
     }
 
 
-def _verified_matches(store: FeatureStore) -> dict[str, tuple[int, int]]:
+def _best_partners(store: FeatureStore) -> dict[str, tuple[int, int]]:
     """name -> (features, geometrically verified matches with the best partner)."""
-    pycolmap = load_pycolmap()
-    db = pycolmap.Database.open(store.database)
-    names = {image.image_id: image.name for image in db.read_all_images()}
-    best = dict.fromkeys(names, 0)
-    pairs, geometries = db.read_two_view_geometries()
-    for pair, geometry in zip(pairs, geometries, strict=True):
-        for image_id in pycolmap.pair_id_to_image_pair(pair):
-            best[image_id] = max(best[image_id], len(geometry.inlier_matches))
-    result = {name: (db.num_keypoints_for_image(i), best[i]) for i, name in names.items()}
+    db = load_pycolmap().Database.open(store.database)
+    features = {
+        image.image_id: (image.name, db.num_keypoints_for_image(image.image_id)) for image in db.read_all_images()
+    }
     db.close()
-    return result
+    best = dict.fromkeys(features, 0)
+    for pair, found in verified_matches(store.database).items():
+        for image_id in pair:
+            best[image_id] = max(best[image_id], len(found))
+    return {name: (count, best[image_id]) for image_id, (name, count) in features.items()}
 
 
 def _reason(name: str, contradicted: set[str], others: list[set[str]], matches: dict[str, tuple[int, int]]) -> str:

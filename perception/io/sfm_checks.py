@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from perception.io.lens import load_pycolmap
+from perception.io.features import verified_matches
 
 MAX_UNREGISTERED, MAX_SECOND_MODEL, MAX_CONTRADICTED, MAX_UNMATCHED = 0.15, 0.30, 0.005, 0.30
 EPIPOLAR_TOLERANCE, TOLERANCE_PIXELS = 4.0 / 1000, 4.0
@@ -95,12 +95,8 @@ def outvoted_photos(pairs: list[Pair]) -> set[int]:
     return {image for image, vote in votes.items() if vote < 0}
 
 
-def verified_pairs(model: Any, database: Path, min_inliers: int = 0) -> list[Pair]:
-    """The verified pairs of at least `min_inliers` matches between registered photos, judged by the model."""
-    pycolmap = load_pycolmap()
-    db = pycolmap.Database.open(database)
-    keys, geometries = db.read_two_view_geometries()
-    db.close()
+def verified_pairs(model: Any, database: Path) -> list[Pair]:
+    """The verified pairs between registered photos, judged by the model."""
     registered = set(model.reg_image_ids())
     poses = {i: model.images[i].cam_from_world().matrix() for i in registered}
     rays: dict[int, np.ndarray] = {i: _normalised(model.images[i]) for i in registered}
@@ -108,13 +104,10 @@ def verified_pairs(model: Any, database: Path, min_inliers: int = 0) -> list[Pai
         i: max(EPIPOLAR_TOLERANCE, TOLERANCE_PIXELS / model.images[i].camera.mean_focal_length()) for i in registered
     }
     pairs = []
-    for key, geometry in zip(keys, geometries, strict=True):
-        i, j = pycolmap.pair_id_to_image_pair(key)
-        count = len(geometry.inlier_matches)
-        if i in registered and j in registered and count >= max(1, min_inliers):
-            a, b = rays[i][geometry.inlier_matches[:, 0]], rays[j][geometry.inlier_matches[:, 1]]
-            distance = _sampson(a, b, poses[i], poses[j])
-            pairs.append(Pair(i, j, count, float((distance < max(tolerance[i], tolerance[j])).mean())))
+    for (i, j), found in verified_matches(database).items():
+        if i in registered and j in registered and len(found):
+            distance = _sampson(rays[i][found[:, 0]], rays[j][found[:, 1]], poses[i], poses[j])
+            pairs.append(Pair(i, j, len(found), float((distance < max(tolerance[i], tolerance[j])).mean())))
     return pairs
 
 

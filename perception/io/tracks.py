@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from perception.io.depth import load_depth
-from perception.io.features import FeatureStore
+from perception.io.features import FeatureStore, verified_matches
 from perception.io.lens import camera_from_lens, load_pycolmap
 from perception.io.views import view_lens
 from perception.types import View
@@ -55,23 +55,15 @@ def features_of(views: list[View], store: FeatureStore) -> Features:
     db = load_pycolmap().Database.open(store.database)
     images = [db.read_image_with_name(name).image_id for name in store.names]
     keypoints = [np.asarray(db.read_keypoints(image), np.float64)[:, :2] for image in images]
+    db.close()
     starts = dict(zip(images, np.cumsum([0, *map(len, keypoints)]), strict=False))
     matches = [np.empty((0, 2), np.int64)]
-    for (a, b), geometry in _geometries(db):
-        matches.append(np.add(geometry.inlier_matches, (starts[a], starts[b]), dtype=np.int64).reshape(-1, 2))
-    db.close()
+    for (a, b), found in verified_matches(store.database).items():
+        matches.append(np.add(found, (starts[a], starts[b]), dtype=np.int64).reshape(-1, 2))
     pairs = np.concatenate(matches)
     view = np.repeat(np.arange(len(views)), [len(found) for found in keypoints])
     rays, focal, depth = (np.concatenate(part) for part in zip(*map(_measured, views, keypoints), strict=True))
     return Features(view, rays, focal, depth, pairs[np.isfinite(rays).all(1)[pairs].all(1)])
-
-
-def _geometries(db: Any) -> list[tuple[tuple[int, int], Any]]:
-    ids, geometries = db.read_two_view_geometries()
-    decode = load_pycolmap().pair_id_to_image_pair
-    return sorted(
-        ((decode(pair), found) for pair, found in zip(ids, geometries, strict=True)), key=lambda item: item[0]
-    )
 
 
 def _measured(view: View, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
