@@ -14,8 +14,7 @@ import numpy as np
 
 from perception.bags.decode import decode_image, encoded
 from perception.bags.depth import MILLIMETRES, choose_depth, depth_topics, write_depth
-from perception.bags.gravity import gravity
-from perception.bags.poses import FIXED_FRAMES, Poses, read_poses
+from perception.bags.poses import FIXED_FRAMES, Poses, gravity, read_poses
 from perception.bags.read import CAMERA_INFO, IMAGES, Bag, open_bag, stamp_of
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3

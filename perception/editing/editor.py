@@ -21,8 +21,8 @@ from perception.boxes import oriented_box
 from perception.config import FrameConfig, InstanceConfig
 from perception.errors import InputError
 from perception.frame.scaled_map import scale_map
+from perception.io.atomic import writing
 from perception.io.map import Map
-from perception.io.map_lock import writing
 from perception.io.store import map_signature, read_info, read_map, write_map
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
 

@@ -13,8 +13,8 @@ from perception.errors import InputError
 from perception.frame.place import measured_scale
 from perception.frame.scale import KnownLength, Measurement, combined, known_length
 from perception.geometry import move_points
+from perception.io.atomic import writing
 from perception.io.map import Map
-from perception.io.map_lock import writing
 from perception.io.recentre import map_from_input, moved
 from perception.io.store import read_map, write_map
 from perception.types import OrientedBox

@@ -2,7 +2,8 @@
 
 A writer fills a temporary sibling `.NAME.new-PID-RANDOM`, holds a lock on it, and renames it at the end. Writers delete
 temporary siblings of terminated writers, recognised by the released lock; process ids are not compared, as they are not
-valid across containers and hosts. On file systems without locks these siblings are kept.
+valid across containers and hosts. On file systems without locks these siblings are kept. `writing` is the write lock of
+a map, so that concurrent mapping, label editing and copying do not overwrite each other.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import ctypes
 import errno
 import os
 import shutil
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from glob import escape
@@ -21,17 +23,16 @@ from uuid import uuid4
 
 from perception.errors import InputError
 
-try:
+try:  # the package `filelock` is not used: it leaves lock files behind, cannot lock folders and does not name the holder
     import fcntl
 except ImportError:  # Windows has no flock
     fcntl = None  # type: ignore[assignment]
 
-SUPPORTED = fcntl is not None
-"""Whether files can be locked (flock). The package `filelock` is not used: it leaves lock files behind, cannot lock
-folders and does not name the holder."""
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # from Linux fcntl.h and fs.h
 _REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
+_held: set[tuple[Path, int]] = set()
+"""Locks of this process: resolved path and thread."""
 
 
 @contextmanager
@@ -244,3 +245,61 @@ def names(path: Path, descriptor: int) -> bool:
     except FileNotFoundError:
         return False
     return (there.st_dev, there.st_ino) == (here.st_dev, here.st_ino)
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Holds the write lock of the map at `path`; InputError at once when another process or thread holds it.
+
+    The lock is an advisory flock on the sibling `.NAME.lock`, which the system releases when the process ends in any
+    way. The file holds the process id and is deleted on release. The lock is re-entrant per thread. Readers need none.
+    Leftovers of killed writers are first restored or deleted (see `atomic.recover`).
+    """
+    path = Path(path).resolve()
+    mine = (path, threading.get_ident())
+    if mine in _held:
+        yield
+        return
+    descriptor = _take(path)
+    try:
+        _held.add(mine)
+        recover(path)
+        yield
+    finally:
+        _held.discard(mine)
+        if descriptor is not None:
+            with contextlib.suppress(OSError):
+                lock_file(path).unlink()  # before the release, so that no other process has locked this file
+            os.close(descriptor)
+
+
+def lock_file(path: Path) -> Path:
+    """Path of the lock file of the map at `path`, which exists while the map is written."""
+    return path.with_name(f".{path.name}.lock")
+
+
+def _take(path: Path) -> int | None:
+    if fcntl is None:  # readers are still safe through atomic renames
+        return None
+    file = lock_file(path)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        while True:
+            descriptor = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
+            if not lock(descriptor):
+                holder = os.pread(descriptor, 32, 0).decode("ascii", "replace").strip()
+                os.close(descriptor)
+                who = f"process {holder}" if holder.isdigit() else "another process"
+                who = "another thread of this process" if holder == str(os.getpid()) else who
+                raise InputError(f"{path}: {who} is writing this map; wait for it to finish, or write to another place")
+            if names(file, descriptor):
+                break
+            os.close(descriptor)  # the last holder deleted the file between open and lock: retry
+        with contextlib.suppress(OSError):  # on a full disk the lock is still valid, without the process id
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        return descriptor
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}: {file.parent}); choose a place you may write to"
+        ) from error

@@ -1,18 +1,25 @@
-"""Reads any input as a Scene: a transforms.json, a COLMAP workspace, an RGB-D recording, photos or a video."""
+"""Reads any input as a Scene: a transforms.json, a COLMAP workspace, an RGB-D recording, photos or a video; and keeps
+scenes, so that a resumed run starts from the same poses and points as the interrupted one."""
 
 from __future__ import annotations
 
+import json
 import shutil
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from perception.errors import InputError
+from perception.io.arrays import DAMAGE
+from perception.io.atomic import atomic_directory
 from perception.io.camera_file import read_camera
 from perception.io.ignore_masks import with_checked_masks
+from perception.io.map_views import view_from_json, view_json
 from perception.io.reading import Reading, check_seen, start_points
-from perception.types import Lens, Scene
+from perception.types import Lens, Scene, View
 
 EXPECTED = (
     "a folder of photos, a video, a COLMAP workspace, a transforms.json or an RGB-D recording (TUM, ScanNet, 7-Scenes, "
@@ -148,3 +155,26 @@ def _scene_of_video(video: Path, lens: Lens | None, how: Reading) -> Scene:
     taken = f"{record['chosen']} of {record['frames']} frames of {video.name}"
     scene.report["notes"].insert(0, f"{folder}: {taken}; they are the map's photos, keep them")
     return scene
+
+
+def save_scene(folder: Path, scene: Scene) -> None:
+    """Writes `scene` to `folder` atomically; photos are not copied."""
+    views = [view_json(view) for view in scene.views]
+    facts = {"views": views, "metric": scene.metric, "frame": scene.frame, "report": scene.report}
+    with atomic_directory(folder) as aside:
+        (aside / "scene.json").write_text(json.dumps(facts, default=str), encoding="utf-8")
+        np.savez(aside / "points.npz", points=scene.points, colors=scene.point_colors)
+
+
+def load_saved_scene(folder: Path) -> Scene | None:
+    """The scene saved in `folder`; None when there is none. InputError when it is damaged."""
+    if not (folder / "scene.json").is_file():
+        return None
+    try:
+        facts = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
+        with np.load(folder / "points.npz") as arrays:
+            points, colors = arrays["points"], arrays["colors"]
+        views: list[View] = [view_from_json(entry) for entry in facts["views"]]
+        return Scene(views, points, colors, facts["metric"], facts["frame"], facts["report"])
+    except DAMAGE as error:
+        raise InputError(f"{folder}: the kept poses are damaged; delete {folder.parent} to start over") from error

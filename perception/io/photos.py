@@ -90,23 +90,17 @@ def _bad_exif(path: Path) -> InputError:
     return InputError(f"{path}: the photo's EXIF data are damaged; save it anew without them, or remove it")
 
 
-def photo_damage(path: Path) -> InputError | None:
-    """The error that reading the whole photo raises (JPEG: at 1/8 size, which reads every byte), or None."""
+def why_left_out(path: Path, strict: bool = False) -> str | None:
+    """The error that reading the whole photo raises, or None; strict: raised. JPEG is read at 1/8 size: every byte."""
     try:
         with open_photo(path) as image:
             image.draft("RGB", reduced_size(*image.size, 8))
             decode(image, path)
     except InputError as error:
-        return error
+        if strict:
+            raise
+        return str(error)
     return None
-
-
-def why_left_out(path: Path, strict: bool) -> str | None:
-    """None for a readable photo, else the error as text; strict: raised as InputError."""
-    damage = photo_damage(path)
-    if damage is not None and strict:
-        raise damage
-    return None if damage is None else str(damage)
 
 
 def read_photo(path: Path) -> np.ndarray:

@@ -25,11 +25,10 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_directory, atomic_file
+from perception.io.atomic import atomic_directory, atomic_file, writing
 from perception.io.checksums import EDITABLE, FACTS, REPORT, facts_of, file_facts, seal, verify
 from perception.io.map import Map
 from perception.io.map_files import FORMAT_VERSION, MapFiles, map_signature, read_info
-from perception.io.map_lock import writing
 from perception.io.map_views import StoredView, moved_record, stored_view, view_from_json, view_json
 from perception.io.ply import write_ply
 from perception.io.safe_names import safe_name

@@ -21,12 +21,11 @@ from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
 from perception.gaussians.transients import train_without_transients
 from perception.instances.label_transfer import transfer_labels, transfer_text
-from perception.io.inputs import load_scene
+from perception.io.inputs import load_saved_scene, load_scene, save_scene
 from perception.io.map_views import stored_view
 from perception.io.photos import load_photo
 from perception.io.reading import Reading
 from perception.io.recentre import recentred
-from perception.io.scene_cache import load_saved_scene, save_scene
 from perception.io.store import Map, read_info, read_map, write_map
 from perception.language.base import Encoder
 from perception.language.ocr import make_reader

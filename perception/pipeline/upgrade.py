@@ -13,8 +13,8 @@ from perception.errors import InputError
 from perception.instances.describe import Load, describe_instances
 from perception.instances.silhouettes import render_silhouettes
 from perception.instances.texts import Reader, read_texts, store_texts
+from perception.io.atomic import writing
 from perception.io.map import PART, Map
-from perception.io.map_lock import writing
 from perception.io.map_views import StoredView, locate_photo, stored_view
 from perception.io.store import FORMAT_VERSION, read_info, read_map, write_map
 from perception.language.base import Encoder, reading_of

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from perception.errors import InputError
+from perception.io.atomic import writing
 from perception.io.inputs import EXPECTED
-from perception.io.map_lock import writing
 from perception.pipeline.checkpoint import CHECKPOINT
 
 WORK_SUFFIX = ".work"

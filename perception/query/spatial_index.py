@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from perception.io.instance_index import InstanceIndex
+from perception.io.map import InstanceIndex
 from perception.query.regions import inside
 from perception.types import OrientedBox
 

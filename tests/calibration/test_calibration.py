@@ -11,8 +11,7 @@ import pytest
 import yaml
 
 from perception.calibration.board import Board, Detection
-from perception.calibration.calibrate import best_model, run_calibration
-from perception.calibration.judge import distinct_views
+from perception.calibration.calibrate import best_model, distinct_views, run_calibration
 from perception.calibration.solve import NAMES, project, solve
 from perception.cli import main
 from perception.io.camera_file import read_camera

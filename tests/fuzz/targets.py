@@ -447,7 +447,7 @@ def _photo() -> Target:
     from PIL import Image
 
     from perception.io import photos
-    from perception.io.photos import photo_damage, photo_size, read_photo
+    from perception.io.photos import photo_size, read_photo, why_left_out
 
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -471,9 +471,7 @@ def _photo() -> Target:
     def read(folder: Path, name: str) -> None:
         file = folder / name
         with patch.object(photos, "MOST_DECODED", _LARGEST):
-            damage = photo_damage(file)
-            if damage is not None:
-                raise damage
+            why_left_out(file, strict=True)
             width, height = photo_size(file)
             photo = read_photo(file)
         assert photo.dtype == np.uint8 and photo.shape == (height, width, 3)

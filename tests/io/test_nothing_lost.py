@@ -18,7 +18,7 @@ from perception.cli import main
 from perception.config import load_config
 from perception.editing import Editor
 from perception.errors import InputError
-from perception.io.map_lock import lock_file, writing
+from perception.io.atomic import lock_file, writing
 from perception.io.store import read_map, set_labels, verify_map
 from perception.pipeline.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint
 from perception.pipeline.mapping import build_map
@@ -211,7 +211,7 @@ def test_a_second_mapper_is_refused_and_harms_nothing(small_scene: Path, tmp_pat
     work_folder(out).mkdir()
     (work_folder(out) / "kept").touch()
     code = (
-        "import sys; from pathlib import Path; from perception.io.map_lock import writing\n"
+        "import sys; from pathlib import Path; from perception.io.atomic import writing\n"
         "with writing(Path(sys.argv[1])):\n    print(flush=True); sys.stdin.read()"
     )
     holder = subprocess.Popen(

@@ -21,7 +21,7 @@ from perception.io.features import build_features
 from perception.io.inputs import load_scene
 from perception.io.lens import load_pycolmap
 from perception.io.photo_folder import choose_photos, list_photos, view_name
-from perception.io.photos import photo_damage, photo_size, read_photo
+from perception.io.photos import photo_size, read_photo, why_left_out
 from perception.io.reading import Reading
 from perception.io.safe_names import safe_name
 from perception.io.views import fit_lens
@@ -168,7 +168,7 @@ def test_photos_above_the_limit_are_reduced_alike_everywhere(tmp_path: Path, mon
         exif = Image.Exif()
         exif[0x0112] = 6
         file = save(tmp_path / name, 0, (301, 203), exif=exif, **options)
-        assert photo_damage(file) is None
+        assert why_left_out(file) is None
         photo = read_photo(file)
         assert photo_size(file) == (102, 151) == photo.shape[1::-1]
         if name == "a.png":
@@ -180,8 +180,8 @@ def test_photos_above_the_limit_are_reduced_alike_everywhere(tmp_path: Path, mon
     assert (scaled.width, scaled.height) == (102, 151) and note is not None
     assert scaled.params[0] == pytest.approx(200 * 102 / 203)
     monkeypatch.setattr(photos_module, "MOST_DECODED", 50_000)
-    assert "301×203 pixels" in str(photo_damage(tmp_path / "a.png"))
-    assert photo_damage(tmp_path / "a.jpg") is None  # JPEG is decoded at the smaller size
+    assert "301×203 pixels" in str(why_left_out(tmp_path / "a.png"))
+    assert why_left_out(tmp_path / "a.jpg") is None  # JPEG is decoded at the smaller size
 
 
 def test_turned_photos_are_staged_with_their_very_pixels(tmp_path: Path) -> None:
@@ -211,12 +211,12 @@ def test_heic_is_read(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6
     file = save(tmp_path / "IMG_1.HEIC", 0, (160, 128), exif=exif, quality=95)
-    assert list_photos(tmp_path) == [file] and photo_damage(file) is None
+    assert list_photos(tmp_path) == [file] and why_left_out(file) is None
     assert photo_size(file) == read_photo(file).shape[1::-1]
     upright = np.asarray(Image.open(file).convert("RGB")).astype(int)
     assert np.abs(read_photo(file) - upright).max() == 0
     file.write_bytes(file.read_bytes()[:500])
-    assert photo_damage(file) is not None
+    assert why_left_out(file) is not None
 
 
 def test_heic_without_its_reader_names_the_line_that_installs_it(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perception.io.map_lock import writing
+from perception.io.atomic import writing
 from perception.io.store import read_map, set_labels, write_map
 from perception.language.description import InstanceDescription, to_arrays
 from perception.query import QueryMap
