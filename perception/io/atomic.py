@@ -23,7 +23,7 @@ from uuid import uuid4
 
 from perception.errors import InputError
 
-try:  # the package `filelock` is not used: it leaves lock files behind, cannot lock folders and does not name the holder
+try:  # `filelock` is not used: it leaves lock files behind, cannot lock folders and does not name the holder
     import fcntl
 except ImportError:  # Windows has no flock
     fcntl = None  # type: ignore[assignment]
