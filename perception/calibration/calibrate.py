@@ -93,17 +93,13 @@ def _pictures(source: Path) -> Iterator[tuple[str, np.ndarray]]:
                 raise InputError(f"{file}: is not a readable picture")
             yield file.name, np.asarray(picture)
     elif source.is_file():
-        yield from _video(source)
+        number = None
+        for number, _, frame in frames(source, most=MAX_FRAMES):
+            yield f"frame_{number:06d}", cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+        if number is None:
+            raise InputError(f"{source}: is not a readable video (nor a folder of photos)")
     else:
         raise InputError(f"{source}: no such file or folder; give photos of a calibration board, or a video of it")
-
-
-def _video(source: Path) -> Iterator[tuple[str, np.ndarray]]:
-    number = None
-    for number, _, frame in frames(source, most=MAX_FRAMES):
-        yield f"frame_{number:06d}", cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-    if number is None:
-        raise InputError(f"{source}: is not a readable video (nor a folder of photos)")
 
 
 def _detect(source: Path, board: Board) -> tuple[list[Detection], tuple[int, int], int]:

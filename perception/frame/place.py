@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -38,7 +37,9 @@ def placed_scene(scene: Scene, options: FrameConfig, seed: int = 0) -> Scene:
     posed = scene.report.get("input") != "photos"
     asked = any((options.known_length, options.tag_size, options.board))
     metric, scale, notes = _unit(scene, options, seed)
-    scene = replace(scene, metric=metric, report=_with(scene.report, metric, scale, notes))
+    facts = {"scale": scale.to_json()} if scale is not None else {"scale": STATED} if metric else {}
+    report = {**scene.report, **facts, "warnings": [*scene.report.get("warnings", []), *notes]}
+    scene = replace(scene, metric=metric, report=report)
     scene = _depth_in_units(scene, scale, posed)
     gravity, notes = _gravity(scene, seed)
     scene.report["warnings"] += notes
@@ -134,11 +135,6 @@ def _measured_points(views: Sequence[View]) -> np.ndarray:
 
 def _real_points(scene: Scene) -> np.ndarray:
     return scene.points[:0] if scene.report.get("points_from") == "random" else scene.points
-
-
-def _with(report: dict[str, Any], metric: bool, scale: Measurement | None, notes: list[str]) -> dict[str, Any]:
-    facts: dict[str, Any] = {"scale": scale.to_json()} if scale is not None else {"scale": STATED} if metric else {}
-    return {**report, **facts, "warnings": [*report.get("warnings", []), *notes]}
 
 
 def _depth_in_units(scene: Scene, scale: Measurement | None, posed: bool) -> Scene:

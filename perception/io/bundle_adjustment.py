@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from perception.io.tracks import Tracks
 
@@ -33,7 +34,7 @@ class Poses:
 
     def turned(self, delta: np.ndarray) -> Poses:
         """Each camera turned by delta[:, :3] (rotation vector, world axes, radians) and moved by delta[:, 3:]."""
-        return Poses(self.rotation @ exp_so3(delta[:, :3]).transpose(0, 2, 1), self.center + delta[:, 3:])
+        return Poses(self.rotation @ Rotation.from_rotvec(-delta[:, :3]).as_matrix(), self.center + delta[:, 3:])
 
     def matrices(self) -> np.ndarray:
         """camera_from_world [N, 4, 4]."""
@@ -45,21 +46,7 @@ class Poses:
     def since(self, given: Poses) -> np.ndarray:
         """delta [N, 6] with given.turned(delta) equal to this."""
         turned = np.einsum("nji,njk->nik", self.rotation, given.rotation)
-        return np.concatenate([log_so3(turned), self.center - given.center], axis=1)
-
-
-def exp_so3(vectors: np.ndarray) -> np.ndarray:
-    """Rotations [N, 3, 3] of rotation vectors [N, 3]."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
-
-
-def log_so3(rotations: np.ndarray) -> np.ndarray:
-    """Rotation vectors [N, 3] of rotations [N, 3, 3]."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_matrix(rotations).as_rotvec())
+        return np.concatenate([Rotation.from_matrix(turned).as_rotvec(), self.center - given.center], axis=1)
 
 
 def starting_points(tracks: Tracks, poses: Poses) -> np.ndarray:
@@ -200,7 +187,7 @@ def _linearised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np
     J_point = root[..., None] * (slope @ poses.rotation[tracks.view])
     arm = points[tracks.point] - poses.center[tracks.view]
     # x_camera = R Exp(θ)ᵀ (p − c − δ):  ∂/∂θ = R [p − c]×,  ∂/∂δ = −R.
-    J_pose = np.concatenate([J_point @ _cross(arm), -J_point], axis=2)
+    J_pose = np.concatenate([np.cross(J_point, arm[:, None]), -J_point], axis=2)
     residual = np.concatenate([np.where(front[:, None], error, 0.0), depth[:, None]], axis=1)
     return root * residual, J_pose, J_point
 
@@ -224,13 +211,6 @@ def _solved(A: Any, b: np.ndarray) -> np.ndarray:
     blocks = np.stack([A[i : i + 6, i : i + 6].toarray() for i in range(0, len(b), 6)])
     inverse = bsr_matrix((np.linalg.inv(blocks), np.arange(len(blocks)), np.arange(len(blocks) + 1)), shape=A.shape)
     return np.asarray(cg(A, b, rtol=1e-6, M=inverse, maxiter=10 * len(b))[0])
-
-
-def _cross(v: np.ndarray) -> np.ndarray:
-    """[v]× [O, 3, 3] of vectors [O, 3]."""
-    result = np.zeros((len(v), 3, 3))
-    result[:, 0, 1], result[:, 0, 2], result[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    return result - result.transpose(0, 2, 1)
 
 
 def _sums(values: np.ndarray, index: np.ndarray, count: int) -> np.ndarray:

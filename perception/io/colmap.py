@@ -37,7 +37,8 @@ def read_workspace(folder: Path, how: Reading) -> Scene:
     path, model = max(found.items(), key=lambda item: item[1].num_reg_images())
     if model.num_reg_images() == 0:
         raise InputError(f"{path}: the sparse model is empty (no registered photo); run structure from motion again")
-    located = _located(model, folder / "images", path)
+    names = {image_id: safe_name(model.images[image_id].name, path) for image_id in model.reg_image_ids()}
+    located = {image_id: (name, folder / "images" / name) for image_id, name in names.items()}
     views, missing, notes = views_of_model(model, located, path, how.strict)
     views = [replace(view, mask=mask_of(how.masks, view.name)) for view in views]
     if not views:
@@ -50,14 +51,8 @@ def read_workspace(folder: Path, how: Reading) -> Scene:
         notes.append(f"{path}: the sparse model holds {len(cloud[0])} points; new ones are triangulated")
     facts: dict[str, Any] = {"input": "colmap", "left_out": missing, "warnings": notes}
     facts |= {"model": path.relative_to(folder).as_posix(), "mean_reprojection_error_px": _reprojection_error(model)}
-    names = {image_id: name for image_id, (name, _) in located.items()}
     views, exposure = with_gains(views, tracks_of_model(model, views, names))
     return posed_scene(views, cloud, {**facts, **exposure}, how, MIN_POINTS)
-
-
-def _located(model: Any, images: Path, source: Path) -> dict[int, tuple[str, Path]]:
-    names = {image_id: safe_name(model.images[image_id].name, source) for image_id in model.reg_image_ids()}
-    return {image_id: (name, images / name) for image_id, name in names.items()}
 
 
 def views_of_model(
@@ -99,11 +94,7 @@ def _models(folder: Path) -> list[Path]:
     if not sparse.is_dir():
         return []
     inside = sorted(path for path in sparse.iterdir() if path.is_dir())
-    return [path for path in [sparse, *inside] if _has_model(path)]
-
-
-def _has_model(path: Path) -> bool:
-    return any((path / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))
+    return [path for path in [sparse, *inside] if any((path / f"images.{kind}").is_file() for kind in ("bin", "txt"))]
 
 
 def _read_model(path: Path) -> Any:

@@ -66,7 +66,8 @@ class MapFiles:
         try:
             self._rows = map_ply(self.path / "gaussians.ply", "vertex")
             self._arrays = {name: self._map_array(name, sides) for name, sides in _ARRAYS.items()}
-            self._archives = {name: _bytes(self.path / f"{name}.npz") for name in ARCHIVES}
+            archives = {name: self.path / f"{name}.npz" for name in ARCHIVES}
+            self._archives = {name: file.read_bytes() for name, file in archives.items() if file.is_file()}
         except OSError as error:
             raise damaged(self.path, str(error)) from error
         for name, array in self._arrays.items():
@@ -121,8 +122,8 @@ class MapFiles:
 
     def _unpack(self, name: str) -> dict[str, np.ndarray]:
         """The arrays of an .npz, {} if it does not exist; InputError when a CRC-32 differs."""
-        raw, file = self._archives[name], self.path / f"{name}.npz"
-        return {} if raw is None else read_npz(raw, file, "the map is damaged, build it again")
+        raw = self._archives.get(name)
+        return {} if raw is None else read_npz(raw, self.path / f"{name}.npz", "the map is damaged, build it again")
 
 
 def _columns(names: list[str]) -> Callable[[np.ndarray], np.ndarray]:
@@ -228,7 +229,3 @@ def _check_instance(entry: dict[str, Any]) -> None:
     label = entry.get("label")
     if label is not None and not isinstance(label, str):
         raise ValueError(f"instance {entry['id']}: label is {type(label).__name__}, expected a text or null")
-
-
-def _bytes(file: Path) -> bytes | None:
-    return file.read_bytes() if file.is_file() else None

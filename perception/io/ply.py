@@ -47,10 +47,6 @@ class _Table:
     rows: int
     properties: list[_Property]
 
-    @property
-    def has_list(self) -> bool:
-        return any(p.count for p in self.properties)
-
 
 def read_ply(path: str | Path) -> dict[str, Element]:
     """All elements of a PLY file: {element: {property: array}}, file order kept, native byte order.
@@ -81,7 +77,7 @@ def map_ply(path: str | Path, element: str) -> np.ndarray:
     with path.open("rb") as file:
         order, tables = _read_header(file, path)
         start, size = file.tell(), path.stat().st_size
-        if order != "<" or not tables or tables[0].name != element or tables[0].has_list:
+        if order != "<" or not tables or tables[0].name != element or any(p.count for p in tables[0].properties):
             raise InputError(f"{path}: expected a binary little-endian PLY that begins with plain element '{element}'")
         dtype = np.dtype([(p.name, order + p.kind) for p in tables[0].properties])
         found = (size - start) // max(dtype.itemsize, 1)

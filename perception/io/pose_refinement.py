@@ -60,7 +60,8 @@ def checked_poses(views: list[View], features: Features, how: str) -> tuple[list
     if len(features.pairs) < LEAST_MATCHES:
         note = f"given poses not checked: {len(features.pairs)} matched features, {LEAST_MATCHES} are needed"
         return views, {"poses": {}, "notes": [note], "warnings": []}
-    before, good = _medians(features, given), TOLERANCE * max(1.0, max(map(_side, views)) / TOLERANCE_SIDE)
+    side = max(max(lens.width, lens.height) for lens in map(view_lens, views))
+    before, good = _medians(features, given), TOLERANCE * max(1.0, side / TOLERANCE_SIDE)
     facts: dict[str, Any] = {"refined": False, "given_error_px": before}
     report: dict[str, Any] = {
         "poses": facts,
@@ -163,11 +164,6 @@ def _changes_text(facts: dict[str, Any]) -> str:
         f"cameras moved {moved['median']:.3g} units in the median, at most {moved['max']:.3g}, "
         f"and turned {turned['median']:.2g}°, at most {turned['max']:.2g}°"
     )
-
-
-def _side(view: View) -> int:
-    lens = view_lens(view)
-    return max(lens.width, lens.height)
 
 
 def _rays(features: Features, of: np.ndarray) -> np.ndarray:

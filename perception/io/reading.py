@@ -20,10 +20,6 @@ FEW_SEEN = 0.01
 """Share of the points in some photo's view below which a warning is given."""
 
 
-def _quiet() -> Progress:
-    return Progress(quiet=True)
-
-
 @dataclass(frozen=True)
 class Reading:
     """workdir: caches features and models for later calls. strict: a damaged photo is an InputError, else left out.
@@ -37,7 +33,7 @@ class Reading:
 
     workdir: Path
     seed: int = 0
-    progress: Progress = field(default_factory=_quiet)
+    progress: Progress = field(default_factory=lambda: Progress(quiet=True))
     strict: bool = False
     masks: Path | None = None
     camera: Path | None = None

@@ -75,7 +75,8 @@ def write_map(path: Path, gmap: Map, keep_report: bool = False) -> None:
         _dump(folder / EDITABLE, {"instances": gmap.instances})
         if keep_report and (path / REPORT).is_file():
             shutil.copy2(path / REPORT, folder / REPORT)
-        _dump(folder / FACTS, _with_checksums(info, folder))
+        facts = json.loads(json.dumps(info, allow_nan=False, default=_plain))  # as it will be read
+        _dump(folder / FACTS, seal({**facts, "files": file_facts(folder)}))
 
 
 def _recorded(view: View, path: Path, before: Path | None) -> StoredView:
@@ -137,12 +138,6 @@ def _write_instances(path: Path, files: MapFiles) -> None:
             _dump(facts, seal({**files.facts, "files": {**files.facts["files"], EDITABLE: facts_of(aside)}}))
 
 
-def write_facts(file: Path, facts: dict[str, Any]) -> None:
-    """Writes map.json with its own checksum; the caller holds the write lock."""
-    with atomic_file(file) as aside:
-        _dump(aside, seal(facts) if "files" in facts else facts)
-
-
 def relink(path: Path, folder: Path) -> dict[str, Any]:
     """Records for every view of the map at `path` the photo below `folder` with the same name and size.
 
@@ -173,13 +168,10 @@ def relink(path: Path, folder: Path) -> dict[str, Any]:
         if linked == 0:
             other = f", {len(differ)} have another size than the photos of the map" if differ else ""
             raise InputError(f"{folder}: holds none of the {len(entries)} photos of {path}{other}; give their folder")
-        write_facts(path / FACTS, {**files.facts, "views": entries})
+        facts = {**files.facts, "views": entries}
+        with atomic_file(path / FACTS) as aside:
+            _dump(aside, seal(facts) if "files" in facts else facts)
     return {"linked": linked, "missing": missing, "differ": differ}
-
-
-def _with_checksums(info: dict[str, Any], folder: Path) -> dict[str, Any]:
-    facts = json.loads(json.dumps(info, allow_nan=False, default=_plain))
-    return seal({**facts, "files": file_facts(folder)})
 
 
 def write_gaussian_ply(path: Path, gmap: Map) -> None:

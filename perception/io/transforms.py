@@ -57,7 +57,7 @@ def read_transforms(file: Path, how: Reading) -> Scene:
     if not photos:
         first = f"{missing[0]['name']}: {missing[0]['why']}"
         raise InputError(f"{file}: none of the {len(frames)} photos it lists can be read (first: {first})")
-    root = _common_root(list(photos.values()))
+    root = Path(os.path.commonpath([_absolute(photo).parent for photo in photos.values()]))
     views, notes = _views(file, data, frames, photos, root, how.masks)
     listed = how.cloud or _listed_cloud(file, data)
     facts: dict[str, Any] = {
@@ -149,10 +149,6 @@ def _is_file(path: Path) -> bool:
         return path.is_file()
     except OSError:  # for example a name too long for the file system
         return False
-
-
-def _common_root(photos: list[Path]) -> Path:
-    return Path(os.path.commonpath([_absolute(photo).parent for photo in photos]))
 
 
 def _absolute(path: Path) -> Path:
