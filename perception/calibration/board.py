@@ -75,15 +75,6 @@ class Board:
             return None
         return Detection(name, found[0].astype(np.float32), found[1].astype(np.float32))
 
-    def texture(self, pixels_per_square: int = 60, margin: int = 30) -> np.ndarray:
-        """The board as an image [H, W] uint8. Its top left square starts `margin` pixels from the image corner."""
-        columns, rows = self.squares
-        if self.kind == "charuco":
-            return self._print(self._charuco_board(), pixels_per_square, margin)
-        cells = (np.add.outer(np.arange(rows), np.arange(columns)) % 2 * 255).astype(np.uint8)
-        grid = np.kron(cells, np.ones((pixels_per_square, pixels_per_square), np.uint8))
-        return np.pad(grid, margin, constant_values=255)
-
     def _charuco_board(self, legacy: bool = False) -> Any:
         words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
         board = cv2.aruco.CharucoBoard(self.squares, self.square, self.marker, words)

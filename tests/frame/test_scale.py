@@ -18,6 +18,7 @@ from perception.frame.known_size import Sighting, scale_of_board, scale_of_pixel
 from perception.frame.scale import Measurement, combined, known_length, scale_of_depth
 from perception.geometry import camera_centres
 from perception.types import DepthImage, View
+from support.board_pictures import board_texture
 from support.measured_scenes import cameras, estimated, painted, random_similarity, seen, tag_texture
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -103,7 +104,7 @@ def test_tags_and_boards_are_found_in_photos(tmp_path: Path) -> None:
     flat = np.diag([0.06 / 60, -0.06 / 60, 1.0, 1.0])
     flat[:3, 3] = [-0.18, 0.15, 0.0]
     posed = [
-        replace(painted(view, sheet.texture(), flat, p.photo), camera_from_world=p.camera_from_world)
+        replace(painted(view, board_texture(sheet), flat, p.photo), camera_from_world=p.camera_from_world)
         for view, p in zip(views, posed, strict=True)
     ]
     assert scale_of_board(posed, sheet).metres == pytest.approx(metres, rel=0.005)

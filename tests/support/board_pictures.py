@@ -85,10 +85,22 @@ def board_views(board: Board, camera: KnownCamera, count: int, seed: int = 0, re
     return poses
 
 
+def board_texture(board: Board, per_square: int = 60, margin: int = 30) -> np.ndarray:
+    """The board as an image [H, W] uint8. Its top left square starts `margin` pixels from the image corner."""
+    columns, rows = board.squares
+    if board.kind == "charuco":
+        size = (columns * per_square + 2 * margin, rows * per_square + 2 * margin)
+        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{board.dictionary}"))
+        printed = cv2.aruco.CharucoBoard(board.squares, board.square, board.marker, words)
+        return np.asarray(printed.generateImage(size, None, margin))
+    cells = (np.add.outer(np.arange(rows), np.arange(columns)) % 2 * 255).astype(np.uint8)
+    return np.pad(np.kron(cells, np.ones((per_square, per_square), np.uint8)), margin, constant_values=255)
+
+
 def render_board(board: Board, camera: KnownCamera, pose: np.ndarray, seed: int = 0, noise: float = 2.0) -> np.ndarray:
     """The board on grey as the camera sees it [H, W] uint8, lit unevenly, with Gaussian noise (grey levels)."""
     rng = np.random.default_rng(seed)
-    texture = board.texture(_PER_SQUARE, _MARGIN)
+    texture = board_texture(board, _PER_SQUARE, _MARGIN)
     rotation = cv2.Rodrigues(pose[:3])[0]
     # Where the ray (u, v, 1) meets the board: solve [r1 r2 -ray] (x, y, depth) = -t.
     to_board = np.linalg.inv(np.column_stack([rotation[:, 0], rotation[:, 1], pose[3:]]))
