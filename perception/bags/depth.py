@@ -47,19 +47,14 @@ def choose_depth(bag: Bag, topics: list[str], wanted: str | None, frame: str) ->
     """
     if wanted == "none" or not (topics or wanted):
         return None
-    if wanted is not None:
-        if wanted not in topics:
-            raise InputError(f"{bag.path}: has no depth topic '{wanted}'; found {', '.join(topics) or 'none'}")
-        return wanted
 
     def rank(topic: str) -> tuple[bool, bool, bool]:
         other = _frame_of(next(bag.messages([topic]))[2]) != frame.lstrip("/")
         return other, not any(word in topic for word in _NAMED), topic.endswith(_COMPRESSED)
 
-    ranked = sorted((rank(topic), topic) for topic in topics)
-    if len(ranked) > 1 and ranked[0][0] == ranked[1][0]:
-        raise InputError(f"{bag.path}: holds several depth topics, choose one with --depth: {', '.join(topics)}")
-    return ranked[0][1]
+    ranks = {topic: rank(topic) for topic in topics}
+    best = topics if wanted else [topic for topic in topics if ranks[topic] == min(ranks.values())]
+    return bag.chosen(best, wanted, "depth", "--depth")
 
 
 def decode_depth(message: Any, where: str) -> np.ndarray:

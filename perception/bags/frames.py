@@ -109,16 +109,9 @@ class Placed:
 
 def _image_topic(bag: Bag, wanted: str | None, depths: list[str]) -> str:
     topics = bag.of_type(*IMAGES)
-    topics = [topic for topic in topics if topic not in depths] or topics
-    if wanted is not None:
-        if wanted not in topics:
-            raise InputError(f"{bag.path}: has no image topic '{wanted}'; found {', '.join(topics) or 'none'}")
-        return wanted
     if not topics:
         raise InputError(f"{bag.path}: holds no images; its topics are {', '.join(sorted(bag.topics)) or 'none'}")
-    if len(topics) > 1:
-        raise InputError(f"{bag.path}: holds several image topics, choose one with --topic: {', '.join(topics)}")
-    return topics[0]
+    return bag.chosen([topic for topic in topics if topic not in depths] or topics, wanted, "image", "--topic")
 
 
 def _camera_info(bag: Bag, topic: str, wanted: str | None) -> Any:
@@ -191,7 +184,7 @@ def _depth(
 def _place(poses: Poses, stamps: dict[str, int], frame: str, fixed: str | None) -> Placed:
     """Poses in the first of FIXED_FRAMES (or the tree's root) with poses for 80 % of the images, else with the most."""
     best = Placed({}, stamps, fixed, frame)
-    for name in [fixed] if fixed else [*FIXED_FRAMES, poses.root(frame)]:
+    for name in [fixed] if fixed else [*FIXED_FRAMES, poses.path(frame)[-1]]:
         found = {image: poses.camera_from_world(name, frame, time) for image, time in stamps.items()}
         known = {image: pose for image, pose in found.items() if pose is not None}
         if len(known) > len(best.known):

@@ -40,27 +40,19 @@ class Poses:
         if static:
             self._static.add(child)
 
-    def root(self, frame: str) -> str:
-        """The topmost ancestor of a frame."""
-        return [frame.lstrip("/"), *self._ancestors(frame)][-1]
-
-    def chain(self, fixed: str, frame: str) -> list[str] | None:
-        """Frames from `frame` up to just below `fixed`; None if `fixed` is not an ancestor of `frame`."""
-        fixed, frames = fixed.lstrip("/"), [frame.lstrip("/")]
-        while frames[-1] != fixed:
-            parent = self.parents.get(frames[-1])
-            if parent is None or parent in frames:
-                return None
-            frames.append(parent)
-        return frames[:-1]
+    def path(self, frame: str) -> list[str]:
+        """The frame and its ancestors up to the root of its tree."""
+        found = [frame.lstrip("/")]
+        while (parent := self.parents.get(found[-1])) is not None and parent not in found:
+            found.append(parent)
+        return found
 
     def camera_from_world(self, fixed: str, frame: str, time: int) -> np.ndarray | None:
-        """[4, 4] at a time in ns, interpolated; None if the frames are not connected or there is no sample nearby."""
-        chain = self.chain(fixed, frame)
-        if not chain:
+        """[4, 4] at a time in ns, interpolated; None if `fixed` is no ancestor of `frame`, or no sample is near."""
+        frames, fixed_from_frame = self.path(frame), np.eye(4)
+        if fixed.lstrip("/") not in frames[1:]:
             return None
-        fixed_from_frame = np.eye(4)
-        for child in chain:
+        for child in frames[: frames.index(fixed.lstrip("/"))]:
             step = self._at(child, time)
             if step is None:
                 return None
@@ -69,20 +61,12 @@ class Poses:
 
     def between(self, a: str, b: str, time: int) -> np.ndarray | None:
         """a_from_b [4, 4] at a time in ns, by their nearest common ancestor; None as in `camera_from_world`."""
-        above = [[frame.lstrip("/"), *self._ancestors(frame)] for frame in (a, b)]
-        common = next((frame for frame in above[0] if frame in above[1]), None)
+        paths = [self.path(frame) for frame in (a, b)]
+        common = next((frame for frame in paths[0] if frame in paths[1]), None)
         if common is None:
             return None
-        ends = [
-            np.eye(4) if frames[0] == common else self.camera_from_world(common, frames[0], time) for frames in above
-        ]
+        ends = [np.eye(4) if path[0] == common else self.camera_from_world(common, path[0], time) for path in paths]
         return None if ends[0] is None or ends[1] is None else ends[0] @ inverse_se3(ends[1])
-
-    def _ancestors(self, frame: str) -> list[str]:
-        found: list[str] = []
-        while (parent := self.parents.get(found[-1] if found else frame.lstrip("/"))) and parent not in found:
-            found.append(parent)
-        return found
 
     def _at(self, child: str, time: int) -> np.ndarray | None:
         if child not in self._arrays:

@@ -26,6 +26,14 @@ class Bag:
         """Topics whose messages are of one of `types`, sorted."""
         return sorted(topic for topic, kind in self.topics.items() if kind in types)
 
+    def chosen(self, topics: list[str], wanted: str | None, what: str, option: str) -> str:
+        """The wanted one of `topics`, or the only one. InputError where it is not there, or there are several."""
+        if wanted is not None and wanted not in topics:
+            raise InputError(f"{self.path}: has no {what} topic '{wanted}'; found {', '.join(topics) or 'none'}")
+        if wanted is None and len(topics) > 1:
+            raise InputError(f"{self.path}: holds several {what} topics, choose one with {option}: {', '.join(topics)}")
+        return wanted or topics[0]
+
     def messages(self, topics: list[str]) -> Iterator[tuple[str, int, Any]]:
         """(topic, recording time in ns, message) in order of time. Raises InputError for a corrupt message."""
         chosen = [c for c in self._reader.connections if c.topic in topics]

@@ -14,6 +14,8 @@ from perception.errors import InputError
 
 MIN_CORNERS = 8
 """Minimum number of corners per image. The pose alone needs three."""
+PER_SQUARE, MARGIN = 60, 30
+"""Pixels of a square, and of the white margin, of the pattern that corners are aligned with."""
 
 
 @dataclass(frozen=True)
@@ -75,33 +77,26 @@ class Board:
             return None
         return Detection(name, found[0].astype(np.float32), found[1].astype(np.float32))
 
-    def _charuco_board(self, legacy: bool = False) -> Any:
-        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
-        board = cv2.aruco.CharucoBoard(self.squares, self.square, self.marker, words)
-        board.setLegacyPattern(legacy)
-        return board
-
     @cached_property
     def _detectors(self) -> list[tuple[Any, np.ndarray, np.ndarray]]:
         """(detector, corners, texture) of the current ChArUco pattern, and of the legacy pattern (OpenCV before 4.6),
         which differs for an even number of rows."""
-        boards = [self._charuco_board(legacy) for legacy in (False, True)]
-        return [
-            (cv2.aruco.CharucoDetector(board), np.asarray(board.getChessboardCorners()), self._print(board))
-            for board in boards
-        ]
-
-    def _print(self, board: Any, per_square: int = 60, margin: int = 30) -> np.ndarray:
-        columns, rows = self.squares
-        size = (columns * per_square + 2 * margin, rows * per_square + 2 * margin)
-        return np.asarray(board.generateImage(size, None, margin))
+        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
+        size, found = tuple(squares * PER_SQUARE + 2 * MARGIN for squares in self.squares), []
+        for legacy in (False, True):
+            board = cv2.aruco.CharucoBoard(self.squares, self.square, self.marker, words)
+            board.setLegacyPattern(legacy)
+            texture = np.asarray(board.generateImage(size, None, MARGIN))
+            found.append((cv2.aruco.CharucoDetector(board), np.asarray(board.getChessboardCorners()), texture))
+        return found
 
     def _charuco(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         for detector, corners, texture in self._detectors:
             pixels, ids, _, _ = detector.detectBoard(picture)
             if ids is not None and len(ids) >= MIN_CORNERS:
                 points = corners[np.ravel(ids)]
-                return points, refine(picture, points, np.reshape(pixels, (-1, 2)), self.square, texture, 60, 30)
+                pixels = np.reshape(pixels, (-1, 2))
+                return points, refine(picture, points, pixels, self.square, texture, PER_SQUARE, MARGIN)
         return None
 
     def _checkerboard(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

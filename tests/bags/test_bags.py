@@ -119,7 +119,7 @@ def test_interpolation_and_gaps() -> None:
     assert poses.camera_from_world("world", "cam", 1_000_000_000) is None  # 1.6 s without a sample
     assert poses.camera_from_world("world", "cam", 2_100_000_000) is None  # after the last
     assert poses.camera_from_world("nowhere", "cam", 0) is None
-    assert poses.root("cam") == "world"
+    assert poses.path("cam")[-1] == "world"
 
 
 def test_sharp_and_spaced() -> None:

@@ -206,7 +206,7 @@ def test_refined_corners_lie_where_the_board_is() -> None:
         true = project("pinhole", camera.values, pose, found.board_points)[0]
         fine.append(np.linalg.norm(found.pixels - true, axis=1))
         corners = np.asarray(CHARUCO._charuco_board().getChessboardCorners())
-        pixels, ids = cv2.aruco.CharucoDetector(CHARUCO._charuco_board()).detectBoard(picture)[:2]
+        pixels, ids = CHARUCO._detectors[0][0].detectBoard(picture)[:2]
         true = project("pinhole", camera.values, pose, corners[ids.ravel()])[0]
         coarse.append(np.linalg.norm(pixels.reshape(-1, 2) - true, axis=1))
     assert np.median(np.concatenate(fine)) < 0.03 < np.median(np.concatenate(coarse))
