@@ -21,6 +21,7 @@ from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.atomic import atomic_directory
 from perception.io.camera_file import read_camera, write_camera_info
 from perception.io.frame_choice import Chooser
+from perception.io.lens import FISHEYE, PERSPECTIVE
 from perception.types import Lens
 
 
@@ -213,12 +214,7 @@ def _write_transforms(
     fx, fy, cx, cy, *extra = lens.params
     data: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if lens.model == "OPENCV_FISHEYE" else "OPENCV"}
     data |= {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": lens.width, "h": lens.height}
-    order = {
-        "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
-        "OPENCV": ("k1", "k2", "p1", "p2"),
-        "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    }.get(lens.model, ())
-    data |= dict(zip(order, extra, strict=True))
+    data |= dict(zip(FISHEYE if lens.model == "OPENCV_FISHEYE" else PERSPECTIVE, extra, strict=False))
     if depth:
         data["depth_unit_scale_factor"] = 1 / MILLIMETRES
     if down is not None:

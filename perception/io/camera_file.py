@@ -9,7 +9,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.documents import brief, read_yaml
-from perception.io.lens import MOST_SIDE
+from perception.io.lens import MOST_SIDE, opencv_lens
 from perception.types import Lens
 
 _COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
@@ -40,8 +40,7 @@ def read_camera(path: Path) -> Lens:
         expected = " or ".join(map(str, _COUNTS[name]))
         raise InputError(f"{path}: {name} has {expected} distortion_coefficients, found {found}")
     k = _numbers(values, found, path, "distortion_coefficients.data").tolist()
-    model, distortion = _colmap_distortion(name, k)
-    return Lens(model, (float(fx), float(fy), float(cx), float(cy), *distortion), width, height)
+    return opencv_lens((float(fx), float(fy), float(cx), float(cy)), k, width, height, name == "equidistant")
 
 
 def write_camera(path: Path, name: str, model: str, size: tuple[int, int], values: np.ndarray) -> None:
@@ -87,16 +86,6 @@ def _write(path: Path, name: str, size: tuple[int, int], kind: str, K: list[floa
     data |= {key: {"rows": r, "cols": c, "data": numbers} for key, (r, c, numbers) in blocks.items()}
     with replacing(path) as file:
         file.write(yaml.safe_dump(data, sort_keys=False, default_flow_style=None).encode())
-
-
-def _colmap_distortion(name: str, k: list[float]) -> tuple[str, list[float]]:
-    if name == "equidistant":
-        return "OPENCV_FISHEYE", k
-    if not any(k):
-        return "PINHOLE", []
-    if not any(k[4:]):
-        return "OPENCV", k[:4]
-    return "FULL_OPENCV", ([*k, 0.0, 0.0, 0.0])[:8]
 
 
 def _load(path: Path) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -15,6 +16,9 @@ from perception.types import Lens
 
 MIN_FOCAL, MOST_PIXELS, MOST_SIDE = 1e-2, 1e9, 1 << 20
 _PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+FISHEYE = ("k1", "k2", "k3", "k4")
+"""Names of OpenCV's coefficients of distortion, in the order of OpenCV and COLMAP."""
 
 
 def load_pycolmap() -> Any:
@@ -33,6 +37,15 @@ def load_pycolmap() -> Any:
     if "GLOG_minloglevel" not in os.environ:
         pycolmap.logging.minloglevel = 3
     return pycolmap
+
+
+def opencv_lens(pinhole: tuple[float, ...], k: Sequence[float], width: int, height: int, fisheye: bool = False) -> Lens:
+    """The simplest COLMAP model that holds OpenCV's coefficients k (see PERSPECTIVE, FISHEYE). pinhole: fx fy cx cy."""
+    if fisheye:
+        return Lens("OPENCV_FISHEYE", (*pinhole, *k), width, height)
+    if any(k[4:]):
+        return Lens("FULL_OPENCV", (*pinhole, *(*k, 0.0, 0.0, 0.0)[:8]), width, height)
+    return Lens("OPENCV", (*pinhole, *k[:4]), width, height) if any(k) else Lens("PINHOLE", pinhole, width, height)
 
 
 def lens_from_camera(camera: Any) -> Lens:

@@ -13,6 +13,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import interpolated_pose, rotation_from_quaternion
 from perception.io.documents import brief, read_json
+from perception.io.lens import opencv_lens
 from perception.io.photos import open_photo, photo_size
 from perception.io.recordings import Frame, Recording
 from perception.types import Lens
@@ -248,8 +249,7 @@ def _open3d_lens(file: Path) -> Lens:
 
 def _lens(values: tuple[float, ...], size: tuple[int, int]) -> Lens:
     fx, fy, cx, cy, *k = (float(value) for value in values)
-    centred = (fx, fy, cx + 0.5, cy + 0.5)
-    return Lens("FULL_OPENCV", (*centred, *k, 0.0, 0.0, 0.0), *size) if k else Lens("PINHOLE", centred, *size)
+    return opencv_lens((fx, fy, cx + 0.5, cy + 0.5), k, *size)
 
 
 def _missing(count: int, total: int, what: str) -> list[str]:

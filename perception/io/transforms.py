@@ -15,6 +15,7 @@ from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.documents import brief, read_json
 from perception.io.ignore_masks import mask_of
+from perception.io.lens import FISHEYE, PERSPECTIVE, opencv_lens
 from perception.io.photos import SUFFIXES, photo_size, why_left_out
 from perception.io.reading import Cloud, Reading, start_points
 from perception.io.safe_names import safe_name
@@ -23,17 +24,7 @@ from perception.io.views import fit_lens, make_view, rigid_pose
 from perception.types import DepthImage, Lens, Scene, View
 
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
-_PERSPECTIVE = (
-    "OPENCV",
-    "PINHOLE",
-    "SIMPLE_PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "FULL_OPENCV",
-    "PERSPECTIVE",
-)
-
-
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE")
 MILLIMETRE = 1e-3
 """Unit of depth images without `depth_unit_scale_factor` or `integer_depth_scale`, in metres: nerfstudio's default."""
 
@@ -219,22 +210,13 @@ def _lens(file: Path, values: dict[str, Any], photo: Path | None) -> Lens:
     fx, fy = _focals(values, what, width, height)
     cx, cy = _number(values, "cx", what), _number(values, "cy", what)
     center = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-    names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-    k1, k2, k3, k4, k5, k6, p1, p2 = (_number(values, key, what) or 0.0 for key in names)
     model = str(values.get("camera_model") or "OPENCV").upper()
-    name: str
-    extra: tuple[float, ...]
-    if values.get("is_fisheye") or model in _FISHEYE:
-        name, extra = "OPENCV_FISHEYE", (k1, k2, k3, k4)
-    elif model not in _PERSPECTIVE:
+    fisheye = bool(values.get("is_fisheye")) or model in _FISHEYE
+    if not fisheye and model not in _PERSPECTIVE:
         raise InputError(f"{what}: camera_model '{model}' is not supported; expected one of {_PERSPECTIVE + _FISHEYE}")
-    elif k3 or k4 or k5 or k6:
-        name, extra = "FULL_OPENCV", (k1, k2, p1, p2, k3, k4, k5, k6)
-    elif any((k1, k2, p1, p2)) and "PINHOLE" not in model:
-        name, extra = "OPENCV", (k1, k2, p1, p2)
-    else:
-        name, extra = "PINHOLE", ()
-    return Lens(name, (fx, fy, *center, *extra), int(width), int(height))
+    k = [_number(values, key, what) or 0.0 for key in (FISHEYE if fisheye else PERSPECTIVE)]
+    k = [] if "PINHOLE" in model and not fisheye else k
+    return opencv_lens((fx, fy, *center), k, int(width), int(height), fisheye)
 
 
 def _focals(values: dict[str, Any], what: str, width: float, height: float) -> tuple[float, float]:
