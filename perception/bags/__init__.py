@@ -1,5 +1,1 @@
 """Extracts photos, intrinsics and poses from ROS bags (ROS 1, ROS 2, MCAP), as input for mapping."""
-
-from perception.bags.frames import FrameOptions, run_frames
-
-__all__ = ["FrameOptions", "run_frames"]

@@ -16,7 +16,8 @@ from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.evaluate.masks import Masks
 from perception.io.atomic import atomic_directory, atomic_file
-from perception.io.store import Map, read_info, read_map
+from perception.io.map_files import read_info
+from perception.io.store import Map, read_map
 from perception.pipeline.mapping import build_map
 from perception.pipeline.rendering import as_gaussians, map_views
 from perception.progress import Progress

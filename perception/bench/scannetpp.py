@@ -18,8 +18,8 @@ from perception.bench.datasets import DatasetBench, link
 from perception.errors import InputError
 from perception.evaluate.labelled_clouds import instances_table
 from perception.evaluate.layouts import run_scannet
-from perception.export import ExportOptions, export_labels
 from perception.export.formats import write_scannet
+from perception.export.transfer import ExportOptions, export_labels
 from perception.io.atomic import atomic_file
 from perception.io.cloud import read_cloud, write_cloud
 from perception.io.photos import photo_size

@@ -49,7 +49,7 @@ def _length(text: str) -> float | str:
 
 def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.errors import InputError
-    from perception.export import ExportOptions
+    from perception.export.transfer import ExportOptions
     from perception.io.store import read_map
     from perception.pipeline.exporting import export_map
     from perception.pipeline.meshing import check_outputs, export_mesh, export_voxels

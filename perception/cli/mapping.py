@@ -134,7 +134,8 @@ def _add_info(commands: Any) -> None:
 
 def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.io.map import Map
-    from perception.io.store import read_info, verify_map
+    from perception.io.map_files import read_info
+    from perception.io.store import verify_map
     from perception.pipeline.summary import info_text
 
     info = read_info(args.map)

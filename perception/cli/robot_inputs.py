@@ -29,7 +29,8 @@ def _add_calibrate(commands: Any) -> None:
 
 
 def _calibrate(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.calibration import Board, run_calibration
+    from perception.calibration.board import Board
+    from perception.calibration.calibrate import run_calibration
 
     words = args.squares.lower().split("x")
     if len(words) != 2 or not all(word.isdigit() for word in words):
@@ -57,7 +58,7 @@ def _add_frames(commands: Any) -> None:
 
 
 def _frames(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.bags import FrameOptions, run_frames
+    from perception.bags.frames import FrameOptions, run_frames
 
     names = ("topic", "camera_info", "camera", "poses", "fixed_frame", "odometry", "depth", "max_frames", "spacing")
     return run_frames(args.bag, args.output, FrameOptions(**{name: getattr(args, name) for name in names}))

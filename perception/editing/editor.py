@@ -23,7 +23,8 @@ from perception.errors import InputError
 from perception.frame.scaled_map import scale_map
 from perception.io.atomic import writing
 from perception.io.map import Map
-from perception.io.store import map_signature, read_info, read_map, write_map
+from perception.io.map_files import map_signature, read_info
+from perception.io.store import read_map, write_map
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
 
 UNDO_DEPTH = 100

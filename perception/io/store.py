@@ -28,26 +28,11 @@ from perception.errors import InputError
 from perception.io.atomic import atomic_directory, atomic_file, writing
 from perception.io.checksums import EDITABLE, FACTS, REPORT, facts_of, file_facts, seal, verify
 from perception.io.map import Map
-from perception.io.map_files import FORMAT_VERSION, MapFiles, map_signature, read_info
+from perception.io.map_files import FORMAT_VERSION, MapFiles
 from perception.io.map_views import StoredView, moved_record, stored_view, view_from_json, view_json
 from perception.io.ply import write_ply
 from perception.io.safe_names import safe_name
 from perception.types import View
-
-__all__ = [
-    "FORMAT_VERSION",
-    "REPORT",
-    "Map",
-    "map_signature",
-    "read_info",
-    "read_map",
-    "relink",
-    "set_labels",
-    "verify_map",
-    "write_gaussian_ply",
-    "write_map",
-]
-
 
 LONGEST_LABEL = 200  # characters
 

@@ -22,11 +22,12 @@ from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
 from perception.gaussians.transients import train_without_transients
 from perception.instances.label_transfer import transfer_labels, transfer_text
 from perception.io.inputs import load_saved_scene, load_scene, save_scene
+from perception.io.map_files import read_info
 from perception.io.map_views import stored_view
 from perception.io.photos import load_photo
 from perception.io.reading import Reading
 from perception.io.recentre import recentred
-from perception.io.store import Map, read_info, read_map, write_map
+from perception.io.store import Map, read_map, write_map
 from perception.language.base import Encoder
 from perception.language.ocr import make_reader
 from perception.masks import MaskSource, compute_masks, make_source

@@ -15,8 +15,9 @@ from perception.instances.silhouettes import render_silhouettes
 from perception.instances.texts import Reader, read_texts, store_texts
 from perception.io.atomic import writing
 from perception.io.map import PART, Map
+from perception.io.map_files import read_info
 from perception.io.map_views import StoredView, locate_photo, stored_view
-from perception.io.store import FORMAT_VERSION, read_info, read_map, write_map
+from perception.io.store import FORMAT_VERSION, read_map, write_map
 from perception.language.base import Encoder, reading_of
 from perception.language.description import from_arrays, to_arrays
 from perception.language.encoders import make_encoder

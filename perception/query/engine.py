@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from perception.errors import InputError
-from perception.io.store import map_signature
+from perception.io.map_files import map_signature
 from perception.language.base import Encoder
 from perception.language.encoders import make_encoder
 from perception.query.query_map import QueryMap, load_map

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception.bags import FrameOptions, run_frames
+from perception.bags.frames import FrameOptions, run_frames
 from perception.errors import InputError
 from perception.geometry import inverse_se3
 from perception.io.transforms import read_frames

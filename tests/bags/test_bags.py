@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception.bags import FrameOptions, run_frames
 from perception.bags.decode import decode_image
+from perception.bags.frames import FrameOptions, run_frames
 from perception.bags.poses import Poses
 from perception.cli import main
 from perception.config import load_config

@@ -16,7 +16,8 @@ from perception.bench.datasets import by_reference, by_words
 from perception.cli import main
 from perception.errors import InputError
 from perception.io.cloud import read_cloud, write_cloud
-from perception.io.store import read_info, read_map
+from perception.io.map_files import read_info
+from perception.io.store import read_map
 from perception.language.ranking import Ranker
 from perception.query import load_map
 from perception.types import PointCloud

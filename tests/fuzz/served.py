@@ -212,7 +212,8 @@ class ViewerTarget:
     _TEXTS = ("", " ", "pear", "<img src=x>", "\x00", "\ud800", "a" * 2000, "é\n*", "&#60;", "[x](y)")
 
     def __init__(self) -> None:
-        from perception.io.store import map_signature, read_map
+        from perception.io.map_files import map_signature
+        from perception.io.store import read_map
         from perception.viewer.guard import Guard
 
         self._folder = TemporaryDirectory(prefix="fuzz-", dir=in_memory())
@@ -228,7 +229,8 @@ class ViewerTarget:
 
     def _renew(self) -> None:
         """The map as it was before an input saved another."""
-        from perception.io.store import map_signature, write_map
+        from perception.io.map_files import map_signature
+        from perception.io.store import write_map
         from support.viewer_maps import small_map
 
         write_map(self._path, small_map(60))
@@ -240,7 +242,7 @@ class ViewerTarget:
 
     def run(self, data: bytes) -> bool:
         """True when nothing was refused."""
-        from perception.io.store import map_signature
+        from perception.io.map_files import map_signature
 
         with patch("perception.editing.editor.read_map", self._read):
             taken = self._run(data)

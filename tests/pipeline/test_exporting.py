@@ -10,7 +10,7 @@ import pytest
 
 from perception.colors import instance_palette
 from perception.errors import InputError
-from perception.export import ExportOptions
+from perception.export.transfer import ExportOptions
 from perception.io.cloud import read_cloud
 from perception.io.store import write_map
 from perception.pipeline.exporting import export_map

@@ -12,7 +12,8 @@ import pytest
 import perception
 from perception.cli import main
 from perception.errors import InputError
-from perception.io.store import FORMAT_VERSION, read_info, read_map, verify_map
+from perception.io.map_files import read_info
+from perception.io.store import FORMAT_VERSION, read_map, verify_map
 from perception.language.ocr import Line
 from perception.pipeline import upgrade
 from perception.pipeline.upgrade import upgrade_map

@@ -18,7 +18,7 @@ import torch
 
 from perception.editing import Editor
 from perception.errors import InputError
-from perception.export import ExportOptions
+from perception.export.transfer import ExportOptions
 from perception.io.inputs import save_scene
 from perception.io.store import read_map, set_labels, verify_map, write_map
 from perception.masks.label_images import write_labels
