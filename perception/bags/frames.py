@@ -76,18 +76,18 @@ def run_frames(
             lens = _write_camera(aside / "camera.yaml", options.camera, info, topic, size, source)
             stamps, frame = _write_images(bag, topic, chosen, aside / "images")
             depth, told = _depth(bag, depths, options.depth, stamps, lens, frame, poses, aside / "depth")
-            placed = _place(poses if options.poses else Poses(), stamps, frame, options.fixed_frame)
-            down = gravity(bag, poses, placed.fixed) if placed.known and placed.fixed is not None else None
-            if placed.known:
-                _write_transforms(aside / "transforms.json", placed, lens, depth, down)
+            known, fixed = _place(poses if options.poses else Poses(), stamps, frame, options.fixed_frame)
+            down = None if fixed is None else gravity(bag, poses, fixed)
+            if fixed is not None:
+                _write_transforms(aside / "transforms.json", known, stamps, fixed, lens, depth, down)
     facts = {
         "output": str(output),
         "topic": topic,
         "images": len(chooser.motion),
         "chosen": len(stamps),
-        "with_pose": len(placed.known),
-        "fixed_frame": placed.fixed if placed.known else None,
-        "camera_frame": placed.frame,
+        "with_pose": len(known),
+        "fixed_frame": fixed,
+        "camera_frame": frame,
         "size": list(size),
         "camera_model": lens.model,
         "depth": told,
@@ -96,16 +96,6 @@ def run_frames(
         "gravity_std_deg": None if down is None else down[1],
     }
     return facts, _text(facts)
-
-
-@dataclass
-class Placed:
-    """Poses of written images: known[name] = camera_from_world, in order; fixed: world frame; frame: of the camera."""
-
-    known: dict[str, np.ndarray]
-    stamps: dict[str, int]
-    fixed: str | None
-    frame: str
 
 
 def _image_topic(bag: Bag, wanted: str | None, depths: list[str]) -> str:
@@ -182,21 +172,30 @@ def _depth(
         return {}, f"left out: {error}"
 
 
-def _place(poses: Poses, stamps: dict[str, int], frame: str, fixed: str | None) -> Placed:
-    """Poses in the first of FIXED_FRAMES (or the tree's root) with poses for 80 % of the images, else with the most."""
-    best = Placed({}, stamps, fixed, frame)
+def _place(
+    poses: Poses, stamps: dict[str, int], frame: str, fixed: str | None
+) -> tuple[dict[str, np.ndarray], str | None]:
+    """camera_from_world by image, in order, and the world frame, None without poses: the first of FIXED_FRAMES (or the
+    tree's root) with poses for 80 % of the images, else that with the most."""
+    best, world = dict[str, np.ndarray](), None
     for name in [fixed] if fixed else [*FIXED_FRAMES, poses.path(frame)[-1]]:
         found = {image: poses.camera_from_world(name, frame, time) for image, time in stamps.items()}
         known = {image: pose for image, pose in found.items() if pose is not None}
-        if len(known) > len(best.known):
-            best = Placed(known, stamps, name, frame)
+        if len(known) > len(best):
+            best, world = known, name
         if len(known) >= 0.8 * len(stamps):
             break
-    return best
+    return best, world
 
 
 def _write_transforms(
-    path: Path, placed: Placed, lens: Lens, depth: dict[str, str], down: tuple[np.ndarray, float] | None
+    path: Path,
+    known: dict[str, np.ndarray],
+    stamps: dict[str, int],
+    fixed: str,
+    lens: Lens,
+    depth: dict[str, str],
+    down: tuple[np.ndarray, float] | None,
 ) -> None:
     """nerfstudio's format: only frames with a pose, OpenGL camera axes, pixel centres at +0.5, depth in millimetres.
 
@@ -205,11 +204,11 @@ def _write_transforms(
     frames = [
         {
             "file_path": f"images/{name}",
-            "transform_matrix": (inverse_se3(placed.known[name]) @ OPENCV_FROM_OPENGL).tolist(),
-            "stamp_ns": placed.stamps[name],
+            "transform_matrix": (inverse_se3(pose) @ OPENCV_FROM_OPENGL).tolist(),
+            "stamp_ns": stamps[name],
             **({"depth_file_path": depth[name]} if name in depth else {}),
         }
-        for name in placed.known
+        for name, pose in known.items()
     ]
     fx, fy, cx, cy, *extra = lens.params
     data: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if lens.model == "OPENCV_FISHEYE" else "OPENCV"}
@@ -219,7 +218,7 @@ def _write_transforms(
         data["depth_unit_scale_factor"] = 1 / MILLIMETRES
     if down is not None:
         data |= {"gravity": down[0].tolist(), "gravity_std_deg": down[1]}
-    facts = {"metric": True, "world_frame": placed.fixed}  # ROS measures in metres (REP 103)
+    facts = {"metric": True, "world_frame": fixed}  # ROS measures in metres (REP 103)
     path.write_text(json.dumps({**data, **facts, "frames": frames}, indent=1), encoding="utf-8")
 
 

@@ -15,6 +15,7 @@ from perception.types import Scene
 
 Cloud = tuple[np.ndarray, np.ndarray]
 """points [P, 3] float64 in the input's frame, colors [P, 3] uint8."""
+NO_CLOUD: Cloud = (np.empty((0, 3)), np.empty((0, 3), np.uint8))
 GREY = 128
 FEW_SEEN = 0.01
 """Share of the points in some photo's view below which a warning is given."""

@@ -14,7 +14,7 @@ from perception.geometry import inverse_se3
 from perception.io.depth import read_depth
 from perception.io.frame_choice import Chooser
 from perception.io.ignore_masks import mask_of
-from perception.io.reading import Reading
+from perception.io.reading import NO_CLOUD, Reading
 from perception.io.safe_names import safe_name
 from perception.io.triangulate import posed_scene
 from perception.io.views import fit_lens, make_view, rigid_pose
@@ -80,8 +80,7 @@ def recorded_scene(recording: Recording, how: Reading) -> Scene:
         "scale": {"source": f"poses and depth of {kind}, in metres by definition"},
     }
     views.sort(key=lambda view: view.name)
-    start = how.cloud or (np.empty((0, 3)), np.empty((0, 3), np.uint8))
-    return replace(posed_scene(views, start, facts, how, least=1), metric=True)
+    return replace(posed_scene(views, how.cloud or NO_CLOUD, facts, how, least=1), metric=True)
 
 
 def choose_frames(

@@ -17,7 +17,7 @@ from perception.io.documents import brief, read_json
 from perception.io.ignore_masks import mask_of
 from perception.io.lens import FISHEYE, PERSPECTIVE, opencv_lens
 from perception.io.photos import SUFFIXES, photo_size, why_left_out
-from perception.io.reading import Cloud, Reading, start_points
+from perception.io.reading import NO_CLOUD, Reading, start_points
 from perception.io.safe_names import safe_name
 from perception.io.triangulate import posed_scene
 from perception.io.views import fit_lens, make_view, rigid_pose
@@ -50,17 +50,19 @@ def read_transforms(file: Path, how: Reading) -> Scene:
         raise InputError(f"{file}: none of the {len(frames)} photos it lists can be read (first: {first})")
     root = Path(os.path.commonpath([_absolute(photo).parent for photo in photos.values()]))
     views, notes = _views(file, data, frames, photos, root, how.masks)
-    listed = how.cloud or _listed_cloud(file, data)
+    listed = how.cloud
+    if listed is None and data.get("ply_file_path"):
+        listed = start_points(_listed(file, "ply_file_path", data["ply_file_path"]))
     facts: dict[str, Any] = {
         "input": "transforms",
         "left_out": missing,
         "warnings": notes,
         "mean_reprojection_error_px": None,
     }
-    if how.cloud is None and len(listed[0]):
+    if how.cloud is None and listed is not None:
         facts["points_from"] = str(data["ply_file_path"])
     facts |= _gravity(file, data)
-    scene = posed_scene(views, listed, facts, how, least=1)
+    scene = posed_scene(views, listed or NO_CLOUD, facts, how, least=1)
     scene.metric = data.get("metric") is True
     return scene
 
@@ -242,13 +244,3 @@ def _number(values: dict[str, Any], key: str, what: str) -> float | None:
             if math.isfinite(number := float(value)):
                 return number
     raise InputError(f"{what}: {key} must be a finite number, found {brief(value)}")
-
-
-def _listed_cloud(file: Path, data: dict[str, Any]) -> Cloud:
-    listed = data.get("ply_file_path")
-    if not listed:
-        return np.empty((0, 3)), np.empty((0, 3), np.uint8)
-    path = file.parent / str(listed)
-    if not _is_file(path):
-        raise InputError(f"{file}: ply_file_path {brief(listed)} does not exist; remove the entry or add the file")
-    return start_points(path)
