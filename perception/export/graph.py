@@ -5,18 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from perception import _core
-from perception.errors import InputError
 from perception.export.neighbors import Neighbors
 from perception.io.cloud_memory import cores
 
 
-def mesh_edges(faces: np.ndarray, num_points: int) -> np.ndarray:
+def mesh_edges(faces: np.ndarray) -> np.ndarray:
     """Edges [E, 2] int32 of triangles [F, 3], three per face as ScanNet's segmentator lists them: 12, 13, 32.
 
     Of faces that contain a vertex twice, edges from a vertex to itself are left out.
     """
-    if faces.size and (faces.min() < 0 or faces.max() >= num_points):
-        raise InputError(f"a face names vertex {faces.max()}, but there are {num_points} vertices")
     edges = np.stack([faces[:, [0, 1]], faces[:, [0, 2]], faces[:, [2, 1]]], axis=1).reshape(-1, 2)
     return np.ascontiguousarray(edges[edges[:, 0] != edges[:, 1]], dtype=np.int32)
 

@@ -60,14 +60,10 @@ def nearest_gaussian(
     −1 for points that are not finite or farther than max_distance from every mean. Equal distances go to the smaller
     index. Means that are not finite are ignored.
     """
-    points = _checked(points, "points")
-    means = _checked(means, "means")
     finite = np.flatnonzero(np.isfinite(means).all(axis=1))
     result = np.full(len(points), -1, np.int64)
     if len(finite) == 0:
         return result
-    if max_distance is not None and not max_distance >= 0:
-        raise InputError(f"max_distance is {max_distance}; expected a length that is not negative")
     tree = Neighbors(means if len(finite) == len(means) else means[finite])
     for begin in range(0, len(points), chunk):
         found = tree.query(points[begin : begin + chunk], 1, np.inf if max_distance is None else max_distance)[0][:, 0]
@@ -81,7 +77,6 @@ def auto_distance(means: np.ndarray) -> float | None:
     Even in sparse regions a point on the mapped surface is within half that spacing of a mean; the limit is four times
     this. Points beyond it were not mapped. None (no limit) for fewer than two distinct means.
     """
-    means = _checked(means, "means")
     means = means[np.isfinite(means).all(axis=1)]
     if len(means) < 2:
         return None
@@ -89,10 +84,3 @@ def auto_distance(means: np.ndarray) -> float | None:
     gaps = Neighbors(means).query(chosen, 2)[1][:, 1]
     gaps = gaps[gaps > 0]
     return 2 * float(np.quantile(gaps, 0.99)) if len(gaps) else None
-
-
-def _checked(points: np.ndarray, name: str) -> np.ndarray:
-    points = np.asarray(points)
-    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
-        raise InputError(f"{name}: expected floats [N, 3], found {points.dtype} {list(points.shape)}")
-    return points

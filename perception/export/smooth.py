@@ -61,7 +61,7 @@ def segment_cloud(cloud: PointCloud, color_weight: float | None = None, scannet:
     require_memory(_BYTES_PER_POINT * len(points), "smoothing", "export without it (--no-smooth) or split the cloud")
     lists = None if meshed else neighbor_lists(points, NORMAL_NEIGHBORS)
     if cloud.faces is not None and meshed:
-        edges, normals = mesh_edges(cloud.faces, len(points)), scannet_normals(points, cloud.faces)
+        edges, normals = mesh_edges(cloud.faces), scannet_normals(points, cloud.faces)
         if not scannet:
             length = np.linalg.norm(normals, axis=1, keepdims=True)
             normals = np.where(length > CREASE, normals / np.maximum(length, CREASE), normals)

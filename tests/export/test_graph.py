@@ -148,7 +148,7 @@ def test_mesh_normals_and_edges():
     half = len(points) // 2
     np.testing.assert_allclose(normals[:half], np.tile([0, 0, 1.0], (half, 1)), atol=1e-6)
     np.testing.assert_allclose(normals[half:], np.tile([1.0, 0, 0], (half, 1)), atol=1e-6)
-    edges = mesh_edges(np.array([[0, 1, 2], [3, 3, 4]], np.int32), 5)
+    edges = mesh_edges(np.array([[0, 1, 2], [3, 3, 4]], np.int32))
     assert edges.tolist() == [[0, 1], [0, 2], [2, 1], [3, 4], [4, 3]]
 
 
