@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from glob import escape
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 from uuid import uuid4
 
 from perception.errors import InputError
@@ -41,19 +41,41 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
     Temporary siblings left by killed writers of `path` are deleted. InputError for a full disk or missing rights.
     """
-    path = Path(path)
+    with _aside(Path(path), lambda new: new.touch(exist_ok=False), Path.replace) as temporary:
+        yield temporary
+
+
+@contextmanager
+def atomic_directory(path: Path) -> Iterator[Path]:
+    """Yield an empty temporary sibling folder to fill; on success it replaces `path`, else it is removed.
+
+    On Linux renameat2 exchanges the two folders in one step, so `path` exists at all times. On other systems the old
+    folder is renamed first, and `path` does not exist between the two renames (microseconds). If the process is killed
+    there, `standing(path)` gives readers the old folder; the next `atomic_directory(path)` or `recover(path)` restores
+    it. `path` is never partly written.
+    """
+    with _aside(Path(path), Path.mkdir, _swap) as temporary:
+        yield temporary
+
+
+@contextmanager
+def _aside(path: Path, make: Callable[[Path], Any], put: Callable[[Path, Path], Any]) -> Iterator[Path]:
+    """Yields a locked temporary sibling of `path`. make: creates it. put: renames it to `path` once it is synced."""
     temporary = _sibling(path, "new")
     try:
         with contextlib.ExitStack() as held, _disk_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             recover(path)
-            held.enter_context(_locked(temporary, lambda: temporary.touch(exist_ok=False)))
-            yield temporary
-            _sync(temporary)
-            temporary.replace(path)
+            held.enter_context(_locked(temporary, lambda: make(temporary)))
+            with _errors_naming(path, temporary):
+                yield temporary
+            for file in (*temporary.rglob("*"), temporary):
+                _sync(file)
+            put(temporary, path)
             _sync(path.parent)
     finally:
-        with contextlib.suppress(OSError):  # in a read-only folder no temporary was created
+        shutil.rmtree(temporary, ignore_errors=True)
+        with contextlib.suppress(OSError):  # it was a folder, took its place, or was never created
             temporary.unlink()
 
 
@@ -72,32 +94,6 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
     except OSError as error:
         reason = error.strerror or error
         raise InputError(f"{path}: cannot be written ({reason}); give a writable place") from error
-
-
-@contextmanager
-def atomic_directory(path: Path) -> Iterator[Path]:
-    """Yield an empty temporary sibling folder to fill; on success it replaces `path`, else it is removed.
-
-    On Linux renameat2 exchanges the two folders in one step, so `path` exists at all times. On other systems the old
-    folder is renamed first, and `path` does not exist between the two renames (microseconds). If the process is killed
-    there, `standing(path)` gives readers the old folder; the next `atomic_directory(path)` or `recover(path)` restores
-    it. `path` is never partly written.
-    """
-    path = Path(path)
-    temporary, old = _sibling(path, "new"), _sibling(path, "old")
-    try:
-        with contextlib.ExitStack() as held, _disk_errors(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            recover(path)
-            held.enter_context(_locked(temporary, temporary.mkdir))
-            with _errors_naming(path, temporary):
-                yield temporary
-            for file in temporary.rglob("*"):
-                _sync(file)
-            _sync(temporary)
-            _swap(temporary, path, old)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def recover(path: Path) -> None:
@@ -152,7 +148,8 @@ def _leftovers(path: Path) -> list[tuple[str, Path]]:
     return [(kind, item) for _, kind, item in sorted(found)]
 
 
-def _swap(new: Path, path: Path, old: Path) -> None:
+def _swap(new: Path, path: Path) -> None:
+    old = _sibling(path, "old")
     if not path.exists():
         new.rename(path)
     elif _exchange(new, path):
