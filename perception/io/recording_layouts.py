@@ -9,9 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from perception.errors import InputError
-from perception.geometry import interpolated_pose, rotation_from_quaternion
+from perception.geometry import interpolated_pose
 from perception.io.documents import brief, read_json
 from perception.io.lens import opencv_lens
 from perception.io.photos import open_photo, photo_size
@@ -70,7 +71,7 @@ def _tum(source: Path) -> Recording:
     if (np.linalg.norm(rows[:, 4:], axis=1) < 1e-6).any():
         raise InputError(f"{truth}: a quaternion is zero; expected lines 'time tx ty tz qx qy qz qw'")
     times, poses = rows[:, 0], np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = [rotation_from_quaternion(row[[7, 4, 5, 6]]) for row in rows]
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:8]).as_matrix()
     poses[:, :3, 3] = rows[:, 1:4]
     nearest = np.abs(depth_at[None] - at[:, None]).argmin(axis=1)
     apart = np.abs(depth_at[nearest] - at)

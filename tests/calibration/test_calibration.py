@@ -205,7 +205,7 @@ def test_refined_corners_lie_where_the_board_is() -> None:
         assert found is not None
         true = project("pinhole", camera.values, pose, found.board_points)[0]
         fine.append(np.linalg.norm(found.pixels - true, axis=1))
-        corners = np.asarray(CHARUCO._charuco_board().getChessboardCorners())
+        corners = np.asarray(CHARUCO._detectors[0][1])
         pixels, ids = CHARUCO._detectors[0][0].detectBoard(picture)[:2]
         true = project("pinhole", camera.values, pose, corners[ids.ravel()])[0]
         coarse.append(np.linalg.norm(pixels.reshape(-1, 2) - true, axis=1))

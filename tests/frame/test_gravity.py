@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from perception.frame.gravity import floor_height, gravity_of_scene
-from perception.geometry import rotation_from_quaternion
 from support.measured_scenes import cameras, estimated, random_similarity, rolled, room_points
+from support.rotations import rotation_from_quaternion
 
 DOWN = np.array([0.0, 0.0, -1.0])
 

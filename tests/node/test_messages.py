@@ -20,9 +20,9 @@ from support.paths import REPOSITORY, SUPPORT, TESTS
 
 pytest.importorskip("rosbags")
 
-from perception.geometry import rotation_from_quaternion
 from perception.node.answers import box_markers, detection, header, point_cloud2, pose
 from support.cdr import serialize, typestore
+from support.rotations import rotation_from_quaternion
 
 STAMP = (7, 999_999_999)
 REQUEST, RESPONSE = "rcl_interfaces/srv/GetParameters_Request", "rcl_interfaces/srv/GetParameters_Response"

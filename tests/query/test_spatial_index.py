@@ -9,11 +9,11 @@ import pytest
 
 import perception
 from perception.errors import InputError
-from perception.geometry import rotation_from_quaternion
 from perception.io.store import Map, read_map, set_labels
 from perception.query import Frame, QueryMap, Where, axis_box, load_map
 from perception.types import OrientedBox
 from support.query_maps import NAMES, encoders, write_map_of
+from support.rotations import rotation_from_quaternion
 from support.synthetic_map import SIGMA, grid
 
 

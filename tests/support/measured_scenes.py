@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from perception.demo.cameras import orbit, walk
-from perception.geometry import rotation_from_quaternion
 from perception.io.recentre import moved
 from perception.types import View
+from support.rotations import rotation_from_quaternion
 
 SIZE = (640, 480)
 

@@ -59,7 +59,7 @@ def test_picking_sees_through_what_is_hidden_and_behind() -> None:
 
 
 def test_covariances_are_those_of_the_rotated_axes() -> None:
-    from perception.geometry import rotation_from_quaternion
+    from support.rotations import rotation_from_quaternion
 
     gmap = small_map(20)
     for i, found in enumerate(covariances(gmap)):
