@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,21 +36,24 @@ def map_photos(store: FeatureStore, fixed: bool, seed: int, count: int, progress
         shutil.rmtree(folder, ignore_errors=True)
 
 
+@dataclass
 class _Mapping:
     """Computes models from subsets of the verified pairs and selects the best."""
 
-    def __init__(
-        self, store: FeatureStore, folder: Path, fixed: bool, seed: int, count: int, progress: Progress
-    ) -> None:
-        self.database, self.image_root, self.folder = store.database, store.image_root, folder
-        self.fixed, self.seed, self.count, self.progress = fixed, seed, count, progress
-        self.shown, self.runs = 0.0, 0
+    store: FeatureStore
+    folder: Path
+    fixed: bool
+    seed: int
+    count: int
+    progress: Progress
+    shown: float = 0.0
+    runs: int = 0
 
     def run(self) -> Found:
         """The first model that contradicts at most MAX_CONTRADICTED of the pairs, else the one with most agreeing."""
         tried: list[tuple[int, Found]] = []
         for found in self._candidates():
-            pairs = verified_pairs(found[0][0], self.database)
+            pairs = verified_pairs(found[0][0], self.store.database)
             tried.append((sum(pair.inliers for pair in pairs if pair.agrees), found))
             if len(stronger_contradictions(pairs)) <= MAX_CONTRADICTED * len(pairs):
                 break
@@ -60,12 +64,12 @@ class _Mapping:
     def _candidates(self) -> Iterator[Found]:
         """For each level: a model from its pairs, then one from all pairs except those that the first contradicts."""
         for level in LEVELS:
-            models = self._map(self.database, level)
+            models = self._map(self.store.database, level)
             if not models:
                 return
             found = self._without_outvoted(models)
             yield found
-            pairs = verified_pairs(found[0][0], self.database)
+            pairs = verified_pairs(found[0][0], self.store.database)
             wrong = [pair for pair in pairs if not pair.agrees]
             again = self._map(self._database_without(wrong), LEVELS[0]) if wrong else []
             if again:
@@ -73,7 +77,7 @@ class _Mapping:
 
     def _database_without(self, pairs: list[Pair]) -> Path:
         copy = self.folder / f"pairs-{self.runs}.db"
-        shutil.copyfile(self.database, copy)
+        shutil.copyfile(self.store.database, copy)
         db = load_pycolmap().Database.open(copy)
         for pair in pairs:
             db.delete_matches(pair.i, pair.j)
@@ -84,7 +88,7 @@ class _Mapping:
     def _without_outvoted(self, models: list[Any]) -> Found:
         """Removes photos most of whose matches contradict the model, tries them again, leaves out those that fail."""
         best = models[0]
-        pairs = verified_pairs(best, self.database)
+        pairs = verified_pairs(best, self.store.database)
         wrong = outvoted_photos(pairs)
         if not wrong or len(wrong) > best.num_reg_images() / 4:
             return models, set()
@@ -95,7 +99,7 @@ class _Mapping:
         others = [p for p in pairs if not p.agrees and p.i not in wrong and p.j not in wrong]
         again = self._map(self._database_without(others), LEVELS[0], source)
         best = again[0] if again and again[0].num_reg_images() >= best.num_reg_images() else best
-        still = outvoted_photos(verified_pairs(best, self.database))
+        still = outvoted_photos(verified_pairs(best, self.store.database))
         still |= wrong - set(best.reg_image_ids())
         names = {best.images[image].name for image in still}
         _take_out(best, still & set(best.reg_image_ids()))
@@ -128,7 +132,7 @@ class _Mapping:
 
         found = pycolmap.incremental_mapping(
             database,
-            self.image_root,
+            self.store.image_root,
             out,
             options,
             input_path=source or "",

@@ -14,6 +14,7 @@ from urllib.parse import quote
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
+from perception.io.documents import read_json
 
 RECORD = "perception.json"
 HUB = "https://huggingface.co"
@@ -138,10 +139,5 @@ def set_default(model: StoredModel) -> None:
 
 def _defaults() -> dict[str, str]:
     file = models_folder() / _DEFAULTS
-    if not file.is_file():
-        return {}
-    try:
-        known = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: cannot be read ({error}); remove it") from error
+    known = read_json(file) if file.is_file() else {}
     return known if isinstance(known, dict) else {}

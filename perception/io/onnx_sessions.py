@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import mmap
 import re
 import warnings
@@ -14,6 +13,7 @@ import numpy as np
 
 from perception.errors import InputError, missing_extra
 from perception.interrupts import uninterrupted
+from perception.io.documents import read_json
 
 _DTYPES: dict[str, type] = {
     "tensor(float)": np.float32,
@@ -71,10 +71,7 @@ def read_config(model: Path, name: str) -> dict[str, Any]:
     for folder in (model.parent, model.parent.parent):
         path = folder / name
         if path.is_file():
-            try:
-                known = json.loads(path.read_text(encoding="utf-8"))
-            except ValueError as error:
-                raise InputError(f"{path}: not valid JSON ({error})") from error
+            known = read_json(path)
             return known if isinstance(known, dict) else {}
     return {}
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory
+from perception.io.documents import read_json
 from perception.io.frame_choice import Chooser
 from perception.io.photo_folder import FRAMES_RECORD
 from perception.progress import Progress
@@ -31,8 +32,9 @@ def video_frames(video: Path, folder: Path, progress: Progress) -> dict[str, obj
     stat = video.stat()
     record: dict[str, object] = {"video": video.name, "bytes": stat.st_size, "mtime_ns": stat.st_mtime_ns}
     if folder.exists():
-        known = _known(folder)
-        if {key: known.get(key) for key in record} == record:
+        listed = folder / FRAMES_RECORD
+        known = read_json(listed) if listed.is_file() else None
+        if isinstance(known, dict) and {key: known.get(key) for key in record} == record:
             return known
         raise InputError(f"{folder}: exists already, and holds no frames of {video}; remove or rename it")
     chooser, numbers = Chooser(), []
@@ -50,14 +52,6 @@ def video_frames(video: Path, folder: Path, progress: Progress) -> dict[str, obj
             progress.update("poses: writing frames", round(100 * share), 100)
         (aside / FRAMES_RECORD).write_text(json.dumps(record), encoding="utf-8")
     return record
-
-
-def _known(folder: Path) -> dict[str, object]:
-    try:
-        record = json.loads((folder / FRAMES_RECORD).read_text(encoding="utf-8"))
-        return record if isinstance(record, dict) else {}
-    except (OSError, ValueError):
-        return {}
 
 
 def frames(
