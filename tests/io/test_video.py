@@ -82,9 +82,9 @@ def test_a_video_that_cannot_be_posed_leaves_no_frames(tmp_path: Path) -> None:
 def test_a_record_that_is_none_is_no_record(tmp_path: Path) -> None:
     video = write_video(tmp_path / "v.mp4", pan(20))
     (tmp_path / "frames").mkdir()
-    for content in ("[", json.dumps([1])):
+    for content, told in (("[", "not readable JSON"), (json.dumps([1]), "exists already")):
         (tmp_path / "frames" / "frames.json").write_text(content)
-        with pytest.raises(InputError, match="exists already"):
+        with pytest.raises(InputError, match=told):
             video_frames(video, tmp_path / "frames", Told())
 
 
