@@ -1,6 +1,6 @@
 """COLMAP workspaces: `images/` beside `sparse/0`, `sparse/*` or `sparse`, binary or text, any undistortable camera.
 
-pycolmap does not check counts and string ends, so a damaged binary file can make it loop forever or allocate all memory.
+pycolmap does not check counts and string ends, so a damaged binary file can make it loop for ever or take all memory.
 Here each file is read once before, and damage is reported by file and record. Layout: COLMAP's documentation, "Output
 Format"; little endian. Rigs and frames came with COLMAP 3.12.
 """
