@@ -1,4 +1,4 @@
-"""The unit and the vertical of a scene from the GPS positions in the EXIF data of its photos."""
+"""The unit of a scene from the GPS positions in the EXIF data of its photos."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from perception.errors import InputError
 from perception.frame.scale import LARGEST_ERROR, Measurement
 from perception.geometry import align_similarity, camera_centres
+from perception.io.lens import load_pycolmap
 from perception.io.photos import DECODE_ERRORS, exif_of, open_photo
 from perception.types import View
 
 LEAST = 6  # photos with a position
 _GPS_FOLDER, _LATITUDE, _LONGITUDE, _ALTITUDE = 0x8825, 1, 3, 5  # EXIF tags; the values follow the references
-_A, _F = 6_378_137.0, 1 / 298.257223563  # WGS84: semi-major axis in metres, flattening
 
 
 def photo_position(photo: Path) -> np.ndarray | None:
@@ -36,19 +36,10 @@ def photo_position(photo: Path) -> np.ndarray | None:
     return place if known else None
 
 
-def east_north_up(places: np.ndarray) -> np.ndarray:
-    """Metres [N, 3] east, north and up of the first of places [N, 3] (WGS84 degrees and metres)."""
-    latitude, longitude = np.radians(places[:, :2]).T
-    e2 = _F * (2 - _F)
-    n = _A / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
-    h = places[:, 2]
-    x = (n + h) * np.cos(latitude) * np.cos(longitude)
-    y = (n + h) * np.cos(latitude) * np.sin(longitude)
-    z = (n * (1 - e2) + h) * np.sin(latitude)
-    sin_a, cos_a, sin_o, cos_o = (f(angle[0]) for angle in (latitude, longitude) for f in (np.sin, np.cos))
-    axes = [[-sin_o, cos_o, 0], [-sin_a * cos_o, -sin_a * sin_o, cos_a], [cos_a * cos_o, cos_a * sin_o, sin_a]]
-    earth = np.stack([x, y, z], axis=1)
-    return (earth - earth[0]) @ np.array(axes).T
+def earth_positions(places: np.ndarray) -> np.ndarray:
+    """Metres [N, 3] from the first of places [N, 3] (WGS84 degrees and metres), in axes fixed to the Earth."""
+    metres = np.asarray(load_pycolmap().GPSTransform().ellipsoid_to_ecef(places))
+    return metres - metres[0]
 
 
 def scale_of_gps(views: Sequence[View], seed: int = 0) -> tuple[Measurement | None, list[str]]:
@@ -58,7 +49,7 @@ def scale_of_gps(views: Sequence[View], seed: int = 0) -> tuple[Measurement | No
     if len(rows) < LEAST:
         return None, []
     centres = camera_centres(np.stack([views[row].camera_from_world for row in rows]))
-    return scale_of_positions(centres, east_north_up(np.stack([p for p in places if p is not None])), seed)
+    return scale_of_positions(centres, earth_positions(np.stack([p for p in places if p is not None])), seed)
 
 
 def scale_of_positions(centres: np.ndarray, metres: np.ndarray, seed: int = 0) -> tuple[Measurement | None, list[str]]:

@@ -13,7 +13,7 @@ from PIL import Image
 
 from perception.calibration.board import Board
 from perception.errors import InputError
-from perception.frame.gps import east_north_up, photo_position, scale_of_gps, scale_of_positions
+from perception.frame.gps import earth_positions, photo_position, scale_of_gps, scale_of_positions
 from perception.frame.known_size import Sighting, scale_of_board, scale_of_pixels, scale_of_sightings, scale_of_tags
 from perception.frame.scale import Measurement, combined, known_length, scale_of_depth
 from perception.geometry import camera_centres
@@ -158,13 +158,19 @@ def test_forms_of_a_known_length() -> None:
             known_length(text)
 
 
+def _turned_about_z(degrees: float) -> np.ndarray:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+
+
 def test_positions_on_the_earth_and_in_photos(tmp_path: Path) -> None:
     """A minute of latitude at 45° is 1852.2 m, one of longitude 1314.2 m (WGS84 tables: 111 132, 78 847 m a degree)."""
     start = np.array([45.0, 9.0, 100.0])
-    moved = east_north_up(start + np.array([[0, 0, 0], [1 / 60, 0, 0], [0, 1 / 60, 0], [0, 0, 30]]))
-    np.testing.assert_allclose(moved[0], 0, atol=1e-9)
-    np.testing.assert_allclose(moved[1:3, :2], [[0, 1852.2], [1314.1, 0]], atol=0.4)
-    np.testing.assert_allclose(moved[3], [0, 0, 30], atol=1e-6)
+    moved = earth_positions(start + np.array([[0, 0, 0], [1 / 60, 0, 0], [0, 1 / 60, 0], [0, 0, 30]]))
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), [0, 1852.2, 1314.1, 30], atol=0.4)
+    cosines = moved[1:] @ moved[1:].T / np.outer(*[np.linalg.norm(moved[1:], axis=1)] * 2)
+    np.testing.assert_allclose(cosines, np.eye(3), atol=1e-3)  # north, east and up
+    np.testing.assert_allclose(moved[3], 30 * np.array([0.7071, 0, 0.7071]) @ _turned_about_z(9), atol=1e-2)
     exif = Image.Exif()
     place = {1: "S", 2: (33.0, 51.0, 54.6), 3: "E", 4: (151.0, 12.0, 36.0), 5: b"\x01", 6: 12.5}
     exif.get_ifd(0x8825).update(place)
