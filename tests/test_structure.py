@@ -34,7 +34,6 @@ LAYERS = [
         "query",
         "export",
         "evaluate",
-        "report",
         "models",
         "editing",
     },

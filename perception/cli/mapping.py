@@ -151,7 +151,7 @@ def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _add_report(commands: Any) -> None:
-    p = command(commands, "report", _report, "one self-contained page: held-out views, curves, instances, answers")
+    p = command(commands, "report", _report, "one self-contained page: held-out views, instances, answers")
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.html")
     p.add_argument("--ask", action="append", default=[], metavar="TEXT", help="a prompt to answer on the page")

@@ -1,59 +1,119 @@
-"""Report of a map: images and a one-page HTML report."""
+"""The report of a map: one self-contained HTML page, images inlined, no scripts, no external resources.
+
+The page is the Jinja2 template report.html, which escapes every value.
+"""
 
 from __future__ import annotations
 
+import base64
+import io
 import shlex
-from functools import cache
+from collections.abc import Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from perception.colors import instance_palette
 from perception.config import MapConfig, flat
 from perception.errors import InputError
 from perception.gaussians.render import render
 from perception.gaussians.train import TrainingView, render_view
 from perception.instances.crops import expand_box, mask_box
 from perception.instances.silhouettes import render_silhouettes
+from perception.io.atomic import atomic_file
 from perception.io.photos import load_photo, scaled_K
 from perception.io.store import Map
-from perception.pictures import features_to_rgb, outline, overlay, titled_row
+from perception.pictures import error_map, features_to_rgb, outline, overlay, titled_row
 from perception.pipeline.rendering import as_gaussians
 from perception.pipeline.summary import depth_text
 from perception.query import QueryMap
 from perception.query.hit import printed_texts
-from perception.report import InstanceRow, QueryRow, ReportData, ViewRow, write_report
 
 SHOWN = ("worst", "middle", "best")
 """Held-out views shown beside their photos, by PSNR."""
+LIMIT = 3_000_000
+"""Maximum size of the page in bytes."""
+SIZES = ((460, 82), (360, 74), (260, 66), (180, 55), (120, 45))
+"""(longest side, quality) of the images, tried in this order."""
 
 
 def write_map_report(opened: QueryMap, path: Path, queries: list[str]) -> Path:
     """The one-page report of a map, with the answers to `queries`; missing photos are left out."""
     info, album = opened.info, _Album(opened)
-    curve = info["training"]["curve"]
-    data = ReportData(
-        title=(opened.path or path).stem,
-        subtitle=f"from {info['source']}",
-        figures=_figures(opened),
-        seconds={name: value for name, value in info["seconds"].items() if name != "total"},
-        psnr_curve=[(entry["iteration"], entry["psnr"]) for entry in curve],
-        ssim_curve=[(entry["iteration"], entry["ssim"]) for entry in curve if "ssim" in entry],
-        gaussians_curve=[(entry["iteration"], entry["gaussians"]) for entry in curve],
-        views=_view_rows(opened, album),
-        overview=_overview(opened, album),
-        instances=_instance_rows(opened, album),
-        metric=opened.metric,
-        queries=[_query_row(opened, text, album) for text in queries],
-        warnings=_warnings(info),
-        settings=dict(flat(info["config"])),
-        command=rerun_command(info, opened.path or Path("MAP")),
-    )
+    data = {
+        "title": (opened.path or path).stem,
+        "subtitle": f"from {info['source']}",
+        "figures": _figures(opened),
+        "seconds": {name: value for name, value in info["seconds"].items() if name != "total" and value > 0},
+        "views": _view_rows(opened, album),
+        "overview": _overview(opened, album),
+        "instances": _instance_rows(opened, album),
+        "metric": opened.metric,
+        "queries": [_query_row(opened, text, album) for text in queries],
+        "warnings": _warnings(info),
+        "settings": dict(flat(info["config"])),
+        "command": rerun_command(info, opened.path or Path("MAP")),
+    }
     try:
-        return write_report(path, data)
+        return write_page(path, data)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def write_page(path: Path, data: Mapping[str, Any]) -> Path:
+    """Writes the page, replacing an old one atomically. Images shrink until it is under LIMIT.
+
+    data: what `write_map_report` gives; images are [H, W, 3] uint8.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    folder = FileSystemLoader(Path(__file__).parent)
+    template = Environment(loader=folder, autoescape=True, undefined=StrictUndefined).get_template("report.html")
+    sides = partial(_sides, scale=100.0 if data["metric"] else 1.0)
+    page = b""
+    for side, quality in SIZES:
+        image = partial(_image, side=side, quality=quality)
+        text = template.render(data=data, image=image, sides=sides, clock=clock, color=_color)
+        page = text.encode(errors="replace")  # an unpaired surrogate in a file name cannot be encoded as UTF-8
+        if len(page) < LIMIT:
+            break
+    with atomic_file(path) as aside:
+        aside.write_bytes(page)
+    return path
+
+
+def _color(instance: int) -> list[int]:
+    return [int(value) for value in instance_palette([instance])[0]]
+
+
+def _image(picture: np.ndarray, side: int, quality: int) -> tuple[int, int, str]:
+    """(width, height, data URI) of an image [H, W, 3] uint8, with a longer side of at most `side` pixels."""
+    from PIL import Image
+
+    image = Image.fromarray(np.ascontiguousarray(picture[..., :3], np.uint8))
+    image.thumbnail((side, side), Image.Resampling.LANCZOS)
+    buffer = io.BytesIO()
+    image.save(buffer, "WEBP", quality=quality, method=4)
+    code = base64.b64encode(buffer.getvalue()).decode()
+    return image.width, image.height, f"data:image/webp;base64,{code}"
+
+
+def _sides(extent: Sequence[float], scale: float) -> str:
+    """Box sides times `scale`, with so many decimals that the longest has three digits."""
+    sides = [scale * side for side in extent]
+    decimals = int(np.clip(2 - np.floor(np.log10(max(*sides, 1e-12))), 0, 6))
+    return " × ".join(f"{side:.{decimals}f}" for side in sides)
+
+
+def clock(seconds: float) -> str:
+    """42.3 -> 42 s, 95 -> 1 min 35 s."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60:02d} s"
 
 
 def rerun_command(info: dict[str, Any], path: Path) -> str:
@@ -171,18 +231,25 @@ def _figures(gmap: Map) -> dict[str, str]:
     return figures
 
 
-def _view_rows(gmap: Map, album: _Album) -> list[ViewRow]:
+def _view_rows(gmap: Map, album: _Album) -> list[dict[str, np.ndarray]]:
+    """{caption: image} of the held-out views in SHOWN: the photo, the render, their difference."""
     scored = gmap.info["quality"].get("views", {})
-    shown: dict[str, str] = {}
     by_psnr = sorted(scored, key=lambda name: float(scored[name]["psnr"]))
-    for rank, place in zip(SHOWN, (0, len(by_psnr) // 2, len(by_psnr) - 1), strict=True):
-        if by_psnr:
-            shown.setdefault(by_psnr[place], f"{rank} of {len(by_psnr)}" if len(by_psnr) > 1 else "")
+    places = dict.fromkeys((0, len(by_psnr) // 2, len(by_psnr) - 1) if by_psnr else ())
     rows = []
-    for name, figures in scored.items():
-        photo = album.photo(name) if name in shown else None
-        render = album.render(name) if photo is not None else None
-        rows.append(ViewRow(name, figures["psnr"], figures["ssim"], photo, render, shown.get(name, "")))
+    for place, rank in zip(places, SHOWN, strict=False):
+        name = by_psnr[place]
+        photo = album.photo(name)
+        if photo is None:
+            continue
+        render, note = album.render(name), f", {rank} of {len(by_psnr)}" if len(by_psnr) > 1 else ""
+        rows.append(
+            {
+                f"photo {name}, not used for the map": photo,
+                f"render: {scored[name]['psnr']:.2f} dB, SSIM {scored[name]['ssim']:.3f}{note}": render,
+                "error: black is none, bright is a quarter of the range": error_map(photo, render),
+            }
+        )
     return rows
 
 
@@ -217,18 +284,24 @@ def _best_crop(opened: QueryMap, index: int, album: _Album, whole: bool) -> np.n
     return picture[y0:y1, x0:x1]
 
 
-def _instance_rows(opened: QueryMap, album: _Album) -> list[InstanceRow]:
+def _instance_rows(opened: QueryMap, album: _Album) -> list[dict[str, Any]]:
     """Every instance with its best crop, printed texts and likely names; names need an encoder."""
     names = opened.likely_names() if opened.problem is None else [[] for _ in opened.instances]
-    rows = []
-    for i, e in enumerate(opened.instances):
-        crop, called = _best_crop(opened, i, album, whole=False), printed_texts(e)[:2] + names[i]
-        score, size, count = e["score"], e["obb"]["extent"], e["num_gaussians"]
-        rows.append(InstanceRow(e["id"], crop, e.get("label"), called, score, size, count))
-    return rows
+    return [
+        {
+            "id": entry["id"],
+            "crop": _best_crop(opened, i, album, whole=False),
+            "label": entry.get("label"),
+            "names": printed_texts(entry)[:2] + names[i],
+            "score": entry["score"],
+            "extent": entry["obb"]["extent"],
+            "num_gaussians": entry["num_gaussians"],
+        }
+        for i, entry in enumerate(opened.instances)
+    ]
 
 
-def _query_row(opened: QueryMap, text: str, album: _Album) -> QueryRow:
+def _query_row(opened: QueryMap, text: str, album: _Album) -> dict[str, Any]:
     hits = opened.query(text)
     picture = _best_crop(opened, opened.position(hits[0].instance_id), album, whole=True) if hits else None
-    return QueryRow(text, bool(hits), [(hit.instance_id, hit.score) for hit in hits], picture)
+    return {"text": text, "hits": [(hit.instance_id, hit.score) for hit in hits], "picture": picture}
