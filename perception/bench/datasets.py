@@ -14,6 +14,7 @@ import numpy as np
 from perception.bench.output import bench_parser, finish
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
+from perception.evaluate.layouts import read_mask_folder
 from perception.evaluate.masks import Masks
 from perception.io.atomic import atomic_directory, atomic_file
 from perception.io.map_files import read_info
@@ -43,8 +44,7 @@ class DatasetBench(ABC):
         self.progress = Progress(quiet=args.json)
         self.config("scene")  # invalid settings raise before the first scene
 
-    @classmethod
-    @abstractmethod
+    @classmethod  # noqa: B027
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
         """Adds the options of this benchmark alone."""
 
@@ -134,14 +134,10 @@ class DatasetBench(ABC):
                 self.progress.log(f"warning: {name} failed and scores 0: {error}")
         return failed
 
-    def chosen_truth(self, folders: Mapping[str, Path]) -> Path:
-        """The download, or with --scenes a folder of links to the truth of these: `folders`, {path in it: folder}."""
-        if not self.args.scenes:
-            return Path(self.args.dataset)
-        root: Path = self.work / "truth" / "+".join(self.args.scenes)
-        for path, folder in folders.items():
-            link(folder, root / path)
-        return root
+    def predicted(self, name: str) -> Masks:
+        """The masks that `predict` wrote for a scene; none for a scene that failed."""
+        folder = self.work / "predictions" / name
+        return read_mask_folder(folder) if folder.is_dir() else {}
 
 
 def _map_facts(path: Path) -> dict[str, Any]:
@@ -169,16 +165,6 @@ class InstanceViews:
             if name in (view.name, have.name, have.stem) or wanted.stem == have.stem:
                 return view
         return None
-
-    def ids(self, view: View) -> np.ndarray:
-        """Instance image [H, W] int32 with occlusion, −1 = none."""
-        import torch
-
-        from perception.instances.silhouettes import render_silhouettes
-
-        pose = torch.from_numpy(view.camera_from_world.astype(np.float32))
-        K = torch.from_numpy(view.K.astype(np.float32))
-        return render_silhouettes(self.gaussians, self.gmap.instance_ids, pose, K, view.width, view.height).ids
 
     def silhouette(self, instances: list[int], view: View) -> np.ndarray:
         """Accumulated rendering weight [H, W] float32 in [0, 1] of the instances' Gaussians, or the bool mask."""
@@ -238,19 +224,6 @@ def by_words(gmap: Map, prompt: str, rule: str, scoring: str = "calibrated") -> 
         return [i for _, i in ranked[:1]]
     best, least = ranked[0][0], ranked[-1][0]
     return [i for score, i in ranked if score - least >= 0.85 * (best - least)]
-
-
-def by_reference(ids: np.ndarray, reference: np.ndarray, share: float = 0.7) -> list[int]:
-    """Instances of an id image [H, W] with more than `share` of their pixels in a mask (rule of Gaussian Grouping)."""
-    import cv2
-
-    if reference.shape != ids.shape:
-        size = (ids.shape[1], ids.shape[0])
-        reference = cv2.resize(reference.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
-    count = int(ids.max(initial=-1)) + 1
-    area = np.bincount(ids[ids >= 0], minlength=count)
-    inside = np.bincount(ids[(ids >= 0) & reference], minlength=count)
-    return np.flatnonzero((area > 0) & (inside > share * area)).tolist()
 
 
 def link(source: Path, target: Path) -> None:

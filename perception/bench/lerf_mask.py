@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
-
-from perception.bench.datasets import HELD_OUT, DatasetBench, InstanceViews, by_reference, by_words
+from perception.bench.datasets import HELD_OUT, DatasetBench, InstanceViews, by_words
 from perception.errors import InputError
-from perception.evaluate.layouts import read_mask_folder, run_lerf_mask
+from perception.evaluate.layouts import read_mask_folder, scenes_result
+from perception.evaluate.masks import evaluate_lerf_mask
 
-RENDERED, SHARE = 0.2, 0.7  # Gaussian Grouping: rendered mask > 0.2; instances > 0.7 inside the reference mask
-SELECTION = {
-    "query": "the map's own words, top-1 whether or not it says present",
-    "truth": "instances inside the TRUE mask of the first test view by > .7: tells segmentation apart from language",
-    "reference": "instances inside a detector's mask of the first test view by > .7",
-}
+RENDERED = 0.2  # Gaussian Grouping: rendered mask > 0.2
 
 
 class LerfMask(DatasetBench):
@@ -28,18 +21,6 @@ class LerfMask(DatasetBench):
     scores 0."""
 
     name, expected = "lerf-mask", "<scene>/test_mask/<view>/<prompt>.png"
-
-    @classmethod
-    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
-        how = "query, truth, or reference:DIR with <scene>/<prompt>.png"
-        parser.add_argument("--select", default="query", metavar="HOW", help=how)
-        parser.add_argument("--missing", choices=("zero", "skip"), default="zero")
-
-    def __init__(self, args: argparse.Namespace) -> None:
-        super().__init__(args)
-        self.select, _, self.references = args.select.partition(":")
-        if self.select not in SELECTION or (self.select == "reference") != bool(self.references):
-            raise InputError(f"--select is '{args.select}'; expected query, truth or reference:DIR")
 
     def scenes(self) -> dict[str, Path]:
         dataset = self.args.dataset
@@ -52,30 +33,22 @@ class LerfMask(DatasetBench):
         truths = read_mask_folder(scene / "test_mask")
         tests = test_photos(scene, sorted({view for view, _ in truths}))
         shown = InstanceViews(self.map(name, scene, sorted(tests.values())), True, RENDERED)
-        found = ((label, shown.find(photo)) for label, photo in sorted(tests.items()))
-        first = next(((label, view) for label, view in found if view is not None), None)
-        if first is None:
+        if not any(shown.find(photo) for photo in tests.values()):
             raise InputError(f"{scene}: none of its test views {sorted(tests.values())} is registered in the map")
-        ids = shown.ids(first[1]) if self.select != "query" else None
-        chosen = {}
-        for prompt in sorted({prompt for _, prompt in truths}):
-            if ids is None:
-                chosen[prompt] = by_words(shown.gmap, prompt, "top-1")
-            else:
-                reference: Any = truths.get((first[0], prompt))
-                if self.references:
-                    reference = cv2.imread(str(Path(self.references) / name / f"{prompt}.png"), cv2.IMREAD_GRAYSCALE)
-                chosen[prompt] = [] if reference is None else by_reference(ids, reference > 128, SHARE)
-        shown.write(target, truths, tests, chosen)
+        prompts = sorted({prompt for _, prompt in truths})
+        shown.write(target, truths, tests, {prompt: by_words(shown.gmap, prompt, "top-1") for prompt in prompts})
 
     def score(self, scenes: Mapping[str, Path]) -> tuple[dict[str, Any], str]:
         switches = {
-            "selection": SELECTION[self.select],
+            "selection": "the map's own words, top-1 whether or not it says present",
             "rendered": f"with occlusion, > {RENDERED}",
             "test_views": HELD_OUT,
         }
-        truth = self.chosen_truth({f"{name}/test_mask": scene / "test_mask" for name, scene in scenes.items()})
-        return run_lerf_mask(self.work / "predictions", truth, missing=self.args.missing, **switches)
+        results = {
+            name: evaluate_lerf_mask(self.predicted(name), read_mask_folder(scene / "test_mask"), **switches)
+            for name, scene in scenes.items()
+        }
+        return scenes_result(results, ("miou", "mbiou"))
 
 
 def test_photos(scene: Path, labels: Sequence[str]) -> dict[str, str]:

@@ -9,7 +9,8 @@ from typing import Any
 
 from perception.bench.datasets import HELD_OUT, DatasetBench, InstanceViews, by_words
 from perception.errors import InputError
-from perception.evaluate.layouts import read_lerf_polygons, run_lerf_ovs
+from perception.evaluate.layouts import read_lerf_polygons, scenes_result
+from perception.evaluate.masks import evaluate_lerf_ovs
 
 SELECTION = {
     "top-1": "top-1: best instance whether or not the map says present",
@@ -53,8 +54,11 @@ class LerfOvs(DatasetBench):
             "occlusion": "on" if self.args.occlusion else "off",
             "test_views": "trained on" if self.args.train_on_test else HELD_OUT,
         }
-        truth = self.chosen_truth({f"label/{name}": label for name, label in scenes.items()})
-        return run_lerf_ovs(self.work / "predictions", truth, **switches)
+        results = {}
+        for name, label in scenes.items():
+            silhouettes = {key: mask / 255.0 for key, mask in self.predicted(name).items()}
+            results[name] = evaluate_lerf_ovs(silhouettes, read_lerf_polygons(label), **switches)
+        return scenes_result(results, ("miou", "macc25"))
 
 
 main = LerfOvs.main

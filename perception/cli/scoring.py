@@ -25,16 +25,9 @@ def _add_eval(commands: Any) -> None:
     p.add_argument("--scores", type=Path, metavar="X.json", help="confidences; default: PRED.json where it lies there")
     _add_rules(p)
     p = command(kinds, "scannet", _eval_scannet, "AP over the scenes of a ScanNet or ScanNet++ submission")
-    p.add_argument("prediction", type=Path, metavar="PRED_DIR", help="<scene>.txt with masks, or <scene>.json")
+    p.add_argument("prediction", type=Path, metavar="PRED_DIR", help="<scene>.txt, which name mask files")
     p.add_argument("truth", type=Path, metavar="GT_DIR", help="<scene>.txt, 1000 * class + instance a vertex")
     _add_rules(p)
-    p = command(kinds, "lerf-mask", _eval_lerf_mask, "mIoU and boundary IoU of masks for text prompts")
-    p.add_argument("prediction", type=Path, metavar="PRED_DIR", help="<scene>/<view>/<prompt>.png")
-    p.add_argument("truth", type=Path, metavar="DATASET", help="<scene>/test_mask/<view>/<prompt>.png")
-    p.add_argument("--missing", choices=("zero", "skip"), default="zero", help="skip is the original script's way")
-    p = command(kinds, "lerf-ovs", _eval_lerf_ovs, "mIoU and mAcc@.25 of Gaussians selected by text")
-    p.add_argument("prediction", type=Path, metavar="PRED_DIR", help="<scene>/<view>/<prompt>.png, silhouettes")
-    p.add_argument("truth", type=Path, metavar="DATASET", help="label/<scene>/frame_*.json")
     p = command(kinds, "images", _eval_images, "PSNR and SSIM per view and mean")
     p.add_argument("prediction", type=Path, metavar="PRED_DIR")
     p.add_argument("truth", type=Path, metavar="GT_DIR")
@@ -51,7 +44,6 @@ def _add_rules(p: argparse.ArgumentParser) -> None:
     p.add_argument("--classes", type=_numbers, metavar="N,N,...", help="classes that count; others are void")
     p.add_argument("--void", type=_numbers, metavar="N,N,...", help="truth ids that are void (default 0; 'none')")
     p.add_argument("--min-region", type=int, metavar="N", help="least points of an instance (default 100)")
-    p.add_argument("--constant-score", action="store_true", help="all confidences 1.0, as Segment3D")
 
 
 def _numbers(text: str) -> tuple[int, ...]:
@@ -61,8 +53,6 @@ def _numbers(text: str) -> tuple[int, ...]:
 def _rules(args: argparse.Namespace) -> dict[str, Any]:
     """The options of the protocol that were given."""
     given = {"valid_classes": args.classes, "void_ids": args.void, "min_region": args.min_region}
-    if args.constant_score:
-        given["constant_score"] = True
     return {"by_class": args.by_class} | {name: value for name, value in given.items() if value is not None}
 
 
@@ -76,18 +66,6 @@ def _eval_scannet(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.evaluate.layouts import run_scannet
 
     return run_scannet(args.prediction, args.truth, args.protocol, **_rules(args))
-
-
-def _eval_lerf_mask(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.evaluate.layouts import run_lerf_mask
-
-    return run_lerf_mask(args.prediction, args.truth, missing=args.missing)
-
-
-def _eval_lerf_ovs(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.evaluate.layouts import run_lerf_ovs
-
-    return run_lerf_ovs(args.prediction, args.truth)
 
 
 def _eval_images(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

@@ -2,7 +2,7 @@
 
 LERF-mask (Gaussian Grouping): <scene>/test_mask/<view>/<prompt>.png|jpg; predictions alike. LERF-OVS:
 label/<scene>/frame_*.json with polygons. ScanNet and ScanNet++: <scene>.txt with true ids (1000 · class + instance, one
-per vertex); predictions are submission files <scene>.txt that name mask files, or <scene>.json with run-length masks.
+per vertex); predictions are submission files <scene>.txt that name mask files.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.evaluate.images import pictures
 from perception.evaluate.instances import Protocol, evaluate_overlaps, get_protocol, mask_overlap
-from perception.evaluate.masks import evaluate_lerf_mask, evaluate_lerf_ovs, mean_over_scenes
+from perception.evaluate.masks import mean_over_scenes
 
 
 def read_mask_folder(folder: str | Path) -> dict[tuple[str, str], np.ndarray]:
@@ -52,60 +52,8 @@ def read_lerf_polygons(folder: str | Path) -> dict[tuple[str, str], np.ndarray]:
     return masks
 
 
-def run_lerf_mask(
-    prediction: str | Path, dataset: str | Path, *, missing: str = "zero", **switches: Any
-) -> tuple[dict[str, Any], str]:
-    """LERF-mask over the scenes of a dataset folder (or one scene): (result, table).
-
-    dataset: <scene>/test_mask/<view>/<prompt>.*; prediction: <scene>/<view>/<prompt>.*, or with test_mask between.
-    """
-    scenes = {
-        name: evaluate_lerf_mask(
-            _predicted(prediction, name, "test_mask"), read_mask_folder(folder), missing=missing, **switches
-        )
-        for name, folder in _scenes(dataset, "test_mask").items()
-    }
-    return _scene_result(scenes, ("miou", "mbiou"))
-
-
-def run_lerf_ovs(prediction: str | Path, dataset: str | Path, **switches: Any) -> tuple[dict[str, Any], str]:
-    """LERF-OVS 3D selection over the scenes of a dataset folder: (result, table).
-
-    dataset: label/<scene>/frame_*.json; prediction: <scene>/<view>/<prompt>.*, silhouettes as images (255 = 1).
-    """
-    root = Path(dataset) / "label" if (Path(dataset) / "label").is_dir() else Path(dataset)
-    folders = {p.name: p for p in sorted(root.iterdir()) if p.is_dir()} if root.is_dir() else {}
-    if not folders:
-        raise InputError(f"{dataset}: holds no scenes; expected label/<scene>/frame_*.json")
-    scenes = {}
-    for name, folder in folders.items():
-        silhouettes = {key: mask / 255.0 for key, mask in _predicted(prediction, name, "").items()}
-        scenes[name] = evaluate_lerf_ovs(silhouettes, read_lerf_polygons(folder), **switches)
-    return _scene_result(scenes, ("miou", "macc25"))
-
-
-def _scenes(dataset: str | Path, inner: str) -> dict[str, Path]:
-    dataset = Path(dataset)
-    if (dataset / inner).is_dir():
-        return {dataset.name: dataset / inner}
-    found = {p.parent.name: p for p in sorted(dataset.glob(f"*/{inner}")) if p.is_dir()}
-    if not found:
-        raise InputError(f"{dataset}: holds no scenes; expected <scene>/{inner}/<view>/<prompt>.png")
-    return found
-
-
-def _predicted(prediction: str | Path, scene: str, inner: str) -> dict[tuple[str, str], np.ndarray]:
-    """Predicted masks of a scene. A missing scene has none and therefore scores 0."""
-    prediction = Path(prediction)
-    if not prediction.is_dir():
-        raise InputError(f"{prediction}: is no folder; expected predictions as <scene>/<view>/<prompt>.png")
-    for folder in (prediction / scene / inner, prediction / scene):
-        if folder.is_dir():
-            return read_mask_folder(folder)
-    return {}
-
-
-def _scene_result(scenes: dict[str, dict[str, Any]], keys: Sequence[str]) -> tuple[dict[str, Any], str]:
+def scenes_result(scenes: dict[str, dict[str, Any]], keys: Sequence[str]) -> tuple[dict[str, Any], str]:
+    """(result, table) of the results of a LERF evaluation by scene: the figures `keys` by scene, and their means."""
     mean = mean_over_scenes(scenes)
     width = max(len(name) for name in [*scenes, "mean"]) + 2
     lines = [" " * width + "".join(f"{key:>10}" for key in keys)]
@@ -125,7 +73,7 @@ def run_scannet(
     """Instance AP over all scenes of a ScanNet or ScanNet++ layout: (result, table).
 
     truth: <scene>.txt, one id per vertex (1000 · class + instance, 0 = void); prediction: <scene>.txt naming mask
-    files, or <scene>.json with run-length masks. For a scene without prediction all true instances count as missed.
+    files. For a scene without prediction all true instances count as missed.
     """
     from perception.evaluate.labelled_clouds import instances_table
 
@@ -160,9 +108,7 @@ _Prediction = tuple[list[np.ndarray], list[int], list[float]]
 
 
 def _read_prediction(folder: Path, scene: str, points: int) -> _Prediction | None:
-    text, rle = folder / f"{scene}.txt", folder / f"{scene}.json"
-    if rle.is_file():
-        return _read_rle(rle, points)
+    text = folder / f"{scene}.txt"
     if not text.is_file():
         return None
     masks, classes, scores = [], [], []
@@ -178,32 +124,4 @@ def _read_prediction(folder: Path, scene: str, points: int) -> _Prediction | Non
         if len(mask) != points:
             raise InputError(f"{folder / name}: has {len(mask)} rows, the truth has {points}")
         masks.append(mask != 0)
-    return masks, classes, scores
-
-
-def _read_rle(path: Path, points: int) -> _Prediction:
-    """ScanNet++ predictions: a list of {"label_id", "confidence", "segmentation": {"length", "counts"}}.
-
-    counts: pairs of start (1-based) and length of runs, as a list or as a string of numbers.
-    """
-    masks, classes, scores = [], [], []
-    try:
-        for row in json.loads(path.read_text(encoding="utf-8")):
-            coded = row["segmentation"]
-            counts = coded["counts"]
-            runs = np.array(counts.split() if isinstance(counts, str) else counts, np.int64).reshape(-1, 2)
-            if int(coded["length"]) != points or (
-                len(runs) and (runs.min() < 1 or runs.sum(axis=1).max() > points + 1)
-            ):
-                raise InputError(f"{path}: a mask is coded for {coded['length']} points, the truth has {points}")
-            mask = np.zeros(points, bool)
-            for start, length in runs.tolist():
-                mask[start - 1 : start - 1 + length] = True
-            masks.append(mask)
-            classes.append(int(row["label_id"]))
-            scores.append(float(row["confidence"]))
-    except InputError:
-        raise
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: is no run-length prediction file ({error!r})") from error
     return masks, classes, scores

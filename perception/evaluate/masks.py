@@ -37,23 +37,20 @@ def boundary_iou(prediction: np.ndarray, truth: np.ndarray, dilation_ratio: floa
     return mask_iou(mask_boundary(prediction, dilation_ratio), mask_boundary(truth, dilation_ratio))
 
 
-def evaluate_lerf_mask(predictions: Masks, truths: Masks, *, missing: str = "zero", **switches: Any) -> dict[str, Any]:
+def evaluate_lerf_mask(predictions: Masks, truths: Masks, **switches: Any) -> dict[str, Any]:
     """LERF-mask (Gaussian Grouping): mIoU and mean boundary IoU; mean per prompt over views, then over prompts.
 
     truths: {(view, prompt): 8-bit mask, object > 128}. predictions: the same, or bool; resized to the truth by nearest
-    neighbour. missing: "zero" scores a missing prediction 0; "skip" leaves it out, as the original script does.
-    switches: how instances are selected and rendered; printed with the result.
+    neighbour. A missing one scores 0 (the original script leaves it out). switches: how instances are selected and
+    rendered; printed with the result.
     """
-    if missing not in ("zero", "skip"):
-        raise InputError(f"missing is '{missing}'; expected zero or skip")
     scores: dict[str, list[tuple[float, float]]] = {}
     absent = []
     for (view, prompt), truth in sorted(truths.items()):
         per_prompt = scores.setdefault(prompt, [])
         if (view, prompt) not in predictions:
             absent.append([view, prompt])
-            if missing == "zero":
-                per_prompt.append((0.0, 0.0))
+            per_prompt.append((0.0, 0.0))
             continue
         true = truth if truth.dtype == bool else truth > 128
         predicted = _fitted(predictions[view, prompt], true.shape, 128)
@@ -63,11 +60,10 @@ def evaluate_lerf_mask(predictions: Masks, truths: Masks, *, missing: str = "zer
     prompts = {
         prompt: {"miou": float(np.mean([s[0] for s in rows])), "mbiou": float(np.mean([s[1] for s in rows]))}
         for prompt, rows in scores.items()
-        if rows
     }
     return {
-        "miou": _mean([row["miou"] for row in prompts.values()]),
-        "mbiou": _mean([row["mbiou"] for row in prompts.values()]),
+        "miou": float(np.mean([row["miou"] for row in prompts.values()])),
+        "mbiou": float(np.mean([row["mbiou"] for row in prompts.values()])),
         "prompts": prompts,
         "missing": absent,
         "protocol": {
@@ -76,7 +72,7 @@ def evaluate_lerf_mask(predictions: Masks, truths: Masks, *, missing: str = "zer
             "prediction": "> 128 or bool, resized nearest",
             "boundary": "3x3 erosion, round(.02 diagonal) times, zero padding",
             "mean": "per prompt over views, then over prompts",
-            "missing_prediction": "scores 0" if missing == "zero" else "skipped",
+            "missing_prediction": "scores 0",
             "empty_union": "scores 1",
             **switches,
         },
@@ -133,7 +129,3 @@ def _fitted(mask: np.ndarray, shape: tuple[int, ...], threshold: float) -> np.nd
         return found
     size = (shape[1], shape[0])
     return cv2.resize(found.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
-
-
-def _mean(values: list[float]) -> float | None:
-    return float(np.mean(values)) if values else None

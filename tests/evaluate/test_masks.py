@@ -10,7 +10,7 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 from perception.errors import InputError
-from perception.evaluate.layouts import run_lerf_mask, run_lerf_ovs, run_scannet
+from perception.evaluate.layouts import read_lerf_polygons, read_mask_folder, run_scannet, scenes_result
 from perception.evaluate.masks import (
     boundary_iou,
     evaluate_lerf_mask,
@@ -54,9 +54,6 @@ def test_lerf_mask_averages_by_prompt_and_scores_the_missing_zero():
     result = evaluate_lerf_mask(predictions, truths)
     assert result["prompts"]["cup"]["miou"] == 0.5 and result["miou"] == pytest.approx((0.5 + 0.5) / 2)
     assert result["missing"] == [["v2", "cup"]]
-    skipped = evaluate_lerf_mask(predictions, truths, missing="skip")
-    assert skipped["miou"] == pytest.approx((1 + 0.5) / 2)
-    assert skipped["protocol"]["missing_prediction"] == "skipped"
 
 
 def test_lerf_ovs_is_a_flat_mean_and_strict_at_a_quarter():
@@ -83,15 +80,17 @@ def test_lerf_mask_directory(tmp_path):
             save(data / scene / "test_mask" / view / "green apple.png", blob(1))
     save(pred / "figurines/test_0/green apple.png", blob(1))
     save(pred / "figurines/test_1/green apple.png", blob(2))
-    result, table = run_lerf_mask(pred, data)
+    found = {name: read_mask_folder(pred / name) if (pred / name).is_dir() else {} for name in ("figurines", "ramen")}
+    scored = {
+        name: evaluate_lerf_mask(masks, read_mask_folder(data / name / "test_mask")) for name, masks in found.items()
+    }
+    result, table = scenes_result(scored, ("miou", "mbiou"))
     want = (1 + mask_iou(blob(2), blob(1))) / 2
     assert result["scenes"]["figurines"]["miou"] == pytest.approx(want)
     assert result["scenes"]["ramen"]["miou"] == 0 and result["mean"]["miou"] == pytest.approx(want / 2)
     assert "figurines" in table and "zero padding" in table
-    with pytest.raises(InputError, match="test_mask"):
-        run_lerf_mask(pred, pred)
     with pytest.raises(InputError, match="no folder"):
-        run_lerf_mask(tmp_path / "none", data)
+        read_mask_folder(tmp_path / "none")
 
 
 def test_lerf_ovs_directory(tmp_path):
@@ -102,42 +101,26 @@ def test_lerf_ovs_directory(tmp_path):
     (label / "frame_00001.json").write_text(json.dumps({"info": {"height": 40, "width": 50}, "objects": objects}))
     mask = np.zeros((40, 50), bool)
     mask[5:25, 10:30] = True
-    save(tmp_path / "pred/teatime/frame_00001/sheep.png", mask)
-    result, table = run_lerf_ovs(tmp_path / "pred", tmp_path, selection="top-1", occlusion="off")
+    found = {("frame_00001", "sheep"): mask}
+    scored = evaluate_lerf_ovs(found, read_lerf_polygons(label), selection="top-1", occlusion="off")
+    result, table = scenes_result({"teatime": scored}, ("miou", "macc25"))
     assert result["mean"] == {"macc25": 1.0, "miou": 1.0}
     assert "selection: top-1" in table
     (label / "frame_00002.json").write_text("{}")
     with pytest.raises(InputError, match="frame_00002"):
-        run_lerf_ovs(tmp_path / "pred", tmp_path)
+        read_lerf_polygons(label)
 
 
-def runs(mask):
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]]))) + 1
-    edges[1::2] -= edges[::2]
-    return " ".join(map(str, edges))
-
-
-def test_scannet_directory_with_mask_files_and_run_lengths(tmp_path):
+def test_scannet_directory(tmp_path):
     rng = np.random.default_rng(0)
     truth = np.repeat([0, 3001, 3002, 5001, 7], 200)
     labels = np.where(rng.random(1000) < 0.1, -1, np.repeat([-1, 4, 6, 8, 9], 200)).astype(np.int32)
     scores = {4: 0.9, 6: 0.5, 8: 0.25, 9: 0.125}
-    gt, text, coded = (tmp_path / name for name in ("gt", "text", "coded"))
+    gt, text = tmp_path / "gt", tmp_path / "text"
     gt.mkdir()
-    coded.mkdir()
     np.savetxt(gt / "scene0.txt", truth, fmt="%d")
     write_scannet(text, "scene0", labels, {i: {"score": s} for i, s in scores.items()}, {4: 3, 6: 3, 8: 5, 9: 5})
-    rows = [
-        {
-            "label_id": {4: 3, 6: 3, 8: 5, 9: 5}[i],
-            "confidence": s,
-            "segmentation": {"length": 1000, "counts": runs(labels == i)},
-        }
-        for i, s in scores.items()
-    ]
-    (coded / "scene0.json").write_text(json.dumps(rows))
     first, table = run_scannet(text, gt, by_class=True)
-    second, _ = run_scannet(coded, gt, "scannetpp", by_class=True)
     void = np.where(truth < 1000, 0, truth)
     want = evaluate_masks(
         [labels == i for i in scores],
@@ -147,7 +130,7 @@ def test_scannet_directory_with_mask_files_and_run_lengths(tmp_path):
         gt_semantics=void // 1000,
         by_class=True,
     )
-    assert first["ap"] == second["ap"] == want["ap"] == pytest.approx(1.0 - 1 / 9, abs=0.2)
+    assert first["ap"] == want["ap"] == pytest.approx(1.0 - 1 / 9, abs=0.2)
     assert "class 3" in table
     np.savetxt(gt / "scene1.txt", truth, fmt="%d")
     halved, _ = run_scannet(text, gt, by_class=True)
@@ -168,8 +151,3 @@ def test_bad_scannet_predictions_are_told(tmp_path):
     (pred / "mask.txt").write_text("1\n0\n")
     with pytest.raises(InputError, match="2 rows, the truth has 10"):
         run_scannet(pred, gt)
-    row = {"label_id": 3, "confidence": 1, "segmentation": {"length": 9, "counts": "1 9"}}
-    for data in ([row], {"a": 1}, [{"label_id": 3}]):
-        (pred / "s.json").write_text(json.dumps(data))
-        with pytest.raises(InputError, match=r"s\.json"):
-            run_scannet(pred, gt)

@@ -64,6 +64,6 @@ def test_eval_takes_the_switches_of_a_protocol(tmp_path: Path, capsys: pytest.Ca
     assert run("--min-region", "10", "--by-class", "--classes", "4,7")["ap"] == pytest.approx(1.0)
     named = run("--min-region", "10", "--scores", str(tmp_path / "other.json"))
     assert named["protocol"]["confidence"].endswith("other.json")
-    assert run("--constant-score")["protocol"]["confidence"] == "constant 1.0"
+    assert run("--protocol", "segment3d")["protocol"]["confidence"] == "constant 1.0"
     assert main(["eval", "instances", "a.ply", "b.ply", "--void", "wall"]) == 2
     assert "\n" not in capsys.readouterr().err.strip()
