@@ -53,8 +53,6 @@ VALUES = {
     "losses.feature_dim": (4, 16),
 }
 """Values of each setting that is varied alone."""
-QUICK_SHORTEN, QUICK_SIDE, QUICK_BUDGET = 6, 320, 20_000
-"""--quick: a sixth of the iterations on small photos. It shows tendencies only; quote figures from a full run."""
 
 
 @dataclass(frozen=True)
@@ -78,19 +76,10 @@ def variants() -> list[Variant]:
 
 
 def settings_of(variant: Variant, options: argparse.Namespace) -> list[str]:
-    """The variant's KEY=VALUE pairs. A run shortened by --quick keeps its number of densifications."""
+    """The variant's KEY=VALUE pairs."""
     labels = options.scene / "labels"
     masks = options.masks or (f"labels:{labels}" if labels.is_dir() else "auto")
-    pairs = [f"masks={masks}", "language.encoder=none", *options.pairs, *variant.settings]
-    config = load_config(None, pairs, variant.preset)
-    if options.quick:
-        pairs += [
-            f"train.iterations={max(1, config.train.iterations // QUICK_SHORTEN)}",
-            f"densify.every={max(20, config.densify.every // QUICK_SHORTEN)}",
-            f"train.budget={min(config.train.budget, QUICK_BUDGET)}",
-            f"photos.max_side={min(config.photos.max_side, QUICK_SIDE)}",
-        ]
-    return pairs
+    return [f"masks={masks}", "language.encoder=none", *options.pairs, *variant.settings]
 
 
 def run_sweep(options: argparse.Namespace, cells: Sequence[Variant]) -> list[dict[str, Any]]:
@@ -166,7 +155,6 @@ def sweep_parser() -> argparse.ArgumentParser:
     parser = bench_parser("map", __doc__)
     parser.add_argument("scene", type=Path, metavar="SCENE", help="input of `map`; its truth, where there, gives AP")
     parser.add_argument("--masks", metavar="SOURCE", help="as of `map`; default: SCENE/labels where there, else auto")
-    parser.add_argument("--quick", action="store_true", help="a sixth of the iterations, 320 pixels, 20 k Gaussians")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
     parser.add_argument("--only", metavar="TEXT", help="only variants with TEXT in their group or name")
     return parser

@@ -17,20 +17,12 @@ def register(commands: Any) -> None:
 
 
 def _add_serve(commands: Any) -> None:
-    p = command(commands, "serve", _serve, "a map over HTTP: JSON, binary points and a page")
+    p = command(commands, "serve", _serve, "a map over HTTP: JSON and binary points")
     p.set_defaults(interrupted="stopped")
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("--host", default="127.0.0.1", help="other than this machine only with a token")
     p.add_argument("--port", type=int, default=8765, help="0: any free one")
     p.add_argument("--token-file", type=Path, metavar="FILE", help="clients send its content as a bearer token")
-    p.add_argument(
-        "--photos",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="DIR",
-        help="show photos from this folder too, not only from the map's own; repeatable",
-    )
     p.add_argument("--timeout", type=float, default=10.0, metavar="S", help="seconds an answer may take")
     p.add_argument("--workers", type=int, default=2, metavar="N", help="questions answered at once")
     p.add_argument("--queue", type=int, default=64, metavar="N", help="questions that may wait; more are refused")
@@ -49,7 +41,6 @@ def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         workers=args.workers,
         queue_size=args.queue,
         watch=args.watch,
-        photos=tuple(args.photos),
     )
     from perception.serve.server import serve
 

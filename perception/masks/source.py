@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from perception.config import SamConfig, read_toml
+from perception.config import SamConfig
 from perception.errors import InputError
 from perception.io.model_store import default_model
 from perception.progress import Progress
@@ -53,14 +53,13 @@ class GeometryMaskSource(MaskSource, Protocol):
 def make_source(spec: str, sam: SamConfig | None = None) -> MaskSource:
     """Parses `auto`, `builtin`, `labels:DIR`, or `sam:PATH` (folder, encoder file, or `ENCODER,DECODER`).
 
-    `auto` uses the first SAM found: the environment variable PERCEPTION_SAM, `masks.sam` in the user's configuration
-    (`perception/config.toml` under XDG_CONFIG_HOME), or the default set by `perception models add --default`. Without
-    one it is `builtin`. Files, model signatures and packages are checked here, before any work. InputError names what
-    is missing or wrong. sam: settings of SAM's mask generation; None: the defaults.
+    `auto` uses the SAM that the environment variable PERCEPTION_SAM names, else the default set by `perception models
+    add --default`; without one it is `builtin`. Files, model signatures and packages are checked here, before any work.
+    InputError names what is missing or wrong. sam: settings of SAM's mask generation; None: the defaults.
     """
     kind, _, argument = spec.partition(":")
     if kind == "auto" and not argument:
-        configured = configured_sam()
+        configured = os.environ.get("PERCEPTION_SAM", "").strip() or default_model("sam")
         kind, argument = ("builtin", "") if configured is None else ("sam", configured)
     if kind == "builtin" and not argument:
         from perception.masks.builtin import BuiltinSegmentation
@@ -75,18 +74,3 @@ def make_source(spec: str, sam: SamConfig | None = None) -> MaskSource:
 
         return SamSource(argument, sam or SamConfig())
     raise InputError(f"--masks {spec}: expected auto, builtin, sam:PATH or labels:DIR")
-
-
-def configured_sam() -> str | None:
-    """The configured SAM as a path or a stored model name, or None."""
-    from_environment = os.environ.get("PERCEPTION_SAM", "").strip()
-    if from_environment:
-        return from_environment
-    home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
-    file = home / "perception" / "config.toml"
-    if not file.is_file():
-        return default_model("sam")
-    value = read_toml(file).get("masks", {}).get("sam")
-    if value is not None and not isinstance(value, str):
-        raise InputError(f"{file}: masks.sam is {value!r}, expected the path of a SAM model as text")
-    return value or default_model("sam")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +9,6 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.map import Map
-from perception.io.map_views import locate_photo
 from perception.query.query_map import QueryMap, UnknownInstance
 from perception.types import View
 
@@ -19,14 +16,12 @@ MARGIN = 0.15
 """Margin around the bounding box, as a share of its longer side."""
 
 
-def best_crop(
-    gmap: QueryMap, instance_id: int, side: int = 320, folders: Sequence[Path] | None = None
-) -> np.ndarray | None:
+def best_crop(gmap: QueryMap, instance_id: int, side: int = 320, inside: Path | None = None) -> np.ndarray | None:
     """The crop of an instance from its best photo, [h, w, 3] uint8 RGB, longer side at most `side` pixels.
 
     None when no photo shows the instance or its photo is missing or unreadable. InputError for an unknown id.
-    folders: where photos may be read, None = anywhere. An untrusted map may name any file as its photo, so
-    UnknownInstance is raised for a photo outside these folders. Symbolic links are resolved first.
+    inside: the folder where photos may be read, None = anywhere. An untrusted map may name any file as its photo, so
+    UnknownInstance is raised for a photo outside this folder. Symbolic links are resolved first.
     """
     from perception.io.photos import load_photo
 
@@ -39,7 +34,7 @@ def best_crop(
     if view is None:
         return None
     try:
-        photo = load_photo(readable_view(gmap, view, folders), int(gmap.info["config"]["photos"]["max_side"]))
+        photo = load_photo(readable_view(gmap, view, inside), int(gmap.info["config"]["photos"]["max_side"]))
     except UnknownInstance:
         raise
     except (InputError, OSError, ValueError, KeyError):
@@ -50,34 +45,19 @@ def best_crop(
     return _shrunk(cut, side) if cut.size else None
 
 
-def folders_needed(gmap: QueryMap, folders: Sequence[Path]) -> list[Path]:
-    """The folders with photos of the map that are neither among `folders` nor below one of them, sorted."""
-    needed = set()
-    for view in gmap.views:
-        with suppress(OSError, ValueError, RuntimeError):
-            photo = locate_photo(view, gmap.path).resolve()
-            if not _is_below(photo, folders):
-                needed.add(photo.parent)
-    return sorted(needed)
-
-
-def _is_below(real: Path, folders: Sequence[Path]) -> bool:
-    return any(real.is_relative_to(folder.resolve()) for folder in folders)
-
-
-def readable_view(gmap: Map, view: View, folders: Sequence[Path] | None) -> View:
-    """`view` with the path of its photo, symbolic links resolved if `folders` are given. Raises InputError when the
-    photo is missing, UnknownInstance when it is not a file below one of `folders` (None: anywhere)."""
+def readable_view(gmap: Map, view: View, inside: Path | None) -> View:
+    """`view` with the path of its photo, symbolic links resolved if `inside` is given. Raises InputError when the
+    photo is missing, UnknownInstance when it is not a file below `inside` (None: anywhere)."""
     located = gmap.with_photo(view)
-    if folders is None:
+    if inside is None:
         return located
     try:
         real = located.photo.resolve()
-        known = _is_below(real, folders) and real.is_file()
+        known = real.is_relative_to(inside.resolve()) and real.is_file()
     except (OSError, ValueError, RuntimeError):  # an invalid path, or a cycle of symbolic links
         known = False
     if not known:
-        raise UnknownInstance(f"{view.name}: this photo is not in the map's folder nor in --photos DIR")
+        raise UnknownInstance(f"{view.name}: this photo is not in the map's folder")
     return replace(located, photo=real)
 
 

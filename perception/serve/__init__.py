@@ -1,1 +1,1 @@
-"""The HTTP server of a map: JSON, binary points, a web page. It only converts messages of perception.query."""
+"""The HTTP server of a map: JSON and binary points. It only converts messages of perception.query."""

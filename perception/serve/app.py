@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
@@ -13,11 +12,9 @@ from starlette.concurrency import run_in_threadpool
 
 from perception import __version__
 from perception.query.bodies import AtBody, FindBody, NearestBody, QueryBody
-from perception.query.crops import best_crop
 from perception.query.engine import QueryEngine
 from perception.query.frames import Frame
-from perception.query.query_map import QueryMap, UnknownInstance
-from perception.serve.crops import Crops
+from perception.query.query_map import QueryMap
 from perception.serve.errors import HANDLERS, OtherMap
 from perception.serve.guard import Guard
 from perception.serve.points import FORMATS, encode
@@ -29,10 +26,8 @@ Id = Annotated[int, Path(alias="id", ge=0, lt=10**9)]
 _ABOUT = (
     "Text prompts and places in, 3D instances of a map out. Lengths are in the unit of the map's frame, metres when "
     "`metric`. With `frame`, everything in a request and its answer is in that frame. An error is one JSON object, "
-    '{"error": line, "status": code}. Points and photos are bytes; the header X-Map-Id names their map.'
+    '{"error": line, "status": code}. Points are bytes; the header X-Map-Id names their map.'
 )
-_PAGE = {"/": "html", "/page.js": "javascript", "/page.css": "css"}
-"""The files of the web page: path → subtype of the media type text."""
 
 
 def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
@@ -47,9 +42,7 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
         exception_handlers=HANDLERS,
     )
     app.add_middleware(Guard, settings=settings)
-    for path, kind in _PAGE.items():
-        app.add_api_route(path, _static(path[1:] or "page.html", f"text/{kind}"), include_in_schema=False)
-    routes = _Routes(engine, settings)
+    routes = _Routes(engine)
     app.get("/health")(routes.health)
     app.post("/query")(routes.query)
     app.post("/find")(routes.find)
@@ -59,23 +52,18 @@ def build_app(engine: QueryEngine, settings: ServeSettings) -> FastAPI:
     app.get("/instances")(routes.instances)
     app.get("/instances/{id}")(routes.describe)
     app.get("/instances/{id}/points", response_class=Response)(routes.points)
-    app.get("/instances/{id}/crop.jpg", response_class=Response)(routes.crop)
     return app
 
 
 class _Routes:
     """One method per route. Each answer is computed on one map, given in `map_id` or in the header X-Map-Id."""
 
-    def __init__(self, engine: QueryEngine, settings: ServeSettings) -> None:
+    def __init__(self, engine: QueryEngine) -> None:
         self.engine = engine
-        self._folders = (engine.path, *settings.photos)
-        self._crops = Crops(engine.timeout)
 
     async def health(self, request: Request) -> Response:
         """How the server is; without the token its status only."""
         health = self.engine.health()
-        if hung := self._crops.hung():
-            health |= {"status": "degraded", "problem": f"{hung} photos cannot be read: their disk does not answer"}
         shown = health if request.state.trusted else {"status": health["status"]}
         return JSONResponse(shown, 200 if health["status"] != "closed" else 503)
 
@@ -129,18 +117,6 @@ class _Routes:
         name = f'attachment; filename="instance_{number}.{format}"'
         return Response(data, media_type=FORMATS[format], headers={"X-Map-Id": made_by, "Content-Disposition": name})
 
-    async def crop(
-        self, number: Id, map_id: MapId = None, side: Annotated[int, Query(ge=16, le=1024)] = 256
-    ) -> Response:
-        """The photo that shows the instance best, cut out, longer side at most `side` pixels."""
-        gmap = self.engine.current
-        _check_map(gmap, map_id)
-        future = self._crops.jpeg((gmap.map_id, number, side), lambda: best_crop(gmap, number, side, self._folders))
-        data = await self.engine.awaited(future)
-        if data is None:
-            raise UnknownInstance(f"instance {number}: no photo of it can be read")
-        return Response(data, media_type="image/jpeg", headers={"X-Map-Id": gmap.map_id})
-
     async def reload(self) -> Response:
         """Takes over the map that lies on disk now."""
         changed = await run_in_threadpool(self.engine.reload)
@@ -171,12 +147,3 @@ def _check_map(gmap: QueryMap, wanted: str | None) -> None:
 
 def _source(gmap: QueryMap, frame: Frame | None) -> dict[str, Any]:
     return {"frame": frame.name if frame else gmap.frame, "metric": gmap.metric, "map_id": gmap.map_id}
-
-
-def _static(name: str, kind: str) -> Any:
-    content = (FilePath(__file__).parent / name).read_bytes()
-
-    async def file() -> Response:
-        return Response(content, media_type=kind)
-
-    return file

@@ -11,18 +11,13 @@ from perception.listening import names_this_machine
 from perception.serve.errors import problem
 from perception.serve.settings import ServeSettings
 
-OPEN = {"/", "/page.js", "/page.css", "/openapi.json", "/health"}
+OPEN = {"/openapi.json", "/health"}
 """Paths that need no token; without one, /health returns its status only."""
 _MAX_DROPPED = 8 << 20
 _HEADERS = [
     (b"x-content-type-options", b"nosniff"),
-    (b"referrer-policy", b"no-referrer"),
     (b"cache-control", b"no-store"),
-    (
-        b"content-security-policy",
-        b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
-        b"frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
-    ),
+    (b"content-security-policy", b"default-src 'none'; frame-ancestors 'none'"),
 ]
 
 Message = dict[str, Any]

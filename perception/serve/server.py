@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
-import shlex
 import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
 from perception.errors import missing_extra
 from perception.language.base import Encoder
 from perception.listening import listen, url_host
-from perception.query.crops import folders_needed
 from perception.query.engine import QueryEngine
 from perception.serve.settings import ServeSettings
 
@@ -53,7 +50,6 @@ def serve(
         (say or _say)(f"serving {path} at http://{url_host(settings.host)}:{sock.getsockname()[1]} (Ctrl-C stops)")
         if (trouble := engine.current.problem) is not None:
             (say or _say)(f"warning: prompts cannot be answered: {trouble}")
-        threading.Thread(target=_tell_photos, args=(engine, settings, say or _say), daemon=True).start()
         connections = Connections(settings.timeout, _TOTAL_TIMEOUT)
         config = uvicorn.Config(
             connections.watched(build_app(engine, settings)),
@@ -66,12 +62,6 @@ def serve(
             timeout_graceful_shutdown=max(1, round(settings.timeout)),
         )
         uvicorn.Server(config).run(sockets=[sock])
-
-
-def _tell_photos(engine: QueryEngine, settings: ServeSettings, say: Callable[[str], None]) -> None:
-    """Reports folders of photos that are not shown. In its own thread, because the photos' disk may hang."""
-    for folder in folders_needed(engine.current, (engine.path, *settings.photos))[:3]:
-        say(f"note: photos in {folder} are not shown; --photos {shlex.quote(str(folder))} would show them")
 
 
 def _say(line: str) -> None:

@@ -37,7 +37,7 @@ class Viewer:
         with contextlib.ExitStack() as undo:
             sock = undo.enter_context(listen(host, port))
             # Local users may see any photo. Remote users see only those in the map's folder: a map may name any file.
-            self.session = Session(path, None if is_local(host) else (path,))
+            self.session = Session(path, None if is_local(host) else path)
             label = f"perception · {path.name}"
             self.server = guarded_server(Guard(token, host), sock, host=host, port=port, label=label, verbose=False)
             undo.pop_all()  # the server owns the socket from here on

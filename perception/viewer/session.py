@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +22,10 @@ CROP_SIDE = 320
 class Session:
     """The state shared by all browsers of one viewer: they see the same map, and edits are applied one at a time."""
 
-    def __init__(self, path: Path, folders: Sequence[Path] | None = None):
-        """folders: where photos may be read, None = anywhere (see `best_crop`)."""
+    def __init__(self, path: Path, inside: Path | None = None):
+        """inside: the folder where photos may be read, None = anywhere (see `best_crop`)."""
         self.editor = Editor(path)
-        self.folders = folders
+        self.inside = inside
         self.mode = "photo"
         self.selected: list[int] = []
         self.part: int | None = None
@@ -170,7 +169,7 @@ class Session:
     def crop(self, instance: int) -> np.ndarray | None:
         """The crop of an instance from its best photo; None when no photo of it can be read."""
         try:
-            return best_crop(self._loaded(), instance, CROP_SIDE, self.folders)
+            return best_crop(self._loaded(), instance, CROP_SIDE, self.inside)
         except InputError:
             return None
 

@@ -15,7 +15,7 @@ from perception.bench import map as bench_map
 from perception.bench.map import Variant, pareto, run_sweep, settings_of, sweep_parser, variants
 from perception.bench.output import table
 from perception.cli import main
-from perception.config import MapConfig, load_config
+from perception.config import load_config
 from perception.errors import InputError
 from perception.evaluate import run_instances
 
@@ -37,23 +37,11 @@ def test_every_variant_is_a_valid_setting_of_its_own(tmp_path: Path) -> None:
     cells = variants()
     assert len({(v.group, v.name) for v in cells}) == len(cells)
     for cell in cells:
-        settings_of(cell, options_of(tmp_path))
+        load_config(None, settings_of(cell, options_of(tmp_path)), cell.preset)
 
 
 def options_of(scene: Path, *more: str) -> argparse.Namespace:
     return sweep_parser().parse_args([str(scene), "-o", str(scene / "out"), *more])
-
-
-def test_quick_runs_keep_their_number_of_densifications(tmp_path: Path) -> None:
-    def config(preset: str, *more: str) -> MapConfig:
-        return load_config(None, settings_of(Variant("a", "b", preset=preset), options_of(tmp_path, *more)), preset)
-
-    plain, quick, rich = config("default"), config("default", "--quick"), config("quality", "--quick")
-    assert quick.train.iterations * 6 == plain.train.iterations < rich.train.iterations * 6
-    assert quick.train.iterations // quick.densify.every == pytest.approx(
-        plain.train.iterations // plain.densify.every, 1
-    )
-    assert (quick.photos.max_side, quick.train.budget, plain.densify.every) == (320, 20_000, 100)
 
 
 def test_an_interrupted_sweep_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

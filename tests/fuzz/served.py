@@ -49,7 +49,7 @@ class HttpTarget:
     decides = True
     memory = 1024
     words = (
-        "GET /", "POST /", "query", "instances/", "/crop.jpg", "?map_id=", "?side=", "?format=ply", "\n\n", "host: ",
+        "GET /", "POST /", "query", "instances/", "/points", "?map_id=", "?format=ply", "\n\n", "host: ",
         "content-type: application/json", '"text":', '"where":', '"near":', '"region":', '"frame":',
         '"from_map":', '"\\ud800"', "1e308", "1e-308", "NaN", "[[", "]]", "null", "true", "%00", "%ff", "\\u0000",
     )  # fmt: skip
@@ -84,7 +84,7 @@ class HttpTarget:
         ]
         head = "host: localhost\ncontent-type: application/json"
         asked = [f"POST /{route}\n{head}\n\n{json.dumps(body)}".encode() for route, body in bodies]
-        paths = ("", "health", "instances", "instances/1", "instances/1/points?format=ply", "openapi.json")
+        paths = ("health", "instances", "instances/1", "instances/1/points?format=ply", "openapi.json")
         return asked + [f"GET /{path}\nhost: localhost\n\n".encode() for path in paths]
 
     def _decided(self, data: bytes) -> bytes:
@@ -134,7 +134,7 @@ def _no_number(name: str) -> Any:
 def served_map() -> Target:
     """The map folders of the target `map`, opened for questions: what is answered is JSON of finite numbers."""
     from perception.query import load_map
-    from perception.query.crops import best_crop, folders_needed
+    from perception.query.crops import best_crop
     from perception.serve.points import encode
 
     target = map_store()
@@ -145,9 +145,8 @@ def served_map() -> Target:
         for hit in gmap.find():
             json.dumps([hit.to_json(), gmap.describe(hit.instance_id).to_json()], allow_nan=False)
             encode(gmap, hit.instance_id, "npz")
-            if best_crop(gmap, hit.instance_id, 32, (path,)) is not None:
+            if best_crop(gmap, hit.instance_id, 32, path) is not None:
                 raise AssertionError("a photo was read, and there is none")
-        folders_needed(gmap, (path,))
 
     target.read = read
     return target

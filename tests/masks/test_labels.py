@@ -227,11 +227,7 @@ def test_folder_that_cannot_be_written_is_one_clear_line(tmp_path):
         write_labels(tmp_path / "file" / "a.png", np.zeros((2, 2), np.int32))
 
 
-def test_configured_sam_is_what_auto_takes(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
-    monkeypatch.delenv("PERCEPTION_SAM", raising=False)
-    assert make_source("auto").name == "builtin"
-    (tmp_path / "perception").mkdir()
-    (tmp_path / "perception" / "config.toml").write_text("[masks]\nsam = 3\n")
-    with pytest.raises(InputError, match=r"masks\.sam is 3"):
+def test_auto_takes_the_sam_that_the_environment_names(tmp_path, monkeypatch):
+    monkeypatch.setenv("PERCEPTION_SAM", str(tmp_path / "none.onnx"))
+    with pytest.raises(InputError, match=r"none\.onnx"):
         make_source("auto")

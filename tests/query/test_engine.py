@@ -272,3 +272,16 @@ def _until(condition, seconds: float = 30.0) -> None:
     while not condition():
         assert time.monotonic() < end, "it never happened"
         time.sleep(0.01)
+
+
+def test_answers_that_hang_are_told(tmp_path: Path) -> None:
+    path = write_map_of(tmp_path / "a.gsmap", gaussians=50)
+    end = threading.Event()
+    with QueryEngine(path, watch=None, workers=1, timeout=0.05, encoders=encoders) as engine:
+        assert engine.health()["status"] == "ok"
+        future = engine.run(lambda gmap: end.wait(60))
+        while engine.health()["status"] == "ok":
+            end.wait(0.01)
+        assert "longer than 0.05 s" in engine.health()["problem"]
+        end.set()
+        assert future.result(60)
