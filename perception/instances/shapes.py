@@ -4,7 +4,7 @@ An image classifier does not recognise walls and floors, but a map has geometry:
 planes, the lowest surface, flat objects on a wall. All lengths are relative to the scene's own, so no metric scale is
 needed. ramp(x; p, q) rises linearly from 0 at p to 1 at q; [·] is 1 if true, else 0. Of each instance:
 
-    n, z, a, t: normal, height of the centre, area and thickness of its best plane; h: its height from low to high
+    n, z, a, t: normal, height of the centre, covered area and thickness of its best plane; h: from low to high
     top, s, rests: height and share of points of its fullest horizontal slab, and the number of smaller objects on it
     gap: distance to the nearest parallel wall
 
@@ -17,10 +17,10 @@ Of the scene:
 Scores:
 
     flat = ramp(t; .35, .2)   level = flat ramp(|n_z|; .85, .95)   upright = flat ramp(|n_z|; .3, .15)
-    wall = upright ramp(a / a_up; .15, .35) ramp(h; .2 span, .4 span)
+    wall = upright ramp(a / a_up; .15, .35) ramp(a / a_max; .05, .15) ramp(h; .2 span, .4 span)
     picture = upright (1 − wall) ramp(gap / span; .1, .05)
-    floor = level [the largest of those at the ground]
-    rug = level [on the ground, not the floor] ramp(a; a_typ, 2 a_typ)
+    floor = level [at the ground] a / (largest a of those): a floor may be in pieces
+    rug = level [on the ground, not the largest] ramp(a; a_typ, 2 a_typ); ½ for the largest, which may be carpeted
     ceiling = level ramp(z; e, e + .1 span) ramp(a; .1 a_max, .3 a_max)
     table = [upright < ½] ramp(s; .25, .45) ramp(a; a_typ, 3 a_typ) (½ + ½ ramp(rests; 0, 2))
             · ramp(top; e + .05 span, e − .05 span) · ramp(top; ground + .05 span, ground + .12 span)
@@ -73,8 +73,7 @@ def shape_scores(
     up direction is unknown, only "ball" is scored.
     """
     scores = np.zeros((len(wanted), len(KINDS)))
-    known = gravity is not None and gravity.confident
-    up = -gravity.direction if gravity is not None and known else up_from_cameras(camera_from_world)
+    up = up_from_cameras(camera_from_world) if gravity is None else -gravity.direction
     frame = level_frame(np.array([0.0, 0.0, 1.0]) if up is None else up)
     measured = [measure(means[instance_ids == i] @ frame.T) for i in wanted]
     rows = [n for n, body in enumerate(measured) if body is not None]
@@ -102,7 +101,7 @@ def measure(points: np.ndarray) -> Body | None:
     """A Body from points [P, 3] in a frame with z up; None for fewer than LEAST points.
 
     thickness = Q(n) / √(Q(u) Q(v)), Q: interquartile range along the plane's normal n and its axes u, v.
-    area = E(u) E(v), E: extent from the 3rd to the 97th percentile.
+    area: see `covered_area`.
     """
     if len(points) < LEAST:
         return None
@@ -111,15 +110,24 @@ def measure(points: np.ndarray) -> Body | None:
     margin = 0.05 * (high - low) + 1e-9
     points = points[((points >= low - margin) & (points <= high + margin)).all(axis=1)]
     center = np.median(points, axis=0)
-    normal = _plane_normal(points, center)
+    normal = plane_normal(points, center)
     in_plane = level_frame(normal)
     local = (points - center) @ in_plane.T
     spread = np.percentile(local, 75, axis=0) - np.percentile(local, 25, axis=0)
-    extent = np.percentile(local, 97, axis=0) - np.percentile(local, 3, axis=0)
     thickness = spread[2] / max(float(np.sqrt(spread[0] * spread[1])), 1e-9)
     top, share, footprint = _slab(points)
-    area = float(extent[0] * extent[1])
+    area = covered_area(local[:, :2])
     return Body(points, center, normal, float(thickness), area, float(low[2]), float(high[2]), top, share, footprint)
+
+
+def covered_area(flat: np.ndarray) -> float:
+    """Area of the square cells that hold points [P, 2] of a plane, without the outer 3 %: of a strip along two walls
+    its own, not that of its rectangle. Evenly spread points have 3 in a cell."""
+    low, high = np.percentile(flat, [3, 97], axis=0)
+    rectangle = float((high - low).prod())
+    side = max(np.sqrt(3 * rectangle / len(flat)), 1e-9)
+    kept = flat[((flat >= low) & (flat <= high)).all(axis=1)]
+    return min(rectangle, float(len(np.unique(np.floor((kept - low) / side), axis=0)) * side**2))
 
 
 def roundness(points: np.ndarray) -> float:
@@ -188,19 +196,19 @@ def room_scores(bodies: list[Body], e: float) -> dict[str, np.ndarray]:
     gap = np.array([min((_gap(body, w) for w in walls if w is not body), default=np.inf) for body in bodies])
     rests = np.array([sum(_rests_on(other, body, span) for other in bodies if other is not body) for body in bodies])
     raised = np.where(floor, 0.5, ramp(top, ground + 0.05 * span, ground + 0.12 * span) if known else 1.0)
-    wall = upright * ramp(a / a_up, 0.15, 0.35) * ramp(high - low, 0.2 * span, 0.4 * span)
+    wall = upright * ramp(a / a_up, 0.15, 0.35) * ramp(a / a_max, 0.05, 0.15) * ramp(high - low, 0.2 * span, 0.4 * span)
     table = ramp(s, 0.25, 0.45) * ramp(a, a_typ, 3 * a_typ) * (0.5 + 0.5 * ramp(rests, 0, 2))
     return {
         "wall": wall,
         "picture": upright * (1 - wall) * ramp(gap / span, 0.1, 0.05),
-        "floor": level * floor,
-        "rug": level * on_ground * ramp(a, a_typ, 2 * a_typ),
+        "floor": level * at_ground * a / max(a[floor].max(initial=0.0), 1e-9),
+        "rug": level * np.where(floor, 0.5, on_ground * ramp(a, a_typ, 2 * a_typ)),
         "ceiling": level * ramp(z, e, e + 0.1 * span) * ramp(a, 0.1 * a_max, 0.3 * a_max),
         "table": (upright < 0.5) * table * ramp(top, e + 0.05 * span, e - 0.05 * span) * raised,
     }
 
 
-def _plane_normal(points: np.ndarray, center: np.ndarray) -> np.ndarray:
+def plane_normal(points: np.ndarray, center: np.ndarray) -> np.ndarray:
     """Normal of the dominant plane of points: principal axes, refitted twice to the points nearest to the plane."""
     kept = points
     normal = np.array([0.0, 0.0, 1.0])

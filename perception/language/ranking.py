@@ -13,8 +13,9 @@ that resemble a present one (a laptop, a book) score above the probes. For encod
 must also be more likely than each phrase (LERF's relevancy, with the scale at which the model was trained in place of
 LERF's 10) and, where the model has a bias (SigLIP), likelier than not. Colour words are matched with measured
 colours, shape words (floor, wall, picture, ball: see `shape_words`) also with the measured shape, and all words with
-the texts printed on an instance (see `printed`; a quoted text must be there). In a metric map
-household things have their usual size (see `household`). A label set by the user counts as a name of the instance.
+the texts printed on an instance (see `printed`; a quoted text must be there). Household things are no floor, wall or
+ceiling and, in a metric map, of usual length and thickness (see `household`). A label set by the user counts as a name
+of the instance.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ from perception.errors import InputError
 from perception.language.base import Encoder, Part, check_texts, reading_of, unit_rows
 from perception.language.colors import color_match, color_words, without_color_words
 from perception.language.description import InstanceDescription
-from perception.language.household import household_thing, size_misfit
+from perception.language.household import household_thing, size_misfits
 from perception.language.printed import Printed, quoted_text
-from perception.language.shape_words import HINTS, KINDS, shape_kind
+from perception.language.shape_words import HINTS, KINDS, STUFF, shape_kind
 
 PRESENT = 0.8  # default minimum score of a hit; the probes are harder than typical absent objects (see bench)
 QUANTILE, NORMAL_QUANTILE = 0.8, 0.8416  # Φ(.8416) = .8
@@ -43,7 +44,9 @@ SHAPE_HINT = 2.0  # added to z for a full match of the kinds in HINTS, where sha
 COLOR_WEIGHT = 3.0  # difference in z between no and full match of colour: separates two objects of one kind
 QUOTED_WEIGHT = 10.0  # difference in z between an instance that bears the quoted text and one that does not
 PRINTED_WEIGHT = 4.0  # added to z if all words of the prompt are printed on the instance
-SIZE_WEIGHT = 1.0  # subtracted from z per factor of two that a thing is too small or too large, at most twice
+SIZE_WEIGHT = 2.0  # subtracted from z per factor of two that a thing is too small or too large, at most twice
+THICK_WEIGHT = 1.0  # the same where it is too thick
+STUFF_WEIGHT = 2.0  # subtracted from z of a floor, wall or ceiling for a household thing
 LABEL_MARGIN = 2.0  # subtracted from z of a label, where z is the similarity of label and prompt relative to the probes
 
 
@@ -79,7 +82,7 @@ class Ranker:
         extents: np.ndarray | None = None,
     ) -> None:
         """labels: the user's name of each instance, or None. shapes: returns scores [I, K] of `shape_words.KINDS`. It
-        is called when a prompt first names a shape. printed: the texts of the instances; None: not looked for.
+        is called at the first prompt. printed: the texts of the instances; None: not looked for.
         extents: [I, 3] sides of their boxes in metres; None if the map's scale is unknown.
         """
         if labels is not None and len(labels) != len(descriptions):
@@ -131,7 +134,8 @@ class Ranker:
         middle, spread = self._null
         z = (relevancy - middle) / spread - self._reading.margin + self._shape_bonus(text) + gain
         if self._extents is not None and (known := household_thing(text)):
-            z = z - SIZE_WEIGHT * np.minimum(size_misfit(self._extents, known.size), 2.0)
+            length, thickness = np.minimum(size_misfits(self._extents, known), 2.0)
+            z = z - SIZE_WEIGHT * length - THICK_WEIGHT * thickness
         if quoted is not None and self._printed is not None:
             z = z + QUOTED_WEIGHT * (self._printed.quoted(quoted) - 0.5)
         elif self._printed:
@@ -149,13 +153,17 @@ class Ranker:
         """Scores [I, K] of `shape_words.KINDS`; None if shapes are not available."""
         return None if self._measure_shapes is None else self._measure_shapes()
 
-    def _shape_bonus(self, text: str) -> np.ndarray | float:
-        """Contribution of the instances' shapes to z [I]; 0 if the prompt names no shape."""
-        kind = shape_kind(text)
-        if kind is None or self.shapes is None:
-            return 0.0
-        match = self.shapes[:, KINDS.index(kind)]
-        return SHAPE_HINT * match if kind in HINTS else SHAPE_WEIGHT * (match - 0.5)
+    def _shape_bonus(self, text: str) -> np.ndarray:
+        """Contribution of the instances' shapes to z [I]; 0 if the prompt names no shape and no household thing."""
+        kind, bonus = shape_kind(text), np.zeros(len(self._plain))
+        if self.shapes is None:
+            return bonus
+        if kind is not None:
+            match = self.shapes[:, KINDS.index(kind)]
+            bonus = SHAPE_HINT * match if kind in HINTS else SHAPE_WEIGHT * (match - 0.5)
+        if kind not in (*STUFF, "picture", "rug") and household_thing(text):
+            bonus -= STUFF_WEIGHT * self.shapes[:, [KINDS.index(stuff) for stuff in STUFF]].max(axis=1)
+        return bonus
 
     def _against_canonical(self, row: np.ndarray) -> np.ndarray:
         """LERF's relevancy [I]: probability of the prompt [1, D] against the best-matching canonical phrase."""

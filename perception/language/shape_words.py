@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 
 KINDS = ("floor", "ceiling", "wall", "table", "picture", "rug", "ball", "box")
+STUFF = ("floor", "ceiling", "wall")
 HINTS = ("ball", "box", "rug", "table")
 """Kinds for which shape supports the score but does not decide it: a ball may be flat, a box open, a desk covered."""
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from perception.language.ranking import Answer, Ranker
 
 Encoders = Callable[[str], Encoder | None]
+SAMPLES, TRIM = 1000, 0.05  # points per instance, and share of them left out, when its sides are measured
 REMEMBERED = 256
 """Number of prompts whose ranking is cached, because planners repeat the same prompts."""
 
@@ -107,8 +108,7 @@ class TextRanking:
             raise InputError(f"{self._gmap.path}: was mapped without an encoder; map again with language.encoder=conse")
         check_encoder(identity, encoder.identity)
         labels = [entry.get("label") for entry in self._gmap.instances]
-        extents = np.array([entry["obb"]["extent"] for entry in self._gmap.instances]).reshape(-1, 3)
-        sizes = extents if self._gmap.metric else None
+        sizes = extents(self._gmap) if self._gmap.metric else None
         return Ranker(descriptions, encoder, labels, self._shapes, printed_on(self._gmap), sizes)
 
     @cached_property
@@ -125,6 +125,23 @@ class TextRanking:
         gravity = self._gmap.info.get("gravity")
         down = None if gravity is None else Gravity.from_json(gravity)
         return shape_scores(index.points, owners, [entry["id"] for entry in self._gmap.instances], poses, down)
+
+
+def extents(gmap: Map) -> np.ndarray:
+    """[I, 3] sides of the instances along the axes of their boxes, or thinner: along the normal of their best plane;
+    without the outer TRIM of the points at either end, which stray in a map, and scaled as if spread evenly.
+    """
+    from perception.instances.shapes import plane_normal
+
+    sides = np.zeros((len(gmap.instances), 3))
+    for n, entry in enumerate(gmap.instances):
+        points = gmap.index.of(entry["id"]).astype(np.float64)
+        points = points[:: len(points) // SAMPLES + 1]
+        if len(points):
+            axes = np.vstack([entry["obb"]["rotation"], plane_normal(points, np.median(points, axis=0))])
+            a, b, c, thickness = np.diff(np.quantile(points @ axes.T, [TRIM, 1 - TRIM], axis=0), axis=0)[0]
+            sides[n] = np.array([a, b, min(c, thickness)]) / (1 - 2 * TRIM)
+    return sides
 
 
 def printed_on(gmap: Map) -> Printed | None:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from perception.language import household
 from perception.language.conse import class_names
 from perception.language.description import InstanceDescription
-from perception.language.household import household_thing, size_misfit
+from perception.language.household import Household, household_thing, size_misfits
 from perception.language.ranking import Ranker
+from perception.query.text_ranking import extents
 
 
 def test_every_line_names_known_classes_and_no_word_twice() -> None:
@@ -24,10 +27,11 @@ def test_every_line_names_known_classes_and_no_word_twice() -> None:
     assert len(words) == len(set(words)) > 450
     for line in lines:
         least, most = map(int, line[2].split("-"))
-        assert 0 < least < most < 1000 and set(line[1].split(", ")) <= firsts
+        assert 0 < least < most < 1000 and set(line[1].split(", ")) <= firsts and 0 < int(line[3]) <= most
         word = line[0].split(", ")[-1]
         known = household_thing(f"the big {word} on the table")
         assert known is not None and known.size == (least / 100, most / 100)
+        assert known.thickness == int(line[3]) / 100
         if word in named:  # its own class is better than what looks like it
             assert known.classes is None
             continue
@@ -44,7 +48,9 @@ def test_the_longest_ending_counts() -> None:
 
 def test_sizes_by_hand() -> None:
     extents = np.array([[0.1, 0.2, 0.1], [0.1, 0.8, 0.1], [0.05, 0.01, 0.0], [0, 0, 0]])
-    assert size_misfit(extents, (0.1, 0.2))[:3].tolist() == [0, 2, 1] and size_misfit(extents, (0.1, 0.2))[3] > 9
+    length, thickness = size_misfits(extents, Household(None, (0.1, 0.2), 0.05))
+    assert length[:3].tolist() == [0, 2, 1] and length[3] > 9
+    assert thickness.tolist() == [1, 1, 0, 0]
 
 
 class Same:
@@ -66,3 +72,16 @@ def test_of_two_alike_the_one_of_the_usual_size_is_the_mug() -> None:
     assert [n for n, _ in Ranker(things, Same(), extents=extents).rank("red mug").hits] == [1, 0]
     assert [n for n, _ in Ranker(things, Same(), extents=extents).rank("fridge").hits] == [0, 1]
     assert [n for n, _ in Ranker(things, Same()).rank("red mug").hits] == [0, 1]
+
+
+def test_sides_are_without_strays_and_thin_across_their_plane() -> None:
+    """A book of 20 × 30 × 2 cm that leans by 40° has those sides, whatever its box and a few points far off say."""
+    rng = np.random.default_rng(0)
+    turn = Rotation.from_euler("x", 40, degrees=True).as_matrix()
+    points = (rng.random((2000, 3)) - 0.5) * [0.3, 0.2, 0.02] @ turn.T
+    points[::100] *= 10
+    book = SimpleNamespace(
+        instances=[{"id": 7, "obb": {"rotation": np.eye(3).tolist()}}], index=SimpleNamespace(of=lambda _: points)
+    )
+    sides = extents(book)[0]  # type: ignore[arg-type]
+    assert sides[0] == pytest.approx(0.3, rel=0.05) and sides.min() == pytest.approx(0.02, rel=0.15)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perception.geometry import look_at
-from perception.instances.shapes import boxiness, roundness, shape_scores, up_from_cameras
+from perception.instances.shapes import boxiness, covered_area, roundness, shape_scores, up_from_cameras
 from perception.language.shape_words import KINDS, head_noun, shape_kind
 
 
@@ -116,6 +116,19 @@ def test_a_room_is_told_by_its_shapes_in_any_frame(seed: int) -> None:
     assert best["wall"] == {"wall n", "wall s", "wall e"} and best["picture"] == {"picture"}
     assert best["rug"] == {"rug"} and best["ball"] == {"ball"}
     assert "box" in best["box"] and not best["box"] & {"can", "ball", "cactus"}
+
+
+def test_a_floor_in_pieces_is_scored_by_what_each_covers_not_by_rectangles() -> None:
+    rng = np.random.default_rng(0)
+    along = [rng.random((1200, 2)) * [4, 0.1], rng.random((900, 2)) * [0.1, 3]]
+    strip = np.concatenate(along)[rng.permutation(2100)]
+    large, small = rng.random((3000, 2)) * [2, 2.8] + 0.15, rng.random((1500, 2)) * [1, 2.8] + [2.5, 0.15]
+    assert covered_area(large) == pytest.approx(5.6 * 0.94**2, rel=0.1) and 0.69 < covered_area(strip) < 3
+    flat = [np.column_stack([part, np.full(len(part), 0.002)]) for part in (large, small, strip)]
+    points = np.concatenate([*flat, at(box((1, 0.6, 0.7), rng), 1, 1, 0.01)])
+    ids = np.repeat(np.arange(4), [3000, 1500, 2100, 800])
+    floor = shape_scores(points, ids, [0, 1, 2, 3], poses(rng))[:, KINDS.index("floor")]
+    assert floor[0] == 1 and floor[1] == pytest.approx(0.5, rel=0.15) and floor[2] < 0.4 and floor[3] == 0
 
 
 def test_rolled_cameras_tell_no_up() -> None:
