@@ -26,7 +26,7 @@ from support.demo_truth import labels_of, load_truth, things
 pytestmark = pytest.mark.slow
 
 QUICK = [
-    *("--set", "train.iterations=300", "--set", "train.budget=5000", "--set", "densify.every=50"),
+    *("--set", "train.iterations=150", "--set", "train.budget=5000", "--set", "densify.every=25"),
     *("--set", "instances.min_cluster_size=15", "--set", "instances.min_samples=5"),
 ]
 TESTS = ["003.jpg", "009.jpg"]

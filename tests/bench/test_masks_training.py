@@ -10,12 +10,17 @@ from perception.bench.masks_training import fit, make_world, pairs_of, plain_rul
 from perception.demo.scene import make_photos
 
 
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory):
+    home = tmp_path_factory.mktemp("worlds") / "clutter_5"
+    return home, make_photos(home / "images", scene="clutter", views=8, width=160, height=120, seed=5, light_samples=2,
+                             truth_folder=home)  # fmt: skip
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("stereo", [False, True])
-def test_truth_of_a_worlds_voxels_against_the_true_points(tmp_path, stereo):
-    home = tmp_path / "clutter_5"
-    made = make_photos(home / "images", scene="clutter", views=8, width=160, height=120, seed=5, light_samples=2,
-                       truth_folder=home)  # fmt: skip
+def test_truth_of_a_worlds_voxels_against_the_true_points(photographed, stereo):
+    home, made = photographed
     world = make_world(home, stereo)
     distance, near = cKDTree(made.points).query(world.graph.surface.points)
     close = (distance < world.graph.surface.size) & (world.truth > 0)

@@ -80,7 +80,8 @@ def test_a_bench_maps_and_scores_a_scene(small_scene: Path, tmp_path: Path) -> N
     shutil.copytree(small_scene / "truth" / "masks_gt", scene / "masks_gt")
     for name in ("gt_points.ply", "scene.json"):
         shutil.copy(small_scene / "truth" / name, scene / name)
-    small = ["train.iterations=120", "train.budget=3000", "densify.every=20", "instances.min_cluster_size=15"]
+    small = ["train.iterations=60", "train.budget=3000", "densify.every=10", "instances.min_cluster_size=15"]
+    small.append("language.encoder=none")
     command = ["bench", "map", str(scene), "-o", str(out), "--only", "feature_dim 4"]
     assert main([*command, *(f"--set={pair}" for pair in small)]) == 0
     rows = json.loads((out / "map.json").read_text())["rows"]

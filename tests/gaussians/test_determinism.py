@@ -83,7 +83,7 @@ def test_so_is_one_of_more_gaussians_than_torch_gives_one_thread(small_scene: Pa
         frame["file_path"] = str(small_scene / frame["file_path"])
     source = tmp_path / "transforms.json"
     source.write_text(json.dumps({**cameras, "ply_file_path": str(tmp_path / "points.ply")}))
-    pairs = ["train.iterations=30", "train.budget=50000", "densify.every=10", "language.encoder=none"]
+    pairs = ["train.iterations=12", "train.budget=50000", "densify.every=4", "language.encoder=none"]
     pairs.append(f"masks=labels:{small_scene / 'labels'}")
     for number in (1, 2):
         threads(number)

@@ -24,7 +24,6 @@ from perception.io.store import read_map
 from perception.pipeline import checkpoint
 from perception.pipeline.demo import truth_in_map_frame
 from perception.pipeline.mapping import build_map
-from perception.pipeline.reporting import write_map_report
 from perception.pipeline.work_folder import work_folder
 from support.demo_truth import load_truth
 from support.interrupts import interrupt_at
@@ -32,9 +31,9 @@ from support.interrupts import interrupt_at
 pytestmark = pytest.mark.slow
 
 SETTINGS = [
-    "train.iterations=400",
+    "train.iterations=200",
     "train.budget=6000",
-    "densify.every=50",
+    "densify.every=25",
     "instances.min_cluster_size=15",
     "instances.min_samples=5",
     "language.encoder=none",
@@ -49,7 +48,8 @@ def settings(scene: Path, *more: str):
 @pytest.fixture(scope="module")
 def finished(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("maps") / "small.gsmap"
-    build_map(small_scene / "transforms.json", path, settings(small_scene, "language.encoder=conse"))
+    words = ("language.encoder=conse", "language.views=1", "language.zooms=1")
+    build_map(small_scene / "transforms.json", path, settings(small_scene, *words))
     return path
 
 
@@ -127,10 +127,11 @@ def test_a_users_label_answers_to_its_name(finished: Path, tmp_path: Path) -> No
 
 
 def test_the_report_is_one_page_that_needs_nothing_else(finished: Path, tmp_path: Path) -> None:
-    page = write_map_report(perception.load_map(finished), tmp_path / "report.html", ["a ball"]).read_text()
+    out = tmp_path / "report.html"
+    assert main(["report", str(finished), "-o", str(out), "--ask", "a ball"]) == 0
+    page = out.read_text()
     assert "http" not in page.replace("http://www.w3.org", "")
     assert page.count("data:image") > len(read_map(finished).instances) // 2
-    assert main(["report", str(finished), "-o", str(tmp_path / "again.html")]) == 0
 
 
 def test_the_truth_is_brought_into_the_maps_frame(finished: Path, small_scene: Path) -> None:
@@ -150,21 +151,6 @@ def test_render_writes_every_kind(finished: Path, small_scene: Path, tmp_path: P
         assert len(list((tmp_path / kind).rglob("*.png"))) == 12
     depth = cv2.imread(str(next((tmp_path / "depth").rglob("*.png"))), cv2.IMREAD_UNCHANGED)
     assert depth.dtype == np.uint16 and 300 < np.median(depth[depth > 0]) < 3000  # metres in thousandths
-
-
-def test_the_same_seed_gives_the_same_map_whatever_the_threads(
-    finished: Path, small_scene: Path, tmp_path: Path
-) -> None:
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        build_map(small_scene / "transforms.json", tmp_path / "again.gsmap", settings(small_scene))
-    finally:
-        torch.set_num_threads(before)
-    for name in ("gaussians.ply", "features.npy", "instance_ids.npy"):
-        assert (finished / name).read_bytes() == (tmp_path / "again.gsmap" / name).read_bytes()
 
 
 def test_killed_and_resumed_is_the_run_that_was_never_killed(finished: Path, small_scene: Path, tmp_path: Path) -> None:
@@ -199,12 +185,12 @@ def test_killed_and_resumed_is_the_run_that_was_never_killed(finished: Path, sma
 
 def test_built_in_masks_are_made_from_the_maps_own_depth(small_scene: Path, tmp_path: Path) -> None:
     """They wait for the geometry, and a run that is interrupted around them ends in the same map."""
-    config = load_config(None, [*SETTINGS, "masks=builtin", "train.iterations=200"])
+    config = load_config(None, [*SETTINGS, "masks=builtin", "train.iterations=120"])
     whole = build_map(small_scene / "transforms.json", tmp_path / "whole.gsmap", config)
     assert whole.info["masks"]["source"] == "builtin" and whole.info["masks"]["photos"] == 10
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(checkpoint.TrainingObserver, "after_step", interrupt_at(150))
+        patch.setattr(checkpoint.TrainingObserver, "after_step", interrupt_at(90))
         build_map(small_scene / "transforms.json", tmp_path / "cut.gsmap", config)
     again = build_map(small_scene / "transforms.json", tmp_path / "cut.gsmap", config, resume=True)
     assert again.info["masks"]["skipped"] == 10
