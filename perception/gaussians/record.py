@@ -10,12 +10,16 @@ from dataclasses import dataclass, field
 
 @dataclass
 class TrainRecord:
-    """JSON-able. profile: wall-clock seconds by part. pairs: contributing (Gaussian, pixel) pairs over all renders."""
+    """JSON-able. profile: wall-clock seconds by part.
+
+    pairs, evaluated_pairs: (Gaussian, pixel) pairs of all training steps that contributed, that were computed.
+    """
 
     curve: list[dict[str, float]] = field(default_factory=list)
     decisions: list[str] = field(default_factory=list)
     profile: dict[str, float] = field(default_factory=dict)
     pairs: int = 0
+    evaluated_pairs: int = 0
     seconds: float = 0.0
     iterations: int = 0
     skipped_gradients: int = 0

@@ -23,7 +23,7 @@ from perception.gaussians.densify import Statistics
 from perception.gaussians.losses import depth_loss, instance_loss, photometric, variance_loss
 from perception.gaussians.model import Gaussians, sigmoid
 from perception.gaussians.optimiser import SparseAdam
-from perception.gaussians.rasterize import Rasterization, rasterize
+from perception.gaussians.rasterize import Rasterization, rasterize, torch_on_one_thread
 from perception.gaussians.rates import learning_rates
 from perception.gaussians.record import TrainRecord
 from perception.gaussians.schedule import Schedule
@@ -74,6 +74,7 @@ class Trainer:
         self.views, self.coarse = views, [view.halved() for view in views]
         self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
 
+    @torch_on_one_thread()
     def run(self, observer: Observer | None = None, until: float = 1.0) -> TrainRecord:
         """Trains until progress `until`. Early stopping is allowed only with until = 1."""
         self._since = time.monotonic()
@@ -131,6 +132,7 @@ class Trainer:
                 long_side = max(view.photo.shape[:2])
                 self.statistics.add(out.stats.mean2d_grad[0], out.stats.radii[0], out.visible[0], long_side)
         self.record.pairs += out.stats.contributing_pairs
+        self.record.evaluated_pairs += out.stats.evaluated_pairs
         self.iteration += 1
         return float(loss.detach())
 

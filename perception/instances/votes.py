@@ -15,7 +15,7 @@ import torch
 from scipy import sparse
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.rasterize import Settings, rasterize_backward, rasterize_forward
+from perception.gaussians.rasterize import Settings, rasterize_backward, rasterize_forward, torch_on_one_thread
 from perception.gaussians.train import TrainingView
 from perception.progress import Progress
 
@@ -73,6 +73,7 @@ class MaskVotes:
         return Table((gather @ self.weights).toarray(), (gather @ self.void).toarray(), self.view, self.area)
 
 
+@torch_on_one_thread()
 def mask_votes(
     gaussians: Gaussians,
     views: Sequence[TrainingView],

@@ -1,0 +1,52 @@
+"""Threads of torch and of the rasterizer while they take turns."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from perception.gaussians import rasterize as module
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch):
+    """Function that renders one Gaussian and returns the number of threads that the compiled core was asked for."""
+    import perception
+
+    before, found = torch.get_num_threads(), []
+    construct = module._core_function
+
+    def spy(name: str, tensor: torch.Tensor):
+        function = construct(name, tensor)
+        if name != "RasterizerInputs":
+            return function
+        return lambda *arguments: (found.append(arguments[14]), function(*arguments))[1]
+
+    monkeypatch.setattr(module, "_core_function", spy)
+
+    def render(**given) -> int:
+        one = torch.ones(1, 3)
+        quats, view, k = torch.ones(1, 4), torch.eye(4)[None], torch.eye(3)[None]
+        perception.rasterize(one, quats, one, torch.ones(1), one, view, k, 4, 4, **given)
+        return found[-1]
+
+    yield render
+    torch.set_num_threads(before)
+
+
+def test_the_rasterizer_keeps_the_threads_that_torch_gives_up(asked) -> None:
+    torch.set_num_threads(3)
+    assert asked() == 3
+    with module.torch_on_one_thread():
+        assert (torch.get_num_threads(), asked(), asked(threads=2)) == (1, 3, 2)
+        with module.torch_on_one_thread():
+            assert (torch.get_num_threads(), asked()) == (1, 3)
+        assert (torch.get_num_threads(), asked()) == (1, 3)
+    assert (torch.get_num_threads(), asked()) == (3, 3)
+
+
+def test_torch_gets_its_threads_back_after_an_error(asked) -> None:
+    torch.set_num_threads(2)
+    with pytest.raises(KeyError), module.torch_on_one_thread():
+        raise KeyError
+    assert (torch.get_num_threads(), asked()) == (2, 2)
