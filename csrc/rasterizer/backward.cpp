@@ -20,12 +20,12 @@ template <class T, bool FEATURES>
 struct ColorTile {
   static constexpr int kChunk = FEATURES ? 64 : 128;
   alignas(64) T px[16][16], py[16][16], transmittance[16][16];
-  alignas(64) T behind[16][16];                                               // R
-  alignas(64) T cotangent[16][4][16];                                         // of red, green, blue, depth
-  alignas(64) T products[FEATURES ? 16 : 1][FEATURES ? kChunk + 32 : 1][16];  // per granule and splat: first Σ_c e g,
-                                                                              // then the weights
-  uint32_t open;                                                              // granules with a pixel that takes light
-  uint32_t counts[16], done[16];                                              // splats listed, splats blended
+  alignas(64) T behind[16][16];                                              // R
+  alignas(64) T cotangent[16][4][16];                                        // of red, green, blue, depth
+  alignas(64) T products[FEATURES ? 16 : 1][FEATURES ? kChunk + 8 : 1][16];  // per granule and splat: first Σ_c e g,
+                                                                             // then the weights
+  uint32_t open;                                                             // granules with a pixel that takes light
+  uint32_t counts[16], done[16];                                             // splats listed, splats blended
   uint32_t lists[16][kChunk + 64];
   uint32_t splats[kChunk];      // of the chunk, those that touch a granule
   uint16_t masks[kChunk + 16];  // and which
@@ -38,40 +38,30 @@ struct BackwardTile : ColorTile<T, (NF > 0)> {
   alignas(64) T by_pixel[16][16][NF ? kRow : 1];    // the same, a row of channels a pixel
 };
 
-// Sum of NF (a power of two) numbers, in pairs; overwrites them.
-template <int NF, class T>
-inline T pairwise_sum(T *values) {
-  for (int half = NF / 2; half > 0; half /= 2)
-    for (int c = 0; c < half; ++c) values[c] += values[c + half];
-  return values[0];
-}
-
-// Feature channels of one pixel (COUNT of them, a constant NF but in the last slice): their cotangents in terms of
-// e = f - shift go to row (e, then e²). Returns what they add to R and, through `constant`, to the alpha channel.
+// Feature channels of one pixel (COUNT of them, a constant NF but in the last slice) with accumulated alpha a: their
+// cotangents in terms of e = f - shift go to row (e, then e²), what each adds to R to `behind`.
 template <class T, int NF, bool VAR, class Count>
-inline T load_pixel_features(int64_t at, Count count, const T *shift, T a, const Outputs<T> &out,
-                             const Cotangents<T> &grad, T *row, T &constant) {
-  T g[NF] = {}, sum[NF] = {}, behind[NF], steady[NF];
-  for (int c = 0; c < count; ++c) sum[c] = out.features[at + c];
-  if (grad.features)
-    for (int c = 0; c < count; ++c) g[c] = grad.features[at + c];
-  for (int c = 0; c < NF; ++c) behind[c] = g[c] * (sum[c] - shift[c] * a), steady[c] = g[c] * shift[c];
+inline void load_pixel_features(int64_t at, Count count, const T *shift, T a, const Outputs<T> &out,
+                                const Cotangents<T> &grad, T *row, T *behind) {
+  using C = Channels<T, NF>;
+  const C s = load_channels<NF>(shift, NF), sum = load_channels<NF>(out.features + at, count), e = sum - s * a;
+  C g = {};
+  if (grad.features) g = load_channels<NF>(grad.features + at, count);
+  C moving = g * e, constant = g * s;
   if constexpr (VAR) {
-    T v[NF] = {}, variance[NF] = {};
-    if (grad.variance)
-      for (int c = 0; c < count; ++c) v[c] = grad.variance[at + c], variance[c] = out.variance[at + c];
-    for (int c = 0; c < NF; ++c) {
-      const T e = sum[c] - shift[c] * a, twice = 2 * v[c] * (sum[c] - shift[c]);
-      const T square = variance[c] + e * e - (1 - a) * shift[c] * (shift[c] * a + 2 * e);  // Σ w e²
-      g[c] -= twice;
-      behind[c] += v[c] * square - twice * e;
-      steady[c] += v[c] * shift[c] * (shift[c] - 2 * sum[c]);
+    C v = {}, square = {};
+    if (grad.variance) {
+      v = load_channels<NF>(grad.variance + at, count), square = load_channels<NF>(out.variance + at, count);
+      square += e * e - (1 - a) * s * (s * a + 2 * e);  // Σ w e²
     }
-    for (int c = 0; c < NF; ++c) row[NF + c] = v[c];
+    const C twice = 2 * v * (sum - s);
+    g -= twice;
+    moving += v * square - twice * e;
+    constant += v * s * (s - 2 * sum);
+    store_channels(v, row + NF, NF);
   }
-  for (int c = 0; c < NF; ++c) row[c] = g[c];
-  constant += pairwise_sum<NF>(steady);
-  return pairwise_sum<NF>(behind);
+  store_channels(g, row, NF);
+  store_channels(moving - constant * (1 - a), behind, NF);
 }
 
 // Cotangents and R before the first splat of row `row`, `columns` of it inside the image (a constant 16 but at the
@@ -98,12 +88,19 @@ inline void load_row(const Inputs<T> &in, const T *background, int64_t pixel, in
         behind[i] += cotangent[3][i] * out.depths[pixel + i];
       }
   }
-  if constexpr (NF > 0)
-    for (int i = 0; i < columns; ++i)
-      behind[i] += load_pixel_features<T, NF, VAR>(
-          (pixel + i) * in.dims + slice.begin, count, shift, out.alphas[pixel + i], out, grad,
-          tile.by_pixel[(row >> 2) * 4 + (i >> 2)][(row & 3) * 4 + (i & 3)], constant[i]);
   for (int i = 0; i < columns; ++i) behind[i] -= constant[i] * (1 - out.alphas[pixel + i]);
+  if constexpr (NF > 0) {
+    alignas(64) T by_pixel[16][NF] = {}, by_channel[NF][16];
+    for (int i = 0; i < columns; ++i)
+      load_pixel_features<T, NF, VAR>((pixel + i) * in.dims + slice.begin, count, shift, out.alphas[pixel + i], out,
+                                      grad, tile.by_pixel[(row >> 2) * 4 + (i >> 2)][(row & 3) * 4 + (i & 3)],
+                                      by_pixel[i]);
+    transpose<16, NF>(by_pixel[0], by_channel[0]);
+    for (int half = NF / 2; half > 0; half /= 2)
+      for (int c = 0; c < half; ++c)
+        for (int i = 0; i < 16; ++i) by_channel[c][i] += by_channel[c + half][i];
+    for (int i = 0; i < 16; ++i) behind[i] += by_channel[0][i];
+  }
   row_to_granules(behind, row, [&](int g) { return tile.behind[g]; });
   for (int c = 0; c < 4; ++c) row_to_granules(cotangent[c], row, [&](int g) { return tile.cotangent[g][c]; });
 }
@@ -293,9 +290,11 @@ inline void store_record(const Worker<T> &w, int j, uint64_t slot, Scratch<T> &s
   const T *from = w.records.data() + static_cast<std::size_t>(j) * Tile::kRecord;
   const T *e = w.features.data() + static_cast<std::size_t>(j) * Tile::kRow;
   T *to = scratch.records.data() + slot * (kGeometry + NF);
-  for (int c = 0; c < kGeometry + NF; ++c) to[c] = from[c];
-  if constexpr (VAR)
-    for (int c = 0; c < NF; ++c) to[kGeometry + c] += 2 * e[c] * from[kGeometry + NF + c];
+  std::memcpy(to, from, (kGeometry + NF) * sizeof(T));
+  if constexpr (VAR) {
+    const auto moved = 2 * load_channels<NF>(e, NF) * load_channels<NF>(from + kGeometry + NF, NF);
+    store_channels(load_channels<NF>(from + kGeometry, NF) + moved, to + kGeometry, NF);
+  }
   scratch.touched[slot] = 1;
 }
 
@@ -309,6 +308,7 @@ void store_records(const Frame<T> &f, int index, const Worker<T> &w, Scratch<T> 
   for (int j = 0; j < w.n + kAhead; ++j) {
     uint64_t &slot = slots[j % kAhead];
     if (j >= kAhead && w.touched[j - kAhead]) store_record<T, NF, VAR>(w, j - kAhead, slot, scratch);
+    if (j + kAhead < w.n) __builtin_prefetch(&scratch.slots[w.source[j + kAhead]]);
     if (j >= w.n || !w.touched[j]) continue;
     const Splat<T> &s = w.splats[j];
     const uint64_t place = static_cast<uint64_t>(ty - s.y0) * (s.x1 - s.x0 + 1) + (tx - s.x0);
@@ -330,10 +330,9 @@ void backward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int 
   if constexpr (NF > 0) {
     for (int j = 0; j < w.n; ++j) {
       T *row = w.features.data() + static_cast<std::size_t>(j) * Tile::kRow;
-      for (int c = 0; c < NF; ++c) {
-        row[c] -= shift[c];
-        if constexpr (VAR) row[NF + c] = row[c] * row[c];
-      }
+      const auto e = load_channels<NF>(row, NF) - load_channels<NF>(shift, NF);
+      store_channels(e, row, NF);
+      if constexpr (VAR) store_channels(e * e, row + NF, NF);
       for (int c = Tile::kFeatures; c < Tile::kRow; ++c) row[c] = 0;
     }
     std::memset(w.features.data() + static_cast<std::size_t>(w.n) * Tile::kRow, 0, Tile::kRow * sizeof(T));

@@ -50,7 +50,7 @@ template <bool DEPTH, class T, bool FEATURES>
     red = fma(b.weight, P(s.r), red), green = fma(b.weight, P(s.g), green), blue = fma(b.weight, P(s.b), blue);
     if constexpr (DEPTH) depth = fma(b.weight, P(s.z), depth);
     if constexpr (FEATURES) b.weight.store(tile.weights[i - 1] + lane);
-    const uint32_t mask = bits(P(T(0)) < b.weight);
+    const uint32_t mask = bits(b.on);
     touched[at] |= static_cast<uint16_t>(mask);
     pairs += __builtin_popcount(mask);
     if (__builtin_expect(stopped, 0)) {
@@ -72,15 +72,12 @@ template <bool DEPTH, class T, bool FEATURES>
 template <class T, int NF, bool VAR>
 inline void blend_features(const T *features, int n, int g, ForwardTile<T, NF, VAR> &tile) {
   const uint32_t *list = tile.lists[g];
-  const T *shift = tile.shift[g];
+  const auto shift = load_channels<NF>(tile.shift[g], NF);
   for (int k = 0; k < n; ++k) {
-    const T *f = features + static_cast<std::size_t>(list[k]) * NF;
     T *row = tile.rows[k];
-    for (int c = 0; c < NF; ++c) {
-      const T e = f[c] - shift[c];
-      row[c] = e;
-      if constexpr (VAR) row[NF + c] = e * e;
-    }
+    const auto e = load_channels<NF>(features + static_cast<std::size_t>(list[k]) * NF, NF) - shift;
+    store_channels(e, row, NF);
+    if constexpr (VAR) store_channels(e * e, row + NF, NF);
     for (int c = NF * (VAR ? 2 : 1); c < kFeatureRow<T, NF, VAR>; ++c) row[c] = 0;
   }
   add_weighted_rows<kFeatureRow<T, NF, VAR>>(tile.weights[0], tile.rows[0], n, tile.features[g][0]);
@@ -136,17 +133,14 @@ void forward_tile(Worker<T> &w, bool depth, int x, int y, const uint32_t *list, 
 template <class T, int NF, bool VAR, class Count>
 inline void write_features(const T *sums, const T *shift, T t, Count count, T *features, T *variance) {
   const T a = 1 - t;
-  T sum[NF], var[NF];
-  for (int c = 0; c < NF; ++c) sum[c] = shift[c] * a + sums[c];
+  const auto s = load_channels<NF>(shift, NF), sum = load_channels<NF>(sums, NF);
+  store_channels(s * a + sum, features, count);
   if constexpr (VAR) {
-    const T inverse = a > 0 ? 1 / a : T(0);
-    for (int c = 0; c < NF; ++c) {
-      const T offset = sums[c] * inverse, mean = shift[c] + offset, m2 = sums[NF + c] - sums[c] * offset;
-      var[c] = (m2 > 0 ? m2 : T(0)) + a * t * mean * mean;
-    }
-    if (variance) std::memcpy(variance, var, count * sizeof(T));
+    if (!variance) return;
+    const auto offset = sum * (a > 0 ? 1 / a : T(0)), mean = s + offset;
+    const auto m2 = load_channels<NF>(sums + NF, NF) - sum * offset;
+    store_channels((m2 > 0 ? m2 : Channels<T, NF>{}) + a * t * mean * mean, variance, count);
   }
-  std::memcpy(features, sum, count * sizeof(T));
 }
 
 // Row `row` of a tile, `columns` of it inside the image (a constant 16 but at the right edge).
@@ -213,7 +207,7 @@ void forward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int i
     write_tile(in, camera, x0 + x, y0 + y, slice, tile, out);
   }
   for (int j = 0; j < w.n; ++j)
-    if (w.touched[j]) __atomic_store_n(&out.visible[in.n * camera + f.splats[w.source[j]].id], 1, __ATOMIC_RELAXED);
+    if (w.touched[j]) __atomic_store_n(&out.visible[in.n * camera + w.splats[j].id], 1, __ATOMIC_RELAXED);
 }
 
 }  // namespace

@@ -57,28 +57,27 @@ struct Blend {
   Pack<T> raw;     // alpha before the clamp
   Pack<T> weight;  // alpha T, 0 where the splat does not contribute
   Pack<T> next;    // transmittance behind
+  PackMask<T> on;  // where it contributes
 };
 
 // Pixels that would fall under the least transmittance stop before: px moves to kFar, `stopped` becomes true.
 template <class T>
 inline Blend<T> blend(const Splat<T> &s, Pack<T> &px, Pack<T> py, Pack<T> transmittance, bool &stopped) {
   using P = Pack<T>;
-  Blend<T> b;
-  const P dx = P(s.x) - px;
-  b.dy = P(s.y) - py;
-  b.u = fma(P(s.k), b.dy, dx);
-  const P e = fma(P(s.a) * b.u, b.u, fma(P(s.d) * b.dy, b.dy, P(s.log_opacity)));
-  b.raw = exp2_nonpositive(e);
-  b.weight = keep(e >= P(kLogThreshold<T>), min(b.raw, P(kMaxAlpha<T>)) * transmittance);
-  b.next = transmittance - b.weight;
-  const PackMask<T> stop = b.next < P(kMinTransmittance<T>);
+  const P dx = P(s.x) - px, dy = P(s.y) - py, u = fma(P(s.k), dy, dx);
+  const P e = fma(P(s.a) * u, u, fma(P(s.d) * dy, dy, P(s.log_opacity))), raw = exp2_nonpositive(e);
+  PackMask<T> on = e >= P(kLogThreshold<T>);
+  P weight = keep(on, min(raw, P(kMaxAlpha<T>)) * transmittance);
+  P next = transmittance - weight;
+  const PackMask<T> stop = next < P(kMinTransmittance<T>);
   if (__builtin_expect(any(stop), 0)) {
     stopped = true;
     px = select(stop, P(kFar<T>), px);
-    b.weight = select(stop, P(T(0)), b.weight);
-    b.next = select(stop, transmittance, b.next);
+    weight = select(stop, P(T(0)), weight);
+    next = select(stop, transmittance, next);
+    on = and_not(on, stop);
   }
-  return b;
+  return {u, dy, raw, weight, next, on};
 }
 
 // Bit i: pixel i of granule g of the 16x16 tile at (x, y) lies in the image.

@@ -15,6 +15,27 @@ constexpr int padded(int n) {
 template <class T, int NF, bool VAR>
 constexpr int kFeatureRow = padded<T>(NF * (VAR ? 2 : 1));
 
+// The N channels of a pixel or a splat, computed on together: GCC's vector type, of as many registers as it takes. The
+// same in loops over arrays stays scalar, as the compiler must assume that their memory overlaps.
+template <class T, int N>
+struct ChannelsOf {
+  typedef T type __attribute__((vector_size(N * sizeof(T))));
+};
+template <class T, int N>
+using Channels = typename ChannelsOf<T, N>::type;
+
+// Channels [0, count), count a constant N or fewer; the others are zero, or are left out.
+template <int N, class T, class Count>
+inline __attribute__((always_inline)) Channels<T, N> load_channels(const T *from, Count count) {
+  Channels<T, N> c = {};
+  std::memcpy(&c, from, count * sizeof(T));
+  return c;
+}
+template <class C, class T, class Count>
+inline __attribute__((always_inline)) void store_channels(const C &c, T *to, Count count) {
+  std::memcpy(to, &c, count * sizeof(T));
+}
+
 // [ROWS, COLUMNS] to [COLUMNS, ROWS], both multiples of 4.
 template <int ROWS, int COLUMNS, class T>
 void transpose(const T *from, T *to) {
@@ -62,12 +83,12 @@ void add_weighted_rows(const T *weights, const T *rows, int n, T *sums) {
   }
 }
 
-// out(k) = Σ_i left(k)[i] right[i] (or added to it) for i < INNER, rows of WIDTH numbers. n is rounded up to kRows:
-// left and out must take the rows that follow.
+// out(k) = Σ_i left(k)[i] right[i] (or added to it) for i < INNER, rows of WIDTH numbers. n is rounded up to at most 8
+// (more pointers than that leave the integer registers): left and out must take the rows that follow.
 template <int INNER, int WIDTH, bool ADD, class T, class Left, class Out>
 void multiply_rows(int n, Left &&left, const T *right, Out &&out) {
   using V = Vec<T>;
-  constexpr int kVectors = WIDTH / V::kLanes, kBlock = kRows<T, WIDTH>;
+  constexpr int kVectors = WIDTH / V::kLanes, kBlock = kRows<T, WIDTH> < 8 ? kRows<T, WIDTH> : 8;
   for (int k0 = 0; k0 < n; k0 += kBlock) {
     const T *from[kBlock];
     for (int k = 0; k < kBlock; ++k) from[k] = left(k0 + k);

@@ -16,6 +16,7 @@ struct TileRange {
 // How many tiles of a splat's box come before tile `tile` in row-major order.
 template <class T>
 inline __attribute__((always_inline)) uint64_t box_tiles_before(const Splat<T> &s, int tiles_x, int tile) {
+  if (tile == 0) return 0;
   auto within = [](int value, int limit) { return value < 0 ? 0 : value > limit ? limit : value; };
   const int width = s.x1 - s.x0 + 1, height = s.y1 - s.y0 + 1, row = tile / tiles_x - s.y0;
   const int in_row = row >= 0 && row < height ? within(tile % tiles_x - s.x0, width) : 0;

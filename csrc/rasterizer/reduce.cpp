@@ -115,6 +115,7 @@ void flush_block(const Inputs<T> &in, const Frame<T> &f, int camera, const T (*c
       for (int c = 0; c < 3; ++c) out.scales[3 * i + c] += b.out[7 + c][j];
     if (out.mean2d)
       for (int c = 0; c < 2; ++c) out.mean2d[2 * (in.n * camera + i) + c] += b.picture[c][j];
+    if (!out.viewmats) continue;
     for (int c = 0; c < 9; ++c) camera_sum[c] += g_R[c];
     for (int c = 0; c < 3; ++c) camera_sum[9 + c] += g_t[c];
   }
