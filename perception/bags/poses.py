@@ -85,17 +85,13 @@ def read_poses(bag: Bag, odometry: str | None = None) -> Poses:
         for entry in message.transforms:
             t, q = entry.transform.translation, entry.transform.rotation
             static = topic.rstrip("/").endswith("static")
-            poses.add(entry.header.frame_id, entry.child_frame_id, _time(entry), _matrix(t, q), static)
+            poses.add(entry.header.frame_id, entry.child_frame_id, stamp_of(entry), _matrix(t, q), static)
     topics = [odometry] if odometry else bag.of_type(ODOMETRY)
     for _, _, message in bag.messages(topics):
         pose = message.pose.pose
         child = message.child_frame_id or "base_link"
-        poses.add(message.header.frame_id, child, _time(message), _matrix(pose.position, pose.orientation))
+        poses.add(message.header.frame_id, child, stamp_of(message), _matrix(pose.position, pose.orientation))
     return poses
-
-
-def _time(message: Any) -> int:
-    return int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
 
 
 def _matrix(position: Any, quaternion: Any) -> np.ndarray:
