@@ -1,7 +1,7 @@
 """Reads and writes point clouds and meshes; the extension selects the format. Order and number of points are kept.
 
-PCD is the Point Cloud Library's format, version 0.7. pypcd4 1.5 is not used: it reads a file truncated at the end of a row
-as a smaller cloud, and allocates the size that a damaged header gives without a check.
+PCD is the Point Cloud Library's format, version 0.7. pypcd4 1.5 is not used: it reads a file truncated at the end of a
+row as a smaller cloud, and allocates the size that a damaged header gives without a check.
 """
 
 from __future__ import annotations
@@ -228,11 +228,8 @@ def _row_type(header: dict[str, list[str]], path: Path) -> tuple[np.dtype, int]:
         names, sizes, types = header["FIELDS"], header["SIZE"], header["TYPE"]
         counts = [int(c) for c in header.get("COUNT", ["1"] * len(names))]
         points = int(header["POINTS"][0] if "POINTS" in header else header["WIDTH"][0])
-        if (
-            not (len(names) == len(sizes) == len(types) == len(counts))
-            or not 0 <= points <= _PCD_MOST
-            or min(counts) < 1
-        ):
+        fits = len(names) == len(sizes) == len(types) == len(counts)
+        if not fits or not 0 <= points <= _PCD_MOST or min(counts) < 1:
             raise ValueError("FIELDS, SIZE, TYPE and COUNT disagree")
         fields: list[tuple] = []
         for i, (name, size, type_, count) in enumerate(zip(names, sizes, types, counts, strict=True)):
