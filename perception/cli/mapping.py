@@ -43,7 +43,6 @@ def _add_map(commands: Any) -> None:
     )
     for key, (metavar, text) in _SHORTCUTS.items():
         p.add_argument(f"--{key.rpartition('.')[2].replace('_', '-')}", metavar=metavar, help=text, dest=key)
-    p.add_argument("--labels-from", type=Path, metavar="OLD.gsmap", help="carry over the names given to its instances")
     p.add_argument("--resume", action="store_true", help="go on with an interrupted run")
 
 
@@ -89,9 +88,7 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.progress import Progress
 
     with sigterm_as_interrupt(), Progress() as progress:
-        gmap = build_map(
-            args.input, args.output, config, resume=args.resume, progress=progress, labels_from=args.labels_from
-        )
+        gmap = build_map(args.input, args.output, config, resume=args.resume, progress=progress)
         _write_own_report(args.output, progress)
 
     return map_facts(args.output, gmap.info, len(gmap), len(gmap.instances)), ""

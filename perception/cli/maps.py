@@ -17,7 +17,6 @@ def register(commands: Any) -> None:
     p.add_argument("id", type=int, nargs="?", metavar="ID", help="without one, the labels are listed")
     p.add_argument("text", nargs="?", metavar="NAME", help='such as "grandma\'s cup"')
     p.add_argument("--clear", action="store_true", help="take the name away")
-    p.add_argument("--from", type=Path, metavar="OLD.gsmap", dest="old", help="carry over the names of an older map")
     p = command(commands, "relink", _relink, "tell a map where its photos lie now")
     p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("folder", type=Path, metavar="DIR", help="the folder that holds the photos")
@@ -37,10 +36,8 @@ def register(commands: Any) -> None:
 
 
 def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    if sum((args.text is not None, args.clear, args.old is not None)) > 1:
-        raise InputError("label: give a NAME, --clear or --from, only one of them")
-    if args.old is not None:
-        return _transfer(args)
+    if args.text is not None and args.clear:
+        raise InputError("label: give a NAME or --clear, only one of them")
     if args.id is not None:
         return _set(args)
     if args.clear:
@@ -59,18 +56,6 @@ def _set(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     label = set_labels(args.map, {args.id: args.text})[args.id]
     said = f"instance {args.id} is called “{label}” now" if label else f"instance {args.id} has no name any more"
     return {"id": args.id, "label": label}, said
-
-
-def _transfer(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.instances.label_transfer import transfer_labels, transfer_text
-    from perception.io.store import read_map, set_labels
-
-    if args.id is not None:
-        raise InputError("label: --from carries all names over and takes no ID")
-    transfer = transfer_labels(read_map(args.old), read_map(args.map))
-    if transfer.labels:
-        set_labels(args.map, dict(transfer.labels))
-    return {"labels": transfer.labels, "dropped": [name for _, name in transfer.dropped]}, transfer_text(transfer)
 
 
 def _scale(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

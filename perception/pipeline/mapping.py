@@ -20,7 +20,6 @@ from perception.gaussians.depth_start import start_on_surface
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
 from perception.gaussians.transients import train_without_transients
-from perception.instances.label_transfer import transfer_labels, transfer_text
 from perception.io.inputs import load_saved_scene, load_scene, save_scene
 from perception.io.map_files import read_info
 from perception.io.map_views import stored_view
@@ -57,14 +56,12 @@ def build_map(
     *,
     resume: bool = False,
     progress: Progress | None = None,
-    labels_from: Path | None = None,
 ) -> Map:
     """Builds a map from photos, a video, a COLMAP workspace or a transforms.json, and writes it to `output`.
 
     Raises InputError for bad input. Intermediate results are kept beside `output` until the map is written; with
-    `resume` a run continues from them and repeats only what has changed (see `pipeline.checkpoint`). labels_from: a map
-    whose labels are transferred to instances at the same place. A run that fails before training leaves no files.
-    Resuming a finished run returns its map.
+    `resume` a run continues from them and repeats only what has changed (see `pipeline.checkpoint`). A run that fails
+    before training leaves no files. Resuming a finished run returns its map.
     """
     progress, stages, started = progress or Progress(quiet=True), Stages(), time.monotonic()
     if config.device == "cuda":
@@ -73,7 +70,6 @@ def build_map(
         progress.log(f"{output}: this run is finished")
         clear_work(output)
         return read_map(output)
-    labelled = None if labels_from is None else read_map(labels_from)
 
     with working(source, output, resume) as work:
         # Files and models are opened first, so that errors appear before hours of work.
@@ -142,8 +138,6 @@ def build_map(
             "peak_memory_mib": peak_memory_mib(),
         }
         gmap = _assemble(gaussians, found, scene, held_out, record, output)
-        if labelled is not None:
-            _transfer_labels(labelled, gmap, progress)
         write_map(output, gmap)
     _tell_result(gmap, output, progress)
     return gmap
@@ -262,14 +256,6 @@ def _assemble(
         language=found.language,
         parts=found.parts,
     )
-
-
-def _transfer_labels(old: Map, gmap: Map, progress: Progress) -> None:
-    transfer = transfer_labels(old, gmap)
-    for entry in gmap.instances:
-        entry["label"] = transfer.labels.get(entry["id"], entry["label"])
-    gmap.info["labels"] = {"carried": len(transfer.labels), "dropped": [name for _, name in transfer.dropped]}
-    progress.log(transfer_text(transfer))
 
 
 # ----------------------------------------------------------------------- words

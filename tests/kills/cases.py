@@ -96,7 +96,7 @@ class Case:
 
 
 class Mapping(Case):
-    """`perception map` of a folder of photos, names carried over from an earlier map that lies beside it."""
+    """`perception map` of a folder of photos."""
 
     name = "mapping"
     settings = (
@@ -109,39 +109,34 @@ class Mapping(Case):
         "photos.max_side=128",
     )
 
-    def __init__(self, source: Path, labels: Path, earlier: Path, iterations: int):
-        self.source, self.labels, self.earlier, self.iterations = source, labels, earlier, iterations
-        self.digest = ""
+    def __init__(self, source: Path, labels: Path, iterations: int):
+        self.source, self.labels, self.iterations = source, labels, iterations
 
     def lay_out(self, place: Path, trial: int) -> None:
-        shutil.copytree(self.earlier, place / "earlier.gsmap")
+        pass
 
-    def words(self, out: Path, earlier: Path | None) -> list[str]:
+    def words(self, out: Path) -> list[str]:
         """The command's arguments."""
         words = ["map", str(self.source), "-o", str(out), "--masks", f"labels:{self.labels}"]
-        words += ["--iterations", str(self.iterations), *(f"--set={pair}" for pair in self.settings)]
-        return words if earlier is None else [*words, "--labels-from", str(earlier)]
+        return [*words, "--iterations", str(self.iterations), *(f"--set={pair}" for pair in self.settings)]
 
     def work(self, place: Path, trial: int) -> int:
         from perception.pipeline import checkpoint
 
         checkpoint.CHECKPOINT_SECONDS = 0.2
-        return command(*self.words(place / "out.gsmap", place / "earlier.gsmap"))
+        return command(*self.words(place / "out.gsmap"))
 
     def again(self, place: Path, trial: int) -> int:
-        return command(*self.words(place / "out.gsmap", place / "earlier.gsmap"), "--resume")
+        return command(*self.words(place / "out.gsmap"), "--resume")
 
     def after_kill(self, place: Path, trial: int) -> str:
-        assert tree(place / "earlier.gsmap") == tree(self.earlier), "the map from before changed"
-        self.digest = self.digest or contents(self.earlier)
-        assert contents(place / "earlier.gsmap") == self.digest
         if not (place / "out.gsmap").exists():
             return "not yet"
         contents(place / "out.gsmap")
         return "whole"
 
     def result(self, place: Path, trial: int) -> Any:
-        assert names(place) == ["earlier.gsmap", "out.gsmap"], names(place)
+        assert names(place) == ["out.gsmap"], names(place)
         assert (place / "out.gsmap" / "report.html").read_text().rstrip().endswith("</html>")
         return contents(place / "out.gsmap"), names(place / "out.gsmap")
 
@@ -191,13 +186,13 @@ def _aside(name: str) -> bool:
 
 
 class Editing(Case):
-    """`perception label`, the viewer's corrections saved, and names carried over, in turns."""
+    """`perception label`, the viewer's corrections saved, in turns."""
 
     name = "editing"
-    variants = 3
+    variants = 2
 
-    def __init__(self, gmap: Path, older: Path):
-        self.gmap, self.older = gmap, older
+    def __init__(self, gmap: Path):
+        self.gmap = gmap
 
     def lay_out(self, place: Path, trial: int) -> None:
         shutil.copytree(self.gmap, place / "m.gsmap")
@@ -207,17 +202,16 @@ class Editing(Case):
         kinds: list[Callable[[], int]] = [
             lambda: command("label", path, 1, "grandma's cup"),
             lambda: corrections(path),
-            lambda: command("label", path, "--from", self.older),
         ]
-        return kinds[trial % 3]()
+        return kinds[trial % 2]()
 
     def again(self, place: Path, trial: int) -> int:
-        if trial % 3 == 1 and self.after_kill(place, trial) == "after":
+        if trial % 2 == 1 and self.after_kill(place, trial) == "after":
             return command("label", place / "m.gsmap", 0, "the table")  # what is merged cannot be merged again
         return self.work(place, trial)
 
     def after_kill(self, place: Path, trial: int) -> str:
-        now, whole = contents(place / "m.gsmap"), self.whole[trial % 3]
+        now, whole = contents(place / "m.gsmap"), self.whole[trial % 2]
         before = contents(self.gmap)
         assert now in (before, whole[0]), "neither the map from before nor the edited one"
         return "before" if now == before else "after"

@@ -105,16 +105,15 @@ def _cases(folder: Path, args: argparse.Namespace) -> dict[str, Case]:
         scene = folder / "scene"
         children.ask(lambda: _make_scene(scene))
     source = scene / "images" if args.sfm else scene / "transforms.json"
-    mapping = Mapping(source, scene / "labels", folder, args.iterations)
-    mapping.earlier = gmap = folder / "earlier.gsmap"
-    _do(lambda: command(*mapping.words(gmap, None)), folder)
+    mapping = Mapping(source, scene / "labels", args.iterations)
+    gmap = folder / "earlier.gsmap"
+    _do(lambda: command(*mapping.words(gmap)), folder)
     first = folder / "first"
     shutil.copytree(gmap, first / "m.gsmap")
     (first / "out").mkdir()
-    _do(lambda: command("label", first / "m.gsmap", 0, "an older name"), folder)
     exporting = Exporting(gmap, scene / "truth" / "gt_points.ply", first / "out")
     _do(lambda: exporting.export(first, "--no-smooth", "--color", "original"), folder)
-    return {"mapping": mapping, "exporting": exporting, "editing": Editing(gmap, first / "m.gsmap")}
+    return {"mapping": mapping, "exporting": exporting, "editing": Editing(gmap)}
 
 
 def _do(work: Callable[[], int], folder: Path) -> float:
@@ -184,7 +183,7 @@ def _check_forking(case: Mapping, folder: Path) -> None:
     place = folder / "fresh"
     place.mkdir()
     case.lay_out(place, 0)
-    words = case.words(place / "out.gsmap", place / "earlier.gsmap")
+    words = case.words(place / "out.gsmap")
     subprocess.run([sys.executable, "-m", "perception.cli", *words], check=True, cwd=folder, capture_output=True)
     assert children.ask(lambda: case.result(place, 0)) == case.whole[0], "a forked run differs from a fresh process"
     shutil.rmtree(place)
