@@ -75,7 +75,7 @@ def _eval_images(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _eval_masks(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.pipeline.scoring import score_masks
+    from perception.pipeline.rendering import score_masks
 
     return score_masks(args.map, args.truth, args.all_views)
 

@@ -18,34 +18,31 @@ from perception.evaluate.overlap import Overlap
 
 @dataclass
 class Matches:
-    """Result for one class at one threshold: scores of true and false positives, number of misses, matched pairs."""
+    """Result for one class at one threshold: scores of true and false positives, number of misses."""
 
     scores: list[float] = field(default_factory=list)
     positive: list[bool] = field(default_factory=list)
     misses: int = 0
     has_truth: bool = False
     has_prediction: bool = False
-    pairs: list[dict] = field(default_factory=list)
 
 
 def match(scenes: Sequence[Overlap], label: int, threshold: float, min_region: int) -> Matches:
     """Greedy matching of predictions and true instances of one class at one IoU threshold, over all scenes."""
     result = Matches()
-    for number, scene in enumerate(scenes):
+    for scene in scenes:
         preds = np.flatnonzero((scene.pred_classes == label) & (scene.pred_sizes >= max(min_region, 1)))
         truths = np.flatnonzero(scene.gt_classes == label)
         big = truths[scene.gt_sizes[truths] >= min_region]
         result.has_truth |= len(big) > 0
         result.has_prediction |= len(preds) > 0
         hit = scene.iou > threshold
-        _match_truth(scene, preds, big, hit, number, result)
+        _match_truth(scene, preds, big, hit, result)
         _unmatched(scene, preds, truths, hit, threshold, min_region, result)
     return result
 
 
-def _match_truth(
-    scene: Overlap, preds: np.ndarray, truths: np.ndarray, hit: np.ndarray, number: int, result: Matches
-) -> None:
+def _match_truth(scene: Overlap, preds: np.ndarray, truths: np.ndarray, hit: np.ndarray, result: Matches) -> None:
     used: set[int] = set()
     for g in truths.tolist():
         candidates = [p for p in preds[hit[preds, g]].tolist() if p not in used]
@@ -61,8 +58,6 @@ def _match_truth(
             best = max(best, score)
         result.scores.append(best)
         result.positive.append(True)
-        pair = {"scene": number, "pred": int(scene.pred_ids[candidates[0]]), "gt": int(scene.gt_ids[g])}
-        result.pairs.append(pair | {"iou": float(scene.iou[candidates[0], g])})
 
 
 def _unmatched(

@@ -158,21 +158,15 @@ def evaluate_overlaps(scenes: Sequence[Overlap], rules: Protocol) -> dict[str, A
     thresholds = [*rules.thresholds, *rules.extra_thresholds]
     labels = sorted({int(c) for scene in scenes for c in scene.gt_classes})
     table = np.full((len(labels), len(thresholds)), np.nan)
-    pairs: list[dict] = []
     for i, label in enumerate(labels):
         for j, threshold in enumerate(thresholds):
-            matches = match(scenes, label, threshold, rules.min_region)
-            table[i, j] = average_precision(matches)
-            if np.isclose(threshold, 0.5):
-                pairs += matches.pairs
+            table[i, j] = average_precision(match(scenes, label, threshold, rules.min_region))
     mean = _nanmean(table, axis=0)
     result: dict[str, Any] = _summary(mean, thresholds, len(rules.thresholds))
     result["per_threshold"] = [{"iou": round(t, 10), "ap": _number(a)} for t, a in zip(thresholds, mean, strict=True)]
     if rules.by_class:
         rows = {str(c): _summary(row, thresholds, len(rules.thresholds)) for c, row in zip(labels, table, strict=True)}
         result["classes"] = rows
-    result["matches_at_50"] = pairs
-    result["truth"] = [row for number, scene in enumerate(scenes) for row in _best(scene, number)]
     result["num_truth"] = sum(int((s.gt_sizes >= rules.min_region).sum()) for s in scenes)
     result["num_predictions"] = sum(int((s.pred_sizes >= max(rules.min_region, 1)).sum()) for s in scenes)
     result["protocol"] = rules.describe()
@@ -195,17 +189,3 @@ def _nanmean(values: np.ndarray, axis: int | None = None) -> Any:
 
 def _number(value: Any) -> float | None:
     return None if np.isnan(value) else float(value)
-
-
-def _best(scene: Overlap, number: int) -> list[dict[str, Any]]:
-    """For each true instance, the prediction with the largest IoU, ignoring classes."""
-    iou = scene.iou
-    rows = []
-    for g, gt_id in enumerate(scene.gt_ids.tolist()):
-        row: dict[str, Any] = {"scene": number, "gt": gt_id, "class": int(scene.gt_classes[g])}
-        row |= {"num_points": int(scene.gt_sizes[g]), "pred": None, "iou": 0.0}
-        if len(iou) and iou[:, g].max() > 0:
-            p = int(iou[:, g].argmax())
-            row |= {"pred": int(scene.pred_ids[p]), "iou": float(iou[p, g])}
-        rows.append(row)
-    return rows

@@ -82,14 +82,6 @@ def compact(ids: np.ndarray, void_ids: Sequence[int] = ()) -> tuple[np.ndarray, 
     if ids.ndim != 1 or ids.dtype.kind not in "iu":
         raise InputError(f"instance ids must be whole numbers [N]; found {ids.dtype} {list(ids.shape)}")
     ids = ids.astype(np.int64)
-    if len(ids) and 0 <= (high := int(ids.max())) < max(4 * len(ids), 1 << 16):  # lookup table instead of sorting
-        seen = np.zeros(high + 2, bool)  # the last entry represents all negative ids
-        seen[np.where(ids < 0, high + 1, ids)] = True
-        seen[[v for v in void_ids if 0 <= v <= high] + [high + 1]] = False
-        values = np.flatnonzero(seen)
-        lookup = np.full(high + 2, -1, np.int64)
-        lookup[values] = np.arange(len(values))
-        return lookup[np.where(ids < 0, high + 1, ids)], values
     values, index = np.unique(ids, return_inverse=True)
     valid = (values >= 0) & ~np.isin(values, list(void_ids))
     return np.where(valid, np.cumsum(valid) - 1, -1)[index], values[valid]

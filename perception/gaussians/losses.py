@@ -197,20 +197,20 @@ class _Prototypes(Function):
     """features [P, D] -> (L_pos, prototypes [M, D])."""
 
     @staticmethod
-    def forward(ctx: Any, features: Tensor, labels: LabelAssignment, per_pixel: bool) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, features: Tensor, labels: LabelAssignment) -> tuple[Tensor, Tensor]:
         count, width = len(labels.ids), features.shape[1]
         means = torch.empty(count, width, dtype=torch.float64)
         scatter = torch.empty(count, dtype=torch.float64)
         _kernels.prototypes(features, labels.slots, labels.counts, labels.first, means, scatter)
         pixels = labels.counts.to(torch.float64)
-        shares = 1 / pixels.sum().expand(count) if per_pixel else 1 / (count * pixels)
+        shares = 1 / (count * pixels)
         ctx.save_for_backward(features, means, shares)
         ctx.labels = labels
         return features.new_tensor(float((shares * scatter).sum())), means.to(features.dtype)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_pos: Tensor, grad_means: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, grad_pos: Tensor, grad_means: Tensor) -> tuple[Tensor, None]:
         # d L_pos / d F(p) = 2 share (F(p) − z): the part through z vanishes, as Σ_p (F(p) − z) = 0.
         features, means, shares = ctx.saved_tensors
         labels = ctx.labels
@@ -218,32 +218,29 @@ class _Prototypes(Function):
         push = grad_means.double() / labels.counts[:, None]
         out = torch.empty_like(features)
         _kernels.spread(features, labels.slots, means, pull, push, out)
-        return out, None, None
+        return out, None
 
 
 class _Separation(Function):
     @staticmethod
-    def forward(ctx: Any, z: Tensor, margin: float, squared: bool) -> Tensor:
+    def forward(ctx: Any, z: Tensor, margin: float) -> Tensor:
         a = z.detach().double().contiguous()
         gradient = torch.empty_like(a)
-        value = _kernels.separation(a, None, margin, squared, gradient, None)
+        value = _kernels.separation(a, None, margin, True, gradient, None)
         ctx.gradient = gradient.to(z.dtype)
         return z.new_tensor(value)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        return ctx.gradient * grad, None, None
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        return ctx.gradient * grad, None
 
 
-def separation_loss(prototypes: Tensor, margin: float = 1.0, squared: bool = True) -> Tensor:
-    """L_neg: mean over pairs i < j of ReLU(γ − ‖z_i − z_j‖²), or of ReLU(γ − ‖z_i − z_j‖) with squared=False.
-
-    prototypes: [M, D]. Without pairs the loss is 0. The gradient of ‖z‖ at 0 is 0.
-    """
+def separation_loss(prototypes: Tensor, margin: float = 1.0) -> Tensor:
+    """L_neg: mean over pairs i < j of ReLU(γ − ‖z_i − z_j‖²); prototypes [M, D]. Without pairs the loss is 0."""
     if prototypes.ndim != 2:
         raise InputError(f"separation loss: found {list(prototypes.shape)}, expected [M, D]")
-    return _Separation.apply(prototypes, float(margin), bool(squared))
+    return _Separation.apply(prototypes, float(margin))
 
 
 @dataclass(frozen=True)
@@ -268,8 +265,6 @@ def instance_loss(
     margin: float = 1.0,
     w_pos: float = 1.0,
     w_neg: float = 1.0,
-    per_pixel: bool = False,
-    squared: bool = True,
 ) -> InstanceLoss:
     """L_inst2D = w_p L_pos + w_n L_neg on a rendered feature map, as in the paper.
 
@@ -278,8 +273,8 @@ def instance_loss(
         L_neg = 2/(N (N − 1)) Σ_{i<j} ReLU(γ − ‖z_i − z_j‖²)
 
     features: [H, W, D] F. labels: [H, W] integers, 0 = unlabelled, or the result of `assign_labels`.
-    The authors' released code differs: per_pixel=True averages L_pos over all labelled pixels instead of per
-    mask, squared=False takes the distance unsquared in L_neg.
+    The authors' released code differs: it averages L_pos over all labelled pixels instead of per mask, and takes the
+    distance unsquared in L_neg.
     """
     if features.ndim != 3 or features.shape[2] < 1:
         raise InputError(f"instance loss: features are {list(features.shape)}, expected [H, W, D]")
@@ -290,8 +285,8 @@ def instance_loss(
         raise InputError(f"instance loss: labels and features have shapes {found}, expected [H, W] and [H, W, D]")
     _ready("features", features)
     flat = features.reshape(-1, features.shape[2]).contiguous()
-    pos, prototypes = _Prototypes.apply(flat, labels, per_pixel)
-    neg = separation_loss(prototypes, margin, squared)
+    pos, prototypes = _Prototypes.apply(flat, labels)
+    neg = separation_loss(prototypes, margin)
     return InstanceLoss(w_pos * pos + w_neg * neg, pos, neg, prototypes, labels.ids, labels.counts)
 
 

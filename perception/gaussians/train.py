@@ -165,14 +165,7 @@ class Trainer:
         total = losses.variance_weight * variance_loss(variance, losses.variance_form)
         if view.labels is None:
             return total
-        instance = instance_loss(
-            out.features[0],
-            view.labels,
-            margin=losses.margin,
-            per_pixel=losses.positive == "per-pixel",
-            squared=losses.negative == "squared",
-        )
-        return total + INSTANCE_WEIGHT * instance.value
+        return total + INSTANCE_WEIGHT * instance_loss(out.features[0], view.labels, margin=losses.margin).value
 
     def _rates(self, progress: float) -> dict[str, float | torch.Tensor]:
         return learning_rates(progress, self.extent, self.gaussians.sh.shape[1])

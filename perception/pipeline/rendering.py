@@ -1,4 +1,4 @@
-"""`perception render`: images of a map rendered from given cameras."""
+"""`perception render` and `perception eval masks`: images of a map from cameras, and how right its masks are."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from perception.errors import InputError
+from perception.evaluate.rendered import evaluate_rendered
 from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
 from perception.gaussians.train import depth_image
@@ -145,3 +146,19 @@ def _write(path: Path, image: np.ndarray) -> None:
         image = np.ascontiguousarray(image[..., ::-1])
     if not cv2.imwrite(str(path), image):
         raise InputError(f"{path}: cannot be written; choose a writable -o")
+
+
+def score_masks(map_path: Path, truth_dir: Path, all_views: bool = False) -> tuple[dict[str, Any], str]:
+    """mIoU of the map's rendered masks in its held-out views; in all its views with all_views or if none was held out.
+
+    truth_dir: one PNG per view, see `evaluate_rendered`. Returns (JSON-able result, table).
+    """
+    gmap = read_map(map_path)
+    views = map_views(gmap, held_out=not all_views)
+    result = evaluate_rendered(as_gaussians(gmap), gmap.instance_ids, views, truth_dir)
+    lines = [f"{'truth':>6}{'map':>6}{'views':>7}{'mIoU':>8}{'pooled':>8}"]
+    for row in result["instances"]:
+        name = "-" if row["pred"] is None else row["pred"]
+        lines.append(f"{row['gt']:>6}{name:>6}{row['views']:>7}{row['miou']:>8.3f}{row['pooled_iou']:>8.3f}")
+    lines.append(f"mIoU {result['miou']:.4f} over {len(result['instances'])} instances in {result['views']} views")
+    return result, "\n".join(lines)

@@ -13,6 +13,7 @@ from perception.errors import InputError
 from perception.evaluate.images import evaluate_images, psnr, run_images, ssim
 from perception.evaluate.instances import evaluate
 from perception.evaluate.labelled_clouds import run_instances
+from perception.evaluate.overlap import overlap_of_ids, read_truth
 from perception.io.cloud import write_cloud
 from perception.types import PointCloud
 
@@ -141,6 +142,7 @@ def test_two_hundred_by_two_hundred_on_a_million_points():
     pred = np.where(rng.random(1_000_000) < 0.3, rng.integers(0, 200, 1_000_000), gt - 1)
     result = evaluate(pred, {i: i / 200 for i in range(200)}, gt)
     assert result["num_truth"] == result["num_predictions"] == 200 and result["ap50"] == 1.0
+    overlap = overlap_of_ids(pred, None, read_truth(gt))
     counts = np.histogram2d(gt, pred, [np.arange(1, 202), np.arange(201)])[0]
     iou = counts / (counts.sum(axis=1)[:, None] + counts.sum(axis=0)[None] - counts)
-    np.testing.assert_allclose([row["iou"] for row in result["truth"]], iou.max(axis=1), rtol=1e-12)
+    np.testing.assert_allclose(overlap.iou.T, iou, rtol=1e-12)

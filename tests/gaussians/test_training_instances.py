@@ -10,18 +10,18 @@ from perception.errors import InputError
 from perception.gaussians.losses import assign_labels, instance_loss, variance_loss
 
 
-def torch_instance(features, labels, margin=1.0, per_pixel=False, squared=True):
+def torch_instance(features, labels, margin=1.0):
     ids = [int(i) for i in torch.unique(labels) if i != 0]
     if not ids:
         return features.sum() * 0, features.sum() * 0, features.new_zeros(0, features.shape[2])
     masks = [features[labels == i] for i in ids]
     z = torch.stack([m.mean(0) for m in masks])
     scatter = [((m - c) ** 2).sum(1) for m, c in zip(masks, z, strict=True)]
-    pos = torch.cat(scatter).mean() if per_pixel else torch.stack([s.mean() for s in scatter]).mean()
+    pos = torch.stack([s.mean() for s in scatter]).mean()
     count = len(ids)
     i, j = torch.triu_indices(count, count, 1)
     square = ((z[i] - z[j]) ** 2).sum(1)
-    hinge = torch.relu(margin - (square if squared else square.sqrt()))
+    hinge = torch.relu(margin - square)
     return pos, hinge.sum() * (2 / (count * (count - 1)) if count > 1 else 0), z
 
 
@@ -42,12 +42,10 @@ def compare(features, labels, tolerance=1e-12, **options):
     return ours
 
 
-@pytest.mark.parametrize("per_pixel", [False, True])
-@pytest.mark.parametrize("squared", [False, True])
 @pytest.mark.parametrize("depth", [1, 3, 8, 16, 32])
-def test_matches_the_equations(depth, per_pixel, squared):
+def test_matches_the_equations(depth):
     features, labels = scene(depth=depth)
-    compare(features, labels, per_pixel=per_pixel, squared=squared, margin=1.5)
+    compare(features, labels, margin=1.5)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -100,11 +98,10 @@ def test_features_far_from_zero_do_not_cancel():
     assert (gradient - expected).abs().max() < 1e-5 * expected.abs().max()
 
 
-@pytest.mark.parametrize("squared", [False, True])
-def test_equal_prototypes_have_a_finite_gradient(squared):
+def test_equal_prototypes_have_a_finite_gradient():
     features = torch.ones(4, 6, 3, dtype=torch.float64, requires_grad=True)
     labels = torch.arange(24).reshape(4, 6) % 2 + 1
-    loss = instance_loss(features, labels, squared=squared)
+    loss = instance_loss(features, labels)
     assert loss.neg.item() == 1
     assert torch.autograd.grad(loss.value, features)[0].abs().max() == 0
 
