@@ -1,6 +1,7 @@
-"""A map's instances against its scene's truth: `perception bench instances SCENE MAP`.
+"""Maps' instances against their scenes' truth: `perception bench instances SCENE MAP …`.
 
 AP with the map's scores and with constant ones, things and stuff together and apart, and mIoU of rendered masks.
+Reliability: of all instances with 100 points or more, the score, and whether the IoU with a true one exceeds 0.5.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from perception.bench.output import Column, bench_parser, finish, table
+from perception.bench.output import Column, bench_parser, parse_pairs, table
+from perception.bench.reliability import SCORED, finish_reliability
 from perception.errors import InputError
 from perception.types import PointCloud
 
@@ -40,8 +42,10 @@ def read_truth_cloud(scene: Path, means: np.ndarray) -> PointCloud:
 
 
 def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
-    """AP (protocol scannet, class-agnostic, exported labels with smoothing) and rendered mIoU against ground truth."""
+    """AP (protocol scannet, class-agnostic, exported labels with smoothing) and rendered mIoU against ground truth;
+    SCORED: score, IoU > 0.5 with a true one (0 or 1) of each instance with MIN_POINTS points or more."""
     from perception.evaluate.instances import evaluate
+    from perception.evaluate.overlap import overlap_of_ids, read_truth
     from perception.evaluate.rendered import rendered_miou
     from perception.export.transfer import export_labels
     from perception.io.store import read_map
@@ -59,10 +63,13 @@ def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
         for kind, scores in (("calibrated", confidence), ("constant", None)):
             result = evaluate(labels, scores, truth, ignore=ignore)
             rows[f"{name}, {kind}"] = {key: result[key] for key in ("ap", "ap50", "ap25")}
+    overlap = overlap_of_ids(labels, confidence, read_truth(truth))
+    scored = np.stack([overlap.pred_scores, overlap.iou.max(axis=1, initial=0) > 0.5], axis=1)
     return {
         "scene": str(scene),
         "map": str(map_path),
         "ap": rows,
+        SCORED: scored[overlap.pred_sizes >= MIN_POINTS].tolist(),
         "instances": len(gmap.instances),
         "truth": len(about),
         "parts": sum(len(entry.get("parts", [])) for entry in gmap.instances),
@@ -71,19 +78,20 @@ def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
     }
 
 
+MIN_POINTS = 100
 COLUMNS: tuple[Column, ...] = (("AP", "ap", ".3f"), ("AP50", "ap50", ".3f"), ("AP25", "ap25", ".3f"))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Prints the table; JSON goes to the output folder."""
-    parser = bench_parser("instances", __doc__)
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="folder with scene.json, gt_points.ply, masks_gt/")
-    parser.add_argument("map", type=Path, metavar="MAP", help="a map in the frame of the scene's transforms.json")
-    options = parser.parse_args(arguments)
-    result = score_map(options.scene, options.map)
-    rows = [{"instances": name, **row} for name, row in result["ap"].items()]
-    text = table(rows, COLUMNS, ("instances",)) + (
-        f"\n{result['instances']} instances ({result['parts']} parts) for {result['truth']} true ones, "
-        f"{result['noise_share']:.1%} of the Gaussians noise, rendered mIoU {result['rendered_miou']:.3f}"
-    )
-    finish("instances", options, result, text)
+    """Prints the tables; JSON and the picture go to the output folder."""
+    options, pairs = parse_pairs(bench_parser("instances", __doc__), "SCENE MAP", arguments)
+    results = [score_map(scene, gmap) for scene, gmap in pairs]
+    lines = []
+    for result in results:
+        rows = [{"instances": name, **row} for name, row in result["ap"].items()]
+        lines += [
+            table(rows, COLUMNS, ("instances",)),
+            f"{result['instances']} instances ({result['parts']} parts) for {result['truth']} true ones, "
+            f"{result['noise_share']:.1%} of the Gaussians noise, rendered mIoU {result['rendered_miou']:.3f}",
+        ]
+    finish_reliability("instances", options, results, lines, "scores")

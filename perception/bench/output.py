@@ -12,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from perception.errors import InputError
 from perception.io.atomic import atomic_file
 
 Column = tuple[str, str, str]
@@ -27,6 +28,17 @@ def bench_parser(name: str, about: str | None) -> argparse.ArgumentParser:
     parser.add_argument("-o", "--output", type=Path, default=folder, metavar="DIR", help=f"for results ({folder})")
     parser.add_argument("--json", action="store_true", help="print one JSON object in place of the table")
     return parser
+
+
+def parse_pairs(
+    parser: argparse.ArgumentParser, names: str, arguments: Sequence[str] | None
+) -> tuple[argparse.Namespace, list[tuple[Path, Path]]]:
+    """The options, and the arguments `names` (a map and its scene's folder) by twos; InputError for an odd number."""
+    parser.add_argument("paths", type=Path, nargs="+", metavar=names, help="a map and its scene's folder, in turns")
+    options = parser.parse_args(arguments)
+    if len(options.paths) % 2:
+        raise InputError(f"bench: expected {names} in turns, found {len(options.paths)} paths")
+    return options, list(zip(options.paths[::2], options.paths[1::2], strict=True))
 
 
 def table(rows: Sequence[dict[str, Any]], columns: Sequence[Column], heads: Sequence[str] = ("group", "name")) -> str:

@@ -1,25 +1,28 @@
-"""How well a finished map answers text on a scene with exact truth: `perception bench queries MAP SCENE`.
+"""How well finished maps answer text on scenes with exact truth: `perception bench queries MAP SCENE …`.
 
 A hit is right when the true object under most of the instance's exported points answers the prompt. Prompts
 are those of scene.json whose objects some photo shows. Absent prompts: 30 things of street, farm, sea and
-museum, and household things that the scene does not name, which are the harder half.
+museum, and household things that the scene does not name, which are the harder half. Reliability: over all prompts of
+all scenes, present and absent, the score of the best hit, and whether the prompt is one of the scene.
 """
 
 from __future__ import annotations
 
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from perception.bench.instances import read_scene, read_truth_cloud
-from perception.bench.output import bench_parser, finish
+from perception.bench.output import bench_parser, parse_pairs
+from perception.bench.reliability import SCORED, finish_reliability
 from perception.errors import InputError
-from perception.language.ranking import Ranker
+from perception.language.ranking import Answer, Ranker, answering
 from perception.query import QueryMap, load_map
+from perception.query.text_ranking import TextRanking
 
 # No word of these two lists may stand in language/probes.txt, which sets the threshold (there is a test).
 ABSENT = (
@@ -37,30 +40,26 @@ HOUSEHOLD = (
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Prints one figure per line. JSON goes to the output folder."""
-    parser = bench_parser("queries", __doc__)
-    parser.add_argument("map", type=Path, metavar="MAP", help="a map in the frame of the scene's transforms.json")
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="folder with scene.json and gt_points.ply")
-    options = parser.parse_args(arguments)
-    report = measure(options.map, options.scene)
-    shown = {key: ", ".join(map(str, value)) if isinstance(value, list) else value for key, value in report.items()}
-    finish("queries", options, report, "\n".join(f"{key:>26}: {value}" for key, value in shown.items()))
+    """Prints one figure per line; JSON and the picture go to the output folder."""
+    options, pairs = parse_pairs(bench_parser("queries", __doc__), "MAP SCENE", arguments)
+    reports, lines = [measure(gmap, scene) for gmap, scene in pairs], []
+    for report in reports:
+        shown = {key: ", ".join(map(str, value)) if isinstance(value, list) else value for key, value in report.items()}
+        lines += [f"{key:>26}: {value}" for key, value in shown.items() if key != SCORED]
+    finish_reliability("queries", options, reports, lines, "presence")
 
 
 def measure(map_path: Path, scene: Path) -> dict[str, Any]:
-    """All figures by name. The cold query runs first, before other queries fill the caches."""
+    """All figures by name."""
     queries, unseen = read_queries(scene)
-    start = time.perf_counter()
     opened = load_map(map_path)
-    opened.query("red mug")
-    cold = time.perf_counter() - start
     if not opened.instances:
         raise InputError(f"{map_path}: holds no instances; map again with masks")
     owners = true_objects(opened, scene)
     report: dict[str, Any] = {"map": str(map_path), "scene": scene.name, "instances": len(opened.instances)}
     report |= {"encoder": str(opened.language["encoder"]), "prompts": len(queries), "unseen_prompts": unseen}
-    report |= _figures(opened.ranker, owners, queries, read_words(scene))
-    return report | {"cold_ms": round(cold * 1e3, 1)} | latency(opened.ranker, [text for text, _ in queries])
+    report |= _figures(TextRanking(opened, opened.encoders).rank, owners, queries, read_words(scene))
+    return report | latency(opened.ranker, [text for text, _ in queries])
 
 
 def read_queries(scene: Path) -> tuple[list[tuple[str, set[int]]], int]:
@@ -92,21 +91,21 @@ def true_objects(opened: QueryMap, scene: Path) -> list[int]:
     return owners
 
 
-def _figures(ranker: Ranker, owners: list[int], queries: list[tuple[str, set[int]]], words: set[str]) -> dict[str, Any]:
+def _figures(
+    rank: Callable[[str], Answer], owners: list[int], queries: list[tuple[str, set[int]]], words: set[str]
+) -> dict[str, Any]:
     right = [{n for n, owner in enumerate(owners) if owner in ids} for _, ids in queries]
-    answers = [ranker.rank(text) for text, _ in queries]
+    answers = [rank(text) for text, _ in queries]
     found = [bool({i for i, _ in a.hits[:3]} & ids) for a, ids in zip(answers, right, strict=True)]
     top1, top3 = accuracy([[i for i, _ in a.hits] for a in answers], right)
-    chance1, chance3 = chance([len(ids) for ids in right], len(owners))
     near = [t for t in HOUSEHOLD if not {singular(w) for w in t.split()} & words]
-    wrong, wrong_near = ([t for t in texts if ranker.rank(t).present] for texts in (ABSENT, near))
+    absent = [rank(t) for t in (*ABSENT, *near)]
+    wrong, wrong_near = ([a.text for a in absent if a.present and a.text in texts] for texts in (ABSENT, near))
     return {
         "top1": top1,
         "top3": top3,
-        "random_top1": chance1,
-        "random_top3": chance3,
         "answered_present": round(float(np.mean([a.present for a in answers])), 3),
-        "present_and_in_top3": round(float(np.mean([a.present and f for a, f in zip(answers, found, strict=True)])), 3),
+        **returned([[owners[i] for i, _ in answering(a.hits)] for a in answers], [ids for _, ids in queries]),
         "absent_prompts": len(ABSENT),
         "false_positives": round(len(wrong) / len(ABSENT), 3),
         "household_absent_prompts": len(near),
@@ -114,6 +113,24 @@ def _figures(ranker: Ranker, owners: list[int], queries: list[tuple[str, set[int
         "false_positive_prompts": wrong + wrong_near,
         "failed_prompts": [text for (text, _), f in zip(queries, found, strict=True) if not f],
         "unmapped_prompts": [text for (text, _), ids in zip(queries, right, strict=True) if not ids],
+        SCORED: [(a.hits[0][1], n < len(answers)) for n, a in enumerate(answers + absent)],
+    }
+
+
+def returned(found: list[list[int]], true: list[set[int]]) -> dict[str, float]:
+    """Precision and recall of all returned hits, and the prompts' mean F1 = 2 · objects found / (hits + objects).
+
+    found: the true object under each returned hit; true: the objects that answer the prompt, each counted once.
+    """
+    pairs = list(zip(found, true, strict=True))
+    objects = [len(set(hits) & ids) for hits, ids in pairs]
+    right = sum(hit in ids for hits, ids in pairs for hit in hits)
+    f1 = [2 * n / (len(hits) + len(ids)) for n, (hits, ids) in zip(objects, pairs, strict=True)]
+    return {
+        "returned_hits": sum(map(len, found)),
+        "returned_precision": round(right / max(sum(map(len, found)), 1), 3),
+        "returned_recall": round(sum(objects) / max(sum(map(len, true)), 1), 3),
+        "returned_f1": round(float(np.mean(f1)), 3),
     }
 
 
@@ -134,15 +151,6 @@ def accuracy(ranked: list[list[int]], right: list[set[int]]) -> tuple[float, flo
     pairs = list(zip(ranked, right, strict=True))
     top1, top3 = (float(np.mean([bool(answers & set(order[:k])) for order, answers in pairs])) for k in (1, 3))
     return round(top1, 3), round(top3, 3)
-
-
-def chance(sizes: list[int], count: int) -> tuple[float, float]:
-    """The same two values expected for a random order: 1 − C(count − m, k) / C(count, k)."""
-
-    def hit(m: int, k: int) -> float:
-        return 1.0 - float(np.prod([(count - m - j) / (count - j) for j in range(min(k, count))]).clip(0))
-
-    return round(float(np.mean([hit(m, 1) for m in sizes])), 3), round(float(np.mean([hit(m, 3) for m in sizes])), 3)
 
 
 def singular(word: str) -> str:

@@ -35,6 +35,9 @@ def _add_export(commands: Any) -> None:
         help="points farther than D from any Gaussian stay -1 (auto: by the map's own spacing)",
     )
     p.add_argument("--segments", type=Path, metavar="X.segs.json", help="ScanNet's segments, or scannet: by its rules")
+    p.add_argument(
+        "--granularity", choices=("parts", "default", "groups"), default="default", help="parts of things, or groups"
+    )
     p.add_argument("--color", choices=("original", "instance"), default="original")
     p.add_argument("--mesh", type=Path, metavar="OUT", help="the map's surface as .ply or .glb (extra: open3d)")
     p.add_argument("--instance", type=int, metavar="ID", help="--mesh: the closed body of this one instead")
@@ -74,8 +77,8 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         if args.output is None:
             return facts, "\n".join(lines)
     options = ExportOptions(max_distance=args.max_distance, smooth=args.smooth, segments=args.segments)
-    place = args.transform or args.align
-    result, table = export_map(args.map, args.output, args.points, options, args.color, args.scannet, place)
+    how = (options, args.color, args.scannet, args.transform or args.align, args.granularity)
+    result, table = export_map(args.map, args.output, args.points, *how)
     return {**facts, **result}, "\n".join([*lines, table])
 
 

@@ -113,6 +113,7 @@ class Editor:
     def current(self) -> Map:
         """The edited map."""
         now = self._now
+        same = [entry["id"] for entry in now.instances] == [entry["id"] for entry in self.original.instances]
         return dataclasses.replace(
             self.original,
             instance_ids=now.ids,
@@ -120,6 +121,7 @@ class Editor:
             instances=list(now.instances),
             language=to_arrays(now.descriptions, self._encoder) if self._encoder else {},
             parts=self._parts_now(),
+            groups=self.original.groups if same else {},
         )
 
     def _parts_now(self) -> dict[str, np.ndarray]:

@@ -39,13 +39,15 @@ def write_export(
 
 
 def sidecar_of(labels: np.ndarray, instances: Instances) -> dict[str, Any]:
-    """{"instances": {"<id>": {"score", "label", "num_points"}}} of the instances that labels [P] name."""
+    """{"instances": {"<id>": {"score", "label", "num_points"}}} of the instances that labels [P] name; parts also have
+    their `parent`, groups the `instances` in them."""
     ids, counts = np.unique(labels[labels >= 0], return_counts=True)
     rows = {}
     for i, n in zip(ids.tolist(), counts.tolist(), strict=True):
         known = instances.get(i, {})
         score = float(known.get("score", 1.0))
-        rows[str(i)] = {"score": score, "label": known.get("label"), "num_points": n}
+        more = {key: known[key] for key in ("parent", "instances") if key in known}
+        rows[str(i)] = {"score": score, "label": known.get("label"), "num_points": n, **more}
     return {"instances": rows}
 
 

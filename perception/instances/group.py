@@ -29,21 +29,22 @@ LEAST = 4  # Gaussians; smaller groups are dropped even if masks support them
 
 @dataclass(frozen=True)
 class Grouping:
-    """ids [N] int32: −1 = none, 0 … K − 1 by falling size; membership [N] float32 in [0, 1], 0 for noise; raw [K] and
-    calibrated scores [K] in [0, 1]; found: evidence of the K instances.
+    """ids [N] int32: −1 = none, 0 … K − 1 by falling size; membership [N] float32 in [0, 1], 0 for noise; scores [K] in
+    [0, 1], calibrated.
 
     part_ids [N] int32: −1 = none, then K, K + 1, …; parents, part_scores, part_views: instance, score, views per part.
+    groups [K] int32: group of each instance, −1 = none; group_scores [G].
     """
 
     ids: np.ndarray
     membership: np.ndarray
-    raw: np.ndarray
     scores: np.ndarray
-    found: Evidence
     part_ids: np.ndarray
     parents: list[int] = field(default_factory=list)
     part_scores: list[float] = field(default_factory=list)
     part_views: list[int] = field(default_factory=list)
+    groups: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
+    group_scores: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
 
     @property
     def count(self) -> int:
@@ -141,12 +142,12 @@ def _scored(ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: Mask
     rename[before] = ids  # −1 for groups without members; the last entry is for id −1
     membership = memberships(ids, votes)
     found = evidence(votes.table(ids, int(ids.max(initial=-1)) + 1))
-    raw = raw_scores(ids, membership, found)
-    part_ids, owners, scores, views = _scored_parts(ids, parts, rename[:-1][parents], votes)
-    return Grouping(ids, membership, raw, calibrated(raw), found, part_ids, owners, scores, views)
+    calibrated_scores = calibrated(raw_scores(ids, membership, found))
+    part_ids, owners, scores, views = scored_parts(ids, parts, rename[:-1][parents], votes)
+    return Grouping(ids, membership, calibrated_scores, part_ids, owners, scores, views)
 
 
-def _scored_parts(
+def scored_parts(
     ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: MaskVotes
 ) -> tuple[np.ndarray, list[int], list[float], list[int]]:
     """Part ids, numbered after the instances, and per part: its instance, its score (mask agreement), its views."""

@@ -66,9 +66,9 @@ class Map:
     Arrays are float32: means [N, 3], quats [N, 4] wxyz, log_scales [N, 3], opacity_logits [N], sh [N, K, 3], as the PLY
     stores them; features [N, D], membership [N], and instance_ids [N] int32, −1 = none. instances: the list of
     instances.json. info: map.json without the views. views: the photos it was made from, sorted by name, `StoredView`
-    in a map read from disk. language, parts: named arrays (see io.store), possibly empty. index: the points of each
-    instance. Reading a field raises InputError naming the file when it is damaged. The folder may be replaced by
-    another map meanwhile. This type needs no torch; training uses `gaussians.model.Gaussians`, which holds the same
+    in a map read from disk. language, parts, groups: named arrays (see io.store), possibly empty. index: the points
+    of each instance. Reading a field raises InputError naming the file when it is damaged. The folder may be replaced
+    by another map meanwhile. This type needs no torch; training uses `gaussians.model.Gaussians`, which holds the same
     values as torch tensors.
     """
 
@@ -85,6 +85,7 @@ class Map:
     views: list[View] = field(default_factory=list)
     language: dict[str, np.ndarray] = field(default_factory=dict)
     parts: dict[str, np.ndarray] = field(default_factory=dict)
+    groups: dict[str, np.ndarray] = field(default_factory=dict)
     path: Path | None = None
     index: InstanceIndex = field(init=False)
     _files: MapFiles | None = field(default=None, init=False)
@@ -149,6 +150,23 @@ class Map:
         return {n.removeprefix(PART): array for n, array in self.parts.items() if n.startswith(PART)}
 
     @property
+    def group_language(self) -> dict[str, np.ndarray]:
+        """As `language`, for the groups; {} without groups or embeddings."""
+        return {n.removeprefix(PART): array for n, array in self.groups.items() if n.startswith(PART)}
+
+    @property
+    def group_ids(self) -> np.ndarray:
+        """[N] int32 group of each Gaussian, −1 = none. InputError when the groups do not fit the instances."""
+        ids = [entry["id"] for entry in self.instances]
+        owner = np.full(max(ids, default=0) + 2, -1, np.int32)
+        if self.groups:
+            of, scores = (self.groups.get(name, np.zeros(0)) for name in ("of", "scores"))
+            if of.shape != (len(ids),) or of.dtype.kind != "i" or not set(range(len(scores))) <= set(of.tolist()):
+                raise InputError(f"{self.path}: groups.npz does not fit the instances; the map is damaged")
+            owner[ids] = of
+        return owner[self.instance_ids]
+
+    @property
     def map_id(self) -> str:
         """Short identifier of the map and its labels; it changes when either changes."""
         return "unsaved" if self._files is None else self._files.map_id
@@ -198,4 +216,4 @@ class Map:
         return found
 
 
-_FIELDS = (*GAUSSIANS, "instances", "info", "views", "language", "parts")
+_FIELDS = (*GAUSSIANS, "instances", "info", "views", "language", "parts", "groups")

@@ -23,7 +23,7 @@ FORMAT_VERSION = 2
 READABLE = (1, 2)
 """Readable format versions. 1 stores the views in map.json and as arrays in cameras.npz, 2 in map.json only."""
 _ARRAYS = {"features": 2, "instance_ids": 1, "membership": 1}
-ARCHIVES = ("cameras", "language", "parts")
+ARCHIVES = ("cameras", "language", "parts", "groups")
 _TRIES = 5
 
 Signature = tuple[tuple[int, int, int], ...]
@@ -97,7 +97,7 @@ class MapFiles:
             return getattr(self, name)
         if name == "views":
             return views_of_facts(self.facts, self.path / FACTS, self._unpack("cameras"))
-        if name in ("language", "parts"):
+        if name in ("language", "parts", "groups"):
             return self._unpack(name)
         self._check_contents()
         if name in _ARRAYS:

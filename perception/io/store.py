@@ -9,6 +9,8 @@ features.npy    [N, D] float32      instance_ids.npy  [N] int32 (−1 = none)   
 language.npz    embeddings of each instance, with the identity of the encoder (absent without an encoder)
 parts.npz       ids [N] int32: the part each Gaussian belongs to (−1 = none; absent without parts). With an encoder also
                 language_*: as language.npz, one row per part in ascending id
+groups.npz      instances that may be one thing: of [I] int32, group of each instance in the order of instances.json,
+                −1 = none; scores [G] float32; language_* as in parts.npz (absent without groups)
 map.json also lists size and SHA-256 of the other files (`files`) and its own (`sha256`); see checksums.
 """
 
@@ -55,8 +57,9 @@ def write_map(path: Path, gmap: Map, keep_report: bool = False) -> None:
         np.save(folder / "membership.npy", gmap.membership.astype(np.float32))
         if gmap.language:
             np.savez_compressed(folder / "language.npz", **gmap.language)  # type: ignore[arg-type]
-        if gmap.parts:
-            np.savez_compressed(folder / "parts.npz", **gmap.parts)  # type: ignore[arg-type]
+        for name, arrays in (("parts", gmap.parts), ("groups", gmap.groups)):
+            if arrays:
+                np.savez_compressed(folder / f"{name}.npz", **arrays)  # type: ignore[arg-type]
         _dump(folder / EDITABLE, {"instances": gmap.instances})
         if keep_report and (path / REPORT).is_file():
             shutil.copy2(path / REPORT, folder / REPORT)

@@ -30,16 +30,16 @@ class Part:
 class Reading:
     """How an encoder's similarities are interpreted.
 
-    parts: slices of its embeddings; empty: one part. margin: required distance above the map's probe scores, in their
-    standard deviations. canonical: generic phrases that a prompt must exceed (LERF); empty for encoders whose sentence
-    embeddings do not describe images in general. zooms: best number of crops per view (3 in the paper). colors: it
-    knows colours, so that colour words stay in the prompt. scale: factor of a cosine in the model's log-odds (CLIP's
-    and SigLIP's logit_scale). even: cosine at which a text and a picture are as likely to belong together as not; None:
-    not known.
+    parts: slices of its embeddings; empty: one part. calibration: a and b of Φ(a z + b), the probability that the
+    thing is there, where z is the best hit's distance above the map's probes, see `ranking`. canonical: generic phrases
+    that a prompt must exceed (LERF); empty for encoders whose sentence embeddings do not describe images in general.
+    zooms: best number of crops per view (3 in the paper). colors: it knows colours, so that colour words stay in the
+    prompt. scale: factor of a cosine in the model's log-odds (CLIP's and SigLIP's logit_scale). even: cosine at which a
+    text and a picture are as likely to belong together as not; None: not known.
     """
 
     parts: tuple[Part, ...] = ()
-    margin: float = 0.0
+    calibration: tuple[float, float] = (1.0, 0.0)
     zooms: int = 3
     canonical: tuple[str, ...] = ()
     colors: bool = False

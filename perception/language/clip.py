@@ -83,7 +83,7 @@ class ClipEncoder:
     def reading(self) -> Reading:
         """LERF's canonical phrases, and the scale and bias of the model's log-odds where its graph gives logits.
 
-        No package ships trained weights to tune with: margin and zooms are the defaults.
+        No package ships trained weights to tune with: calibration and zooms are the defaults.
         """
         scale, bias = self._logits() or (CLIP_SCALE, None)
         even = None if bias is None else (PRIOR - bias) / scale

@@ -7,15 +7,17 @@ sum over the parts.
 
 Probes decide whether the best instance is good enough: LERF's canonical phrases (object, things, stuff, texture) and a
 list of objects that are rarely in a scene. Their best relevancies in this map are the distribution of "not present":
-    score_ti = Φ((x_ti − m) / s − margin),   m: their median,   s: chosen so that their 80 % quantile scores .8.
-Without margin, .8 means "fits better than four of five probes". `margin` is a property of the encoder: absent objects
-that resemble a present one (a laptop, a book) score above the probes. For encoders with canonical phrases, the prompt
-must also be more likely than each phrase (LERF's relevancy, with the scale at which the model was trained in place of
-LERF's 10) and, where the model has a bias (SigLIP), likelier than not. Colour words are matched with measured
-colours, shape words (floor, wall, picture, ball: see `shape_words`) also with the measured shape, and all words with
-the texts printed on an instance (see `printed`; a quoted text must be there). Household things are no floor, wall or
-ceiling and, in a metric map, of usual length and thickness (see `household`). A label set by the user counts as a name
-of the instance.
+    z_ti = (x_ti − m) / s,   m: their median,   s: chosen so that their 80 % quantile has Φ(z) = .8
+    score_ti = Φ(a z_ti + b)
+a and b are properties of the encoder, so that the best score is the probability that the thing is there: absent objects
+that resemble a present one (a laptop, a book) exceed the probes. Unknown, they are 1 and 0. An instance answers the
+prompt if it scores PRESENT or more and is at most BESIDE behind the best: "chair" has four answers, "red chair" one.
+For encoders with canonical phrases, the prompt must also be more likely than each phrase (LERF's relevancy, with the
+scale at which the model was trained in place of LERF's 10) and, where the model has a bias (SigLIP), likelier than not.
+Colour words are matched with measured colours, shape words (floor, wall, picture, ball: see `shape_words`) also with
+the measured shape, and all words with the texts printed on an instance (see `printed`; a quoted text must be there).
+Household things are no floor, wall or ceiling and, in a metric map, of usual length and thickness (see `household`). A
+label set by the user counts as a name of the instance.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from statistics import NormalDist
 
 import numpy as np
 
@@ -36,7 +39,8 @@ from perception.language.household import household_thing, size_misfits
 from perception.language.printed import Printed, quoted_text
 from perception.language.shape_words import HINTS, KINDS, STUFF, shape_kind
 
-PRESENT = 0.8  # default minimum score of a hit; the probes are harder than typical absent objects (see bench)
+PRESENT = 0.8  # default minimum score of an answer; the probes are harder than typical absent objects (see bench)
+BESIDE = 0.6  # largest difference in Φ⁻¹(score) to the best hit, of another one that answers the prompt too
 QUANTILE, NORMAL_QUANTILE = 0.8, 0.8416  # Φ(.8416) = .8
 BETA = 0.5  # fraction of the map's mean embedding that is subtracted
 SHAPE_WEIGHT = 6.0  # difference in z between no and full match of shape, for kinds that geometry alone decides
@@ -52,11 +56,19 @@ LABEL_MARGIN = 2.0  # subtracted from z of a label, where z is the similarity of
 
 @dataclass(frozen=True)
 class Answer:
-    """hits: (index of the instance, score in [0, 1]), best first. present: whether the best reaches the threshold."""
+    """hits: (index of the instance, score in [0, 1]), all instances, best first. present: whether any answers."""
 
     text: str
     hits: list[tuple[int, float]]
     present: bool
+
+
+def answering(hits: Sequence[tuple[int, float]], min_score: float | None = None) -> list[tuple[int, float]]:
+    """Those of `hits`, best first, that answer the prompt; with `min_score` those with at least this score."""
+    if min_score is None:
+        best = min(max([PRESENT, *(score for _, score in hits)]), 1 - 1e-9)
+        min_score = max(PRESENT, _phi(NormalDist().inv_cdf(best) - BESIDE))
+    return [(i, score) for i, score in hits if score >= min_score]
 
 
 @dataclass(frozen=True)
@@ -114,16 +126,15 @@ class Ranker:
         """A Ranker with the same encoder for other instances, without labels. shapes: as `self.shapes`, for these."""
         return Ranker(descriptions, self._encoder, shapes=None if shapes is None else lambda: shapes)
 
-    def rank(self, prompt: str, min_score: float | None = None, gain: np.ndarray | float = 0.0) -> Answer:
+    def rank(self, prompt: str, gain: np.ndarray | float = 0.0) -> Answer:
         """Scores every instance for one prompt; see the module docstring. gain: [I], added to z."""
         text = check_texts([prompt])[0]
-        least = PRESENT if min_score is None else min_score
         if not len(self._plain):
             return Answer(text, [], False)
         quoted = quoted_text(text) if self._printed is not None else None
         scores = self._scores(text if quoted is None else quoted[0], quoted and quoted[1], gain)
         hits = [(int(i), float(scores[i])) for i in np.argsort(-scores, kind="stable")]
-        return Answer(text, hits, hits[0][1] >= least)
+        return Answer(text, hits, bool(answering(hits)))
 
     def _scores(self, text: str, quoted: str | None = None, gain: np.ndarray | float = 0.0) -> np.ndarray:
         """Scores [I] for a prompt; quoted: what must be printed on the instance; gain: added to z."""
@@ -132,7 +143,7 @@ class Ranker:
         row = self._encode([text if kept else without_color_words(text)])
         relevancy = self._relevancy(row)[0]
         middle, spread = self._null
-        z = (relevancy - middle) / spread - self._reading.margin + self._shape_bonus(text) + gain
+        z = (relevancy - middle) / spread + self._shape_bonus(text) + gain
         if self._extents is not None and (known := household_thing(text)):
             length, thickness = np.minimum(size_misfits(self._extents, known), 2.0)
             z = z - SIZE_WEIGHT * length - THICK_WEIGHT * thickness
@@ -142,7 +153,8 @@ class Ranker:
             z = z + PRINTED_WEIGHT * self._printed.evidence(text)
         if colors:
             z = z + COLOR_WEIGHT * (color_match(self._palettes, colors) - 0.5)
-        scores = np.array([_phi(x) for x in z])
+        slope, offset = self._reading.calibration
+        scores = np.array([_phi(slope * x + offset) for x in z])
         if len(self._canonical):
             scores = np.minimum(scores, 2 * PRESENT * self._against_canonical(row))
         scores[~self.seen] = 0.0

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from perception.errors import InputError
-from perception.masks.merging import segments
+from perception.masks.merging import Segmentation, segmentation
 from perception.masks.stereo import measure_depths
 from perception.masks.stereo_views import StereoView, make_stereo_view
 from perception.masks.surface import Surface, SurfaceBuilder, to_world, voxel_side
@@ -49,21 +49,22 @@ class BuiltinSegmentation:
         load_photo: Callable[[View], np.ndarray],
         load_depth: Callable[[View], np.ndarray],
         progress: Progress | None = None,
-    ) -> None:
+    ) -> Segmentation | None:
         """Segments the surface seen by all photos jointly. load_depth: view -> [h, w] z-depth, 0 = none.
 
-        There are no segments if fewer than two photos have depth, or if no depths agree.
+        There are no segments, None, if fewer than two photos have depth, or if no depths agree.
         """
         made = [make_stereo_view(view, load_photo(view), load_depth(view)) for view in views]
         found = [view for view in made if view is not None]
         if len(found) < 2:
-            return
+            return None
         measure_depths(found, progress)
         surface = fuse(found)
         if len(surface) < _LEAST_VOXELS:
-            return
-        self._segment = segments(surface_graph(found, surface))
-        self._views = {view.name: view for view in found}
+            return None
+        cuts = segmentation(surface_graph(found, surface))
+        self._segment, self._views = cuts.segment, {view.name: view for view in found}
+        return cuts
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
         """[H, W] int32 labels of `photo` [H, W, 3], after `survey`. All 0 if the photo does not show the surface."""

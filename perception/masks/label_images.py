@@ -22,10 +22,12 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.documents import brief
 from perception.io.safe_names import safe_name
+from perception.masks.merging import Segmentation
 from perception.masks.source import GeometryMaskSource, MaskSource
 from perception.progress import Progress
 from perception.types import View
 
+SEGMENTATION = "segmentation.npz"
 _KEY = "perception-masks"
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -39,7 +41,8 @@ def compute_masks(
     load_depth: Callable[[View], np.ndarray] | None = None,
     depth_key: str = "",
 ) -> dict[str, Any]:
-    """Writes the label image of every view below `folder`, skipping up-to-date files. Returns a report.
+    """Writes the label image of every view below `folder`, skipping up-to-date files, and SEGMENTATION if the source
+    finds segments of a surface. Returns a report.
 
     load_photo: view -> [h, w, 3] uint8 RGB, undistorted. load_depth: view -> [h, w] z-depth, 0 = none; required by a
     GeometryMaskSource. depth_key: a string that changes whenever the depth changes.
@@ -51,7 +54,11 @@ def compute_masks(
         if load_depth is None:
             raise ValueError(f"masks from {source.name} need load_depth")
         if any(stored_key(label_file(folder, view)) != _key(view, source, depth_key) for view in views):
-            source.survey(views, load_photo, load_depth, progress)
+            found = source.survey(views, load_photo, load_depth, progress)
+            (folder / SEGMENTATION).unlink(missing_ok=True)
+            if found is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+                np.savez(folder / SEGMENTATION, **vars(found))
 
     def masks_of(view: View) -> tuple[int, bool]:
         """Number of masks in the view's label image, and whether it was there already."""
@@ -86,6 +93,15 @@ def compute_masks(
         "empty": empty,
         "warnings": warnings,
     }
+
+
+def load_segmentation(folder: Path) -> Segmentation | None:
+    """The segments of the surface that compute_masks found; None where the source finds none."""
+    file = folder / SEGMENTATION
+    if not file.is_file():
+        return None
+    with np.load(file) as stored:
+        return Segmentation(**stored)
 
 
 def label_file(folder: Path, view: View) -> Path:

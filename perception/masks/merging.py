@@ -17,14 +17,45 @@ from perception.masks.merge_model import MergeModel, packaged_model
 from perception.masks.surface_graph import SurfaceGraph
 
 SMALLEST = 2e-4  # area / (camera distance)² below which a patch joins a neighbour before all others do
+GROUP_COST = 0.4  # of an object, for groups
 _LARGE = 0.1  # area in the same unit, above which a flat segment can be a part of a floor, a wall or a table
 _FLAT = 0.03  # relative to depth: standard deviation of such a segment across its plane, including low objects on it
 _UNKNOWN = 9.0  # largest log odds of a feature, and those of merges inside a patch
 
 
-def segments(graph: SurfaceGraph) -> np.ndarray:
-    """[V] int32 segment of each voxel, numbered from 1 by falling size; 0 for small patches without neighbours."""
-    return divided(graph, tree_by(packaged_model(), graph), packaged_model())[0]
+@dataclass(frozen=True)
+class Segmentation:
+    """Three cuts of a surface of V voxels into segments, their parts, and groups of them.
+
+    points: [V, 3] float32, world frame. segment: [V] int32 of each voxel, numbered from 1 by falling size; 0 for small
+    patches without neighbours. part: [V] int32; each lies in one segment. group: [S + 1] int32 of each segment. The
+    others are probabilities that the IoU with an object exceeds 0.5: of segments [S + 1], parts and groups.
+    """
+
+    points: np.ndarray
+    segment: np.ndarray
+    probability: np.ndarray
+    part: np.ndarray
+    part_probability: np.ndarray
+    group: np.ndarray
+    group_probability: np.ndarray
+
+
+def segmentation(graph: SurfaceGraph) -> Segmentation:
+    """The cuts with the packaged model, at a third of its cost of an object, at its cost, and at GROUP_COST; such cuts
+    are nested."""
+    model = packaged_model()
+    tree = tree_by(model, graph)
+    segment, probability = divided(graph, tree, model)
+    odds = model.whole(tree.features).astype(np.float64)
+    p, sure = _logistic(odds).mean(axis=1), _logistic(model.calibration[0] * odds[:, 0] + model.calibration[1])
+    fine, coarse = (tree.cut(p - cost)[graph.patch] for cost in (model.cost / 3, GROUP_COST))
+    names, part = np.unique(segment * np.int64(len(p)) + fine, return_inverse=True)
+    votes = np.zeros((len(probability), len(p)), np.int32)
+    np.add.at(votes, (segment, coarse), 1)
+    groups, group = np.unique(votes.argmax(axis=1), return_inverse=True)
+    points = graph.surface.points.astype(np.float32)
+    return Segmentation(points, segment, probability, part, sure[names % len(p)], group, sure[groups])
 
 
 def tree_by(model: MergeModel, graph: SurfaceGraph) -> MergeTree:

@@ -12,6 +12,7 @@ import numpy as np
 from perception.config import SamConfig
 from perception.errors import InputError
 from perception.io.model_store import default_model
+from perception.masks.merging import Segmentation
 from perception.progress import Progress
 from perception.types import View
 
@@ -45,8 +46,9 @@ class GeometryMaskSource(MaskSource, Protocol):
         load_photo: Callable[[View], np.ndarray],
         load_depth: Callable[[View], np.ndarray],
         progress: Progress | None = None,
-    ) -> None:
-        """Processes all photos jointly, once. load_depth: view -> [h, w] z-depth, 0 = none."""
+    ) -> Segmentation | None:
+        """Processes all photos jointly, once. load_depth: view -> [h, w] z-depth, 0 = none. Returns the segments of
+        the surface whose numbers the label images hold, if it has any."""
         ...
 
 

@@ -33,6 +33,7 @@ def export_map(
     color: str = "original",
     scannet: Path | None = None,
     place: Path | bool = False,
+    granularity: str = "default",
 ) -> tuple[dict[str, Any], str]:
     """Labels a cloud, writes it and its sidecar JSON, and returns (JSON-able facts, table).
 
@@ -42,7 +43,8 @@ def export_map(
 
     color: of the written points, "original" or "instance". scannet: folder of a submission, too (scene = the output's
     stem). place: `points` lie in a frame of their own: True registers them (`export.align`), a path names a file with
-    map_from_scan [4, 4]. The result keeps that frame; the sidecar and the facts hold `map_from_scan`.
+    map_from_scan [4, 4]. The result keeps that frame; the sidecar and the facts hold `map_from_scan`. granularity: see
+    `at_granularity`.
     """
     if output.suffix.lower() not in SUFFIXES:
         raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected one of {', '.join(SUFFIXES)}")
@@ -52,6 +54,7 @@ def export_map(
         raise InputError("--align and --transform place a scan in the map; give it with --points")
     known = None if isinstance(place, bool) else read_transform(place)
     gmap = read_map(map_path)
+    ids, instances = at_granularity(gmap, granularity)
     given = None if points is None else read_cloud(points)
     placed = map_from_input(map_path, gmap.info)
     if points is None and not np.array_equal(placed[:3, :3], np.eye(3)):
@@ -69,12 +72,11 @@ def export_map(
     if given is None:  # every point is its own nearest Gaussian
         cloud, options = surface_points(gmap, means), ExportOptions(drop_noise=False, smooth=False)
     else:
-        cloud, options = given, resolved(options, means, gmap.instance_ids)
+        cloud, options = given, resolved(options, means, ids)
     inside = check_overlap(means, cloud.points)
-    labels = export_labels(means, gmap.instance_ids, cloud, options)
+    labels = export_labels(means, ids, cloud, options)
     if color == "instance":
         cloud = replace(cloud, colors=instance_palette(labels))
-    instances = {entry["id"]: entry for entry in gmap.instances}
     if scannet is not None:
         write_scannet(scannet, output.stem, labels, instances)
     sidecar = write_export(output, cloud, labels, instances, facts)  # last: where it is, everything was written
@@ -89,6 +91,27 @@ def export_map(
         **sidecar,
     }
     return result, _table(result)
+
+
+def at_granularity(gmap: Map, granularity: str) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
+    """Ids [N] int32, −1 = none, and the entry of each id: of "parts" (and instances, for what is in none), "default",
+    or "groups", with the id of the first of their `instances`. InputError where the map has no such level."""
+    entries = {entry["id"]: entry for entry in gmap.instances}
+    if granularity == "default":
+        return gmap.instance_ids, entries
+    if granularity == "parts" and "ids" in gmap.parts:
+        parts = {part["id"]: part for entry in gmap.instances for part in entry.get("parts", [])}
+        return np.where(np.isin(gmap.parts["ids"], list(parts)), gmap.parts["ids"], gmap.instance_ids), entries | parts
+    groups = gmap.group_ids
+    if granularity != "groups" or not (groups >= 0).any():
+        why = "only built-in masks that were unsure make them (parts also: photos that disagree)"
+        raise InputError(f"{gmap.path}: holds no {granularity} of instances; {why}; leave out --granularity")
+    ids = gmap.instance_ids.copy()
+    for group, score in enumerate(gmap.groups["scores"].tolist()):
+        members = np.unique(ids[groups == group]).tolist()
+        ids[groups == group] = members[0]
+        entries[members[0]] = {"label": None, "score": score, "instances": members}
+    return ids, entries
 
 
 def surface_points(gmap: Map, means: np.ndarray | None = None) -> PointCloud:

@@ -15,11 +15,14 @@ from perception.gaussians.train import TrainingView
 from perception.instances.crops import choose_views, view_scores
 from perception.instances.describe import describe_instances
 from perception.instances.group import Grouping, group
+from perception.instances.levels import with_levels
 from perception.instances.silhouettes import Silhouettes, render_silhouettes
 from perception.instances.texts import Reader, read_texts, store_texts
 from perception.instances.votes import mask_votes
+from perception.io.map import PART
 from perception.language.base import Encoder, reading_of
 from perception.language.description import to_arrays
+from perception.masks.merging import Segmentation
 from perception.progress import Progress
 
 BOX_TRIM = 0.01
@@ -31,7 +34,7 @@ HALVED_FROM = 480
 @dataclass
 class FoundInstances:
     """ids [N] int32 (−1 = none), membership [N] float32, instances.json's list, language arrays, facts, and the
-    arrays of parts.npz (see io.store)."""
+    arrays of parts.npz and groups.npz (see io.store)."""
 
     ids: np.ndarray
     membership: np.ndarray
@@ -39,17 +42,24 @@ class FoundInstances:
     language: dict[str, np.ndarray] = field(default_factory=dict)
     report: dict[str, Any] = field(default_factory=dict)
     parts: dict[str, np.ndarray] = field(default_factory=dict)
+    groups: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def group_gaussians(
-    gaussians: Gaussians, views: list[TrainingView], config: MapConfig, progress: Progress
+    gaussians: Gaussians,
+    views: list[TrainingView],
+    config: MapConfig,
+    progress: Progress,
+    cuts: Segmentation | None = None,
 ) -> Grouping | None:
-    """Groups Gaussians into instances by features and votes of all masks (§3.2.1); None if no photo has masks."""
+    """Groups Gaussians into instances by features and votes of all masks (§3.2.1); None if no photo has masks.
+
+    cuts: of the surface, if the masks come from one."""
     if not any(view.labels is not None and bool((view.labels > 0).any()) for view in views):
         return None
     progress.log(f"grouping {len(gaussians)} Gaussians")
     votes = mask_votes(gaussians, views, half_resolution=config.losses.half_resolution, progress=progress)
-    return group(
+    found = group(
         gaussians.means.detach().numpy(),
         gaussians.scales.detach().numpy(),
         gaussians.opacities.detach().numpy(),
@@ -59,6 +69,7 @@ def group_gaussians(
         margin=config.losses.margin,
         seed=config.seed,
     )
+    return found if cuts is None else with_levels(found, gaussians.means.detach().numpy(), votes, cuts)
 
 
 def describe(
@@ -84,16 +95,24 @@ def describe(
         choices = _best_views(grouped.ids, seen, words.views)
         texts = read_texts(reader, choices, lambda n: _shown(views[n], seen[n]), progress)
         store_texts(found.instances, texts)
+
+    def language_of(ids: np.ndarray, what: str) -> dict[str, np.ndarray]:
+        if encoder is None:
+            return {}
+        seen = _silhouettes(gaussians, ids, views, f"silhouettes of {what}", progress)
+        arrays = _embed(encoder, ids, seen, views, min(2, words.views), 1, progress)
+        return {PART + name: array for name, array in arrays.items()}
+
     if grouped.parents:
         local = np.where(grouped.part_ids >= 0, grouped.part_ids - grouped.count, -1).astype(np.int32)
-        language: dict[str, np.ndarray] = {}
-        if encoder is not None:
-            seen = _silhouettes(gaussians, local, views, "silhouettes of parts", progress)
-            language = _embed(encoder, local, seen, views, min(2, words.views), 1, progress)
-        found.parts = {"ids": grouped.part_ids, **{f"language_{name}": array for name, array in language.items()}}
+        found.parts = {"ids": grouped.part_ids, **language_of(local, "parts")}
+    if len(grouped.group_scores):
+        of = np.append(grouped.groups, -1).astype(np.int32)
+        found.groups = {"of": of[:-1], "scores": grouped.group_scores, **language_of(of[grouped.ids], "groups")}
     found.report = {
         "count": grouped.count,
         "parts": len(grouped.parents),
+        "groups": len(found.groups.get("scores", ())),
         "noise_share": float(np.mean(grouped.ids < 0)) if count else 0.0,
         "encoder": str(found.language["encoder"]) if found.language else None,
     }

@@ -30,6 +30,7 @@ from perception.io.store import Map, read_map, write_map
 from perception.language.base import Encoder
 from perception.language.ocr import make_reader
 from perception.masks import MaskSource, compute_masks, make_source
+from perception.masks.label_images import load_segmentation
 from perception.masks.source import GeometryMaskSource
 from perception.pipeline.checkpoint import TrainingObserver, fingerprint, poses_mark, training_mark
 from perception.pipeline.estimate import log_estimate
@@ -114,7 +115,8 @@ def build_map(
 
         # Group the Gaussians by their features into instances (§3.2.1), describe these from their best views (§3.2.2).
         with stages("instances"):
-            grouped = group_gaussians(gaussians, views, config, progress)
+            cuts = load_segmentation(work / "masks") if from_geometry else None
+            grouped = group_gaussians(gaussians, views, config, progress, cuts)
             found = describe(gaussians, grouped, views, config.language, encoder, progress, reader)
 
         with stages("score"):
@@ -255,6 +257,7 @@ def _assemble(
         views=[stored_view(held.get(view.name, view), output, view.name in held) for view in scene.views],
         language=found.language,
         parts=found.parts,
+        groups=found.groups,
     )
 
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from perception.io.store import Map
 from perception.query import Hit
 
 
@@ -102,6 +101,8 @@ def query_text(answers: list[tuple[str, list[Hit]]], metric: bool) -> str:
             x, y, z = hit.centroid
             a, b, c = hit.obb.extent
             name = f" ({hit.label})" if hit.label else ""
+            name += "" if hit.part is None else f", part {hit.part}"
+            name += f", together {', '.join(map(str, hit.instances))}" if hit.instances else ""
             lines.append(
                 f'"{text}" {rank}. instance {hit.instance_id}{name}  score {hit.score:.2f}'
                 f"  at {x:.3f} {y:.3f} {z:.3f}{unit}"
@@ -110,12 +111,13 @@ def query_text(answers: list[tuple[str, list[Hit]]], metric: bool) -> str:
     return "\n".join(lines)
 
 
-def write_hits(path: Path, gmap: Map, hits: list[Hit]) -> None:
+def write_hits(path: Path, hits: list[Hit]) -> None:
     """Writes the points of all hits as one cloud, with `instance_id` and the colours of the map."""
-    from perception.colors import rgb8_from_sh
     from perception.io.cloud import write_cloud
     from perception.types import PointCloud
 
-    rows = np.flatnonzero(np.isin(gmap.instance_ids, [hit.instance_id for hit in hits]))
-    colors = rgb8_from_sh(gmap.sh[rows, 0])
-    write_cloud(path, PointCloud(gmap.means[rows], colors, labels={"instance_id": gmap.instance_ids[rows]}))
+    hits = list({(hit.instance_id, hit.part, hit.instances): hit for hit in hits}.values())
+    points = np.concatenate([np.zeros((0, 3), np.float32), *(hit.points for hit in hits)])
+    colors = np.concatenate([np.zeros((0, 3), np.uint8), *(hit.colors() for hit in hits if hit.colors is not None)])
+    ids = np.repeat(np.array([hit.instance_id for hit in hits], np.int32), [len(hit.points) for hit in hits])
+    write_cloud(path, PointCloud(points, colors, labels={"instance_id": ids}))

@@ -69,7 +69,7 @@ def _encoder(gmap: Map, encoders: Callable[[str], Encoder | None]) -> Encoder | 
 
 
 def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:
-    """Replaces `language` and, if present, the `language_` arrays of the parts."""
+    """Replaces `language` and, if present, the `language_` arrays of the parts and groups."""
     zooms = int(gmap.info.get("config", {}).get("language", {}).get("zooms") or reading_of(encoder).zooms)
     ids = [entry["id"] for entry in gmap.instances]
     gmap.language = _described(gmap, encoder, gmap.language, gmap.instance_ids, ids, zooms, progress)
@@ -78,6 +78,10 @@ def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:
         known = sorted({int(i) for i in np.unique(owners) if i >= 0})
         anew = _described(gmap, encoder, gmap.part_language, owners, known, 1, progress)
         gmap.parts = {"ids": owners, **{PART + name: array for name, array in anew.items()}}
+    if gmap.group_language:
+        known = list(range(len(gmap.groups["scores"])))
+        anew = _described(gmap, encoder, gmap.group_language, gmap.group_ids, known, 1, progress)
+        gmap.groups = {**gmap.groups, **{PART + name: array for name, array in anew.items()}}
 
 
 def _read_again(gmap: Map, reader: Reader | None, progress: Progress) -> None:

@@ -7,7 +7,6 @@ with QueryEngine("kitchen.gsmap") as engine  for servers: bounded request queue,
 from perception.query.engine import AnswerTimeout, EngineBusy, EngineClosed, QueryEngine
 from perception.query.frames import Frame
 from perception.query.hit import Description, Hit, Neighbor
-from perception.query.parts import PartsMap
 from perception.query.query_map import QueryMap, load_map
 from perception.query.regions import axis_box
 from perception.query.requests import Reply, Request
@@ -21,7 +20,6 @@ __all__ = [
     "Frame",
     "Hit",
     "Neighbor",
-    "PartsMap",
     "QueryEngine",
     "QueryMap",
     "Reply",

@@ -16,7 +16,7 @@ from perception.errors import InputError
 from perception.geometry import scale_of
 from perception.query.frames import Frame
 from perception.query.regions import axis_box
-from perception.query.requests import MAX_TEXT, MAX_TEXTS, MAX_TOP, Request
+from perception.query.requests import MAX_TEXT, MAX_TEXTS, MAX_TOP, TOP, Request
 from perception.query.where import Where
 from perception.types import OrientedBox
 
@@ -147,7 +147,7 @@ class QueryBody(FilteredBody):
     def requests(self) -> list[Request]:
         """One Request for each prompt."""
         texts = self.text if isinstance(self.text, list) else [self.text]
-        where, frame, top_k = self.asked_where(), self.asked_frame(), self.top_k or 3
+        where, frame, top_k = self.asked_where(), self.asked_frame(), self.top_k or TOP
         return [Request(text, top_k, self.min_score, where, frame) for text in texts]
 
 

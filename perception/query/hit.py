@@ -23,8 +23,9 @@ class Hit:
     obb: oriented bounding box of the points. covariance: [3, 3] float64 of the points about their mean, divided by P.
     score: in [0, 1]; for a text prompt how well the instance matches, else the mapper's confidence. views: the photos
     that show it best, best first. distance: from the query's position to the nearest point; None without a position.
-    parent: for a part, the id of its instance. colors(): [P, 3] uint8 of the points, read when called; None where they
-    are not known. All of it is in `frame`, in metres when the map is metric.
+    part: id of the part that fits better than its instance; instances: ids of the group that fits better than its
+    members; points, box and colours are then the part's or the group's. colors(): [P, 3] uint8 of the points, read when
+    called; None where they are not known. All of it is in `frame`, in metres when the map is metric.
     """
 
     instance_id: int
@@ -37,7 +38,8 @@ class Hit:
     covariance: np.ndarray = field(default_factory=lambda: _NO_SPREAD)
     frame: str = "map"
     distance: float | None = None
-    parent: int | None = None
+    part: int | None = None
+    instances: tuple[int, ...] = ()
     colors: Callable[[], np.ndarray] | None = field(default=None, repr=False, compare=False)
 
     def transformed(self, a_from_b: np.ndarray, frame: str | None = None) -> Hit:
@@ -79,8 +81,10 @@ class Hit:
             "views": list(self.views),
             "covariance": [[float(x) for x in row] for row in self.covariance],
         }
-        if self.parent is not None:
-            answer["parent"] = self.parent
+        if self.part is not None:
+            answer["part"] = self.part
+        if self.instances:
+            answer["instances"] = list(self.instances)
         return answer if self.distance is None else {**answer, "distance": float(self.distance)}
 
 

@@ -5,23 +5,21 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import move_points
 from perception.io.map import Map
+from perception.language.ranking import Ranker, answering
 from perception.query.frames import Frame
 from perception.query.hit import Description, Hit, Neighbor
-from perception.query.requests import Request
+from perception.query.nodes import Nodes
+from perception.query.requests import TOP, Request
 from perception.query.spatial_index import SpatialIndex
 from perception.query.text_ranking import Encoders, TextRanking
 from perception.query.where import Where, place, tidy
 from perception.types import OrientedBox
-
-if TYPE_CHECKING:
-    from perception.language.ranking import Ranker
 
 _NEIGHBORS = 3
 _LEAST_COLOR = 0.05
@@ -66,35 +64,30 @@ class QueryMap(Map):
     def query(
         self,
         text: str,
-        top_k: int = 3,
+        top_k: int = TOP,
         min_score: float | None = None,
         *,
         where: Where | None = None,
         frame: Frame | None = None,
     ) -> list[Hit]:
-        """The instances that match `text`, best first, at most top_k; empty when it is not present.
+        """The instances that answer `text` (`language.ranking.answering`), best first, none, one or up to top_k.
 
-        `min_score` replaces the encoder's presence threshold by this bound on the score. `where` keeps only instances
-        that fulfil it, and presence is then decided among those. Raises InputError for an empty or overlong text, and
+        A part of an instance, or a group of them, is answered where it fits clearly better (see `Hit`). `min_score`:
+        the instances with at least this score instead. `where` keeps only instances that fulfil it, and those
+        that answer are then decided among these. Raises InputError for an empty or overlong text, and
         for a map without embeddings or whose encoder is not installed.
         """
         Request(text, top_k, min_score)
         if not self.instances:
             return []
-        answer = self._ranking.rank(text, min_score)
-        chosen, wanted = answer.hits, (where or Where()).in_map(frame)
+        chosen, wanted = self._ranking.rank(text).hits, (where or Where()).in_map(frame)
         if where is not None:
-            from perception.language.ranking import PRESENT
-
             allowed = set(self._fulfilling(wanted))
             chosen = [(n, s) for n, s in chosen if n in allowed]
-            if not chosen or chosen[0][1] < (PRESENT if min_score is None else min_score):
-                return []
-        elif not answer.present:
-            return []
-        if min_score is not None:
-            chosen = [(n, s) for n, s in chosen if s >= min_score]
-        return [self._in(frame, self._measured(n, wanted, s)) for n, s in chosen[:top_k]]
+        elif min_score is None:
+            chosen = self._nodes.fitting(text, chosen)
+        chosen = answering(chosen, min_score)[:top_k]
+        return [self._in(frame, self._measured(n, wanted, s)) for n, s in chosen]
 
     def find(self, where: Where | None = None, *, frame: Frame | None = None) -> list[Hit]:
         """All instances that fulfil `where`, in the order of instances.json, scored by the mapper's confidence."""
@@ -217,8 +210,9 @@ class QueryMap(Map):
         return where.within is None or self._spatial.distance(entry["id"], np.asarray(where.near)) <= where.within
 
     def _measured(self, position: int, where: Where, score: float | None = None) -> Hit:
-        """A Hit, with its distance if `where.near` is given."""
-        hit = self.hit(position, score)
+        """A Hit, with its distance if `where.near` is given; positions after the instances are parts and groups."""
+        beyond = position - len(self.instances)
+        hit = self.hit(position, score) if beyond < 0 else self._nodes.hit(beyond, score or 0.0)
         if where.near is None:
             return hit
         return replace(hit, distance=self._spatial.distance(hit.instance_id, np.asarray(where.near)))
@@ -277,6 +271,10 @@ class QueryMap(Map):
     @cached_property
     def _ranking(self) -> TextRanking:
         return TextRanking(self, self.encoders)
+
+    @cached_property
+    def _nodes(self) -> Nodes:
+        return Nodes(self)
 
     @cached_property
     def _spatial(self) -> SpatialIndex:

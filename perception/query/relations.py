@@ -61,18 +61,18 @@ def parse(prompt: str) -> Relation | None:
     return Relation(found["thing"], _KIND[found["relation"].lower()], found["other"])
 
 
-def ranked(ranker: Ranker, places: Places | None, text: str, min_score: float | None) -> Answer:
+def ranked(ranker: Ranker, places: Places | None, text: str) -> Answer:
     """The ranking of the instances for a prompt, by the relation in it if there is one and z is known."""
     from perception.language.printed import quoted_text
 
     relation = parse(text)
     if relation is None or places is None or quoted_text(text) is not None:
-        return ranker.rank(text, min_score)
+        return ranker.rank(text)
     others, score = ranker.rank(relation.other), np.zeros(len(places.lows))
     for n, value in others.hits if others.present else ():
         score[n] = value
     gain = WEIGHT * (places.match(relation.kind) * score[None]).max(axis=1, initial=0.0)
-    return replace(ranker.rank(relation.thing, min_score, gain), text=" ".join(text.split()))
+    return replace(ranker.rank(relation.thing, gain), text=" ".join(text.split()))
 
 
 class Places:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 MAX_TEXT = 1000
 """Largest number of characters in a prompt. No encoder reads more; the bound limits the work of a server."""
-MAX_TOP = 1000
+TOP, MAX_TOP = 20, 1000  # hits of a prompt: unless told otherwise, and at most
 MAX_TEXTS = 32
 
 
@@ -25,7 +25,7 @@ class Request:
     """One prompt with its filters; its coordinates and those of the reply are in `frame`, None = the map's."""
 
     text: str
-    top_k: int = 3
+    top_k: int = TOP
     min_score: float | None = None
     where: Where | None = None
     frame: Frame | None = None

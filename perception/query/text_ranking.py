@@ -8,7 +8,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,11 +16,9 @@ from perception.io.map import Map
 from perception.language.base import Encoder
 from perception.language.encoders import make_encoder
 from perception.language.printed import Printed
+from perception.language.ranking import Answer, Ranker
 from perception.query.relations import Places, ranked
 from perception.query.where import tidy
-
-if TYPE_CHECKING:
-    from perception.language.ranking import Answer, Ranker
 
 Encoders = Callable[[str], Encoder | None]
 SAMPLES, TRIM = 1000, 0.05  # points per instance, and share of them left out, when its sides are measured
@@ -37,7 +34,7 @@ class TextRanking:
         self._encoders = encoders or make_encoder
         self._lock = threading.RLock()
         self._made: Ranker | InputError | None = None
-        self._ranked: OrderedDict[tuple[str, float | None], Answer] = OrderedDict()
+        self._ranked: OrderedDict[str, Answer] = OrderedDict()
 
     @property
     def problem(self) -> str | None:
@@ -48,12 +45,12 @@ class TextRanking:
             return str(error)
         return None
 
-    def rank(self, text: str, min_score: float | None) -> Answer:
+    def rank(self, text: str) -> Answer:
         """The ranking of `perception.language.ranking`. Without embeddings or encoder, the instances with this label.
 
         Raises InputError when the map has no embeddings or encoder and no instance has the label `text`.
         """
-        key = (" ".join(text.split()), min_score)
+        key = " ".join(text.split())
         with self._lock:
             if key in self._ranked:
                 self._ranked.move_to_end(key)
@@ -66,7 +63,7 @@ class TextRanking:
             raise
         with _one_thread():
             named = self._by_label(text) is not None
-            answer = ranker.rank(text, min_score) if named else ranked(ranker, self._places, text, min_score)
+            answer = ranker.rank(text) if named else ranked(ranker, self._places, text)
         with self._lock:
             self._ranked[key] = answer
             if len(self._ranked) > REMEMBERED:
@@ -75,8 +72,6 @@ class TextRanking:
 
     def _by_label(self, text: str) -> Answer | None:
         """The instances that the user labelled `text`, None without any. Needs no embeddings and no encoder."""
-        from perception.language.ranking import Answer
-
         same = [n for n, e in enumerate(self._gmap.instances) if tidy(e.get("label") or "") == tidy(text)]
         return Answer(text, [(n, 1.0) for n in same], True) if same else None
 
@@ -95,7 +90,6 @@ class TextRanking:
 
     def _make(self) -> Ranker:
         from perception.language.description import check_encoder, from_arrays
-        from perception.language.ranking import Ranker
 
         if not self._gmap.language:
             raise InputError(

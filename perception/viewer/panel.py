@@ -46,7 +46,6 @@ class Panel:
     def _build_ask(self) -> None:
         with self.gui.add_form("Ask") as form:
             self._text = self.gui.add_text("prompt", "", hint='a thing, such as "red mug"; Enter asks')
-            self._parts = self.gui.add_checkbox("parts of things", False, hint='such as "handle of the mug"')
             button = self.gui.add_button("Search")
         button.on_click(lambda _: form.submit())
         form.on_submit(lambda event: self.viewer.guarded(self._ask, event.client))
@@ -55,7 +54,7 @@ class Panel:
         self._hit_buttons: list[Any] = []
 
     def _ask(self) -> None:
-        self.session.ask(self._text.value, parts=self._parts.value)
+        self.session.ask(self._text.value)
 
     def _build_show(self) -> None:
         with self.gui.add_folder("Show"):
@@ -196,8 +195,8 @@ class Panel:
         self._answer.content = f'"{escaped(session.question)}": {len(session.hits)} found'
         with self._hits_folder:
             for rank, hit in enumerate(session.hits, start=1):
-                whole = session.editor.entry(hit.instance_id if hit.parent is None else hit.parent)
-                name = session.name(whole) if hit.parent is None else f"part of {session.name(whole)}"
+                whole = session.editor.entry(hit.instance_id)
+                name = session.name(whole) if hit.part is None else f"part of {session.name(whole)}"
                 button = self.gui.add_button(f"{rank}. {name} · {hit.score:.2f}")
                 button.on_click(lambda event, hit=hit: self.viewer.guarded(lambda: session.show_hit(hit), event.client))
                 self._hit_buttons.append(button)

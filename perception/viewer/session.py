@@ -10,7 +10,7 @@ import numpy as np
 
 from perception.editing import Editor
 from perception.errors import InputError
-from perception.query import Hit, PartsMap, QueryMap
+from perception.query import Hit, QueryMap
 from perception.query.crops import best_crop
 from perception.viewer.paint import highlight, paint
 from perception.viewer.picking import pick, pick_point
@@ -43,26 +43,22 @@ class Session:
             self._opened = (self._edits, QueryMap.of(self.editor.current()))
         return self._opened[1]
 
-    def ask(self, text: str, top_k: int = 5, parts: bool = False) -> list[Hit]:
-        """Ranked hits, which are then highlighted; empty when the text is not present. Hidden instances are left out.
-
-        parts: search parts of instances, such as "handle of the mug"; each hit then has its `parent`.
-        """
+    def ask(self, text: str, top_k: int = 5) -> list[Hit]:
+        """Ranked hits, which are then highlighted; empty when the text is not present. None is hidden."""
         with self._lock:
             hidden = {entry["id"] for entry in self.editor.instances if entry.get("hidden")}
-            opened = self._loaded()
-            found = (PartsMap(opened) if parts else opened).query(text, top_k + len(hidden))
+            found = self._loaded().query(text, top_k + len(hidden))
             self.question = " ".join(text.split())
-            self.hits = [hit for hit in found if _whole(hit) not in hidden][:top_k]
+            self.hits = [hit for hit in found if hit.instance_id not in hidden][:top_k]
             self.select(None)
             for hit in self.hits[:1]:
                 self.show_hit(hit)
             return self.hits
 
     def show_hit(self, hit: Hit) -> None:
-        """Selects the instance of a hit; for a part its parent, with the part highlighted."""
-        self.select(_whole(hit))
-        self.part = hit.instance_id if hit.parent is not None else None
+        """Selects the instance of a hit, all those of a group; a part is highlighted."""
+        self.select(hit.instance_id)
+        self.selected, self.part = list(hit.instances or self.selected), hit.part
 
     # -------------------------------------------------- selecting and measuring
 
@@ -129,7 +125,7 @@ class Session:
             parts = {part["id"] for entry in self.editor.instances for part in entry.get("parts", [])}
             self.selected = [instance for instance in self.selected if instance in known]
             self.part = self.part if self.part in parts else None
-            self.hits = [hit for hit in self.hits if hit.instance_id in (known if hit.parent is None else parts)]
+            self.hits = [hit for hit in self.hits if hit.instance_id in known and hit.part in {None, *parts}]
 
     def reopen(self) -> None:
         """Opens the map that another program changed; unsaved edits are dropped."""
@@ -156,7 +152,7 @@ class Session:
 
     def lit(self) -> list[int]:
         """The highlighted instances: the selected ones, else those of all hits; empty when there are neither."""
-        return self.selected or [_whole(hit) for hit in self.hits]
+        return self.selected or [hit.instance_id for hit in self.hits]
 
     def opacities(self) -> np.ndarray:
         """[N] float32 opacities; 0 for Gaussians that are not shown."""
@@ -172,8 +168,3 @@ class Session:
             return best_crop(self._loaded(), instance, CROP_SIDE, self.inside)
         except InputError:
             return None
-
-
-def _whole(hit: Hit) -> int:
-    """The instance id of a hit; for a part, that of its parent."""
-    return hit.instance_id if hit.parent is None else hit.parent

@@ -151,7 +151,9 @@ def test_a_made_scene_is_a_truth_scene(ovs_run: Path, small_scene: Path, tmp_pat
     assert found["truth"] == len(load_truth(small_scene / "truth").instances)
     queries.main([gmap, scene, "-o", str(tmp_path)])
     asked = json.loads((tmp_path / "queries.json").read_text())
-    assert asked["prompts"] > 20 and asked["absent_prompts"] == 30 and 0 < asked["random_top1"] < asked["random_top3"]
+    assert asked["prompts"] > 20 and asked["absent_prompts"] == 30
+    assert asked["reliability"]["count"] == 30 + asked["prompts"] + asked["household_absent_prompts"]
+    assert found["reliability"]["count"] > 3 and (tmp_path / "instances.png").is_file()
     (tmp_path / "bare").mkdir()
     with pytest.raises(InputError, match=r"no scene\.json"):
         queries.main([gmap, str(tmp_path / "bare")])

@@ -176,31 +176,3 @@ def test_parts_survive_what_happens_to_others(path: Path) -> None:
     editor.merge([0, 1])
     editor.save()
     assert (read_map(path).parts["ids"] == -1).all() and len(read_map(path).parts["language_embeddings"]) == 0
-
-
-def test_parts_are_asked_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from perception.query import PartsMap, load_map
-    from perception.query.hit import Hit
-
-    opened = load_map(with_parts(path))
-    parts = PartsMap(opened)
-    assert [(hit.instance_id, len(hit.points), hit.parent) for hit in parts.of(0)] == [(4, 30, 0), (3, 25, 0)]
-    assert parts.of(1) == []
-    np.testing.assert_array_equal(parts.of(0)[1].points, opened.means[:25])
-
-    class Ranked:
-        """Part number 1 fits "handle" best."""
-
-        def rank(self, text: str, min_score: float | None) -> object:
-            hits = [(1, 0.9), (0, 0.2)] if text == "handle" else []
-            return type("Answer", (), {"hits": hits, "present": bool(hits)})
-
-    wholes: dict[str, list[Hit]] = {"mug": [opened.hit(0)], "table": [opened.hit(1)]}
-    monkeypatch.setattr(opened, "query", lambda text, top_k: wholes.get(text, []))
-    monkeypatch.setattr(type(parts._asked), "ranker", property(lambda self: Ranked()))
-    assert [hit.instance_id for hit in parts.query("the handle of the mug")] == [4, 3]
-    assert parts.query("handle of a table") == [] and parts.query("handle of the boat") == []
-    assert [hit.parent for hit in parts.query("handle", top_k=1)] == [0]
-    assert parts.query("spout") == []
-    with pytest.raises(InputError, match="empty"):
-        parts.query(" ")

@@ -28,7 +28,7 @@ from perception.language.description import (
     to_arrays,
     unseen,
 )
-from perception.language.ranking import Answer, Ranker, probes
+from perception.language.ranking import PRESENT, Answer, Ranker, answering, probes
 from perception.language.shape_words import KINDS
 
 DIM = 24
@@ -116,7 +116,7 @@ def test_absent_things_are_not_present(scene: tuple[Table, list[InstanceDescript
     ranker = Ranker(things, encoder)
     passed = [ranker.rank(f"absent thing {n}").present for n in range(400)]
     assert np.mean(passed) == pytest.approx(0.2, abs=0.1)
-    assert not ranker.rank("mug", min_score=1.1).present
+    assert answering(ranker.rank("mug").hits, 1.1) == []
 
 
 def test_order_of_instances_changes_no_score(scene: tuple[Table, list[InstanceDescription]]) -> None:
@@ -247,8 +247,17 @@ def test_a_margin_is_taken_off_every_answer(scene: tuple[Table, list[InstanceDes
     encoder, things = scene
     for text in ("plate", "vague prompt"):
         plain = _z(rank(text, things, encoder).hits)
-        strict = _z(rank(text, things, Read(encoder.known, Reading(margin=0.7))).hits)
+        strict = _z(rank(text, things, Read(encoder.known, Reading(calibration=(1.0, -0.7)))).hits)
         assert np.allclose(plain - strict, 0.7, atol=1e-6)
+
+
+def test_none_one_or_several_answer() -> None:
+    """Scores by their quantiles: .7 behind the best is too far, .5 is not; below PRESENT nothing answers."""
+    hits = [(n, float(norm.cdf(x))) for n, x in enumerate((2.0, 1.5, 1.3, -1.0))]
+    assert answering(hits) == hits[:2] and answering(hits[1:]) == hits[1:3] and answering(hits[3:]) == []
+    assert answering(hits, 0.0) == hits and answering(hits, 0.99) == [] and answering([]) == []
+    assert answering([(1, PRESENT + 0.01), (0, PRESENT - 0.01)]) == [(1, PRESENT + 0.01)]
+    assert answering([(0, 1.0), (1, 1.0), (2, 0.99)]) == [(0, 1.0), (1, 1.0)]  # labels that equal the prompt
 
 
 def test_shapes_add_by_kind_and_only_where_named(scene: tuple[Table, list[InstanceDescription]]) -> None:

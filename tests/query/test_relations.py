@@ -114,8 +114,8 @@ def test_the_place_decides_between_equals_and_an_absent_other_changes_nothing() 
     ranker = Ranker([thing(0), thing(0), thing(1)], Axes())
     lows = np.array([[0.0, 0, 0], [3, 0, 0], [3.5, 0, 0]])
     places = Places(lows, lows + np.array([0.3, 0.3, 0.2]), np.zeros((0, 4, 4)))
-    answer = ranked(ranker, places, "book next to the lamp", None)
+    answer = ranked(ranker, places, "book next to the lamp")
     assert answer.text == "book next to the lamp" and [n for n, _ in answer.hits][:1] == [1] and answer.present
     plain = ranker.rank("book")
-    assert ranked(ranker, places, "book next to the shelf", None).hits == plain.hits
-    assert ranked(ranker, None, "book", None).hits == plain.hits
+    assert ranked(ranker, places, "book next to the shelf").hits == plain.hits
+    assert ranked(ranker, None, "book").hits == plain.hits

@@ -235,17 +235,13 @@ def test_parts_are_shown_found_and_split_along(path: Path, browser: Any, monkeyp
     from perception.types import OrientedBox
     from perception.viewer import session, start_viewer
 
-    class AskedParts:
-        def __init__(self, opened: Any):
-            self.gmap = opened
-
+    class AskedParts(Asked):
         def query(self, text: str, top_k: int) -> list[Hit]:
-            points = self.gmap.means[self.gmap.parts["ids"] == 10]
+            points = self.means[self.parts["ids"] == 10]
             box = OrientedBox(points.mean(0), np.eye(3), np.ones(3))
-            return [Hit(10, 0.8, points, points.mean(0), box, parent=1)]
+            return [Hit(1, 0.8, points, points.mean(0), box, part=10)]
 
-    monkeypatch.setattr(session, "QueryMap", Asked)
-    monkeypatch.setattr(session, "PartsMap", AskedParts)
+    monkeypatch.setattr(session, "QueryMap", AskedParts)
     viewer = start_viewer(path, port=free_port())
     try:
         viewer.session.mode = "parts"
@@ -256,8 +252,6 @@ def test_parts_are_shown_found_and_split_along(path: Path, browser: Any, monkeyp
         page.set_default_timeout(120_000)
         page.goto(viewer.url)
         page.wait_for_selector("text=Gaussians · instances")
-        page.get_by_label("parts of things").check()
-        until(lambda: viewer.panel._parts.value)
         enter(page, viewer, "prompt", "stalk of the pear")
         page.wait_for_selector("text=1. part of instance 1")
         page.wait_for_selector("text=2 parts; Split takes it apart")

@@ -1,0 +1,76 @@
+"""Parts and groups as answers: embeddings of names tell which of part, instance and group a prompt means."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perception.errors import InputError
+from perception.export.transfer import ExportOptions
+from perception.io.cloud import read_cloud
+from perception.io.store import read_map, write_map
+from perception.language.colors import PALETTE
+from perception.language.description import InstanceDescription, to_arrays
+from perception.pipeline.exporting import at_granularity, export_map
+from perception.query import QueryMap, load_map
+from support.query_maps import HashEncoder, encoders, write_map_of
+
+
+def said(*names: str) -> dict[str, np.ndarray]:
+    rows, colors = HashEncoder().encode_texts(names), np.zeros((PALETTE, 4), np.float32)
+    found = [InstanceDescription(row, row[None], colors, ["a.jpg"], [(0, 0, 1, 1)]) for row in rows]
+    return {f"language_{name}": array for name, array in to_arrays(found, HashEncoder.identity).items()}
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Mug 3 with a handle (id 20) and an inside (21), banana 4, and laptop 5 and teapot 6, which are a tea set."""
+    path = write_map_of(tmp_path_factory.mktemp("nodes") / "m.gsmap", first_id=3)
+    gmap = read_map(path)
+    left = gmap.means[:, 0] < gmap.means[gmap.instance_ids == 3][:, 0].mean()
+    ids = np.where(gmap.instance_ids == 3, np.where(left, 20, 21), -1).astype(np.int32)
+    mug = gmap.instances[0]
+    mug["parts"] = [{**mug, "id": i, "parent": 3, "num_gaussians": int((ids == i).sum())} for i in (20, 21)]
+    gmap.parts = {"ids": ids, **said("handle", "hollow")}
+    of = np.array([-1, -1, 0, 0, -1, -1, -1, -1, -1], np.int32)
+    gmap.groups = {"of": of, "scores": np.array([0.7], np.float32), **said("breakfast")}
+    write_map(path, gmap)
+    return path
+
+
+@pytest.fixture(scope="module")
+def gmap(path: Path) -> QueryMap:
+    return load_map(path, encoders)
+
+
+def test_a_prompt_is_answered_by_the_node_that_it_names(gmap: QueryMap) -> None:
+    (mug,) = gmap.query("mug", top_k=1)
+    assert mug.instance_id == 3 and mug.part is None and not mug.instances
+    (handle,) = gmap.query("handle", top_k=1)
+    assert (handle.instance_id, handle.part, handle.to_json()["part"]) == (3, 20, 20)
+    np.testing.assert_array_equal(handle.points, gmap.means[gmap.parts["ids"] == 20])
+    (both,) = gmap.query("breakfast", top_k=1)
+    assert both.instance_id == 5 and both.to_json()["instances"] == [5, 6]
+    members = gmap.means[np.isin(gmap.instance_ids, [5, 6])]
+    np.testing.assert_array_equal(np.sort(both.points, axis=0), np.sort(members, axis=0))
+    assert "part" not in mug.to_json() and "instances" not in mug.to_json()
+    assert {hit.instance_id for hit in gmap.query("handle", min_score=0.0)} == set(range(3, 12))  # instances alone
+
+
+def test_granularity_of_an_export(path: Path, tmp_path: Path) -> None:
+    gmap = read_map(path)
+    ids, entries = at_granularity(gmap, "parts")
+    np.testing.assert_array_equal(ids, np.where(gmap.parts["ids"] >= 0, gmap.parts["ids"], gmap.instance_ids))
+    assert entries[20]["parent"] == 3
+    facts, _ = export_map(path, tmp_path / "out.ply", None, ExportOptions(), granularity="groups")
+    solid = gmap.opacities >= 0.5
+    expected = np.where(gmap.instance_ids == 6, 5, gmap.instance_ids)[solid]
+    np.testing.assert_array_equal(read_cloud(tmp_path / "out.ply").labels["instance_id"], expected)
+    assert facts["instances"]["5"]["instances"] == [5, 6] and "6" not in facts["instances"]
+    assert facts["instances"]["5"]["score"] == pytest.approx(0.7)
+    bare = write_map_of(tmp_path / "bare.gsmap")
+    for level in ("parts", "groups"):
+        with pytest.raises(InputError, match=f"holds no {level} of instances"):
+            at_granularity(read_map(bare), level)
