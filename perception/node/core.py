@@ -28,7 +28,7 @@ class Transport(Protocol):
     """What the core uses of `ros.RosTransport`. `publish` is called from any thread and does not raise for a slow or
     absent reader. The health message contains `warnings` (present problems) and `figures` (counts)."""
 
-    def publish(self, topic: channels.Topic, message: Message) -> None: ...
+    def publish(self, topic: channels.Channel, message: Message) -> None: ...
 
     def warnings(self) -> list[str]: ...
 
@@ -112,11 +112,8 @@ class Core:
             questions = read_questions(name)
             if len(questions) != 1:
                 raise InputError("query: one text for a name; give further texts as further names")
-            asked, began = questions[0], time.monotonic()
-            item = asked.request
-            hits = gmap.query(item.text, item.top_k, item.min_score, where=item.where, frame=item.frame)
-            frame = item.frame.name if item.frame else gmap.frame
-            reply = Reply(item, tuple(hits), gmap.map_id, frame, gmap.metric, time.monotonic() - began)
+            asked = questions[0]
+            reply = asked.request.answered(gmap, time.monotonic())
         except InputError as error:
             return self._error_value(error, name)
         if asked.points:

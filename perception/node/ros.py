@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from perception.node import channels
-from perception.node.channels import DEPTH, Topic
+from perception.node.channels import DEPTH, Channel
 from perception.node.config import NodeConfig
 from perception.node.core import Core, Message
 
@@ -33,8 +33,8 @@ class RosTransport:
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=config.domain_id, signal_handler_options=SignalHandlerOptions.NO)
         self._node = rclpy.create_node("node", namespace=f"/{config.namespace}", context=self._context)
-        self._answer_name = f"/{channels.ANSWER.path(config.namespace)}"
-        self._publishers: dict[Topic, Any] = {}
+        self._answer_name = f"/{config.namespace}/{channels.ANSWER.name}"
+        self._publishers: dict[Channel, Any] = {}
         self._absent: list[str] = []
 
     def others(self) -> int:
@@ -56,10 +56,9 @@ class RosTransport:
             except ImportError:
                 self._absent.append(f"{topic.name} is not published: {topic.kind.split('/')[0]} is not installed")
                 continue
-            name = f"/{topic.path(self._config.namespace)}"
-            self._publishers[topic] = self._node.create_publisher(kind, name, _qos(topic.latched))
+            self._publishers[topic] = self._node.create_publisher(kind, topic.name, _qos(topic.latched))
 
-    def publish(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Channel, message: Message) -> None:
         """Sends a message; unless latched, it is not built when there is no subscriber."""
         publisher = self._publishers.get(topic)
         if publisher is not None and (topic.latched or publisher.get_subscription_count()):
@@ -79,10 +78,10 @@ class RosTransport:
         from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
         from rclpy.executors import MultiThreadedExecutor
 
-        calls, space = ReentrantCallbackGroup(), self._config.namespace
+        calls = ReentrantCallbackGroup()
         self._node.create_subscription(
             _class(channels.PROMPT.kind),
-            f"/{channels.PROMPT.path(space)}",
+            channels.PROMPT.name,
             lambda message: core.prompt(message.data),
             _qos(False),
             callback_group=MutuallyExclusiveCallbackGroup(),
@@ -90,7 +89,7 @@ class RosTransport:
         for service, answer in ((channels.QUERY, self._query), (channels.RELOAD, self._reload)):
             self._node.create_service(
                 _class(service.kind),
-                f"/{service.path(space)}",
+                service.name,
                 lambda request, response, answer=answer: answer(core, request, response),  # type: ignore[misc]
                 callback_group=calls,
             )

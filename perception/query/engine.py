@@ -101,12 +101,7 @@ class QueryEngine:
         asked = time.monotonic()
         item = Request(request) if isinstance(request, str) else request
 
-        def work(gmap: QueryMap) -> Reply:
-            hits = gmap.query(item.text, item.top_k, item.min_score, where=item.where, frame=item.frame)
-            frame = item.frame.name if item.frame else gmap.frame
-            return Reply(item, tuple(hits), gmap.map_id, frame, gmap.metric, time.monotonic() - asked)
-
-        return self.run(work, timeout)
+        return self.run(lambda gmap: item.answered(gmap, asked), timeout)
 
     def run(self, work: Callable[[QueryMap], T], timeout: float | None = None) -> Future[T]:
         """Queues `work`, which a worker thread calls with the current map. EngineBusy when the queue is full."""

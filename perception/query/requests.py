@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from perception.query.where import Where
 
 if TYPE_CHECKING:
     from perception.query.hit import Hit
+    from perception.query.query_map import QueryMap
 
 MAX_TEXT = 1000
 """Largest number of characters in a prompt. No encoder reads more; the bound limits the work of a server."""
@@ -46,6 +48,12 @@ class Request:
             raise InputError(f"query: min_score is {score!r}, expected a number or none")
         if score is not None and not np.isfinite(score):
             raise InputError(f"query: min_score is {score}, expected a finite number")
+
+    def answered(self, gmap: QueryMap, since: float) -> Reply:
+        """The reply of one map; since: `time.monotonic()` when the request came."""
+        hits = gmap.query(self.text, self.top_k, self.min_score, where=self.where, frame=self.frame)
+        frame = self.frame.name if self.frame else gmap.frame
+        return Reply(self, tuple(hits), gmap.map_id, frame, gmap.metric, time.monotonic() - since)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -72,10 +73,7 @@ class _Routes:
         questions = body.requests()
 
         def work(gmap: QueryMap) -> dict[str, Any]:
-            results = []
-            for q in questions:
-                hits = gmap.query(q.text, q.top_k, q.min_score, where=q.where, frame=q.frame)
-                results.append({"text": q.text, "present": bool(hits), "hits": [hit.to_json() for hit in hits]})
+            results = [question.answered(gmap, time.monotonic()).to_json() for question in questions]
             return {"results": results, **_source(gmap, questions[0].frame)}
 
         return JSONResponse(await self._answer(map_id, work))

@@ -34,7 +34,7 @@ def serve(
     import uvicorn
 
     from perception.serve.app import build_app
-    from perception.serve.connections import MAX_CONNECTIONS, Connections
+    from perception.serve.connections import MAX_CONNECTIONS, timed_protocol
 
     with (
         listen(settings.host, settings.port) as sock,
@@ -50,10 +50,9 @@ def serve(
         (say or _say)(f"serving {path} at http://{url_host(settings.host)}:{sock.getsockname()[1]} (Ctrl-C stops)")
         if (trouble := engine.current.problem) is not None:
             (say or _say)(f"warning: prompts cannot be answered: {trouble}")
-        connections = Connections(settings.timeout, _TOTAL_TIMEOUT)
         config = uvicorn.Config(
-            connections.watched(build_app(engine, settings)),
-            http=connections.protocol_class(),
+            build_app(engine, settings),
+            http=timed_protocol(settings.timeout, _TOTAL_TIMEOUT),
             proxy_headers=False,  # a client could forge them
             log_level="warning",
             lifespan="off",

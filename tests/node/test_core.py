@@ -42,10 +42,10 @@ class Heard:
     """A transport that remembers."""
 
     def __init__(self) -> None:
-        self.messages: list[tuple[channels.Topic, dict[str, Any]]] = []
+        self.messages: list[tuple[channels.Channel, dict[str, Any]]] = []
         self.news = threading.Condition()
 
-    def publish(self, topic: channels.Topic, message: dict[str, Any]) -> None:
+    def publish(self, topic: channels.Channel, message: dict[str, Any]) -> None:
         with self.news:
             self.messages.append((topic, message))
             self.news.notify_all()
@@ -324,7 +324,7 @@ def test_map_replaced_under_load_answers_come_from_one_or_the_other(tmp_path: Pa
             seen.append(told[0]["map_id"])
         assert set(seen) == truth.keys()
 
-        def came(topic: channels.Topic) -> list[dict[str, Any]]:
+        def came(topic: channels.Channel) -> list[dict[str, Any]]:
             return [message for own, message in heard.messages if own is topic]
 
         with heard.news:
