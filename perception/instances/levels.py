@@ -35,9 +35,8 @@ def with_levels(grouping: Grouping, means: np.ndarray, votes: MaskVotes, cuts: S
     q = cuts.probability[own] * shared / np.maximum(sizes + both.sum(axis=0)[own] - shared, 1)
 
     width = len(cuts.part_probability)
-    keys, index, count = np.unique(
-        grouping.ids[rows] * np.int64(width) + cuts.part[voxel], return_inverse=True, return_counts=True
-    )
+    pairs = grouping.ids[rows] * np.int64(width) + cuts.part[voxel]  # of instance and part
+    keys, index, count = np.unique(pairs, return_inverse=True, return_counts=True)
     kept = (count >= LEAST_PART) & (count <= LARGEST_PART * sizes[keys // width])
     parts = np.full(len(means), -1, np.int64)
     parts[rows] = np.where(kept, np.cumsum(kept) - 1, -1)[index]

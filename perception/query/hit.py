@@ -81,10 +81,8 @@ class Hit:
             "views": list(self.views),
             "covariance": [[float(x) for x in row] for row in self.covariance],
         }
-        if self.part is not None:
-            answer["part"] = self.part
-        if self.instances:
-            answer["instances"] = list(self.instances)
+        answer |= {} if self.part is None else {"part": self.part}
+        answer |= {"instances": list(self.instances)} if self.instances else {}
         return answer if self.distance is None else {**answer, "distance": float(self.distance)}
 
 

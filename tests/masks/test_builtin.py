@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from perception.masks import GeometryMaskSource, compute_masks, load_labels, mak
 from perception.masks.builtin import fuse, surface_graph
 from perception.masks.cues import depth_cues
 from perception.masks.merge_model import packaged_model
-from perception.masks.merging import MergeTree, divided, tree_by
+from perception.masks.merging import MergeTree, divided, segmentation, tree_by
 from perception.masks.stereo import confirmed, homographies, measure_depths, plane_depths
 from perception.masks.stereo_views import StereoView, make_stereo_view
 from perception.masks.surface import pack_voxels, to_world, unpack_voxels, voxel_keys
@@ -367,6 +368,27 @@ def test_the_cut_of_a_tree_against_all_cuts():
         owner = tree.cut(gain)
         assert all((owner[members[k]] == k).all() and not (owner[~members[k]] == k).any() for k in owner)
         np.testing.assert_allclose(gain[np.unique(owner)].sum(), best)
+
+
+def test_cuts_of_rising_cost_are_nested():
+    rng = np.random.default_rng(6)
+    for _ in range(100):
+        tree = random_tree(rng, 15)
+        p = rng.random(len(tree.features)) ** 2
+        owners = [tree.cut(p - cost) for cost in (0.0, 0.05, 0.15, 0.4, 0.8)]
+        for fine, coarse in itertools.pairwise(owners):
+            assert all(len(np.unique(coarse[fine == k])) == 1 for k in fine)
+
+
+def test_parts_lie_in_segments_and_probabilities_belong_to_them():
+    seen = true_views()[:3]
+    cuts = segmentation(surface_graph(seen, fuse(seen)))
+    assert all(len(np.unique(cuts.segment[cuts.part == k])) == 1 for k in range(len(cuts.part_probability)))
+    assert cuts.part.max() + 1 == len(cuts.part_probability) and cuts.group.max() + 1 == len(cuts.group_probability)
+    assert len(cuts.group) == len(cuts.probability) == cuts.segment.max() + 1 and len(cuts.points) == len(cuts.segment)
+    alone = [s for s in range(1, len(cuts.group)) if len(np.unique(cuts.part[cuts.segment == s])) == 1]
+    whole = [cuts.part_probability[cuts.part[cuts.segment == s][0]] for s in alone]
+    np.testing.assert_allclose(whole, cuts.probability[alone])  # a segment that is its only part
 
 
 def test_regions_of_the_tree_are_sums_of_their_patches():
