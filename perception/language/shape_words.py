@@ -27,7 +27,7 @@ _KIND = {word: kind for kind, words in _WORDS.items() for word in words.split()}
 # Words after which the object itself is no longer named: "the rug ON the floor".
 _RELATIONS = re.compile(
     r"\b(?:on|of|with|without|under|in|inside|at|by|from|near|for|behind|above|below|beside|next|over|to|that|which|"
-    r"between|full|against|beneath|underneath|and|or)\b"
+    r"between|full|against|beneath|underneath|(?:and|or)(?=\s+(?:an?|the|some|one|two|three|four)\b))\b"
 )
 _MEASURES = re.compile(r"\b(?:pair|piece|set|pile|stack|bunch|sheet|kind|sort)s? of\b")
 _WORD = re.compile(r"[^\W\d_]+")

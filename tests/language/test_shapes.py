@@ -156,6 +156,8 @@ def test_rolled_cameras_tell_no_up() -> None:
         ("boxes", "box", "box"),
         ("bowl of apples", "bowl", None),
         ("wooden table with white legs", "table", "table"),
+        ("small red and yellow box", "box", "box"),
+        ("a mug and a box", "mug", None),
         ("стена", "стена", None),
         ("???", "", None),
         ("with", "with", None),
