@@ -46,7 +46,7 @@ def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
     SCORED: score, IoU > 0.5 with a true one (0 or 1) of each instance with MIN_POINTS points or more."""
     from perception.evaluate.instances import evaluate
     from perception.evaluate.overlap import overlap_of_ids, read_truth
-    from perception.evaluate.rendered import rendered_miou
+    from perception.evaluate.rendered import evaluate_rendered
     from perception.export.transfer import export_labels
     from perception.io.store import read_map
     from perception.pipeline.rendering import as_gaussians, map_views
@@ -58,6 +58,7 @@ def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
     stuff = np.isin(truth, [entry["id"] for entry in about if entry["is_stuff"]])
     labels = export_labels(gmap.means, gmap.instance_ids, cloud)
     confidence = {entry["id"]: float(entry["score"]) for entry in gmap.instances}
+    rendered = evaluate_rendered(as_gaussians(gmap), gmap.instance_ids, map_views(gmap), scene / "masks_gt")
     rows = {}
     for name, ignore in (("all", None), ("things", stuff), ("stuff", ~stuff)):
         for kind, scores in (("calibrated", confidence), ("constant", None)):
@@ -74,7 +75,7 @@ def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
         "truth": len(about),
         "parts": sum(len(entry.get("parts", [])) for entry in gmap.instances),
         "noise_share": float(np.mean(gmap.instance_ids < 0)),
-        "rendered_miou": rendered_miou(as_gaussians(gmap), gmap.instance_ids, map_views(gmap), scene / "masks_gt"),
+        "rendered_miou": rendered["miou"],
     }
 
 

@@ -21,11 +21,6 @@ from perception.types import View
 SMALLEST = 50  # pixels of a true instance in a view; with fewer, the view is not counted for it
 
 
-def rendered_miou(gaussians: Gaussians, ids: np.ndarray, views: Sequence[View], truth_dir: str | Path) -> float:
-    """The miou value of `evaluate_rendered`. ids [N] int32, −1 = none."""
-    return float(evaluate_rendered(gaussians, ids, views, truth_dir)["miou"])
-
-
 def evaluate_rendered(
     gaussians: Gaussians, ids: np.ndarray, views: Sequence[View], truth_dir: str | Path
 ) -> dict[str, Any]:

@@ -5,12 +5,10 @@ with QueryEngine("kitchen.gsmap") as engine  for servers: bounded request queue,
 """
 
 from perception.query.engine import AnswerTimeout, EngineBusy, EngineClosed, QueryEngine
-from perception.query.frames import Frame
 from perception.query.hit import Description, Hit, Neighbor
 from perception.query.query_map import QueryMap, load_map
-from perception.query.regions import axis_box
 from perception.query.requests import Reply, Request
-from perception.query.where import Where
+from perception.query.where import Frame, Where, axis_box
 
 __all__ = [
     "AnswerTimeout",

@@ -14,10 +14,8 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, Validatio
 
 from perception.errors import InputError
 from perception.geometry import scale_of
-from perception.query.frames import Frame
-from perception.query.regions import axis_box
 from perception.query.requests import MAX_TEXT, MAX_TEXTS, MAX_TOP, TOP, Request
-from perception.query.where import Where
+from perception.query.where import Frame, Where, axis_box
 from perception.types import OrientedBox
 
 MAX_NUMBER = 1e12

@@ -12,13 +12,12 @@ from perception.errors import InputError
 from perception.geometry import move_points
 from perception.io.map import Map
 from perception.language.ranking import Ranker, answering
-from perception.query.frames import Frame
 from perception.query.hit import Description, Hit, Neighbor
 from perception.query.nodes import Nodes
 from perception.query.requests import TOP, Request
 from perception.query.spatial_index import SpatialIndex
 from perception.query.text_ranking import Encoders, TextRanking
-from perception.query.where import Where, place, tidy
+from perception.query.where import Frame, Where, place, tidy
 from perception.types import OrientedBox
 
 _NEIGHBORS = 3

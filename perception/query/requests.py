@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.query.frames import Frame
-from perception.query.where import Where
+from perception.query.where import Frame, Where
 
 if TYPE_CHECKING:
     from perception.query.hit import Hit

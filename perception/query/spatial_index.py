@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from perception.io.map import InstanceIndex
-from perception.query.regions import inside
+from perception.query.where import inside
 from perception.types import OrientedBox
 
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])

@@ -14,8 +14,8 @@ from starlette.concurrency import run_in_threadpool
 from perception import __version__
 from perception.query.bodies import AtBody, FindBody, NearestBody, QueryBody
 from perception.query.engine import QueryEngine
-from perception.query.frames import Frame
 from perception.query.query_map import QueryMap
+from perception.query.where import Frame
 from perception.serve.errors import HANDLERS, OtherMap
 from perception.serve.guard import Guard
 from perception.serve.points import FORMATS, encode

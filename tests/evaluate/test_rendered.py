@@ -11,7 +11,7 @@ import torch
 
 pytest.importorskip("perception._core")
 from perception.errors import InputError
-from perception.evaluate.rendered import evaluate_rendered, mask_miou, rendered_miou
+from perception.evaluate.rendered import evaluate_rendered, mask_miou
 from perception.gaussians.model import from_points
 from perception.types import View
 
@@ -70,15 +70,15 @@ def discs(tmp_path: Path) -> tuple:
 
 def test_a_map_whose_halves_are_known(tmp_path: Path) -> None:
     gaussians, ids, view = discs(tmp_path)
-    assert rendered_miou(gaussians, ids, [view], tmp_path) > 0.95
+    assert evaluate_rendered(gaussians, ids, [view], tmp_path)["miou"] > 0.95
     swapped = evaluate_rendered(gaussians, 1 - ids, [view], tmp_path)
     assert [row["pred"] for row in swapped["instances"]] == [1, 0]
-    assert rendered_miou(gaussians, np.full_like(ids, -1), [view], tmp_path) == 0
-    assert rendered_miou(gaussians, np.zeros_like(ids), [view], tmp_path) == pytest.approx(0.25, abs=0.02)
+    assert evaluate_rendered(gaussians, np.full_like(ids, -1), [view], tmp_path)["miou"] == 0
+    assert evaluate_rendered(gaussians, np.zeros_like(ids), [view], tmp_path)["miou"] == pytest.approx(0.25, abs=0.02)
     assert torch.is_grad_enabled()
 
 
 def test_a_view_without_truth_is_told(tmp_path: Path) -> None:
     gaussians, ids, view = discs(tmp_path)
     with pytest.raises(InputError, match="no true mask"):
-        rendered_miou(gaussians, ids, [view], tmp_path / "empty")
+        evaluate_rendered(gaussians, ids, [view], tmp_path / "empty")

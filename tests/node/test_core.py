@@ -217,8 +217,8 @@ def test_service_gives_what_the_map_gives(free: tuple[Core, Heard], map_path: Pa
 
 def test_topics_give_what_the_map_gives(free: tuple[Core, Heard], map_path: Path) -> None:
     core, heard = free
-    hits = load_map(map_path, encoders=encoders).query("laptop", 2)
-    core.prompt('{"text": "laptop", "top_k": 2, "id": "mine"}')
+    hits = load_map(map_path, encoders=encoders).query("laptop", 2, 0.0)
+    core.prompt('{"text": "laptop", "top_k": 2, "min_score": 0, "id": "mine"}')
     (facts,) = heard.answers(1)
     points, detections, markers = (message for _, message in heard.messages[:3])
     assert facts["id"] == "mine" and facts["hits"] == [hit.to_json() for hit in hits]
