@@ -73,7 +73,10 @@ class Board:
     def detect(self, name: str, picture: np.ndarray) -> Detection | None:
         """Detects the board in a grey image [H, W] uint8; None with fewer than MIN_CORNERS corners."""
         found = self._charuco(picture) if self.kind == "charuco" else self._checkerboard(picture)
-        if found is None or len(found[0]) < MIN_CORNERS or _on_a_line(found[0]):
+        if found is None or len(found[0]) < MIN_CORNERS:
+            return None
+        spread = (found[0] - found[0].mean(axis=0))[:, :2]
+        if int(np.linalg.matrix_rank(spread, tol=1e-6)) < 2:  # all corners lie on a line
             return None
         return Detection(name, found[0].astype(np.float32), found[1].astype(np.float32))
 
@@ -107,7 +110,3 @@ class Board:
             return None
         grid = np.stack([*np.meshgrid(np.arange(columns), np.arange(rows)), np.zeros((rows, columns))], axis=-1)
         return grid.reshape(-1, 3) * self.square, np.reshape(pixels, (-1, 2))
-
-
-def _on_a_line(points: np.ndarray) -> bool:
-    return int(np.linalg.matrix_rank((points - points.mean(axis=0))[:, :2], tol=1e-6)) < 2

@@ -134,7 +134,10 @@ def _facts(solution: Solution, looked_at: int, found: int, board: Board, notes: 
         "parameters": {n: {"value": float(v), "sigma": float(s)} for n, v, s, free in rows if free},
         "pixel_convention": "ROS and OpenCV: the centre of the first pixel is (0, 0)",
         "reprojection_error_px": solution.rms * float(np.sqrt(2)),
-        "views": {v.name: float(e) for v, e in zip(solution.views, solution.view_errors, strict=True)},
+        "views": {
+            view.name: float(np.sqrt((r**2).sum(axis=1).mean()))
+            for view, r in zip(solution.views, solution.residuals, strict=True)
+        },
         "pictures_looked_at": looked_at,
         "pictures_with_board": found,
         "coverage": coverage(solution),

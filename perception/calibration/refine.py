@@ -43,7 +43,8 @@ def refine(
         if laid is None:
             continue
         at = _apply(laid, corner + patch)
-        side = np.sqrt(np.abs(_area(laid, corner, square)))
+        base, right, down = _apply(laid, corner + np.array([[0, 0], [square, 0], [0, square]]))
+        side = np.sqrt(np.abs(np.linalg.det([right - base, down - base])))  # of a square in the image, pixels
         # A pixel averages over its area: the texture is blurred accordingly, in steps of a quarter octave.
         blur = float(2 ** (np.round(4 * np.log2(max(0.5 * per_square / max(side, 1), 0.3))) / 4))
         if blur not in smooth:
@@ -86,9 +87,3 @@ def _sample(image: np.ndarray, at: np.ndarray) -> np.ndarray:
 def _apply(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
     mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
-
-
-def _area(homography: np.ndarray, corner: np.ndarray, square: float) -> float:
-    """Signed area in pixels² of the image of a board square at `corner`."""
-    base, right, down = _apply(homography, corner + np.array([[0, 0], [square, 0], [0, square]]))
-    return float((right - base)[0] * (down - base)[1] - (right - base)[1] * (down - base)[0])

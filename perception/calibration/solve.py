@@ -49,11 +49,6 @@ class Solution:
     residuals: list[np.ndarray]
     rms: float
 
-    @property
-    def view_errors(self) -> np.ndarray:
-        """Root mean square length [V] of each view's residuals, pixels."""
-        return np.array([np.sqrt((r**2).sum(axis=1).mean()) for r in self.residuals])
-
 
 def project(model: str, values: np.ndarray, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels [N, 2] of board points [N, 3] under camera_from_board `pose` [6], and their Jacobian [2N, 6 + P]:

@@ -224,8 +224,8 @@ class Registration:
         """Correlation, at least 0, of the scan's brightness with its mean over the views that see a point."""
         total, count = np.zeros((2, len(moved)))
         for view in views:
-            rows, value = view.brightness_at(moved, self.tolerance)
-            total[rows] += value
+            rows, u, v, _ = view.seen(moved, self.tolerance)
+            total[rows] += view.brightness[v.astype(np.int64), u.astype(np.int64)]
             count[rows] += 1
         seen = count > 0
         if seen.sum() < 30:

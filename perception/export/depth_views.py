@@ -49,11 +49,6 @@ class DepthView:
         rows = np.flatnonzero((depth > 0) & (np.abs(depth - own[:, 2]) <= tolerance))
         return rows, own[rows, 3], own[rows, 4], own[rows, :3]
 
-    def brightness_at(self, points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-        """(rows of the points [P, 3] within `tolerance` of the depth, the brightness in their pixels)."""
-        rows, u, v, _ = self.seen(points, tolerance)
-        return rows, self.brightness[v.astype(np.int64), u.astype(np.int64)]
-
 
 @torch.no_grad()
 def depth_views(gaussians: Gaussians, views: Sequence[View], long_side: int = 640) -> list[DepthView]:

@@ -77,8 +77,10 @@ def segment_cloud(cloud: PointCloud, color_weight: float | None = None, scannet:
         color_weight = 0.0 if meshed else COLOR_WEIGHT
     if color_weight and cloud.colors is not None:
         near = neighbor_lists(points, _COLOR_NEIGHBORS) if lists is None else lists[:, :_COLOR_NEIGHBORS]
-        difference = _color_difference(_median_colors(cloud.colors, near), edges)
-        weights += color_weight * np.maximum(difference - _COLOR_EDGE, 0)
+        colors = _median_colors(cloud.colors, near)
+        difference = colors[edges[:, 0]] - colors[edges[:, 1]]
+        distance = np.sqrt(np.einsum("ei,ei->e", difference, difference)) / np.float32(255)
+        weights += color_weight * np.maximum(distance - _COLOR_EDGE, 0)
     weights = np.nan_to_num(weights, nan=2.0).astype(np.float32)
     return felzenszwalb(edges, weights, len(points))
 
@@ -89,12 +91,6 @@ def _median_colors(colors: np.ndarray, lists: np.ndarray) -> np.ndarray:
     own = np.arange(len(colors), dtype=lists.dtype)[:, None]
     near = colors[np.where(lists >= 0, lists, own)]
     return np.partition(near, lists.shape[1] // 2, axis=1)[:, lists.shape[1] // 2].astype(np.float32)
-
-
-def _color_difference(colors: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Euclidean RGB distance [E] float32 of the ends of edges, in [0, √3]; colors: [P, 3] float32 in 0..255."""
-    difference = colors[edges[:, 0]] - colors[edges[:, 1]]
-    return np.sqrt(np.einsum("ei,ei->e", difference, difference)) / np.float32(255)
 
 
 def vote(labels: np.ndarray, segments: np.ndarray) -> np.ndarray:

@@ -180,17 +180,13 @@ def triangulated(poses: np.ndarray, rays: np.ndarray) -> np.ndarray:
     return points
 
 
-def _residuals(poses: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    local = np.einsum("vij,kj->vki", poses[:, :3, :3], triangulated(poses, rays)) + poses[:, None, :3, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(local[..., :2] / local[..., 2:] - rays)
-
-
 def _without_outliers(poses: np.ndarray, rays: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """The rays without views whose residual exceeds five times the median, worst first; and their residuals."""
     rays = rays.copy()
     while True:
-        residuals = _residuals(poses, rays)
+        local = np.einsum("vij,kj->vki", poses[:, :3, :3], triangulated(poses, rays)) + poses[:, None, :3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            residuals = local[..., :2] / local[..., 2:] - rays
         squares = np.nan_to_num(residuals**2).sum(axis=(1, 2))
         each = np.sqrt(squares / np.maximum(np.isfinite(residuals).sum(axis=(1, 2)), 1))
         shown = np.isfinite(residuals).any(axis=(1, 2))

@@ -138,15 +138,6 @@ def _write_ply_cloud(path: Path, cloud: PointCloud) -> None:
     write_ply(path, elements)
 
 
-def _write_pcd_cloud(path: Path, cloud: PointCloud) -> None:
-    """With rgb packed in a float, as PCL does."""
-    columns = _columns_of(cloud, _NORMALS[1])
-    if cloud.colors is not None:
-        r, g, b = cloud.colors.astype(np.uint32).T
-        columns["rgb"] = ((r << 16) | (g << 8) | b).view(np.float32)
-    write_pcd(path, columns | {name: values.astype(np.int32) for name, values in cloud.labels.items()})
-
-
 def _triangles(faces: np.ndarray, path: Path) -> np.ndarray:
     if faces.dtype != object:
         if faces.ndim != 2:
@@ -186,7 +177,7 @@ def _write_npz(path: Path, cloud: PointCloud) -> None:
         np.savez(file, **everything)
 
 
-def read_pcd(path: Path) -> dict[str, np.ndarray]:
+def _read_pcd(path: Path) -> dict[str, np.ndarray]:
     """The fields of COUNT 1, [P] each; packed rgb(a) as uint32. Fields named "_" are padding and left out."""
     data = path.read_bytes()
     header, at = _read_header(data, path)
@@ -256,8 +247,13 @@ def _from_ascii(data: bytes, dtype: np.dtype, points: int, path: Path) -> np.nda
     return rows
 
 
-def write_pcd(path: Path, columns: dict[str, np.ndarray]) -> None:
-    """Binary PCD 0.7 of named columns [P]."""
+def _write_pcd(path: Path, cloud: PointCloud) -> None:
+    """Binary, with rgb packed in a float, as PCL does."""
+    columns = _columns_of(cloud, _NORMALS[1])
+    if cloud.colors is not None:
+        r, g, b = cloud.colors.astype(np.uint32).T
+        columns["rgb"] = ((r << 16) | (g << 8) | b).view(np.float32)
+    columns |= {name: values.astype(np.int32) for name, values in cloud.labels.items()}
     rows = np.rec.fromarrays(list(columns.values()), names=list(columns))  # type: ignore[call-overload]
     kinds = [rows.dtype[name] for name in columns]
     header = (
@@ -275,11 +271,11 @@ def write_pcd(path: Path, columns: dict[str, np.ndarray]) -> None:
 
 _READERS: dict[str, Callable[[Path], PointCloud]] = {
     ".ply": _read_ply_cloud,
-    ".pcd": lambda path: _cloud_of(read_pcd(path), path),
+    ".pcd": lambda path: _cloud_of(_read_pcd(path), path),
     ".npz": _read_npz,
 }
 _WRITERS: dict[str, Callable[[Path, PointCloud], None]] = {
     ".ply": _write_ply_cloud,
-    ".pcd": _write_pcd_cloud,
+    ".pcd": _write_pcd,
     ".npz": _write_npz,
 }
