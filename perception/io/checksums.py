@@ -48,7 +48,8 @@ def sha256(file: Path) -> str:
 def seal(info: dict[str, Any]) -> dict[str, Any]:
     """`info` with its own checksum under "sha256", over its canonical JSON without that key."""
     plain = {key: value for key, value in info.items() if key != "sha256"}
-    return {**plain, "sha256": _digest(plain)}
+    text = json.dumps(plain, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return {**plain, "sha256": hashlib.sha256(text.encode()).hexdigest()}
 
 
 def check_sizes(folder: Path, info: dict[str, Any]) -> None:
@@ -105,8 +106,3 @@ def listed(folder: Path, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
     if not good:
         raise damaged(folder / FACTS, "its list of files cannot be understood")
     return files
-
-
-def _digest(value: Any) -> str:
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()

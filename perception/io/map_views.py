@@ -8,7 +8,7 @@ file of another size is not accepted. The last two may be null; format version 1
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ class StoredView(View):
 
 def stored_view(view: View, folder: Path, held_out: bool = False) -> StoredView:
     """`view` with the record of its photo for the map at `folder`: both paths, and the size (None if missing)."""
-    photo = Path(os.path.abspath(view.photo))  # noqa: PTH100  (links are kept: they are how the user names his photos)
+    photo = absolute(view.photo)  # links are kept: they are how the user names his photos
     try:
         size = photo.stat().st_size if photo.is_file() else None
     except OSError:
@@ -45,8 +45,6 @@ def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
     """The record of a map at `before`, for a map at `after`: the relative photo path is adapted."""
     if view.photo_beside is None or absolute(before) == absolute(after):
         return view
-    from dataclasses import replace
-
     return replace(view, photo_beside=_relative(absolute(before / view.photo_beside), after))
 
 

@@ -16,6 +16,7 @@ from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.documents import brief, read_json
 from perception.io.ignore_masks import mask_of
 from perception.io.lens import FISHEYE, PERSPECTIVE, opencv_lens
+from perception.io.map_views import absolute
 from perception.io.photos import SUFFIXES, photo_size, why_left_out
 from perception.io.reading import NO_CLOUD, Reading, start_points
 from perception.io.safe_names import safe_name
@@ -48,7 +49,7 @@ def read_transforms(file: Path, how: Reading) -> Scene:
     if not photos:
         first = f"{missing[0]['name']}: {missing[0]['why']}"
         raise InputError(f"{file}: none of the {len(frames)} photos it lists can be read (first: {first})")
-    root = Path(os.path.commonpath([_absolute(photo).parent for photo in photos.values()]))
+    root = Path(os.path.commonpath([absolute(photo).parent for photo in photos.values()]))
     views, notes = _views(file, data, frames, photos, root, how.masks)
     listed = how.cloud
     if listed is None and data.get("ply_file_path"):
@@ -95,7 +96,7 @@ def _views(
     for index, photo in photos.items():
         frame = frames[index]
         lens, note = fit_lens(_lens(file, {**data, **frame}, photo), photo, file)
-        name = safe_name(_absolute(photo).relative_to(root).as_posix(), file)
+        name = safe_name(absolute(photo).relative_to(root).as_posix(), file)
         if name in views:
             notes.add(f"{name} is listed more than once; the first pose is used")
             continue
@@ -142,11 +143,6 @@ def _is_file(path: Path) -> bool:
         return path.is_file()
     except OSError:  # for example a name too long for the file system
         return False
-
-
-def _absolute(path: Path) -> Path:
-    """The path without ".." and without following links, so that a view's name cannot leave its folder."""
-    return Path(os.path.abspath(path))  # noqa: PTH100
 
 
 def _pose(file: Path, frame: dict[str, Any]) -> np.ndarray:
