@@ -135,7 +135,7 @@ class Registration:
         for rotation in likely_rotations(self.scan_normals, self.normals):
             turned = rows @ rotation.T
             for scale in self.scales:
-                found += _correlated(grid, spectra, low, step, turned * scale, scale * rotation)
+                found += _correlated(grid, spectra, low, step, np.asfortranarray(turned * scale), scale * rotation)
         return sorted(found, key=lambda place: -place.score)
 
     def _evidence(self, low: np.ndarray, step: float) -> np.ndarray:
