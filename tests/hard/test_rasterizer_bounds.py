@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import pytest
 import torch
@@ -21,16 +22,29 @@ def gradients(rasterize, inputs):
     return {name: inputs[name].grad for name in GIVEN}
 
 
+@cache
+def naive(name):
+    """(images, gradients) of a scene by the naive rasterizer, computed once for all SIMD levels."""
+    inputs = SCENES[name]()
+    return reference.rasterize(**inputs), gradients(reference.rasterize, inputs)
+
+
+@cache
+def bounded(name):
+    """(inputs of float32 values in float64, `relative_bound`, pixels away from thresholds, naive weights), likewise."""
+    inputs = {k: v.float().double() if isinstance(v, torch.Tensor) else v for k, v in SCENES[name]().items()}
+    return inputs, *relative_bound(inputs), weights(reference.rasterize, inputs)
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_float64_is_the_naive_rasterizer(name):
     """Values to 1e-9 of the largest; gradients to 1e-7 of each argument's largest."""
-    inputs = SCENES[name]()
-    out, expected = perception.rasterize(**inputs), reference.rasterize(**inputs)
+    inputs, (expected, theirs) = SCENES[name](), naive(name)
+    out, ours = perception.rasterize(**inputs), gradients(perception.rasterize, inputs)
     for image in IMAGES:
         scale = float(expected[image].abs().max())
         torch.testing.assert_close(getattr(out, image), expected[image], rtol=1e-9, atol=1e-9 * scale, msg=image)
     assert torch.equal(out.visible, expected["visible"])
-    ours, theirs = gradients(perception.rasterize, inputs), gradients(reference.rasterize, inputs)
     for argument in GIVEN:
         scale = float(theirs[argument].abs().max())
         assert math.isfinite(scale), argument
@@ -40,9 +54,8 @@ def test_float64_is_the_naive_rasterizer(name):
 @pytest.mark.parametrize("name", SCENES)
 def test_float32_weights_keep_their_bound(name):
     """What each Gaussian adds to each pixel, off the thresholds where one rounding decides between all and nothing."""
-    inputs = {k: v.float().double() if isinstance(v, torch.Tensor) else v for k, v in SCENES[name]().items()}
-    bound, away = relative_bound(inputs)
-    exact, single = weights(reference.rasterize, inputs), weights(perception.rasterize, cast(inputs))
+    inputs, bound, away, exact = bounded(name)
+    single = weights(perception.rasterize, cast(inputs))
     assert bool(torch.isfinite(single).all())
     error = ((single - exact).abs() - 4 * U)[away] / exact[away].clamp(min=1e-300)
     assert bool((error <= bound[away]).all()), float((error / bound[away]).max())
@@ -56,10 +69,8 @@ def test_float32_gradients_of_colours_and_opacities_keep_their_bound(name):
     all three factors are products of weights, |c_i − R_i| ≤ 2 max |c|, so it errs by Σ |g| (w_i / o_i) 2 max |c| 3 b.
     Sums over P pixels add P U of the sum of magnitudes. Pixels on a threshold may be off by all that they hold.
     """
-    inputs = {k: v.float().double() if isinstance(v, torch.Tensor) else v for k, v in SCENES[name]().items()}
-    inputs["background"] = None
-    bound, away = relative_bound(inputs)
-    w = weights(reference.rasterize, inputs)
+    inputs, bound, away, w = bounded(name)
+    inputs = {**inputs, "background": None}
     found = weights(perception.rasterize, cast(inputs))
     opacity = inputs["opacities"].clamp(min=1e-300)
     steep = (w / w.new_tensor(1).sub(_before(inputs, w)).clamp(min=1e-9)) > 0.99  # near the clamp of alpha
@@ -95,10 +106,9 @@ def _before(inputs, w):
 def test_float32_gradients_are_finite_and_near_those_of_float64(name):
     """Every argument. No bound is derived for sums that cancel: within 2 % of the largest component, except where a
     pixel lies on a threshold in some Gaussian; needles and far cameras magnify roundings and are held to be finite."""
-    inputs = {k: v.float().double() if isinstance(v, torch.Tensor) else v for k, v in SCENES[name]().items()}
+    inputs, bound, away, w = bounded(name)
     exact, single = gradients(perception.rasterize, inputs), gradients(perception.rasterize, cast(inputs))
-    bound, away = relative_bound(inputs)
-    known = bool(away.all()) and float(bound[weights(reference.rasterize, inputs) > 0].max()) < 1e-2
+    known = bool(away.all()) and float(bound[w > 0].max()) < 1e-2
     for argument in GIVEN:
         assert bool(torch.isfinite(single[argument]).all()), argument
         if known:
