@@ -29,7 +29,7 @@ def image(path: Path) -> np.ndarray:
 def scene(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder as `perception demo --photos-only` writes it, of small photos; seeds that choose for themselves."""
     folder = tmp_path_factory.mktemp(request.param)
-    made = {"scene": request.param, "seed": 5, "views": 10, "width": 160, "height": 120, "light_samples": 2}
+    made = {"scene": request.param, "seed": 5, "views": 10, "width": 160, "height": 120, "light_samples": 1}
     make_photos(folder / "images", truth_folder=folder, **made)
     return folder
 
