@@ -74,26 +74,26 @@ class Trainer:
         self.views, self.coarse = views, [view.halved() for view in views]
         self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
 
-    @torch_on_one_thread()
     def run(self, observer: Observer | None = None, until: float = 1.0) -> TrainRecord:
         """Trains until progress `until`. Early stopping is allowed only with until = 1."""
         self._since = time.monotonic()
         whole = True  # what a failed step left is no state to resume from
         try:
-            while (progress := self.progress) < until:
-                with uninterrupted():
-                    whole = False
-                    self.complete = False
-                    loss = self.step(progress)
-                    self.schedule.after_step(progress, may_stop=until >= 1.0)
-                    whole = True
-                if observer is not None:
-                    observer.after_step(self, loss)
-            if until >= 1.0 and not self.complete:
-                with uninterrupted():
-                    whole = False
-                    self.schedule.finish()
-                    self.complete = whole = True
+            with torch_on_one_thread():
+                while (progress := self.progress) < until:
+                    with uninterrupted():
+                        whole = False
+                        self.complete = False
+                        loss = self.step(progress)
+                        self.schedule.after_step(progress, may_stop=until >= 1.0)
+                        whole = True
+                    if observer is not None:
+                        observer.after_step(self, loss)
+                if until >= 1.0 and not self.complete:
+                    with uninterrupted():
+                        whole = False
+                        self.schedule.finish()
+                        self.complete = whole = True
         finally:
             self.record.seconds, self.record.iterations = self.elapsed, self.iteration
             self._since = None
