@@ -1,9 +1,10 @@
 """Trains the merge model of the built-in masks on rendered worlds: `python -m perception.bench.masks_training WORK`.
 
-Worlds are clutter, rooms and tabletops by seed; of ten, one chooses the cost and the calibration, one is for testing.
-Their depth is true but noisy, in every third world as stereo finds it, else as a depth camera. Pairs of patches are
-gathered along merges that the truth permits, in the order of a plain rule, then of the model so far (Nunez-Iglesias et
-al. 2013). WORK keeps the worlds, so that a run that was stopped goes on. A world takes 20 s of a core, learning 8 min.
+Worlds are clutter, rooms and tabletops by seed, in sets of four: twelve sets train, two choose the cost and the
+calibration, two are for testing. Each world is read twice, as maps with and without depth images see its surface. Pairs
+of patches are gathered along merges that the truth permits, in the order of a plain rule, then of the model so far
+(Nunez-Iglesias et al. 2013). WORK keeps the worlds, so that a run that was stopped goes on. A world takes 20 s of a
+core, learning 3 min. Equal seeds give equal weights. The packaged ones are those of this command.
 """
 
 from __future__ import annotations
@@ -24,17 +25,22 @@ import numpy as np
 from perception.bench.output import Column, table
 from perception.masks.merge_model import WEIGHTS, MergeModel, Network
 from perception.masks.merging import SMALLEST, MergeTree, divided, merge_tree, tree_by
+from perception.masks.surface import FOOTPRINTS
 from perception.masks.surface_graph import SurfaceGraph
 
 SCENES = (("clutter", 3100, 2), ("clutter", 3101, 2), ("room", 2000, 1), ("tabletop", 1000, 1))  # first seed, step
-SHARES = {"training": range(8), "validation": range(8, 9), "test": range(9, 10)}  # last digit of a world's number
+KEPT = {"validation": (8, 18), "test": (9, 19)}  # numbers of sets that are not trained on
 PAIRS, LEAST = 8000, 20  # pairs of one world and round; voxels of a region that is learned from
-MEMBERS = 3  # networks of an ensemble
-COSTS = (0.05, 0.1, 0.15, 0.2)  # higher ones join things in scenes unlike the worlds
+MEMBERS = 3  # networks of an ensemble for pairs; twice as many for regions, of which there are fewer
+COSTS = (0.02, 0.05, 0.1, 0.15, 0.2)  # higher ones join things in scenes unlike the worlds
 NOISE, NEARER = 0.1, 0.3  # standard deviations: of inputs, relative to theirs; of the logarithm of the size of things
 PAIR_SIZE = {6: 2, 7: 2, 9: 1, **dict.fromkeys(range(27, 33), 1)}  # power of that size in SurfaceGraph.features
 WHOLE_SIZE = {4: 2, 5: 1, 6: 1, 7: 1}  # and in MergeTree.features
-COLUMNS: tuple[Column, ...] = tuple((name, name.lower(), ".3f") for name in ("AP", "AP50", "AP25", "ECE"))
+RENDERED, SENSED = 0.1, 0.025  # relative errors of depth; the latter make flat patches as thick as a Kinect's are
+POSES = 0.005  # errors of poses: radians, and relative to the median depth
+SIDES = (3.0, 5.0)  # of voxels, in pixel footprints
+GOALS = ("AP", "AP50", "AP25", "reach")
+COLUMNS: tuple[Column, ...] = tuple((name, name.lower(), ".3f") for name in (*GOALS, "ECE"))
 Samples = tuple[np.ndarray, ...]  # inputs [P, F], targets [P, O], weights [P]
 
 
@@ -50,9 +56,11 @@ class World:
         np.add.at(self.votes, (self.graph.patch, self.truth), 1)
 
 
-def read_world(folder: Path, stereo: bool, seed: int = 0, skip: int = -1) -> World:
-    """A scene in the format of docs/benchmarks.md. seed: of the noise. skip: a photo to leave out."""
+def read_world(folder: Path, stereo: bool, seed: int = 0, skip: int = -1, side: float = 0) -> World:
+    """A scene in the format of docs/benchmarks.md, as a map with depth images or, `stereo`, without sees its surface.
+    seed: of the noise. skip: a photo to leave out. side: of a voxel, in pixel footprints; 0: drawn from SIDES."""
     import cv2
+    from scipy.spatial.transform import Rotation
 
     from perception.io.photos import read_photo
     from perception.masks.builtin import fuse, surface_graph
@@ -63,23 +71,27 @@ def read_world(folder: Path, stereo: bool, seed: int = 0, skip: int = -1) -> Wor
     about = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
     K = np.array([[about["fl_x"], 0, about["cx"]], [0, about["fl_y"], about["cy"]], [0, 0, 1]])
     rng = np.random.default_rng([seed, *folder.name.encode()])
+    share, drawn = rng.uniform(0, 1), rng.uniform(*SIDES)
     views, ids = [], []
     for k, frame in enumerate(about["frames"]):
         photo = folder / frame["file_path"]
         files = (str(folder / kind / f"{photo.stem}.png") for kind in ("depth", "masks_gt"))
         depth, truth = (np.asarray(cv2.imread(file, cv2.IMREAD_UNCHANGED)) for file in files)
+        depth = depth.astype(np.float32) / 1000
         pose = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1.0, -1, -1, 1]))
-        noisy = _noisy(depth.astype(np.float32) / 1000, stereo, rng)
-        made = make_stereo_view(
-            View(photo.stem, photo, K, depth.shape[1], depth.shape[0], pose), read_photo(photo), noisy
-        )
+        noisy = _noisy(depth, stereo, share, rng)
+        if not stereo:
+            pose[:3, :3] = Rotation.from_rotvec(rng.normal(0, POSES * share, 3)).as_matrix() @ pose[:3, :3]
+            pose[:3, 3] += rng.normal(0, POSES * share * np.median(depth[depth > 0]), 3)
+        view = View(photo.stem, photo, K, depth.shape[1], depth.shape[0], pose)
+        made = make_stereo_view(view, read_photo(photo), noisy)
         if made is not None and k != skip:
+            made.measured = not stereo
             views.append(made)
             shown = cv2.resize(truth, made.grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
             ids.append(shown.astype(np.int64))
-    if stereo:
-        measure_depths(views)
-    surface = fuse(views)
+    measure_depths(views)
+    surface = fuse(views, side or drawn)
     graph = surface_graph(views, surface)
     votes = np.zeros((len(surface), int(max(image.max() for image in ids)) + 1), np.int32)
     for view, image in zip(views, ids, strict=True):
@@ -87,19 +99,27 @@ def read_world(folder: Path, stereo: bool, seed: int = 0, skip: int = -1) -> Wor
     return World(graph, votes.argmax(axis=1))
 
 
-def _noisy(depth: np.ndarray, stereo: bool, rng: np.random.Generator) -> np.ndarray:
-    """Depth [h, w] as a map in training renders it, smooth and wrong by 3 % in waves; or as a depth camera measures it:
-    noise grows with the square of the depth (Khoshelham & Elberink 2012), and most pixels at steps are unknown."""
+def _noisy(depth: np.ndarray, stereo: bool, share: float, rng: np.random.Generator) -> np.ndarray:
+    """Depth [h, w] as a map in training renders it, smooth and wrong by 5 to 6 % in the median; or as a depth camera
+    measures it: noise grows with the square of the depth (Khoshelham & Elberink 2012), and most pixels at steps are
+    unknown. Both are wrong in waves. share: in [0, 1], of the largest errors."""
     import cv2
 
+    from perception.io.depth import without_edges
+
+    def waves(spread: float) -> np.ndarray:
+        knots = rng.normal(0, spread, (5, 7))
+        return np.asarray(np.exp(cv2.resize(knots, depth.shape[::-1], interpolation=cv2.INTER_CUBIC)))
+
     if stereo:
-        waves = cv2.resize(rng.normal(1, 0.03, (5, 7)), depth.shape[::-1], interpolation=cv2.INTER_CUBIC)
-        return np.where(depth > 0, cv2.GaussianBlur(depth, (0, 0), depth.shape[1] / 40) * waves, 0)
+        smooth = cv2.GaussianBlur(depth, (0, 0), depth.shape[1] / 40)
+        return np.where(depth > 0, smooth * waves(RENDERED * (0.5 + share)), 0)
     noise = cv2.GaussianBlur(rng.normal(0, 1, depth.shape), (0, 0), 0.8)
     kernel = np.ones((5, 5), np.uint8)
     step = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel) > 0.04 * depth
     unknown = (depth == 0) | step & (rng.random(depth.shape) < 0.7)
-    return np.where(unknown, 0, depth + (0.0024 + 0.0038 * (depth - 0.4) ** 2) * noise)
+    noisy = depth + (0.5 + 2 * share) * (0.0024 + 0.0038 * (depth - 0.4) ** 2) * noise
+    return without_edges(np.where(unknown, 0, noisy * waves(SENSED * share)).astype(np.float32))
 
 
 def make_world(folder: Path, stereo: bool) -> World:
@@ -158,32 +178,35 @@ def regions_of(world: World, pair: Network) -> Samples:
     return tree.features[size >= LEAST], np.stack([best > 0.5, best > 0.75], axis=1), np.ones(len(best))
 
 
-def fit(samples: list[Samples], size: dict[int, int], epochs: int, seed: int) -> Network:
+def fit(samples: list[Samples], size: dict[int, int], epochs: int, seed: int, members: int = MEMBERS) -> Network:
     """Networks with 24 and 12 hidden units, by AdamW on the weighted cross entropy. size: features that grow with
     the size of things, and their power of it. Inputs are varied by other sizes and by noise, for stability."""
     import torch
 
     torch.manual_seed(seed)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # sums of one order
     x, y, weight = (np.concatenate(column) for column in zip(*samples, strict=True))
     mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-3)
     inputs = torch.from_numpy(np.clip((x - mean) / scale, -5, 5).astype(np.float32))
     target, weights = (torch.from_numpy(a.astype(np.float32)) for a in (y, weight[:, None] / weight.mean()))
     nearer = torch.tensor([NEARER * size.get(k, 0) / float(scale[k]) for k in range(len(scale))])
     sizes = [x.shape[1], 24, 12, y.shape[1]]
-    layers = [(torch.randn(MEMBERS, b, a) * (2 / a) ** 0.5).requires_grad_() for a, b in pairwise(sizes)]
-    offsets = [torch.zeros(MEMBERS, 1, b, requires_grad=True) for b in sizes[1:]]
+    layers = [(torch.randn(members, b, a) * (2 / a) ** 0.5).requires_grad_() for a, b in pairwise(sizes)]
+    offsets = [torch.zeros(members, 1, b, requires_grad=True) for b in sizes[1:]]
     steps = epochs * len(x) // 1024
     optimiser = torch.optim.AdamW([*layers, *offsets], lr=4e-3, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     for _ in range(steps):
-        some = torch.randint(len(x), (MEMBERS, 1024))
-        h = inputs[some] + NOISE * torch.randn(MEMBERS, 1024, x.shape[1]) + torch.randn(MEMBERS, 1024, 1) * nearer
+        some = torch.randint(len(x), (members, 1024))
+        h = inputs[some] + NOISE * torch.randn(members, 1024, x.shape[1]) + torch.randn(members, 1024, 1) * nearer
         for k, (layer, offset) in enumerate(zip(layers, offsets, strict=True)):
             h = torch.baddbmm(offset, h.relu() if k else h, layer.transpose(1, 2))
         optimiser.zero_grad()
         torch.nn.functional.binary_cross_entropy_with_logits(h, target[some], weights[some]).backward()
         optimiser.step()
         schedule.step()
+    torch.set_num_threads(threads)
     learned = (part.detach().numpy() for pair in zip(layers, offsets, strict=True) for part in pair)
     return Network((mean.astype(np.float32), scale.astype(np.float32), *learned))
 
@@ -193,11 +216,13 @@ def learn(worlds: list[World], seed: int = 0) -> MergeModel:
     samples = [pairs_of(world, plain_rule, seed) for world in worlds]
     first = fit(samples, PAIR_SIZE, 6, seed)
     pair = fit(samples + [pairs_of(world, first, seed + 1) for world in worlds], PAIR_SIZE, 6, seed)
-    return MergeModel(pair, fit([regions_of(world, pair) for world in worlds], WHOLE_SIZE, 40, seed), COSTS[0])
+    whole = fit([regions_of(world, pair) for world in worlds], WHOLE_SIZE, 20, seed, 2 * MEMBERS)
+    return MergeModel(pair, whole, COSTS[0])
 
 
 def scores(world: World, tree: MergeTree, model: MergeModel) -> dict[str, Any]:
-    """AP of all instances of a world, and of each segment of ≥ 100 voxels its probability and whether it is right."""
+    """AP of all instances of a world; reach, the share of them with a segment that lies in it by half and covers a
+    quarter of it; and of each segment of ≥ 100 voxels its probability and whether it is right."""
     from perception.evaluate.instances import evaluate
 
     labels, probability = divided(world.graph, tree, model)
@@ -206,26 +231,28 @@ def scores(world: World, tree: MergeTree, model: MergeModel) -> dict[str, Any]:
     sizes = both.sum(axis=1)
     best = (both / (sizes[:, None] + both.sum(axis=0) - both + 1e-9))[:, 1:].max(axis=1)
     large = (sizes >= 100) & (np.arange(len(best)) > 0)
+    whole = both.sum(axis=0)
+    held = ((both >= 0.5 * sizes[:, None]) & (both >= 0.25 * whole))[1:, 1:].any(axis=0)[whole[1:] >= LEAST]
     result = evaluate(labels - 1, dict(enumerate(probability[1:])), world.truth)
-    return result | {"p": probability[large], "right": best[large] > 0.5}
+    return result | {"reach": held.mean(), "p": probability[large], "right": best[large] > 0.5}
 
 
 def _mean(model: MergeModel, cases: list[tuple[World, MergeTree]]) -> dict[str, Any]:
-    """Mean AP, AP50, AP25; p and right of all segments; expected calibration error in ten bins (Guo et al. 2017)."""
+    """Means of GOALS; p and right of all segments; expected calibration error in ten bins (Guo et al. 2017)."""
     found = [scores(*case, model) for case in cases]
     p, right = (np.concatenate([row[key] for row in found]) for key in ("p", "right"))
     error = np.abs(np.bincount(np.minimum((p * 10).astype(int), 9), p - right)).sum() / len(p)
-    return {k: float(np.mean([row[k] for row in found])) for k in ("ap", "ap50", "ap25")} | {
+    return {k: float(np.mean([row[k] for row in found])) for k in map(str.lower, GOALS)} | {
         "p": p, "right": right, "ece": error}  # fmt: skip
 
 
 def tuned(model: MergeModel, worlds: list[World]) -> MergeModel:
-    """The cost with the best mean of AP, AP50 and AP25, and the calibration of the segments found with it."""
+    """The cost with the best mean of GOALS, and the calibration of the segments found with it."""
     from scipy.optimize import minimize
 
     cases = [(world, tree_by(model, world.graph)) for world in worlds]
     runs = {cost: _mean(replace(model, cost=cost), cases) for cost in COSTS}
-    cost = max(COSTS, key=lambda c: runs[c]["ap"] + runs[c]["ap50"] + runs[c]["ap25"])
+    cost = max(COSTS, key=lambda c: sum(runs[c][goal.lower()] for goal in GOALS))
     p, sign = runs[cost]["p"].clip(1e-6, 1 - 1e-6), np.where(runs[cost]["right"], -1, 1)
     odds = np.log(p / (1 - p))
     found = minimize(lambda ab: np.logaddexp(0, sign * (ab[0] * odds + ab[1])).mean(), [1.0, 0.0])
@@ -244,26 +271,33 @@ def report(model: MergeModel, groups: dict[str, list[World]]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m perception.bench.masks_training", description=__doc__)
     parser.add_argument("work", type=Path, metavar="WORK", help="folder of the worlds")
-    parser.add_argument("--worlds", type=int, default=25, metavar="N", help="sets of four (default 25)")
+    parser.add_argument("--worlds", type=int, default=12, metavar="N", help="sets of four to train on (default 12)")
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="SCENE", help="more scenes to test on")
     parser.add_argument("-o", "--output", type=Path, default=WEIGHTS, metavar="NPZ", help="default: the package's file")
     options = parser.parse_args(arguments)
     options.work.mkdir(parents=True, exist_ok=True)
+    numbers = {"training": [k for k in range(2 * options.worlds) if k % 10 < 8][: options.worlds], **KEPT}
     jobs = [
-        (k, options.work / f"{name}_{first + step * k}") for k in range(options.worlds) for name, first, step in SCENES
+        (name, options.work / f"{scene}_{first + step * k}", stereo)
+        for name, sets in numbers.items()
+        for k in sets
+        for scene, first, step in SCENES
+        for stereo in (False, True)
     ]
     with ProcessPoolExecutor(os.cpu_count()) as pool:
-        stereo = ((k + number) % 3 == 1 for number, (k, _) in enumerate(jobs))
-        worlds = list(pool.map(make_world, (folder for _, folder in jobs), stereo))
-    groups = {
-        name: [world for (k, _), world in zip(jobs, worlds, strict=True) if k % 10 in digits]
-        for name, digits in SHARES.items()
-    }
+        worlds = list(pool.map(make_world, *zip(*(job[1:] for job in jobs), strict=True), chunksize=2))
+    groups: dict[str, list[World]] = {}
+    for (name, _, stereo), world in zip(jobs, worlds, strict=True):
+        groups.setdefault(name, []).append(world)
+        groups.setdefault(f"{name}, {'stereo' if stereo else 'sensor'}", []).append(world)
     for scene in options.scenes:
-        groups |= {f"{scene.name}, {kind}": [read_world(scene, kind == "stereo")] for kind in ("sensor", "stereo")}
+        groups |= {
+            f"{scene.name}, {kind}": [read_world(scene, kind == "stereo", side=FOOTPRINTS)]
+            for kind in ("sensor", "stereo")
+        }
     model = tuned(learn(groups["training"]), groups["validation"])
     model.save(options.output)
-    print(report(model, groups))
+    print(report(model, {name: worlds for name, worlds in groups.items() if "," in name}))
 
 
 if __name__ == "__main__":

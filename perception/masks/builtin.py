@@ -13,12 +13,12 @@ from perception.errors import InputError
 from perception.masks.merging import Segmentation, segmentation
 from perception.masks.stereo import measure_depths
 from perception.masks.stereo_views import StereoView, make_stereo_view
-from perception.masks.surface import Surface, SurfaceBuilder, to_world, voxel_side
+from perception.masks.surface import FOOTPRINTS, Surface, SurfaceBuilder, to_world
 from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.progress import Progress
 from perception.types import View
 
-VERSION = 12  # increased whenever the label images change, so that cached ones are recomputed
+VERSION = 13  # increased whenever the label images change, so that cached ones are recomputed
 _SMOOTH = 0.03  # relative to the depth: a pixel with a larger depth step is not part of the surface
 _LEAST_VOXELS = 100
 
@@ -76,10 +76,10 @@ class BuiltinSegmentation:
         return cv2.resize(labels, photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
 
 
-def fuse(views: list[StereoView]) -> Surface:
-    """Fuses the confirmed pixels of all photos into one surface."""
+def fuse(views: list[StereoView], side: float = FOOTPRINTS) -> Surface:
+    """Fuses the confirmed pixels of all photos into one surface. side: of a voxel, in pixel footprints."""
     footprints = np.concatenate([(view.depth[::4, ::4] / view.K[0, 0]).ravel() for view in views])
-    builder = SurfaceBuilder(voxel_side(footprints))
+    builder = SurfaceBuilder(side * float(np.median(footprints)))
     for view in views:
         photo, depth = view.cues()
         builder.add(photo, depth, view.confirmed & (depth.step.max(axis=0) < _SMOOTH), view.world_from_camera)

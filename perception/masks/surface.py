@@ -8,7 +8,7 @@ import numpy as np
 
 from perception.masks.cues import DepthCues, PhotoCues
 
-_FOOTPRINTS = 4.0  # voxel side in pixel footprints at the median depth; above the noise of the depth
+FOOTPRINTS = 4.0  # voxel side in pixel footprints at the median depth; above the noise of the depth
 _MOST = 400_000  # voxels; larger scenes use larger voxels
 _LEAST_PIXELS = 3  # over all photos, minimum for a voxel to be kept
 _OFFSET = 1 << 20  # makes voxel indices positive; 2^21 values per axis
@@ -85,11 +85,6 @@ class SurfaceBuilder:
             normals.astype(np.float32),
             (sums[:, 7:10] / count).astype(np.float32),
         )
-
-
-def voxel_side(footprints: np.ndarray) -> float:
-    """Initial voxel side, from the pixel footprints [P] (depth / focal length, in scene units)."""
-    return _FOOTPRINTS * float(np.median(footprints))
 
 
 def to_world(points: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from perception.bench.masks_training import fit, make_world, pairs_of, plain_rule
+from perception.bench.masks_training import fit, learn, make_world, pairs_of, plain_rule
 from perception.demo.scene import make_photos
 
 
@@ -30,6 +30,12 @@ def test_truth_of_a_worlds_voxels_against_the_true_points(photographed, stereo):
     assert len(features) == len(one) == len(weights) > 50 and 0.1 < one.mean() < 0.95
     again = make_world(home, stereo)  # from its file
     np.testing.assert_array_equal(again.graph.sums, world.graph.sums)
+    home.with_suffix(".stereo" if stereo else ".sensor").unlink()
+    np.testing.assert_array_equal(make_world(home, stereo).truth, world.truth)  # from its photos, with the same noise
+    first, second, other = (learn([world, again], seed=seed) for seed in (0, 0, 1))
+    for one, two in zip(first.pair.parts + first.whole.parts, second.pair.parts + second.whole.parts, strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert (first.pair.parts[2] != other.pair.parts[2]).any()
 
 
 def test_networks_learn_a_rule_that_is_not_linear():
