@@ -136,7 +136,10 @@ def test_sigterm_is_ctrl_c(small_scene: Path, tmp_path: Path) -> None:
         "import sys; from perception.cli import main; from perception.io.lens import load_pycolmap\n"
         "import perception.pipeline.mapping as m; load = m.load_scene\n"
         "def load_scene(*a, **k):\n    load_pycolmap()\n    return load(*a, **k)\n"
-        "m.load_scene = load_scene\nsys.exit(main(sys.argv[1:]))"
+        "m.load_scene = load_scene\n"
+        "from perception.progress import Progress; show = Progress.update\n"  # a line a step, not one in ten seconds
+        "def update(self, *words):\n    self._last = -10.0\n    show(self, *words)\n"
+        "Progress.update = update\nsys.exit(main(sys.argv[1:]))"
     )
     words = [
         "map",
