@@ -94,8 +94,9 @@ def read_world(folder: Path, stereo: bool, seed: int = 0, skip: int = -1, side: 
     surface = fuse(views, side or drawn)
     graph = surface_graph(views, surface)
     votes = np.zeros((len(surface), int(max(image.max() for image in ids)) + 1), np.int32)
-    for view, image in zip(views, ids, strict=True):
-        np.add.at(votes, (view.voxel[view.voxel >= 0], image[view.voxel >= 0]), 1)
+    for shown_by, image in zip(views, ids, strict=True):
+        on_surface = shown_by.voxel >= 0
+        np.add.at(votes, (shown_by.voxel[on_surface], image[on_surface]), 1)
     return World(graph, votes.argmax(axis=1))
 
 
