@@ -42,8 +42,11 @@ def read_truth_cloud(scene: Path, means: np.ndarray) -> PointCloud:
 
 
 def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
-    """AP (protocol scannet, class-agnostic, exported labels with smoothing) and rendered mIoU against ground truth;
-    SCORED: score, IoU > 0.5 with a true one (0 or 1) of each instance with MIN_POINTS points or more."""
+    """AP (protocol scannet, class-agnostic, exported labels with smoothing) and rendered mIoU against ground truth.
+
+    Under the key SCORED, a pair for each instance with at least MIN_POINTS points: its score, and 1 if its IoU with a
+    true instance exceeds 0.5, else 0.
+    """
     from perception.evaluate.instances import evaluate
     from perception.evaluate.overlap import overlap_of_ids, read_truth
     from perception.evaluate.rendered import evaluate_rendered

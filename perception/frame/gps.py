@@ -56,8 +56,8 @@ def scale_of_positions(centres: np.ndarray, metres: np.ndarray, seed: int = 0) -
     """Metres per unit from camera centres [N, 3] and their measured positions [N, 3] with outliers, and notes.
 
     The similarity metres = s R centres + t of least median residual over triples (LMedS) is refined on its inliers.
-    The standard error is the jackknife's: the scale is computed again without each photo, and the spread is taken. An
-    error that all photos share does not show in it.
+    The standard error is a jackknife estimate: the scale is computed once for each photo that is left out, and their
+    spread gives the error. An error that all photos share is not part of it.
     """
     inside = _inliers(centres, metres, np.random.default_rng(seed))
     count = int(inside.sum())

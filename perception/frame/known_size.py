@@ -111,8 +111,9 @@ def scale_of_sightings(
 ) -> Measurement:
     """Metres per unit from things of known size; pixel_error: least standard deviation of their pixels.
 
-    The standard error is the larger of two. One is the effect of random pixel noise. The other is the jackknife's, the
-    spread of the scales computed without each view: a wrong pose moves all corners of its view together.
+    The standard error is the larger of two estimates. The first adds random noise to the pixels. The second is a
+    jackknife estimate: the scale is computed once for each view that is left out, and their spread gives the error. It
+    covers wrong poses, which move all corners of a view together.
     InputError when the corners do not have the shape.
     """
     poses = np.stack([view.camera_from_world for view in views])
