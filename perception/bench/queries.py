@@ -4,6 +4,8 @@ A hit is right when the true object under most of the instance's exported points
 are those of scene.json whose objects some photo shows. Absent prompts: 30 things of street, farm, sea and
 museum, and household things that the scene does not name, which are the harder half. Reliability: over all prompts of
 all scenes, present and absent, the score of the best hit, and whether the prompt is one of the scene.
+Prompts with a word in capitals are about printed words; those in `absent` of scene.json, about words that are on
+nothing. They are also scored apart, with the texts read on the instances and without.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ from perception.language.ranking import Answer, Ranker, answering
 from perception.query import QueryMap, load_map
 from perception.query.text_ranking import TextRanking
 
+PRINTED = re.compile(r"\b[A-Z]{2,}\b")
+PRINTED_FIGURES = "top1", "top3", "returned_precision", "returned_recall", "false_positive_prompts", "failed_prompts"
 # No word of these two lists may stand in language/probes.txt, which sets the threshold (there is a test).
 ABSENT = (
     "elephant", "car", "airplane", "bicycle", "motorcycle", "train", "horse", "giraffe", "sailing boat",
@@ -58,7 +62,15 @@ def measure(map_path: Path, scene: Path) -> dict[str, Any]:
     owners = true_objects(opened, scene)
     report: dict[str, Any] = {"map": str(map_path), "scene": scene.name, "instances": len(opened.instances)}
     report |= {"encoder": str(opened.language["encoder"]), "prompts": len(queries), "unseen_prompts": unseen}
-    report |= _figures(TextRanking(opened, opened.encoders).rank, owners, queries, read_words(scene))
+    words = read_words(scene)
+    near = [t for t in HOUSEHOLD if not {singular(w) for w in t.split()} & words]
+    report |= _figures(TextRanking(opened, opened.encoders).rank, owners, queries, near)
+    printed = [query for query in queries if PRINTED.search(query[0])]
+    nowhere = [text for text in read_scene(scene).get("absent", []) if PRINTED.search(text)]
+    report |= {"printed_prompts": len(printed), "printed_absent_prompts": len(nowhere)} if printed else {}
+    for name, texts in (("printed", True), ("printed_without_texts", False)) if printed else ():
+        found = _figures(TextRanking(opened, opened.encoders, texts).rank, owners, printed, nowhere)
+        report |= {f"{name}_{key}": found[key] for key in PRINTED_FIGURES}
     return report | latency(opened.ranker, [text for text, _ in queries])
 
 
@@ -92,13 +104,12 @@ def true_objects(opened: QueryMap, scene: Path) -> list[int]:
 
 
 def _figures(
-    rank: Callable[[str], Answer], owners: list[int], queries: list[tuple[str, set[int]]], words: set[str]
+    rank: Callable[[str], Answer], owners: list[int], queries: list[tuple[str, set[int]]], near: list[str]
 ) -> dict[str, Any]:
     right = [{n for n, owner in enumerate(owners) if owner in ids} for _, ids in queries]
     answers = [rank(text) for text, _ in queries]
     found = [bool({i for i, _ in a.hits[:3]} & ids) for a, ids in zip(answers, right, strict=True)]
     top1, top3 = accuracy([[i for i, _ in a.hits] for a in answers], right)
-    near = [t for t in HOUSEHOLD if not {singular(w) for w in t.split()} & words]
     absent = [rank(t) for t in (*ABSENT, *near)]
     wrong, wrong_near = ([a.text for a in absent if a.present and a.text in texts] for texts in (ABSENT, near))
     return {

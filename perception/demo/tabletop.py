@@ -32,7 +32,7 @@ def build(seed: int, light_samples: int = 20) -> Scene:
     light_samples: rays per texel of the light maps, for the lamp and for ambient light; fewer are faster and noisier.
     """
     rng = np.random.default_rng(seed)
-    bodies = (_demo_things(rng) if seed == 0 else _chosen_things(rng)) + _room(rng, seed != 0)
+    bodies = (_demo_things(rng) if seed == 0 else _chosen_things(rng)) + room_around(rng, seed != 0)
     bake_all(bodies, LIGHTING, rng, light_samples)
     asked = ["red mug", "basketball", "banana"] if seed == 0 else [body.name for body in bodies[:3]]
     return Scene(bodies, LIGHTING, partial(orbit, focal_35mm=FOCAL_35MM), [*asked, "laptop"])
@@ -77,20 +77,20 @@ def _chosen_things(rng: np.random.Generator) -> list[Body]:
     ]
     scales = rng.uniform(0.88, 1.12, len(alone))
     turns = rng.uniform(0, 360, len(alone))
-    spots = _spots(rng, [radius * scale for (radius, _), scale in zip(alone, scales, strict=True)])
+    found = spots(rng, [radius * scale for (radius, _), scale in zip(alone, scales, strict=True)])
     placed = [
         body.placed(turn, np.array([*spot, 0.0]), scale)
-        for (_, body), turn, spot, scale in zip(alone, turns, spots, scales, strict=True)
+        for (_, body), turn, spot, scale in zip(alone, turns, found, scales, strict=True)
         if spot is not None
     ]
     stacked = things.book(rng, other)
-    if spots[0] is not None:  # the first disc always fits
-        placed.append(stacked.placed(turns[0] + 25, np.array([*spots[0], 0.036 * scales[0]]), 0.85))
+    if found[0] is not None:  # the first disc always fits
+        placed.append(stacked.placed(turns[0] + 25, np.array([*found[0], 0.036 * scales[0]]), 0.85))
     spot = np.array([rng.uniform(0.1, 0.4), WALL, 0.46])
     return [*placed, things.clock(rng).placed(0, spot)]
 
 
-def _spots(rng: np.random.Generator, radii: list[float]) -> list[tuple[float, float] | None]:
+def spots(rng: np.random.Generator, radii: list[float]) -> list[tuple[float, float] | None]:
     """Non-overlapping positions on the table for discs; every third touches an earlier disc. None where none fits."""
     found: list[tuple[float, float] | None] = []
     taken: list[tuple[float, float, float]] = []
@@ -112,7 +112,7 @@ def _spots(rng: np.random.Generator, radii: list[float]) -> list[tuple[float, fl
     return found
 
 
-def _room(rng: np.random.Generator, shuffled: bool) -> list[Body]:
+def room_around(rng: np.random.Generator, shuffled: bool) -> list[Body]:
     """Table, walls, floor and posters. shuffled: with random colours."""
     grounds = ["#b9cdc4", "#cfc3ae"]
     if shuffled:

@@ -37,6 +37,7 @@ BALLS = {  # paint, its size, direction of the pole
     "basketball": (tex.basketball, (480, 960), [0.5, -0.45, 0.75]),
     "soccer ball": (tex.soccer_ball, (440, 880), [0.2, -0.3, 1]),
 }
+Printed = tuple[str, str, str, tuple[float, float, float]]  # colour, name, word; width, depth, height in metres
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 """Rotation of a tube that bends in the plane of x and z."""
 
@@ -250,43 +251,51 @@ def plate(rng: np.random.Generator, color: str) -> Body:
     return Body("dinner plate", ["plate", "dinner plate"], [Part(shape, paint, 0.5, (32, 48))])
 
 
-def bottle(rng: np.random.Generator, name: str, color: str) -> Body:
-    """A bottle with a paper label and a cap."""
+def bottle(rng: np.random.Generator, name: str, color: str, word: str = "CIDER") -> Body:
+    """A bottle with a paper label, which bears the word twice, and a cap."""
     paint = tex.glaze(rng, 640, 480, color, ["#111111", "#ffffff"], 120)
     label = tex.mosaic(rng, 140, 480, ["#d1495b", "#edae49", "#00798c", "#30638e"])
     for x in (120, 360):
-        label = tex.draw_text(label, "CIDER", (x, 70), 54, "#22262b")
+        label = tex.draw_text(label, word, (x, 70), 270 // len(word), "#22262b")
     paint[190:330] = label[::-1]  # row 0 is the bottom of a surface of revolution
     paint[570:] = tex.rgb("#b08d2e")
     shape = lathe("0 0 33 0 36 4 36 150 30 178 14 205 13 240 15 241 15 258 0 258")
     return Body(name, ["bottle"], [Part(shape, paint, 0.7, (48, 36))])
 
 
-def tin(rng: np.random.Generator, name: str) -> Body:
-    """A food tin with a printed label."""
+def tin(rng: np.random.Generator, name: str, word: str = "TOMATO") -> Body:
+    """A food tin with a printed label: a short word three times, a long word once around it."""
     paint = tex.glaze(rng, 420, 560, "#b9bcc0", ["#8b8f94", "#e6e8ea"], 200)
     label = tex.glaze(rng, 220, 560, "#c8302a", ["#e9c46a", "#7c1512"], 160)
     for x in (90, 280, 470):
         tex.disc(label, (x, 80), 46, "#e8e3d2")
         tex.disc(label, (x, 80), 34, "#d3271f")
-        label = tex.draw_text(label, "TOMATO", (x, 170), 42, "#fff3cf")
+        if len(word) < 7 or x == 280:
+            label = tex.draw_text(label, word, (x, 170), 42 if len(word) < 7 else 800 // len(word), "#fff3cf")
     paint[96:316] = label[::-1]  # row 0 is the bottom of a surface of revolution
     shape = lathe("0 0 37 0 37 108 35 110 34 106 0 106")
     return Body(name, ["tin", "food tin", "can"], [Part(shape, paint, 0.4, (32, 40))])
 
 
-def carton(rng: np.random.Generator) -> Body:
-    """A food carton, printed on its four sides."""
+def carton(rng: np.random.Generator, printed: Printed | None = None) -> Body:
+    """A food carton, oats or milk unless told what is printed on its four sides; a long word runs downwards."""
     color, name, word, extent = (
-        ("#d9782d", "cereal box", "OATS", (0.125, 0.055, 0.19)),
-        ("#2d6fb0", "milk carton", "MILK", (0.075, 0.075, 0.18)),
-    )[int(rng.integers(2))]
+        printed
+        or (
+            ("#d9782d", "cereal box", "OATS", (0.125, 0.055, 0.19)),
+            ("#2d6fb0", "milk carton", "MILK", (0.075, 0.075, 0.18)),
+        )[int(rng.integers(2))]
+    )
     top = tex.glaze(rng, 120, 200, color, ["#fff3cf"], 40)
     sides = []
     for across in (*extent[:2], *extent[:2]):
         side = tex.mosaic(rng, 560, int(3000 * across), [color, "#fff3cf", "#8f1d14", "#e9c46a"])
         side = 0.45 * side + 0.55 * tex.rgb(color)
-        sides.append(tex.draw_text(side, word, (1500 * across, 170), int(900 * across), "#fff8e6"))
+        if len(word) < 6:
+            sides.append(tex.draw_text(side, word, (1500 * across, 170), int(900 * across), "#fff8e6"))
+        else:
+            down = tex.draw_text(np.rot90(side), word, (280, 1500 * across), 800 // len(word), "#fff8e6")
+            sides.append(np.rot90(down, -1))
     return Body(name, ["carton", "food box"], box_parts(np.array([0, 0, extent[2] / 2]), extent, [top, top, *sides]))
 
 

