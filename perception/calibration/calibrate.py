@@ -37,11 +37,7 @@ SAME_VIEW = 0.03
 
 
 def run_calibration(
-    source: Path,
-    output: Path,
-    board: Board,
-    model: str = "auto",
-    log: Callable[[str], None] | None = None,
+    source: Path, output: Path, board: Board, model: str = "auto", log: Callable[[str], None] | None = None
 ) -> tuple[dict[str, Any], str]:
     """Calibrates a camera from a folder of photos or a video of a board: (JSON-serialisable result, table).
 

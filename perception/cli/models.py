@@ -69,11 +69,7 @@ def _add(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.progress import Progress
 
     model = add_model(
-        args.name,
-        args.source,
-        sha256=args.sha256,
-        default=args.default,
-        progress=Progress(quiet=args.json),
+        args.name, args.source, sha256=args.sha256, default=args.default, progress=Progress(quiet=args.json)
     )
     return _told(model)
 

@@ -91,11 +91,7 @@ def evaluate_images(prediction_dir: str | Path, truth_dir: str | Path) -> dict[s
                 f"{predictions[stem]}: is {predicted.shape[1]}x{predicted.shape[0]} pixels, the truth {path} "
                 f"is {true.shape[1]}x{true.shape[0]}; render at the truth's size"
             )
-        views[stem] = {
-            "psnr": min(psnr(predicted, true), 100.0),
-            "ssim": ssim(predicted, true),
-            "missing": False,
-        }
+        views[stem] = {"psnr": min(psnr(predicted, true), 100.0), "ssim": ssim(predicted, true), "missing": False}
     return {
         "psnr": float(np.mean([v["psnr"] for v in views.values()])),
         "ssim": float(np.mean([v["ssim"] for v in views.values()])),

@@ -10,14 +10,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.evaluate.average_precision import average_precision, match
-from perception.evaluate.overlap import (
-    Overlap,
-    Truth,
-    mode_by_group,
-    overlap_of_ids,
-    overlap_of_masks,
-    read_truth,
-)
+from perception.evaluate.overlap import Overlap, Truth, mode_by_group, overlap_of_ids, overlap_of_masks, read_truth
 
 
 @dataclass(frozen=True)
@@ -124,10 +117,7 @@ def mask_overlap(
     if rules.by_class and classes is None:
         raise InputError("evaluation by class needs a class for each predicted mask; there are none")
     return overlap_of_masks(
-        kept,
-        [1.0] * len(kept) if rules.constant_score else scores,
-        truth,
-        classes if rules.by_class else None,
+        kept, [1.0] * len(kept) if rules.constant_score else scores, truth, classes if rules.by_class else None
     )
 
 
@@ -144,11 +134,7 @@ def _truth(
         gt_ids = np.where(np.asarray(ignore, bool), -1, gt_ids)
     semantics = None if gt_semantics is None else np.asarray(gt_semantics)[keep]
     truth = read_truth(
-        gt_ids[keep],
-        semantics,
-        void_ids=rules.void_ids,
-        valid_classes=rules.valid_classes,
-        by_class=rules.by_class,
+        gt_ids[keep], semantics, void_ids=rules.void_ids, valid_classes=rules.valid_classes, by_class=rules.by_class
     )
     return keep, truth
 

@@ -65,10 +65,7 @@ def scenes_result(scenes: dict[str, dict[str, Any]], keys: Sequence[str]) -> tup
 
 
 def run_scannet(
-    prediction: str | Path,
-    truth: str | Path,
-    protocol: str | Protocol = "scannet",
-    **changes: Any,
+    prediction: str | Path, truth: str | Path, protocol: str | Protocol = "scannet", **changes: Any
 ) -> tuple[dict[str, Any], str]:
     """Instance AP over all scenes of a ScanNet or ScanNet++ layout: (result, table).
 

@@ -99,10 +99,7 @@ def mode_by_group(group: np.ndarray, values: np.ndarray, count: int) -> np.ndarr
 
 
 def overlap_of_ids(
-    pred_ids: np.ndarray,
-    pred_scores: dict[int, float] | None,
-    truth: Truth,
-    pred_classes: dict[int, int] | None = None,
+    pred_ids: np.ndarray, pred_scores: dict[int, float] | None, truth: Truth, pred_classes: dict[int, int] | None = None
 ) -> Overlap:
     """Overlap of point labels pred_ids [N] int, negative = none. Predictions are ordered by ascending id.
 

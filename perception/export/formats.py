@@ -52,11 +52,7 @@ def sidecar_of(labels: np.ndarray, instances: Instances) -> dict[str, Any]:
 
 
 def write_scannet(
-    folder: str | Path,
-    scene: str,
-    labels: np.ndarray,
-    instances: Instances,
-    classes: Mapping[int, int] | None = None,
+    folder: str | Path, scene: str, labels: np.ndarray, instances: Instances, classes: Mapping[int, int] | None = None
 ) -> Path:
     """ScanNet's 3D instance submission: <scene>.txt with "predicted_masks/<scene>_<nnn>.txt <class> <confidence>" rows.
 

@@ -131,12 +131,7 @@ class _Mapping:
             self.progress.update("poses: mapping", round(100 * self.shown), 100)
 
         found = pycolmap.incremental_mapping(
-            database,
-            self.store.image_root,
-            out,
-            options,
-            input_path=source or "",
-            next_image_callback=next_image,
+            database, self.store.image_root, out, options, input_path=source or "", next_image_callback=next_image
         )
         models = [model for model in found.values() if model.num_reg_images() >= MIN_MODEL_SIZE]
         return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))

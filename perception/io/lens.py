@@ -63,11 +63,7 @@ def camera_from_lens(lens: Lens, camera_id: int = 1) -> Any:
     pycolmap = load_pycolmap()
     try:
         camera = pycolmap.Camera(
-            model=lens.model,
-            width=lens.width,
-            height=lens.height,
-            params=list(lens.params),
-            camera_id=camera_id,
+            model=lens.model, width=lens.width, height=lens.height, params=list(lens.params), camera_id=camera_id
         )
         valid = camera.verify_params() and np.isfinite(lens.params).all()
     except (ValueError, RuntimeError) as error:

@@ -92,11 +92,7 @@ def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, fixed: bool, how: 
 
 
 def _report(
-    models: list[Any],
-    contradicted: set[str],
-    store: FeatureStore,
-    shown: list[str],
-    seconds: dict[str, float],
+    models: list[Any], contradicted: set[str], store: FeatureStore, shown: list[str], seconds: dict[str, float]
 ) -> dict[str, Any]:
     best = models[0]
     inside = [{model.images[i].name for i in model.reg_image_ids()} for model in models]

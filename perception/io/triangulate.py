@@ -23,11 +23,7 @@ FALLBACK_POINTS = 5000
 
 
 def posed_scene(
-    views: list[View],
-    cloud: tuple[np.ndarray, np.ndarray],
-    facts: dict[str, Any],
-    how: Reading,
-    least: int,
+    views: list[View], cloud: tuple[np.ndarray, np.ndarray], facts: dict[str, Any], how: Reading, least: int
 ) -> Scene:
     """The Scene of views with known poses. cloud: points [P, 3] and colors [P, 3] from the input.
 
@@ -65,11 +61,7 @@ def triangulated_cloud(views: list[View], store: Any, seed: int) -> tuple[np.nda
     view frusta are returned, with a warning.
     """
     points, colors, error = _triangulate(views, store, seed)
-    facts: dict[str, Any] = {
-        "points_from": "triangulated",
-        "mean_reprojection_error_px": error,
-        "warnings": [],
-    }
+    facts: dict[str, Any] = {"points_from": "triangulated", "mean_reprojection_error_px": error, "warnings": []}
     if len(points) < MIN_POINTS:
         measured = any(view.depth for view in views)
         facts["warnings"].append(

@@ -220,10 +220,7 @@ def _figures(gmap: Map) -> dict[str, str]:
     info = gmap.info
     figures = {"Gaussians": f"{len(gmap):,}", "Instances": str(len(gmap.instances))}
     if "psnr" in info["quality"]:
-        figures |= {
-            "Held-out PSNR": f"{info['quality']['psnr']:.2f} dB",
-            "SSIM": f"{info['quality']['ssim']:.3f}",
-        }
+        figures |= {"Held-out PSNR": f"{info['quality']['psnr']:.2f} dB", "SSIM": f"{info['quality']['ssim']:.3f}"}
     if info["quality"].get("depth"):
         figures["Held-out depth"] = depth_text(info["quality"]["depth"])
     figures["Time"] = f"{info['seconds']['total']:.0f} s"
