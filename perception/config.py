@@ -275,13 +275,13 @@ def expected(field: FieldInfo) -> str:
     return f"{words} or none" if NoneType in kinds else words
 
 
-def settings_text(model: type[Settings] = MapConfig, method: tuple[str, ...] = METHOD) -> str:
+def settings_text() -> str:
     """All settings with default, range and effect, user settings first, for `--help`."""
     lines: dict[bool, list[str]] = {False: [], True: []}
-    for key, field in fields(model):
+    for key, field in fields(MapConfig):
         default = field.default
         default = "none" if default is None else str(default).lower() if isinstance(default, bool) else default
-        lines[key.startswith(method)] += [f"  {key}={default}  ({expected(field)})", f"      {field.description}"]
+        lines[key.startswith(METHOD)] += [f"  {key}={default}  ({expected(field)})", f"      {field.description}"]
     head = "settings, for --set KEY=VALUE and --config FILE.toml:"
     return "\n".join([head, *lines[False], "settings that vary the method, for experiments:", *lines[True]])
 

@@ -13,13 +13,14 @@ from urllib.parse import unquote, urlparse
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory
 from perception.io.checksums import facts_of, sha256
-from perception.io.download import download, is_url
 from perception.io.model_store import (
     RECORD,
     StoredModel,
     catalogue,
     check_name,
+    download,
     find_model,
+    is_url,
     known_names,
     models_folder,
     set_default,

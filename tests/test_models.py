@@ -14,8 +14,7 @@ import pytest
 
 from perception.cli import main
 from perception.errors import InputError
-from perception.io.download import download
-from perception.io.model_store import Entry, catalogue, find_model, models_folder
+from perception.io.model_store import Entry, catalogue, download, find_model, models_folder
 from perception.masks import make_source
 from perception.models import add_model, check_file, get_model
 from support.onnx_files import FLOAT, INT64, SAM_DECODER, write_onnx
@@ -132,7 +131,7 @@ def test_a_later_run_goes_on(server: Server, tmp_path: Path) -> None:
     server.files["/big"], server.breaks = noise(100_000), 1
     server.statuses = []
     part = tmp_path / "big.part"
-    from perception.io import download as module
+    from perception.io import model_store as module
 
     assert "broke" in str(module._attempt(f"{server.url}/big", part, None)) and part.stat().st_size == 50_000
     told = Told()
@@ -147,7 +146,7 @@ def test_without_ranges_it_starts_over(server: Server, tmp_path: Path) -> None:
 
 
 def test_a_file_that_changed_is_fetched_anew(server: Server, tmp_path: Path) -> None:
-    from perception.io import download as module
+    from perception.io import model_store as module
 
     server.files["/big"], server.breaks = noise(100_000), 1
     module._attempt(f"{server.url}/big", tmp_path / "p", None)
@@ -156,7 +155,7 @@ def test_a_file_that_changed_is_fetched_anew(server: Server, tmp_path: Path) -> 
 
 
 def test_a_part_that_is_whole_already_is_taken(server: Server, tmp_path: Path) -> None:
-    from perception.io import download as module
+    from perception.io import model_store as module
 
     server.files["/big"] = noise(1000)
     assert module._attempt(f"{server.url}/big", tmp_path / "p", None) is None

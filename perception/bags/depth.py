@@ -10,9 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from perception.bags.decode import raw_rows
 from perception.bags.poses import Poses
-from perception.bags.read import CAMERA_INFO, IMAGES, Bag, stamp_of
+from perception.bags.read import CAMERA_INFO, IMAGES, Bag, raw_rows, stamp_of
 from perception.errors import InputError
 from perception.io.camera_file import read_camera, write_camera_info
 from perception.io.lens import camera_from_lens, rescale_lens

@@ -5,23 +5,21 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from perception.bags.decode import decode_image, encoded
 from perception.bags.depth import MILLIMETRES, choose_depth, depth_topics, write_depth
 from perception.bags.poses import FIXED_FRAMES, Poses, gravity, read_poses
-from perception.bags.read import CAMERA_INFO, IMAGES, Bag, open_bag, stamp_of
+from perception.bags.read import CAMERA_INFO, IMAGES, Bag, decode_image, encoded, open_bag, stamp_of
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.atomic import atomic_directory
 from perception.io.camera_file import read_camera, write_camera_info
-from perception.io.frame_choice import Chooser
 from perception.io.lens import FISHEYE, PERSPECTIVE
+from perception.io.video import Chooser
 from perception.types import Lens
 
 
@@ -45,14 +43,12 @@ class FrameOptions:
     spacing: float = 0.08
 
 
-def run_frames(
-    source: Path, output: Path, options: FrameOptions | None = None, tell: Callable[[str], None] | None = None
-) -> tuple[dict[str, Any], str]:
+def run_frames(source: Path, output: Path, options: FrameOptions | None = None) -> tuple[dict[str, Any], str]:
     """Writes `output`/images, camera.yaml, depth of the images, and, with poses, transforms.json: (JSON result, text).
 
     Map `output` if there are poses. Otherwise map `output`/images with --camera `output`/camera.yaml.
     """
-    options, tell = options or FrameOptions(), tell or (lambda line: None)
+    options = options or FrameOptions()
     if output.exists() and any(output.iterdir()):
         raise InputError(f"{output}: is not empty; choose another -o or remove it first")
     if options.max_frames < 2 or not options.spacing > 0:
@@ -70,7 +66,6 @@ def run_frames(
         if size is None:
             raise InputError(f"{source}: {topic} holds no images")
         chosen = chooser.chosen(options.max_frames)
-        tell(f"{topic}: {len(chosen)} of {len(chooser.motion)} images chosen")
         poses = read_poses(bag, options.odometry)
         with atomic_directory(output) as aside:
             lens = _write_camera(aside / "camera.yaml", options.camera, info, topic, size, source)

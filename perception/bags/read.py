@@ -1,4 +1,4 @@
-"""Reads topics and messages of a bag with the optional package `rosbags`."""
+"""Reads topics and messages of a bag with the optional package `rosbags`, and decodes sensor_msgs' images."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import cv2
+import numpy as np
 
 from perception.errors import InputError, missing_extra
 
@@ -73,3 +76,72 @@ def stamp_of(message: Any) -> int:
     """Header time of a message in ns."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+# Encoding -> (channels of the message, OpenCV's conversion to BGR or None). Bayer names differ: ROS names the first
+# row's first two pixels, OpenCV the second row's second and third.
+_EIGHT_BIT: dict[str, tuple[int, int | None]] = {
+    "rgb8": (3, cv2.COLOR_RGB2BGR),
+    "bgr8": (3, None),
+    "8UC3": (3, None),
+    "rgba8": (4, cv2.COLOR_RGBA2BGR),
+    "bgra8": (4, cv2.COLOR_BGRA2BGR),
+    "8UC4": (4, cv2.COLOR_BGRA2BGR),
+    "mono8": (1, cv2.COLOR_GRAY2BGR),
+    "8UC1": (1, cv2.COLOR_GRAY2BGR),
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2BGR),
+    "yuv422": (2, cv2.COLOR_YUV2BGR_UYVY),
+    "uyvy": (2, cv2.COLOR_YUV2BGR_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2BGR_YUY2),
+    "yuyv": (2, cv2.COLOR_YUV2BGR_YUY2),
+}
+
+
+def decode_image(message: Any, where: str) -> np.ndarray:
+    """An Image or CompressedImage as [H, W, 3] uint8 BGR. InputError naming `where` if it is not an 8-bit image."""
+    if hasattr(message, "encoding"):
+        return _raw(message, where)
+    picture = cv2.imdecode(np.frombuffer(bytes(message.data) or b"\0", np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise InputError(f"{where}: a compressed image of format '{message.format}' cannot be decoded (jpeg, png can)")
+    return np.asarray(picture)
+
+
+def _raw(message: Any, where: str) -> np.ndarray:
+    encoding = str(message.encoding)
+    if encoding not in _EIGHT_BIT:
+        raise InputError(
+            f"{where}: images are encoded as '{encoding}'; expected one of {', '.join(_EIGHT_BIT)} "
+            "(a depth image? give another --topic)"
+        )
+    channels, conversion = _EIGHT_BIT[encoding]
+    rows = raw_rows(message, channels, where)
+    picture = rows if channels == 1 else rows.reshape(len(rows), -1, channels)
+    return picture if conversion is None else np.asarray(cv2.cvtColor(picture, conversion))
+
+
+def raw_rows(message: Any, size: int, where: str) -> np.ndarray:
+    """The pixels [height, width * size] uint8 of an Image without padding; size: bytes of a pixel."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    if min(height, width) < 1 or step < width * size or data.size < step * height:
+        raise InputError(
+            f"{where}: an image of {width}x{height} ({message.encoding}, rows of {step} bytes) holds {data.size} bytes"
+        )
+    return np.ascontiguousarray(data[: step * height].reshape(height, step)[:, : width * size])
+
+
+def encoded(message: Any, picture: np.ndarray) -> tuple[str, bytes]:
+    """(suffix, bytes) of an image file: a compressed message is written unchanged, others as PNG."""
+    if not hasattr(message, "encoding"):
+        data = bytes(message.data)
+        if data[:2] == b"\xff\xd8":
+            return ".jpg", data
+        if data[:4] == b"\x89PNG":
+            return ".png", data
+    done, buffer = cv2.imencode(".png", picture)
+    assert done  # encoding an 8-bit image as PNG does not fail
+    return ".png", buffer.tobytes()

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from perception.bench.output import Column, bench_parser, parse_pairs, table
-from perception.bench.reliability import SCORED, finish_reliability
+from perception.bench.output import SCORED, Column, bench_parser, finish_reliability, parse_pairs, table
 from perception.errors import InputError
 from perception.types import PointCloud
 

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from perception.bench.instances import read_scene, read_truth_cloud
-from perception.bench.output import bench_parser, parse_pairs
-from perception.bench.reliability import SCORED, finish_reliability
+from perception.bench.output import SCORED, bench_parser, finish_reliability, parse_pairs
 from perception.errors import InputError
 from perception.language.ranking import Answer, Ranker, answering
 from perception.query import QueryMap, load_map

@@ -16,8 +16,7 @@ import numpy as np
 
 from perception.bench.datasets import DatasetBench, link
 from perception.errors import InputError
-from perception.evaluate.labelled_clouds import instances_table
-from perception.evaluate.layouts import run_scannet
+from perception.evaluate.layouts import instances_table, run_scannet
 from perception.export.formats import write_scannet
 from perception.export.transfer import ExportOptions, export_labels
 from perception.io.atomic import atomic_file

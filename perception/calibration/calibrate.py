@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +36,7 @@ SAME_VIEW = 0.03
 """Views count as equal if their corners move by less than this share of the image width."""
 
 
-def run_calibration(
-    source: Path, output: Path, board: Board, model: str = "auto", log: Callable[[str], None] | None = None
-) -> tuple[dict[str, Any], str]:
+def run_calibration(source: Path, output: Path, board: Board, model: str = "auto") -> tuple[dict[str, Any], str]:
     """Calibrates a camera from a folder of photos or a video of a board: (JSON-serialisable result, table).
 
     Writes `output` (ROS camera_info YAML) and next to it a .json with all figures. Photos are rotated according to
@@ -46,9 +44,7 @@ def run_calibration(
     """
     if model not in MODELS:
         raise InputError(f"--model is '{model}'; expected one of {', '.join(MODELS)}")
-    log = log or (lambda line: None)
     found, size, looked_at = _detect(source, board)
-    log(f"{board} seen in {len(found)} of {looked_at} pictures")
     views = distinct_views(found, size[0])
     check_count(views, len(found), looked_at, str(board), str(source))
     views = [views[i] for i in np.linspace(0, len(views) - 1, min(len(views), MAX_VIEWS)).round().astype(int)]

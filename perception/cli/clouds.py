@@ -6,18 +6,12 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from perception.cli.parser import command
+from perception.cli.parser import map_command
 
 
 def register(commands: Any) -> None:
     """Adds this module's subcommands."""
-    _add_export(commands)
-    _add_render(commands)
-
-
-def _add_export(commands: Any) -> None:
-    p = command(commands, "export", _export, "instances onto a point cloud or mesh, or onto the map's own points")
-    p.add_argument("map", type=Path, metavar="MAP")
+    p = map_command(commands, "export", _export, "instances onto a point cloud or mesh, or onto the map's own points")
     p.add_argument("--points", type=Path, metavar="CLOUD")
     place = p.add_mutually_exclusive_group()
     place.add_argument(
@@ -44,6 +38,11 @@ def _add_export(commands: Any) -> None:
     p.add_argument("--voxels", type=Path, metavar="OUT.npz", help="free, occupied and unknown space; distances")
     p.add_argument("--voxel-size", type=float, metavar="S", help="of --mesh and --voxels, in map units")
     p.add_argument("--scannet", type=Path, metavar="DIR", help="ScanNet submission layout")
+
+    p = map_command(commands, "render", _render, "pictures of the map from given cameras")
+    p.add_argument("--cameras", type=Path, metavar="transforms.json", help="default: the map's held-out views")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    p.add_argument("--what", default="rgb", metavar="KINDS", help="comma-separated: rgb, depth, instances, features")
 
 
 def _length(text: str) -> float | str:
@@ -80,14 +79,6 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     how = (options, args.color, args.scannet, args.transform or args.align, args.granularity)
     result, table = export_map(args.map, args.output, args.points, *how)
     return {**facts, **result}, "\n".join([*lines, table])
-
-
-def _add_render(commands: Any) -> None:
-    p = command(commands, "render", _render, "pictures of the map from given cameras")
-    p.add_argument("map", type=Path, metavar="MAP")
-    p.add_argument("--cameras", type=Path, metavar="transforms.json", help="default: the map's held-out views")
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
-    p.add_argument("--what", default="rgb", metavar="KINDS", help="comma-separated: rgb, depth, instances, features")
 
 
 def _render(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

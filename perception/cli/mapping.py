@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from perception.cli.parser import command
+from perception.cli.parser import command, map_command
 from perception.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,9 +20,18 @@ if TYPE_CHECKING:
 def register(commands: Any) -> None:
     """Adds this module's subcommands."""
     _add_map(commands)
-    _add_info(commands)
-    _add_report(commands)
-    _add_demo(commands)
+    p = map_command(commands, "info", _info, "what a map holds, how it was made, how good it is")
+    p.add_argument("--verify", action="store_true", help="read every byte and compare it with the checksums")
+
+    p = map_command(commands, "report", _report, "one self-contained page: held-out views, instances, answers")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.html")
+    p.add_argument("--ask", action="append", default=[], metavar="TEXT", help="a prompt to answer on the page")
+
+    p = command(commands, "demo", _demo, "photos -> SfM -> map -> export -> text query, on a scene it makes itself")
+    p.add_argument("-o", "--output", type=Path, default=Path("perception-demo"), metavar="DIR")
+    p.add_argument("--scene", choices=("tabletop", "room"), default="tabletop", help="what is made (default: tabletop)")
+    p.add_argument("--seed", type=int, default=0, metavar="N", help="another N makes another scene (default: 0)")
+    p.add_argument("--photos-only", type=Path, metavar="DIR", help="write photos, masks and truth to DIR; no map")
 
 
 def _add_map(commands: Any) -> None:
@@ -123,12 +132,6 @@ def sigterm_as_interrupt() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
-def _add_info(commands: Any) -> None:
-    p = command(commands, "info", _info, "what a map holds, how it was made, how good it is")
-    p.add_argument("map", type=Path, metavar="MAP")
-    p.add_argument("--verify", action="store_true", help="read every byte and compare it with the checksums")
-
-
 def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.io.map import Map
     from perception.io.map_files import read_info
@@ -147,27 +150,12 @@ def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     return {**info, "verified": states}, "\n".join([told, *lines])
 
 
-def _add_report(commands: Any) -> None:
-    p = command(commands, "report", _report, "one self-contained page: held-out views, instances, answers")
-    p.add_argument("map", type=Path, metavar="MAP")
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.html")
-    p.add_argument("--ask", action="append", default=[], metavar="TEXT", help="a prompt to answer on the page")
-
-
 def _report(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.pipeline.reporting import write_map_report
     from perception.query import load_map
 
     page = write_map_report(load_map(args.map), args.output, args.ask)
     return {"report": str(page)}, str(page)
-
-
-def _add_demo(commands: Any) -> None:
-    p = command(commands, "demo", _demo, "photos -> SfM -> map -> export -> text query, on a scene it makes itself")
-    p.add_argument("-o", "--output", type=Path, default=Path("perception-demo"), metavar="DIR")
-    p.add_argument("--scene", choices=("tabletop", "room"), default="tabletop", help="what is made (default: tabletop)")
-    p.add_argument("--seed", type=int, default=0, metavar="N", help="another N makes another scene (default: 0)")
-    p.add_argument("--photos-only", type=Path, metavar="DIR", help="write photos, masks and truth to DIR; no map")
 
 
 def _demo(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

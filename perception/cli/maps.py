@@ -1,4 +1,4 @@
-"""`perception label`, `relink`, `upgrade` and `scale`: names, new photo paths, the new format, metres."""
+"""`perception query`, `label`, `relink`, `upgrade` and `scale`: answers, names, photo paths, the new format, metres."""
 
 from __future__ import annotations
 
@@ -6,25 +6,26 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from perception.cli.parser import command
+from perception.cli.parser import map_command
 from perception.errors import InputError
 
 
 def register(commands: Any) -> None:
     """Adds this module's subcommands."""
-    p = command(commands, "label", _label, "name an instance; queries know the name from then on")
-    p.add_argument("map", type=Path, metavar="MAP")
+    p = map_command(commands, "query", _query, 'ranked 3D instances for each text, or "not present"')
+    p.add_argument("text", nargs="+", metavar="TEXT")
+    p.add_argument("--top", type=int, default=20, metavar="K", help="at most so many hits of those that answer (20)")
+    p.add_argument("--min-score", type=float, metavar="X", help="all with this score instead of those that answer")
+    p.add_argument("--points", type=Path, metavar="OUT.ply", help="write the hits' points, labelled by instance_id")
+    p = map_command(commands, "label", _label, "name an instance; queries know the name from then on")
     p.add_argument("id", type=int, nargs="?", metavar="ID", help="without one, the labels are listed")
     p.add_argument("text", nargs="?", metavar="NAME", help='such as "grandma\'s cup"')
     p.add_argument("--clear", action="store_true", help="take the name away")
-    p = command(commands, "relink", _relink, "tell a map where its photos lie now")
-    p.add_argument("map", type=Path, metavar="MAP")
+    p = map_command(commands, "relink", _relink, "tell a map where its photos lie now")
     p.add_argument("folder", type=Path, metavar="DIR", help="the folder that holds the photos")
-    p = command(commands, "upgrade", _upgrade, "bring an older map to the newest format and encoder")
-    p.add_argument("map", type=Path, metavar="MAP")
+    p = map_command(commands, "upgrade", _upgrade, "bring an older map to the newest format and encoder")
     p.add_argument("-o", "--output", type=Path, metavar="OUT.gsmap", help="default: in place")
-    p = command(commands, "scale", _scale, "give a finished map metres, by a length, tags, a board or GPS")
-    p.add_argument("map", type=Path, metavar="MAP")
+    p = map_command(commands, "scale", _scale, "give a finished map metres, by a length, tags, a board or GPS")
     p.add_argument("-o", "--output", type=Path, metavar="OUT.gsmap", help="default: in place")
     p.add_argument(
         "--known-length",
@@ -33,6 +34,18 @@ def register(commands: Any) -> None:
     )
     p.add_argument("--tag-size", metavar="M", help="side of the AprilTags or ArUco markers in the photos")
     p.add_argument("--board", metavar="TEXT", help="a calibration board in the photos, such as charuco:8x11:0.02")
+
+
+def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.pipeline.summary import query_text, write_hits
+    from perception.query import load_map
+
+    opened = load_map(args.map)
+    answers = [(text, opened.query(text, args.top, args.min_score)) for text in args.text]
+    if args.points:
+        write_hits(args.points, [hit for _, hits in answers for hit in hits])
+    results = [{"text": text, "present": bool(hits), "hits": [h.to_json() for h in hits]} for text, hits in answers]
+    return {"results": results, "frame": opened.frame, "metric": opened.metric}, query_text(answers, opened.metric)
 
 
 def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from perception.errors import InputError
@@ -31,4 +32,11 @@ def command(commands: Any, name: str, run: Run, summary: str) -> Parser:
     parser: Parser = commands.add_parser(name, help=summary, description=summary)
     parser.set_defaults(run=run)
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else there")
+    return parser
+
+
+def map_command(commands: Any, name: str, run: Run, summary: str) -> Parser:
+    """As `command`, with the argument `map`, the path of a map."""
+    parser = command(commands, name, run, summary)
+    parser.add_argument("map", type=Path, metavar="MAP")
     return parser

@@ -12,11 +12,6 @@ from perception.errors import InputError
 
 def register(commands: Any) -> None:
     """Adds this module's subcommands."""
-    _add_calibrate(commands)
-    _add_frames(commands)
-
-
-def _add_calibrate(commands: Any) -> None:
     p = command(commands, "calibrate", _calibrate, "a camera file from photos or a video of a calibration board")
     p.add_argument("input", type=Path, metavar="INPUT", help="a folder of photos, or a video")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="CAMERA.yaml")
@@ -27,20 +22,6 @@ def _add_calibrate(commands: Any) -> None:
     p.add_argument("--dictionary", default="5X5_100", help="of the markers, as OpenCV names it")
     p.add_argument("--model", choices=("auto", "pinhole", "fisheye"), default="auto")
 
-
-def _calibrate(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.calibration.board import Board
-    from perception.calibration.calibrate import run_calibration
-
-    words = args.squares.lower().split("x")
-    if len(words) != 2 or not all(word.isdigit() for word in words):
-        raise InputError(f"--squares is '{args.squares}'; expected columns x rows of squares, such as 8x11")
-    marker = args.marker if args.marker is not None else 0.75 * args.square
-    board = Board(args.board, (int(words[0]), int(words[1])), args.square, marker, args.dictionary)
-    return run_calibration(args.input, args.output, board, args.model)
-
-
-def _add_frames(commands: Any) -> None:
     p = command(commands, "frames", _frames, "sharp, well-spaced photos out of a ROS bag, with intrinsics and poses")
     p.add_argument("bag", type=Path, metavar="BAG", help="ROS 1 .bag, ROS 2 bag folder, or .mcap")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
@@ -55,6 +36,18 @@ def _add_frames(commands: Any) -> None:
     )
     p.add_argument("--max-frames", type=int, default=200, metavar="N")
     p.add_argument("--spacing", type=float, default=0.08, metavar="S", help="least motion, as share of the width")
+
+
+def _calibrate(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.calibration.board import Board
+    from perception.calibration.calibrate import run_calibration
+
+    words = args.squares.lower().split("x")
+    if len(words) != 2 or not all(word.isdigit() for word in words):
+        raise InputError(f"--squares is '{args.squares}'; expected columns x rows of squares, such as 8x11")
+    marker = args.marker if args.marker is not None else 0.75 * args.square
+    board = Board(args.board, (int(words[0]), int(words[1])), args.square, marker, args.dictionary)
+    return run_calibration(args.input, args.output, board, args.model)
 
 
 def _frames(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 from pathlib import Path
 from typing import Any
 
-from perception.cli.parser import Parser, command
+from perception.bench import BENCHES
+from perception.cli.parser import Parser, command, map_command
 from perception.errors import InputError
 
 
 def register(commands: Any) -> None:
     """Adds this module's subcommands."""
-    _add_eval(commands)
-    _add_bench(commands)
-
-
-def _add_eval(commands: Any) -> None:
     parser = commands.add_parser("eval", help="score predictions by the field's own rules")
     kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True, parser_class=Parser)
     p = command(kinds, "instances", _eval_instances, "AP, AP50, AP25 of labelled clouds")
@@ -31,10 +28,13 @@ def _add_eval(commands: Any) -> None:
     p = command(kinds, "images", _eval_images, "PSNR and SSIM per view and mean")
     p.add_argument("prediction", type=Path, metavar="PRED_DIR")
     p.add_argument("truth", type=Path, metavar="GT_DIR")
-    p = command(kinds, "masks", _eval_masks, "mIoU of a map's rendered instance masks in its held-out views")
-    p.add_argument("map", type=Path, metavar="MAP")
+    p = map_command(kinds, "masks", _eval_masks, "mIoU of a map's rendered instance masks in its held-out views")
     p.add_argument("truth", type=Path, metavar="MASKS_DIR", help="one PNG a view: instance ids alike in all, 0 = void")
     p.add_argument("--all-views", action="store_true", help="score the training views too")
+
+    p = command(commands, "bench", _bench, "measure speed against error on this machine")
+    p.add_argument("name", metavar="NAME", help=", ".join(BENCHES))
+    p.add_argument("rest", nargs=argparse.REMAINDER, metavar="...")
 
 
 def _add_rules(p: argparse.ArgumentParser) -> None:
@@ -57,7 +57,7 @@ def _rules(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _eval_instances(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.evaluate import run_instances
+    from perception.evaluate.layouts import run_instances
 
     return run_instances(args.prediction, args.truth, args.protocol, scores=args.scores, **_rules(args))
 
@@ -69,7 +69,7 @@ def _eval_scannet(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _eval_images(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.evaluate import run_images
+    from perception.evaluate.images import run_images
 
     return run_images(args.prediction, args.truth)
 
@@ -80,19 +80,7 @@ def _eval_masks(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     return score_masks(args.map, args.truth, args.all_views)
 
 
-def _add_bench(commands: Any) -> None:
-    from perception.bench import BENCHES
-
-    p = command(commands, "bench", _bench, "measure speed against error on this machine")
-    p.add_argument("name", metavar="NAME", help=", ".join(BENCHES))
-    p.add_argument("rest", nargs=argparse.REMAINDER, metavar="...")
-
-
 def _bench(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    import importlib
-
-    from perception.bench import BENCHES
-
     if args.name not in BENCHES:
         raise InputError(f"bench: found '{args.name}', expected one of: {', '.join(BENCHES)}")
     importlib.import_module(f"perception.bench.{args.name.replace('-', '_')}").main(args.rest)

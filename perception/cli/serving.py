@@ -6,20 +6,13 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from perception.cli.parser import command
+from perception.cli.parser import map_command
 
 
 def register(commands: Any) -> None:
     """Adds this module's subcommands."""
-    _add_serve(commands)
-    _add_node(commands)
-    _add_view(commands)
-
-
-def _add_serve(commands: Any) -> None:
-    p = command(commands, "serve", _serve, "a map over HTTP: JSON and binary points")
+    p = map_command(commands, "serve", _serve, "a map over HTTP: JSON and binary points")
     p.set_defaults(interrupted="stopped")
-    p.add_argument("map", type=Path, metavar="MAP")
     p.add_argument("--host", default="127.0.0.1", help="other than this machine only with a token")
     p.add_argument("--port", type=int, default=8765, help="0: any free one")
     p.add_argument("--token-file", type=Path, metavar="FILE", help="clients send its content as a bearer token")
@@ -27,6 +20,16 @@ def _add_serve(commands: Any) -> None:
     p.add_argument("--workers", type=int, default=2, metavar="N", help="questions answered at once")
     p.add_argument("--queue", type=int, default=64, metavar="N", help="questions that may wait; more are refused")
     p.add_argument("--watch", type=float, default=1.0, metavar="S", help="look for a new map this often, 0: never")
+
+    p = map_command(commands, "node", _node, "serve a map on ROS 2 (rclpy): prompts in; points, boxes and markers out")
+    p.add_argument("--namespace", metavar="NAME", help="before all topics; default: perception")
+    p.add_argument("--domain", metavar="N", help="ROS domain; default: ROS_DOMAIN_ID or 0")
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs", help="further settings")
+
+    p = map_command(commands, "view", _view, "walk through a map in the browser: ask, pick, correct, save")
+    p.add_argument("--host", default="127.0.0.1", help="other than this machine only with a token")
+    p.add_argument("--port", type=int, default=8090, help="0: any free one")
+    p.add_argument("--token-file", type=Path, metavar="FILE", help="its content opens the page; default: a new token")
 
 
 def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -48,14 +51,6 @@ def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     return {}, ""
 
 
-def _add_node(commands: Any) -> None:
-    p = command(commands, "node", _node, "serve a map on ROS 2 (rclpy): prompts in; points, boxes and markers out")
-    p.add_argument("map", type=Path, metavar="MAP")
-    p.add_argument("--namespace", metavar="NAME", help="before all topics; default: perception")
-    p.add_argument("--domain", metavar="N", help="ROS domain; default: ROS_DOMAIN_ID or 0")
-    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs", help="further settings")
-
-
 def _node(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.config import read_pairs
     from perception.node.config import node_config
@@ -73,14 +68,6 @@ def _node(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     return figures, f"{figures['answered']} questions answered"
 
 
-def _add_view(commands: Any) -> None:
-    p = command(commands, "view", _view, "walk through a map in the browser: ask, pick, correct, save")
-    p.add_argument("map", type=Path, metavar="MAP")
-    p.add_argument("--host", default="127.0.0.1", help="other than this machine only with a token")
-    p.add_argument("--port", type=int, default=8090, help="0: any free one")
-    p.add_argument("--token-file", type=Path, metavar="FILE", help="its content opens the page; default: a new token")
-
-
 def _view(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     import sys
     import threading
@@ -89,9 +76,9 @@ def _view(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     token = None if args.token_file is None else read_token(args.token_file)
     check_address(args.host, args.port, token)
-    from perception.viewer import start_viewer
+    from perception.viewer import Viewer
 
-    viewer = start_viewer(args.map, args.host, args.port, token)
+    viewer = Viewer(args.map, args.host, args.port, token)
     port = viewer.address.rpartition(":")[2]
     shown = viewer.url if token is None else f"{viewer.address}/?token=CONTENT-OF-{args.token_file.name}"
     hint = f"; over SSH: ssh -L {port}:localhost:{port} THIS-MACHINE, then open it there"

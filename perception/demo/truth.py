@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from perception.demo.cameras import Camera
+from perception.geometry import OPENCV_FROM_OPENGL
 from perception.io.cloud import write_cloud
 from perception.types import PointCloud
-
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes <-> the OpenGL axes of transforms.json
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ def _transforms(photos: str, names: list[str], cameras: list[Camera]) -> dict[st
     frames = [
         {
             "file_path": f"{photos}/{name}",
-            "transform_matrix": (np.linalg.inv(camera.camera_from_world) @ FLIP).tolist(),
+            "transform_matrix": (np.linalg.inv(camera.camera_from_world) @ OPENCV_FROM_OPENGL).tolist(),
             "instance_file_path": f"masks_gt/{Path(name).stem}.png",
         }
         for name, camera in zip(names, cameras, strict=True)

@@ -106,9 +106,6 @@ def evaluate_lerf_ovs(predictions: Masks, truths: Masks, **switches: Any) -> dic
             "mean": "flat over (view, object)",
             "accuracy": "IoU > .25, strict",
             "missing_prediction": "scores 0",
-            "selection": switches.pop("selection", "not stated"),
-            "occlusion": switches.pop("occlusion", "not stated"),
-            "test_views": switches.pop("test_views", "not stated"),
             **switches,
         },
     }

@@ -25,8 +25,7 @@ from scipy.ndimage import binary_dilation
 from perception.errors import InputError
 from perception.export.align_steps import Place, gray_images, likely_rotations, photometric_step, plane_step
 from perception.export.depth_views import DepthView, cell_means, fused_surface, grid_cells, observe
-from perception.export.graph import list_normals, neighbor_lists
-from perception.export.neighbors import Neighbors
+from perception.export.neighbors import Neighbors, list_normals, neighbor_lists
 from perception.types import PointCloud
 
 SCALES = 2.0 ** np.arange(-2, 1.51, 1 / 9)

@@ -87,18 +87,12 @@ def observe(
     return on, free, gap / np.maximum(on, 1)
 
 
-def fused_surface(
-    views: Sequence[DepthView], width: float | None = None, step: int = 2
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean point and unit normal, [P, 3] float64 each, of all depth pixels in each cell of a grid; normals face the
-    cameras. width: of the cells; None = an eightieth of the extent. Every `step`-th pixel is taken."""
-    points, normals = (
-        np.concatenate(parts) for parts in zip(*(_backprojected(view, step) for view in views), strict=True)
-    )
-    if width is None:
-        low, high = np.percentile(points, [2, 98], axis=0)
-        width = float(np.linalg.norm(high - low)) / 80
-    cell, count = grid_cells(points, width)
+def fused_surface(views: Sequence[DepthView]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean point and unit normal, [P, 3] float64 each, of every second depth pixel in each cell of a grid, an eightieth
+    of the extent wide; normals face the cameras."""
+    points, normals = (np.concatenate(parts) for parts in zip(*map(_backprojected, views), strict=True))
+    low, high = np.percentile(points, [2, 98], axis=0)
+    cell, count = grid_cells(points, float(np.linalg.norm(high - low)) / 80)
     mean = cell_means(points, cell, count)
     turned = cell_means(normals, cell, count)
     length = np.linalg.norm(turned, axis=1)
@@ -121,17 +115,16 @@ def cell_means(values: np.ndarray, cell: np.ndarray, count: np.ndarray) -> np.nd
     return np.stack([np.bincount(cell, column) for column in values.T], axis=1) / count[:, None]
 
 
-def _backprojected(view: DepthView, step: int) -> tuple[np.ndarray, np.ndarray]:
+def _backprojected(view: DepthView) -> tuple[np.ndarray, np.ndarray]:
     height, width = view.depth.shape
     v, u = np.mgrid[:height, :width] + 0.5
     rays = np.stack([(u - view.K[0, 2]) / view.K[0, 0], (v - view.K[1, 2]) / view.K[1, 1], np.ones_like(u)], axis=-1)
     own = rays * view.depth[..., None]
-    normal = np.cross(own[2:, 1:-1] - own[:-2, 1:-1], own[1:-1, 2:] - own[1:-1, :-2])[::step, ::step]
+    normal = np.cross(own[2:, 1:-1] - own[:-2, 1:-1], own[1:-1, 2:] - own[1:-1, :-2])[::2, ::2]
     whole = view.depth > 0
-    whole = (whole[1:-1, 1:-1] & whole[2:, 1:-1] & whole[:-2, 1:-1] & whole[1:-1, 2:] & whole[1:-1, :-2])[
-        ::step, ::step
-    ]
-    inner = own[1:-1, 1:-1][::step, ::step][whole]
+    whole = whole[1:-1, 1:-1] & whole[2:, 1:-1] & whole[:-2, 1:-1] & whole[1:-1, 2:] & whole[1:-1, :-2]
+    whole = whole[::2, ::2]
+    inner = own[1:-1, 1:-1][::2, ::2][whole]
     length = np.linalg.norm(normal[whole], axis=1, keepdims=True)
     rotation, shift = view.camera_from_world[:3, :3], view.camera_from_world[:3, 3]
     return (inner - shift) @ rotation, (normal[whole] / np.maximum(length, 1e-30)) @ rotation

@@ -9,7 +9,7 @@ import numpy as np
 
 from perception import _core
 from perception.errors import InputError
-from perception.export.graph import (
+from perception.export.neighbors import (
     list_edges,
     list_normals,
     mesh_edges,

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from perception.calibration.board import Board
-from perception.calibration.refine import refine
+from perception.calibration.board import Board, refine
 from perception.errors import InputError
 from perception.frame.scale import LARGEST_ERROR, KnownLength, Measurement
 from perception.geometry import align_similarity

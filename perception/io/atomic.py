@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import fcntl  # not filelock, which leaves lock files behind, cannot lock folders and does not name the holder
 import os
 import shutil
 import threading
@@ -22,11 +23,6 @@ from typing import Any, BinaryIO
 from uuid import uuid4
 
 from perception.errors import InputError
-
-try:  # `filelock` is not used: it leaves lock files behind, cannot lock folders and does not name the holder
-    import fcntl
-except ImportError:  # Windows has no flock
-    fcntl = None  # type: ignore[assignment]
 
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # from Linux fcntl.h and fs.h
@@ -222,10 +218,8 @@ def _disk_errors(path: Path) -> Iterator[None]:
 def lock(descriptor: int) -> bool:
     """Takes the exclusive lock on an open file or folder; False when another descriptor holds it.
 
-    OSError where the file system or the operating system does not support flock.
+    OSError where the file system does not support flock.
     """
-    if fcntl is None:
-        raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
@@ -264,10 +258,9 @@ def writing(path: Path) -> Iterator[None]:
         yield
     finally:
         _held.discard(mine)
-        if descriptor is not None:
-            with contextlib.suppress(OSError):
-                lock_file(path).unlink()  # before the release, so that no other process has locked this file
-            os.close(descriptor)
+        with contextlib.suppress(OSError):
+            lock_file(path).unlink()  # before the release, so that no other process has locked this file
+        os.close(descriptor)
 
 
 def lock_file(path: Path) -> Path:
@@ -275,9 +268,7 @@ def lock_file(path: Path) -> Path:
     return path.with_name(f".{path.name}.lock")
 
 
-def _take(path: Path) -> int | None:
-    if fcntl is None:  # readers are still safe through atomic renames
-        return None
+def _take(path: Path) -> int:
     file = lock_file(path)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)

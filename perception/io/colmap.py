@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.documents import safe_name
 from perception.io.exposure import with_gains
 from perception.io.ignore_masks import mask_of
 from perception.io.lens import lens_from_camera, load_pycolmap
 from perception.io.photos import why_left_out
 from perception.io.reading import Reading
-from perception.io.safe_names import safe_name
 from perception.io.tracks import tracks_of_model
 from perception.io.triangulate import MIN_POINTS, cloud_of, posed_scene
 from perception.io.views import fit_lens, make_view

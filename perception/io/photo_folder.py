@@ -12,13 +12,11 @@ import numpy as np
 from PIL import Image
 
 from perception.errors import InputError
-from perception.io.frame_choice import THUMBNAIL, motion_between
 from perception.io.photos import SUFFIXES, decode, open_photo, photo_size, upright
+from perception.io.video import FRAMES_RECORD, THUMBNAIL, motion_between
 from perception.progress import Progress
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
-FRAMES_RECORD = "frames.json"
-"""Name of the record file in a folder of frames taken from a video."""
 SAME_MOTION, SAME_GREY = 0.006, 6.0
 """Neighbouring photos are duplicates when their corners move by less than this share of the width and their 320 pixel
 thumbnails differ by less than this mean grey level. Measured between neighbours on a walk: at least 0.011 and 11."""

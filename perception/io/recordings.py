@@ -12,11 +12,11 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import inverse_se3
 from perception.io.depth import read_depth
-from perception.io.frame_choice import Chooser
+from perception.io.documents import safe_name
 from perception.io.ignore_masks import mask_of
 from perception.io.reading import NO_CLOUD, Reading
-from perception.io.safe_names import safe_name
 from perception.io.triangulate import posed_scene
+from perception.io.video import Chooser
 from perception.io.views import fit_lens, make_view, rigid_pose
 from perception.progress import Progress
 from perception.types import DepthImage, Lens, Scene, View

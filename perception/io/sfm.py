@@ -18,12 +18,11 @@ from perception.io.colmap import views_of_model
 from perception.io.exposure import with_gains
 from perception.io.features import FeatureStore, build_features, verified_matches
 from perception.io.ignore_masks import mask_of
-from perception.io.incremental_sfm import map_photos
+from perception.io.incremental_sfm import map_photos, model_warnings
 from perception.io.lens import lens_from_camera, lens_text, load_pycolmap
 from perception.io.photo_folder import PhotoSet, choose_photos
 from perception.io.photos import photo_size
 from perception.io.reading import Reading
-from perception.io.sfm_checks import model_warnings
 from perception.io.tracks import tracks_of_model
 from perception.io.triangulate import cloud_of
 from perception.types import Lens, Scene

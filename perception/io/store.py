@@ -29,11 +29,11 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory, atomic_file, writing
 from perception.io.checksums import EDITABLE, FACTS, REPORT, facts_of, file_facts, seal, verify
+from perception.io.documents import safe_name
 from perception.io.map import Map
 from perception.io.map_files import FORMAT_VERSION, MapFiles
 from perception.io.map_views import StoredView, moved_record, stored_view, view_from_json, view_json
 from perception.io.ply import write_ply
-from perception.io.safe_names import safe_name
 from perception.types import View
 
 LONGEST_LABEL = 200  # characters

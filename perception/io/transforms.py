@@ -13,13 +13,12 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
-from perception.io.documents import brief, read_json
+from perception.io.documents import brief, read_json, safe_name
 from perception.io.ignore_masks import mask_of
 from perception.io.lens import FISHEYE, PERSPECTIVE, opencv_lens
 from perception.io.map_views import absolute
 from perception.io.photos import SUFFIXES, photo_size, why_left_out
 from perception.io.reading import NO_CLOUD, Reading, start_points
-from perception.io.safe_names import safe_name
 from perception.io.triangulate import posed_scene
 from perception.io.views import fit_lens, make_view, rigid_pose
 from perception.types import DepthImage, Lens, Scene, View

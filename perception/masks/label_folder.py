@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.safe_names import safe_name
+from perception.io.documents import safe_name
 from perception.masks.label_images import read_labels, read_png_header
 from perception.types import View
 

@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.documents import brief
-from perception.io.safe_names import safe_name
+from perception.io.documents import brief, safe_name
 from perception.masks.merging import Segmentation
 from perception.masks.source import GeometryMaskSource, MaskSource
 from perception.progress import Progress

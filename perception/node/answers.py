@@ -1,4 +1,5 @@
-"""The engine's replies, the map and the health figures as standard ROS 2 messages, independent of the transport.
+"""The engine's replies, the map and the health figures as standard ROS 2 messages, independent of the transport; the
+topics and services, by short name, of standard types only.
 
 A message is a dict of its fields; omitted fields have the ROS default. Arrays are numpy, times are
 (seconds, nanoseconds). Layouts: the interface definitions of ROS 2 (common_interfaces, vision_msgs 4).
@@ -7,6 +8,7 @@ A message is a dict of its fields; omitted fields have the ROS default. Arrays a
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,11 +18,36 @@ from perception.colors import instance_palette, rgb8_from_sh
 from perception.query import Hit, QueryMap, Reply
 from perception.types import OrientedBox
 
-POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-DETECTIONS = "vision_msgs/msg/Detection3DArray"
-MARKERS = "visualization_msgs/msg/MarkerArray"
-STRING = "std_msgs/msg/String"
-DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+
+@dataclass(frozen=True)
+class Channel:
+    """A topic or service. name: in the node's namespace, unless it begins with a slash. kind: ROS type. latched: late
+    subscribers receive the last message."""
+
+    name: str
+    kind: str
+    latched: bool = False
+
+
+PROMPT = Channel("prompt", "std_msgs/msg/String")
+"""Input: a prompt as plain text, or a JSON object with "text" and optionally "id", "top_k", "min_score", …"""
+ANSWER = Channel("answer", "std_msgs/msg/String")
+"""Output: JSON, the last message of an answer. Its "stamp", unique to the answer, is also that of the three below."""
+POINTS = Channel("answer/points", "sensor_msgs/msg/PointCloud2")
+BOXES = Channel("answer/detections", "vision_msgs/msg/Detection3DArray")
+MARKS = Channel("answer/markers", "visualization_msgs/msg/MarkerArray")
+MAP_CLOUD = Channel("map/points", "sensor_msgs/msg/PointCloud2", latched=True)
+HEALTH = Channel("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+"""The topic on which ROS tools expect health (REP 107)."""
+
+QUERY = Channel("query", "rcl_interfaces/srv/GetParameters")
+"""The standard service type that takes texts and returns typed values: each name is a prompt, each value its answer."""
+RELOAD = Channel("reload", "std_srvs/srv/Trigger")
+
+OUTPUTS = (ANSWER, POINTS, BOXES, MARKS, MAP_CLOUD, HEALTH)
+
+DEPTH = 64
+"""Largest number of messages queued for a slow reader; older ones are dropped, which bounds the memory."""
 
 Stamp = tuple[int, int]
 _FIELD_KINDS = {"<i4": 5, "<u4": 6, "<f4": 7}  # sensor_msgs/PointField

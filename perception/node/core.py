@@ -11,14 +11,81 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from perception.errors import InputError
-from perception.node import answers, channels
+from perception.node import answers
 from perception.node.config import NodeConfig
-from perception.node.questions import Question, error_json, identity_of, read_questions
-from perception.query import EngineBusy, EngineClosed, QueryEngine, QueryMap, Reply
+from perception.query import AnswerTimeout, EngineBusy, EngineClosed, QueryEngine, QueryMap, Reply, Request
+from perception.query.bodies import QueryBody, parse
+
+MAX_BYTES = 64 * 1024
+"""Largest prompt in bytes, JSON included; larger ones are rejected before parsing."""
+_SHOWN = 80
+
+
+@dataclass(frozen=True)
+class Question:
+    """One prompt. identity: an id chosen by the client, returned with the answer. points: the service returns points
+    instead of the JSON."""
+
+    request: Request
+    identity: str | None = None
+    points: bool = False
+
+
+def read_questions(data: str) -> list[Question]:
+    """The questions in a prompt: one for a plain text, one per text of a JSON object. InputError when malformed."""
+    size = len(data.encode("utf-8", "surrogatepass"))
+    if size > MAX_BYTES:
+        raise InputError(f"prompt: has {size} bytes, expected at most {MAX_BYTES}")
+    if not data.lstrip().startswith("{"):
+        return [Question(Request(data))]
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"prompt: begins like JSON but is none ({error})") from error
+    identity, want = value.pop("id", None), value.pop("want", "hits")
+    if identity is not None and not (isinstance(identity, str) and len(identity) <= 200):
+        raise InputError("prompt: id is to be a text of at most 200 characters")
+    if want not in ("hits", "points"):
+        raise InputError(f"prompt: want is {str(want)[:_SHOWN]!r}, expected hits or points")
+    return [Question(request, identity, want == "points") for request in parse(QueryBody, value).requests()]
+
+
+def identity_of(data: str) -> str | None:
+    """The id of a rejected prompt, when it can be parsed, so that the client can match the error; else None."""
+    if len(data) > MAX_BYTES:
+        return None
+    try:
+        identity = json.loads(data).get("id")
+    except (ValueError, AttributeError, RecursionError):
+        return None
+    return identity if isinstance(identity, str) and len(identity) <= 200 else None
+
+
+def error_json(error: BaseException, text: str, identity: str | None) -> dict[str, Any]:
+    """The JSON that is sent instead of an answer; kind: bad_input, busy, timeout, closed or failed."""
+    return {
+        "id": identity,
+        "text": text if len(text) <= _SHOWN else text[:_SHOWN] + "…",
+        "error": {"kind": error_kind(error), "message": " ".join(str(error).split()) or type(error).__name__},
+    }
+
+
+def error_kind(error: BaseException) -> str:
+    """bad_input: change the request; busy, timeout: retry later; closed: use another node; failed: a defect here."""
+    kinds: tuple[tuple[type[BaseException], str], ...] = (
+        (InputError, "bad_input"),
+        (EngineBusy, "busy"),
+        (AnswerTimeout, "timeout"),
+        (EngineClosed, "closed"),
+        (CancelledError, "timeout"),
+    )
+    return next((name for kind, name in kinds if isinstance(error, kind)), "failed")
+
 
 Message = dict[str, Any]
 _MOST_NAMES = 32
@@ -28,7 +95,7 @@ class Transport(Protocol):
     """What the core uses of `ros.RosTransport`. `publish` is called from any thread and does not raise for a slow or
     absent reader. The health message contains `warnings` (present problems) and `figures` (counts)."""
 
-    def publish(self, topic: channels.Channel, message: Message) -> None: ...
+    def publish(self, topic: answers.Channel, message: Message) -> None: ...
 
     def warnings(self) -> list[str]: ...
 
@@ -72,9 +139,9 @@ class Core:
             self._send_error(error, question.request.text, question.identity)
             return
         reply, stamp, send = done.result(), self._stamps.next(), self._transport.publish
-        send(channels.POINTS, answers.hits_cloud(reply, stamp))
-        send(channels.BOXES, answers.hits_detections(reply, stamp))
-        send(channels.MARKS, answers.hits_markers(reply, question.identity, stamp))
+        send(answers.POINTS, answers.hits_cloud(reply, stamp))
+        send(answers.BOXES, answers.hits_detections(reply, stamp))
+        send(answers.MARKS, answers.hits_markers(reply, question.identity, stamp))
         self._send_json({**answers.answer_json(reply, question.identity), "stamp": answers.stamp_json(stamp)})
 
     def _send_error(self, error: BaseException, text: str, identity: str | None) -> None:
@@ -83,7 +150,7 @@ class Core:
         self._send_json({**body, "stamp": answers.stamp_json(self._stamps.next())})
 
     def _send_json(self, value: Message) -> None:
-        self._transport.publish(channels.ANSWER, {"data": json.dumps(value, allow_nan=False)})
+        self._transport.publish(answers.ANSWER, {"data": json.dumps(value, allow_nan=False)})
 
     # ---------------------------------------------------------------- services
 
@@ -141,7 +208,7 @@ class Core:
         refused = {f"refused_{kind}": count for kind, count in self._refused.items()}
         facts = {**self._engine.health(), **refused, **self._transport.figures()}
         body = answers.diagnostics(self._config.namespace, facts, self._transport.warnings(), self._stamps.next())
-        self._transport.publish(channels.HEALTH, body)
+        self._transport.publish(answers.HEALTH, body)
 
     def _send_map(self, gmap: QueryMap) -> None:
         if not self._config.map_points:
@@ -149,7 +216,7 @@ class Core:
         with self._sending_map:
             if gmap is self._engine.current:  # else a newer map is published soon
                 cloud = answers.map_cloud(gmap, self._config.map_points, self._stamps.next())
-                self._transport.publish(channels.MAP_CLOUD, cloud)
+                self._transport.publish(answers.MAP_CLOUD, cloud)
 
     def _submit(self, work: Callable[[QueryMap], None]) -> None:
         """Runs work on the map in a thread of the engine, or in the calling thread when the request queue is full."""

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from perception.node import channels
-from perception.node.channels import DEPTH, Channel
+from perception.node import answers
+from perception.node.answers import DEPTH, Channel
 from perception.node.config import NodeConfig
 from perception.node.core import Core, Message
 
@@ -33,7 +33,7 @@ class RosTransport:
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=config.domain_id, signal_handler_options=SignalHandlerOptions.NO)
         self._node = rclpy.create_node("node", namespace=f"/{config.namespace}", context=self._context)
-        self._answer_name = f"/{config.namespace}/{channels.ANSWER.name}"
+        self._answer_name = f"/{config.namespace}/{answers.ANSWER.name}"
         self._publishers: dict[Channel, Any] = {}
         self._absent: list[str] = []
 
@@ -45,12 +45,12 @@ class RosTransport:
         return self._answerers()
 
     def _answerers(self) -> int:
-        own = 1 if channels.ANSWER in self._publishers else 0
+        own = 1 if answers.ANSWER in self._publishers else 0
         return max(0, len(self._node.get_publishers_info_by_topic(self._answer_name)) - own)
 
     def open(self) -> None:
         """Creates the publishers. A topic whose type is not installed (vision_msgs) is skipped; see `figures`."""
-        for topic in channels.OUTPUTS:
+        for topic in answers.OUTPUTS:
             try:
                 kind = _class(topic.kind)
             except ImportError:
@@ -80,13 +80,13 @@ class RosTransport:
 
         calls = ReentrantCallbackGroup()
         self._node.create_subscription(
-            _class(channels.PROMPT.kind),
-            channels.PROMPT.name,
+            _class(answers.PROMPT.kind),
+            answers.PROMPT.name,
             lambda message: core.prompt(message.data),
             _qos(False),
             callback_group=MutuallyExclusiveCallbackGroup(),
         )
-        for service, answer in ((channels.QUERY, self._query), (channels.RELOAD, self._reload)):
+        for service, answer in ((answers.QUERY, self._query), (answers.RELOAD, self._reload)):
             self._node.create_service(
                 _class(service.kind),
                 service.name,

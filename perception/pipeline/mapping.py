@@ -32,14 +32,20 @@ from perception.language.ocr import make_reader
 from perception.masks import MaskSource, compute_masks, make_source
 from perception.masks.label_images import load_segmentation
 from perception.masks.source import GeometryMaskSource
-from perception.pipeline.checkpoint import TrainingObserver, fingerprint, poses_mark, training_mark
+from perception.pipeline.checkpoint import (
+    TrainingObserver,
+    clear_work,
+    fingerprint,
+    frames_folder,
+    poses_mark,
+    training_mark,
+    working,
+)
 from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
 from perception.pipeline.photos import exposed_as_neighbours, load_all, split_views, with_labels
-from perception.pipeline.record import Stages, finite, peak_memory_mib, versions
-from perception.pipeline.sensor_depth import depth_errors, depth_used
+from perception.pipeline.record import Stages, depth_errors, depth_used, finite, peak_memory_mib, versions
 from perception.pipeline.summary import depth_text, frame_lines
-from perception.pipeline.work_folder import clear_work, frames_folder, working
 from perception.progress import Progress
 from perception.types import Scene, View
 

@@ -18,7 +18,7 @@ from perception.io.cloud import write_cloud
 from perception.io.open3d import fuse_depth, write_glb
 from perception.io.recentre import map_from_input
 from perception.io.store import Map
-from perception.pipeline.placing import rendered_depth
+from perception.pipeline.exporting import rendered_depth
 from perception.types import PointCloud
 
 MOST_VIEWS, LONG_SIDE = 300, 640

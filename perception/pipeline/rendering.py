@@ -16,8 +16,8 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
 from perception.gaussians.train import depth_image
 from perception.instances.silhouettes import render_silhouettes
+from perception.io.documents import safe_name
 from perception.io.recentre import map_from_input, moved
-from perception.io.safe_names import safe_name
 from perception.io.store import Map, read_map
 from perception.types import View
 

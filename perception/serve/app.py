@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Callable
 from typing import Annotated, Any, Literal, TypeVar
@@ -12,14 +13,45 @@ from fastapi.responses import JSONResponse, Response
 from starlette.concurrency import run_in_threadpool
 
 from perception import __version__
+from perception.io.ply import ply_bytes
 from perception.query.bodies import AtBody, FindBody, NearestBody, QueryBody
 from perception.query.engine import QueryEngine
 from perception.query.query_map import QueryMap
 from perception.query.where import Frame
-from perception.serve.errors import HANDLERS, OtherMap
-from perception.serve.guard import Guard
-from perception.serve.points import FORMATS, encode
+from perception.serve.guard import HANDLERS, Guard, OtherMap
 from perception.serve.settings import ServeSettings
+
+FORMATS = {"npz": "application/x-npz", "ply": "application/octet-stream"}
+"""Name → media type."""
+
+
+def encode(gmap: QueryMap, instance_id: int, kind: str) -> bytes:
+    """The instance's points in the map's frame, in map order.
+
+    npz: points [P, 3] float32, centroid [3], covariance [3, 3], obb_center, obb_rotation, obb_extent, instance_id,
+    frame, metric, map_id. ply: binary, x y z float and instance_id int, as `perception export` writes.
+    """
+    hit = gmap.get(instance_id)
+    if kind == "ply":
+        columns = {axis: np.ascontiguousarray(hit.points[:, n]) for n, axis in enumerate("xyz")}
+        ids = np.full(len(hit.points), instance_id, np.int32)
+        return ply_bytes({"vertex": {**columns, "instance_id": ids}})
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        points=hit.points,
+        centroid=hit.centroid,
+        covariance=hit.covariance,
+        obb_center=hit.obb.center,
+        obb_rotation=hit.obb.rotation,
+        obb_extent=hit.obb.extent,
+        instance_id=np.int64(instance_id),
+        frame=np.array(gmap.frame),
+        metric=np.array(gmap.metric),
+        map_id=np.array(gmap.map_id),
+    )
+    return buffer.getvalue()
+
 
 T = TypeVar("T")
 MapId = Annotated[str | None, Query(description="answer only from this very map, else 409")]
@@ -126,7 +158,8 @@ class _Routes:
         """The result of `work` in the engine; OtherMap when `wanted` is given and is not the map's id."""
 
         def checked(gmap: QueryMap) -> T:
-            _check_map(gmap, wanted)
+            if wanted is not None and wanted != gmap.map_id:
+                raise OtherMap(f"the map is now {gmap.map_id}, not {wanted[:40]}; ask again")
             return work(gmap)
 
         return await self.engine.awaited(self.engine.run(checked))
@@ -136,11 +169,6 @@ class _Routes:
             return {"hits": [hit.to_json() for hit in work(gmap)], **_source(gmap, frame)}
 
         return JSONResponse(await self._answer(wanted, answer))
-
-
-def _check_map(gmap: QueryMap, wanted: str | None) -> None:
-    if wanted is not None and wanted != gmap.map_id:
-        raise OtherMap(f"the map is now {gmap.map_id}, not {wanted[:40]}; ask again")
 
 
 def _source(gmap: QueryMap, frame: Frame | None) -> dict[str, Any]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from perception.errors import missing_extra
 from perception.language.base import Encoder
@@ -13,20 +15,18 @@ from perception.listening import listen, url_host
 from perception.query.engine import QueryEngine
 from perception.serve.settings import ServeSettings
 
+MAX_CONNECTIONS = 256
+MAX_WAITING = MAX_CONNECTIONS // 2
+"""Largest number of connections whose next header is not complete."""
 _TOTAL_TIMEOUT = 300.0
 """Seconds from a request's header to the end of its answer: 100 MB of points at 3 Mbit/s."""
 
 
-def serve(
-    path: Path,
-    settings: ServeSettings,
-    say: Callable[[str], None] | None = None,
-    encoders: Callable[[str], Encoder | None] | None = None,
-) -> None:
+def serve(path: Path, settings: ServeSettings, encoders: Callable[[str], Encoder | None] | None = None) -> None:
     """Serves the map at `path` until SIGINT or SIGTERM; running requests are finished.
 
     InputError when the map cannot be opened, the port is taken, or the packages of the extra `serve` are missing.
-    say: called with the address in one line once requests are accepted; by default it writes to standard error.
+    The address is written to standard error in one line once requests are accepted.
     """
     for package in ("fastapi", "uvicorn"):
         if importlib.util.find_spec(package) is None:
@@ -34,7 +34,6 @@ def serve(
     import uvicorn
 
     from perception.serve.app import build_app
-    from perception.serve.connections import MAX_CONNECTIONS, timed_protocol
 
     with (
         listen(settings.host, settings.port) as sock,
@@ -47,9 +46,9 @@ def serve(
             encoders=encoders,
         ) as engine,
     ):
-        (say or _say)(f"serving {path} at http://{url_host(settings.host)}:{sock.getsockname()[1]} (Ctrl-C stops)")
+        _say(f"serving {path} at http://{url_host(settings.host)}:{sock.getsockname()[1]} (Ctrl-C stops)")
         if (trouble := engine.current.problem) is not None:
-            (say or _say)(f"warning: prompts cannot be answered: {trouble}")
+            _say(f"warning: prompts cannot be answered: {trouble}")
         config = uvicorn.Config(
             build_app(engine, settings),
             http=timed_protocol(settings.timeout, _TOTAL_TIMEOUT),
@@ -64,5 +63,57 @@ def serve(
 
 
 def _say(line: str) -> None:
-    sys.stderr.write(line + "\n")
-    sys.stderr.flush()
+    print(line, file=sys.stderr, flush=True)
+
+
+def timed_protocol(header: float, total: float) -> type[asyncio.Protocol]:
+    """The protocol class for uvicorn's setting `http`, with the time-outs of connections that uvicorn lacks.
+
+    header, total: seconds until the next header is complete, and for a whole request. Clients that send incomplete
+    headers could occupy all connections: when more than MAX_WAITING wait for a header, the oldest is closed.
+    """
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    waiting: dict[asyncio.Protocol, None] = {}  # in the order in which they began to wait
+
+    class Timed(H11Protocol):
+        timer: asyncio.TimerHandle | None = None
+
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            super().connection_made(transport)
+            self._wait()
+
+        def handle_events(self) -> None:
+            before = self.cycle
+            super().handle_events()
+            if self.cycle is not before:  # a header is complete
+                self._start(total)
+
+        def on_response_complete(self) -> None:
+            answered = self.cycle
+            super().on_response_complete()
+            if self.cycle is answered:  # else the next request had come already
+                self._wait()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            self._stop()
+            super().connection_lost(exc)
+
+        def _wait(self) -> None:
+            self._start(header)
+            waiting[self] = None
+            if len(waiting) > MAX_WAITING:
+                oldest: Any = next(iter(waiting))
+                del waiting[oldest]
+                oldest.transport.abort()
+
+        def _start(self, seconds: float) -> None:
+            self._stop()
+            self.timer = self.loop.call_later(seconds, self.transport.abort)
+
+        def _stop(self) -> None:
+            waiting.pop(self, None)
+            if self.timer is not None:
+                self.timer.cancel()
+
+    return Timed

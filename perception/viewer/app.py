@@ -17,17 +17,21 @@ import numpy as np
 from perception.errors import InputError, missing_extra
 from perception.listening import check_address, is_local, listen, url_host
 from perception.viewer.guard import Guard, guarded_server
-from perception.viewer.paint import HIGHLIGHT
 from perception.viewer.panel import Panel
 from perception.viewer.picking import covariances
-from perception.viewer.session import Session
+from perception.viewer.session import HIGHLIGHT, Session
 
 WATCH = 1.0
 """Seconds between checks whether another program changed the map."""
 
 
 class Viewer:
-    """A running viewer page. `address`: its URL; `url`: the same with the access token; `stop` closes it."""
+    """A map in a page at http://host:port (port 0: any free one). `address`: its URL; `url`: the same with the access
+    token; `stop` closes it.
+
+    token: the access token; None generates one, which is refused where other machines can reach `host`.
+    Raises InputError when `path` is no map, the port is in use, the token is missing, or viser is not installed.
+    """
 
     def __init__(self, path: Path, host: str = "127.0.0.1", port: int = 8090, token: str | None = None):
         check_address(host, port, token)
@@ -185,12 +189,3 @@ class Viewer:
             if problem and problem != self._problem:
                 self.panel.notify(None, problem)
             self._problem = problem
-
-
-def start_viewer(path: Path, host: str = "127.0.0.1", port: int = 8090, token: str | None = None) -> Viewer:
-    """Opens a map in a page at http://host:port (port 0: any free one).
-
-    token: the access token; None generates one, which is refused where other machines can reach `host`.
-    Raises InputError when `path` is no map, the port is in use, the token is missing, or viser is not installed.
-    """
-    return Viewer(Path(path), host, port, token)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from perception.pipeline.summary import frame_lines
 from perception.query.hit import printed_texts
-from perception.viewer.paint import MODES
+from perception.viewer.session import MODES
 
 if TYPE_CHECKING:
     from perception.viewer.app import Viewer

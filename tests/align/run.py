@@ -17,7 +17,7 @@ from perception.export import align as module
 from perception.geometry import move_points
 from perception.io.cloud import read_cloud
 from perception.io.store import read_map
-from perception.pipeline.placing import LONG_SIDE, MOST_VIEWS, rendered_depth
+from perception.pipeline.exporting import LONG_SIDE, MOST_VIEWS, rendered_depth
 from perception.types import PointCloud
 
 

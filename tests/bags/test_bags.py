@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception.bags.decode import decode_image
 from perception.bags.frames import FrameOptions, run_frames
 from perception.bags.poses import Poses
+from perception.bags.read import decode_image
 from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
 from perception.geometry import inverse_se3
 from perception.io.camera_file import read_camera
-from perception.io.frame_choice import Chooser
 from perception.io.transforms import read_frames
+from perception.io.video import Chooser
 from perception.pipeline.mapping import build_map
 
 pytest.importorskip("rosbags")

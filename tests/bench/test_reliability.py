@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perception.bench.reliability import draw_reliability, reliability
+from perception.bench.output import draw_reliability, reliability
 
 
 def test_calibration_error_by_hand(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from perception.bench.output import table
 from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
-from perception.evaluate import run_instances
+from perception.evaluate.layouts import run_instances
 
 
 def test_the_front_is_what_brute_force_says() -> None:

@@ -10,16 +10,17 @@ import pytest
 from scipy.spatial import Delaunay
 
 from perception.errors import InputError
-from perception.export.graph import (
+from perception.export.neighbors import (
+    Neighbors,
     list_edges,
     list_normals,
     mesh_edges,
+    nearest_gaussian,
     neighbor_lists,
     scannet_normals,
     scannet_weights,
     step_weights,
 )
-from perception.export.neighbors import Neighbors, nearest_gaussian
 from perception.export.smooth import felzenszwalb, read_segments, segment_cloud, vote
 from perception.types import PointCloud
 

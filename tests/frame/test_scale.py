@@ -13,9 +13,17 @@ from PIL import Image
 
 from perception.calibration.board import Board
 from perception.errors import InputError
-from perception.frame.gps import earth_positions, photo_position, scale_of_gps, scale_of_positions
 from perception.frame.known_size import Sighting, scale_of_board, scale_of_pixels, scale_of_sightings, scale_of_tags
-from perception.frame.scale import Measurement, combined, known_length, scale_of_depth
+from perception.frame.scale import (
+    Measurement,
+    combined,
+    earth_positions,
+    known_length,
+    photo_position,
+    scale_of_depth,
+    scale_of_gps,
+    scale_of_positions,
+)
 from perception.geometry import camera_centres
 from perception.types import DepthImage, View
 from support.board_pictures import board_texture

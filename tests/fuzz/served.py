@@ -135,7 +135,7 @@ def served_map() -> Target:
     """The map folders of the target `map`, opened for questions: what is answered is JSON of finite numbers."""
     from perception.query import load_map
     from perception.query.crops import best_crop
-    from perception.serve.points import encode
+    from perception.serve.app import encode
 
     target = map_store()
 
@@ -243,7 +243,7 @@ class ViewerTarget:
         """True when nothing was refused."""
         from perception.io.map_files import map_signature
 
-        with patch("perception.editing.editor.read_map", self._read):
+        with patch("perception.editing.read_map", self._read):
             taken = self._run(data)
         if map_signature(self._path) != self._signature:
             self._renew()

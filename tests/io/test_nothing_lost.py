@@ -20,9 +20,8 @@ from perception.editing import Editor
 from perception.errors import InputError
 from perception.io.atomic import lock_file, writing
 from perception.io.store import read_map, set_labels, verify_map
-from perception.pipeline.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint
+from perception.pipeline.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint, work_folder
 from perception.pipeline.mapping import build_map
-from perception.pipeline.work_folder import work_folder
 from support.paths import SUPPORT
 from support.query_maps import write_map_of
 

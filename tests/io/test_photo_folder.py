@@ -17,13 +17,13 @@ from PIL import Image
 from perception.errors import InputError
 from perception.geometry import look_at
 from perception.io import photos as photos_module
+from perception.io.documents import safe_name
 from perception.io.features import build_features
 from perception.io.inputs import load_scene
 from perception.io.lens import load_pycolmap
 from perception.io.photo_folder import choose_photos, list_photos, view_name
 from perception.io.photos import photo_size, read_photo, why_left_out
 from perception.io.reading import Reading
-from perception.io.safe_names import safe_name
 from perception.io.views import fit_lens
 from perception.types import Lens
 from support.progress import Told

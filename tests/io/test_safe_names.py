@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perception.errors import InputError
-from perception.io.safe_names import safe_name
+from perception.io.documents import safe_name
 
 GOOD = [
     "a.jpg",

@@ -13,12 +13,12 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from perception.geometry import align_similarity, inverse_se3, look_at
-from perception.io import features, sfm_checks
+from perception.io import features, incremental_sfm
 from perception.io.features import build_features
+from perception.io.incremental_sfm import Pair
 from perception.io.inputs import load_scene
 from perception.io.lens import load_pycolmap
 from perception.io.reading import Reading
-from perception.io.sfm_checks import Pair
 from support.progress import Told
 
 pytestmark = pytest.mark.slow
@@ -151,12 +151,12 @@ def test_a_wrecked_model_raises_a_warning(run, wrecked):
     pycolmap = load_pycolmap()
     (store,) = run[2].glob("features-*")
     model = pycolmap.Reconstruction(store / "model")
-    assert sfm_checks.model_warnings([model], store / "database.db", VIEWS) == []
+    assert incremental_sfm.model_warnings([model], store / "database.db", VIEWS) == []
     half_turn = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(np.diag([-1.0, -1.0, 1.0])), np.zeros(3))
     for image in sorted(model.images.values(), key=lambda image: image.name)[-wrecked:]:
         frame = model.frames[image.frame_id]
         frame.rig_from_world = pycolmap.Rigid3d((frame.rig_from_world.matrix() @ matrix_4x4(half_turn))[:3])
-    warnings = sfm_checks.model_warnings([model], store / "database.db", VIEWS)
+    warnings = incremental_sfm.model_warnings([model], store / "database.db", VIEWS)
     assert len(warnings) == 1 and "folded" in warnings[0]
 
 
@@ -166,10 +166,10 @@ def matrix_4x4(transform):
 
 def test_contradictions_count_when_stronger_than_every_chain():
     chain = [Pair(0, 1, 100, 1.0), Pair(1, 2, 60, 0.9)]
-    assert sfm_checks.stronger_contradictions([*chain, Pair(0, 2, 50, 0.0)]) == []
-    assert sfm_checks.stronger_contradictions([*chain, Pair(0, 2, 70, 0.1)]) == [Pair(0, 2, 70, 0.1)]
-    assert sfm_checks.stronger_contradictions([*chain, Pair(0, 2, 60, 0.1)]) == []  # equal strength: no contradiction
-    assert sfm_checks.outvoted_photos([*chain, Pair(0, 2, 70, 0.1)]) == {2}
+    assert incremental_sfm.stronger_contradictions([*chain, Pair(0, 2, 50, 0.0)]) == []
+    assert incremental_sfm.stronger_contradictions([*chain, Pair(0, 2, 70, 0.1)]) == [Pair(0, 2, 70, 0.1)]
+    assert incremental_sfm.stronger_contradictions([*chain, Pair(0, 2, 60, 0.1)]) == []  # equally strong
+    assert incremental_sfm.outvoted_photos([*chain, Pair(0, 2, 70, 0.1)]) == {2}
 
 
 def test_photos_with_few_features_are_upsampled(corner, tmp_path, monkeypatch):

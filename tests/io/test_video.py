@@ -15,7 +15,7 @@ from perception.io.inputs import load_scene
 from perception.io.photo_folder import list_photos
 from perception.io.reading import Reading
 from perception.io.video import frame_size, video_frames
-from perception.pipeline.work_folder import frames_folder, working
+from perception.pipeline.checkpoint import frames_folder, working
 from support.progress import Told
 from support.videos import turn_video, write_video
 

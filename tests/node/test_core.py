@@ -15,7 +15,7 @@ import pytest
 
 from perception import load_map
 from perception.errors import InputError
-from perception.node import channels
+from perception.node import answers
 from perception.node.config import NodeConfig, node_config
 from perception.node.core import Core
 from perception.query import QueryEngine
@@ -42,10 +42,10 @@ class Heard:
     """A transport that remembers."""
 
     def __init__(self) -> None:
-        self.messages: list[tuple[channels.Channel, dict[str, Any]]] = []
+        self.messages: list[tuple[answers.Channel, dict[str, Any]]] = []
         self.news = threading.Condition()
 
-    def publish(self, topic: channels.Channel, message: dict[str, Any]) -> None:
+    def publish(self, topic: answers.Channel, message: dict[str, Any]) -> None:
         with self.news:
             self.messages.append((topic, message))
             self.news.notify_all()
@@ -60,7 +60,7 @@ class Heard:
         """The first `count` JSON answers."""
 
         def found() -> list[dict[str, Any]]:
-            return [json.loads(message["data"]) for topic, message in self.messages if topic is channels.ANSWER]
+            return [json.loads(message["data"]) for topic, message in self.messages if topic is answers.ANSWER]
 
         with self.news:
             assert self.news.wait_for(lambda: len(found()) >= count, 20)
@@ -167,7 +167,7 @@ def test_thinned_cloud_of_the_map(tmp_path: Path) -> None:
             assert heard.news.wait_for(lambda: bool(heard.messages), 20)
         topic, cloud = heard.messages[0]
         means = engine.current.means[::4]
-    assert topic is channels.MAP_CLOUD and cloud["width"] == 25
+    assert topic is answers.MAP_CLOUD and cloud["width"] == 25
     rows = np.frombuffer(cloud["data"].tobytes(), [("xyz", "<f4", 3), ("rgb", "<u4"), ("id", "<i4")])
     np.testing.assert_array_equal(rows["xyz"], means)
 
@@ -324,18 +324,18 @@ def test_map_replaced_under_load_answers_come_from_one_or_the_other(tmp_path: Pa
             seen.append(told[0]["map_id"])
         assert set(seen) == truth.keys()
 
-        def came(topic: channels.Channel) -> list[dict[str, Any]]:
+        def came(topic: answers.Channel) -> list[dict[str, Any]]:
             return [message for own, message in heard.messages if own is topic]
 
         with heard.news:
-            assert heard.news.wait_for(lambda: bool(came(channels.MAP_CLOUD)), 20)
-        rows = np.frombuffer(came(channels.MAP_CLOUD)[-1]["data"].tobytes(), [("xyz", "<f4", 3), ("rest", "<u4", 2)])
+            assert heard.news.wait_for(lambda: bool(came(answers.MAP_CLOUD)), 20)
+        rows = np.frombuffer(came(answers.MAP_CLOUD)[-1]["data"].tobytes(), [("xyz", "<f4", 3), ("rest", "<u4", 2)])
         np.testing.assert_array_equal(rows["xyz"], opened.means)
         shutil.rmtree(path)
         while engine.health()["problem"] is None and time.monotonic() < limit:
             time.sleep(0.01)
         core.send_health()
-        status = came(channels.HEALTH)[-1]["status"][0]
+        status = came(answers.HEALTH)[-1]["status"][0]
         assert status["level"] == 1 and "live.gsmap" in status["message"]
         assert asked(core, "banana")[0]["hits"] == truth[opened.map_id]["banana"]
 

@@ -22,9 +22,9 @@ from perception.io.atomic import lock_file
 from perception.io.cloud import read_cloud
 from perception.io.store import read_map
 from perception.pipeline import checkpoint
+from perception.pipeline.checkpoint import work_folder
 from perception.pipeline.demo import truth_in_map_frame
 from perception.pipeline.mapping import build_map
-from perception.pipeline.work_folder import work_folder
 from support.demo_truth import load_truth
 from support.interrupts import interrupt_at
 
@@ -88,7 +88,7 @@ def test_instances_agree_with_the_truth(finished: Path, small_scene: Path, tmp_p
     truth = small_scene / "truth" / "gt_points.ply"
     assert main(["export", str(finished), "--points", str(truth), "-o", str(out), "--json"]) == 0
     assert main(["eval", "instances", str(out), str(truth), "--json"]) == 0
-    from perception.evaluate import run_instances
+    from perception.evaluate.layouts import run_instances
 
     result, _ = run_instances(out, truth)
     assert result["ap25"] > 0.4

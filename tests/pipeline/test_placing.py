@@ -16,7 +16,7 @@ from perception.errors import InputError
 from perception.io.cloud import read_cloud, write_cloud
 from perception.io.open3d import load_open3d
 from perception.io.store import write_map
-from perception.pipeline.placing import read_transform
+from perception.pipeline.exporting import read_transform
 from perception.query import load_map
 from perception.types import PointCloud
 from support.viewer_maps import small_map

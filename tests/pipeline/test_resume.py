@@ -23,10 +23,16 @@ from perception.errors import InputError
 from perception.gaussians import train
 from perception.io.store import read_map
 from perception.pipeline import checkpoint, mapping
-from perception.pipeline.checkpoint import BEFORE_MASKS, CHECKPOINT, fingerprint, load_checkpoint, save_checkpoint
+from perception.pipeline.checkpoint import (
+    BEFORE_MASKS,
+    CHECKPOINT,
+    fingerprint,
+    load_checkpoint,
+    save_checkpoint,
+    work_folder,
+)
 from perception.pipeline.mapping import build_map
 from perception.pipeline.record import finite
-from perception.pipeline.work_folder import work_folder
 from support.interrupts import interrupt_at
 from support.progress import Told
 

@@ -182,9 +182,9 @@ def test_neither_unsaved_corrections_nor_another_programs_work_is_lost(path: Pat
 @pytest.fixture
 def viewer(path: Path) -> Iterator[Any]:
     pytest.importorskip("viser")
-    from perception.viewer import start_viewer
+    from perception.viewer import Viewer
 
-    running = start_viewer(path, port=free_port())
+    running = Viewer(path, port=free_port())
     yield running
     running.stop()
 

@@ -11,8 +11,8 @@ import torch
 
 from perception.errors import InputError
 from perception.io.store import write_map
-from perception.viewer.paint import HIGHLIGHT, MODES, highlight, paint
 from perception.viewer.picking import covariances, pick
+from perception.viewer.session import HIGHLIGHT, MODES, highlight, paint
 from support.processes import hears_ctrl_c
 from support.viewer_maps import free_port, small_map
 
@@ -88,15 +88,15 @@ def test_highlight_dims_the_rest() -> None:
 
 def test_a_port_in_use_is_told(tmp_path: Path) -> None:
     pytest.importorskip("viser")
-    from perception.viewer import start_viewer
+    from perception.viewer import Viewer
 
     with socket.socket() as busy:
         busy.bind(("127.0.0.1", 0))
         busy.listen()
         with pytest.raises(InputError, match="is in use"):
-            start_viewer(tmp_path / "none.gsmap", port=busy.getsockname()[1])
+            Viewer(tmp_path / "none.gsmap", port=busy.getsockname()[1])
     with pytest.raises(InputError, match="no map"):
-        start_viewer(tmp_path / "none.gsmap", port=free_port())
+        Viewer(tmp_path / "none.gsmap", port=free_port())
 
 
 def test_without_a_display_the_address_is_printed_and_ctrl_c_ends(tmp_path: Path) -> None:

@@ -65,10 +65,10 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def viewer(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    from perception.viewer import session, start_viewer
+    from perception.viewer import Viewer, session
 
     monkeypatch.setattr(session, "QueryMap", Asked)
-    running = start_viewer(path, port=free_port())
+    running = Viewer(path, port=free_port())
     yield running
     running.stop()
 
@@ -233,7 +233,7 @@ def test_parts_are_shown_found_and_split_along(path: Path, browser: Any, monkeyp
     write_map(path, gmap)
     from perception.query import Hit
     from perception.types import OrientedBox
-    from perception.viewer import session, start_viewer
+    from perception.viewer import Viewer, session
 
     class AskedParts(Asked):
         def query(self, text: str, top_k: int) -> list[Hit]:
@@ -242,7 +242,7 @@ def test_parts_are_shown_found_and_split_along(path: Path, browser: Any, monkeyp
             return [Hit(1, 0.8, points, points.mean(0), box, part=10)]
 
     monkeypatch.setattr(session, "QueryMap", AskedParts)
-    viewer = start_viewer(path, port=free_port())
+    viewer = Viewer(path, port=free_port())
     try:
         viewer.session.mode = "parts"
         colors = viewer.session.colors()

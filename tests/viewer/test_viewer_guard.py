@@ -14,7 +14,7 @@ import pytest
 from perception.cli import main
 from perception.errors import InputError
 from perception.io.store import write_map
-from perception.viewer import start_viewer
+from perception.viewer import Viewer
 from support.viewer_maps import free_port, small_map
 
 viser = pytest.importorskip("viser")
@@ -28,7 +28,7 @@ TOKEN = "0123456789abcdef;%\"'"
 def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     path = tmp_path_factory.mktemp("guard") / "m.gsmap"
     write_map(path, small_map(60))
-    running = start_viewer(path, port=free_port(), token=TOKEN)
+    running = Viewer(path, port=free_port(), token=TOKEN)
     yield running
     running.stop()
 
@@ -128,7 +128,7 @@ def test_other_machines_need_a_token_file(tmp_path: Path, capsys: pytest.Capture
         told = capsys.readouterr().err
         assert told.count("\n") == 1 and "--token-file" in told
         with pytest.raises(InputError, match="token"):
-            start_viewer(tmp_path / "m.gsmap", host)
+            Viewer(tmp_path / "m.gsmap", host)
     (tmp_path / "token").write_text("short")
     assert main(["view", str(tmp_path / "m.gsmap"), "--token-file", str(tmp_path / "token")]) == 2
 
