@@ -22,7 +22,6 @@ from perception.io.video import frames
 
 MAX_FRAMES = 240
 """Maximum number of video frames that are read, evenly spaced."""
-MODELS = ("auto", "pinhole", "fisheye")
 MAX_VIEWS = 60
 """Maximum number of views used. More of them increase the run time without changing the result."""
 MIN_VIEWS = 5
@@ -42,8 +41,6 @@ def run_calibration(source: Path, output: Path, board: Board, model: str = "auto
     Writes `output` (ROS camera_info YAML) and next to it a .json with all figures. Photos are rotated according to
     EXIF, as in mapping. Raises InputError if no board is found, or if the views are too few or too similar.
     """
-    if model not in MODELS:
-        raise InputError(f"--model is '{model}'; expected one of {', '.join(MODELS)}")
     found, size, looked_at = _detect(source, board)
     views = distinct_views(found, size[0])
     check_count(views, len(found), looked_at, str(board), str(source))

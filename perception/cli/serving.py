@@ -72,10 +72,9 @@ def _view(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     import sys
     import threading
 
-    from perception.listening import check_address, read_token
+    from perception.listening import read_token
 
     token = None if args.token_file is None else read_token(args.token_file)
-    check_address(args.host, args.port, token)
     from perception.viewer import Viewer
 
     viewer = Viewer(args.map, args.host, args.port, token)

@@ -101,8 +101,6 @@ def export_map(
     """
     if output.suffix.lower() not in SUFFIXES:
         raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected one of {', '.join(SUFFIXES)}")
-    if color not in ("original", "instance"):
-        raise InputError(f"color is '{color}'; expected original or instance")
     if place and points is None:
         raise InputError("--align and --transform place a scan in the map; give it with --points")
     known = None if isinstance(place, bool) else read_transform(place)
