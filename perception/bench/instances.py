@@ -6,7 +6,6 @@ Reliability: of all instances with 100 points or more, the score, and whether th
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,16 +14,13 @@ import numpy as np
 
 from perception.bench.output import SCORED, Column, bench_parser, finish_reliability, parse_pairs, table
 from perception.errors import InputError
+from perception.io.documents import read_json
 from perception.types import PointCloud
 
 
 def read_scene(scene: Path) -> dict[str, Any]:
-    """The content of scene.json. Raises InputError when the file is missing."""
-    file = scene / "scene.json"
-    if not file.is_file():
-        raise InputError(f"{scene}: no scene.json there; expected the folder of a scene with truth")
-    about: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-    return about
+    """The content of scene.json, which a scene with truth holds. Raises InputError when the file is missing."""
+    return dict(read_json(scene / "scene.json"))
 
 
 def read_truth_cloud(scene: Path, means: np.ndarray) -> PointCloud:

@@ -8,7 +8,7 @@ over the views that show it. A true instance without a match scores 0.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.gaussians.model import Gaussians
 from perception.instances.silhouettes import render_silhouettes
+from perception.masks.label_folder import LabelFolder
 from perception.types import View
 
 SMALLEST = 50  # pixels of a true instance in a view; with fewer, the view is not counted for it
@@ -26,37 +27,21 @@ def evaluate_rendered(
 ) -> dict[str, Any]:
     """Renders the instances in each view and scores them against `truth_dir`/STEM.png (see `mask_miou`).
 
-    ids [N] int32, −1 = none. Truth: 8 or 16-bit PNG of the photo's size, ids alike in all views, 0 = void.
+    ids [N] int32, −1 = none. Truth: label images (see `LabelFolder`), ids alike in all views, 0 = void.
     """
     import torch
 
     def pairs() -> Iterable[tuple[np.ndarray, np.ndarray]]:
         for view in views:
-            truth = read_truth_mask(truth_dir, view)
             pose = torch.from_numpy(view.camera_from_world.astype(np.float32))
             K = torch.from_numpy(view.K.astype(np.float32))
             found = render_silhouettes(gaussians, ids, pose, K, view.width, view.height)
-            yield found.ids, truth
+            yield found.ids, truths.label_image(view, found.ids)
 
     if not views:
         raise InputError("rendered masks: there are no views to score")
+    truths = LabelFolder(Path(truth_dir))
     return mask_miou(pairs())
-
-
-def read_truth_mask(folder: str | Path, view: View) -> np.ndarray:
-    """[H, W] int64 true instance ids of a view, resampled to the view's pinhole image."""
-    import cv2
-
-    from perception.io.photos import warp_labels
-
-    stem = PurePosixPath(view.name).with_suffix(".png")
-    file = next((f for f in (Path(folder) / stem, Path(folder) / stem.name) if f.is_file()), None)
-    if file is None:
-        raise InputError(f"{Path(folder) / stem}: no true mask for view {view.name}; expected one PNG a view")
-    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 2:
-        raise InputError(f"{file}: expected a one-channel PNG of instance ids, 8 or 16 bit")
-    return warp_labels(view, image, view.width, view.height).astype(np.int64)
 
 
 def mask_miou(pairs: Iterable[tuple[np.ndarray, np.ndarray]], smallest: int = SMALLEST) -> dict[str, Any]:

@@ -68,8 +68,8 @@ def map_views(gmap: Map, held_out: bool = True) -> list[View]:
 
 def _cameras(path: Path) -> list[View]:
     """The frames of a transforms.json as views; their photos need not exist."""
-    from perception.io.lens import is_pinhole, pinhole_from_lens
     from perception.io.transforms import read_frames
+    from perception.io.views import make_view
 
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a transforms.json with the cameras to render")
@@ -78,13 +78,8 @@ def _cameras(path: Path) -> list[View]:
         folder = os.path.commonpath([str(PurePosixPath(name).parent) for name, _, _ in frames]) if frames else ""
     except ValueError as error:
         raise InputError(f"{path}: some file_path are absolute, others relative; write all of one kind") from error
-    views = []
-    for name, camera_from_world, lens in frames:
-        (fx, fy, cx, cy), width, height = pinhole_from_lens(lens)
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-        short = PurePosixPath(name).relative_to(folder).as_posix()
-        views.append(View(short, path, K, width, height, camera_from_world, None if is_pinhole(lens) else lens))
-    return views
+    short = [PurePosixPath(name).relative_to(folder).as_posix() for name, _, _ in frames]
+    return [make_view(name, path, lens, pose, path) for name, (_, pose, lens) in zip(short, frames, strict=True)]
 
 
 def _through_lens(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarray:

@@ -80,5 +80,5 @@ def test_a_map_whose_halves_are_known(tmp_path: Path) -> None:
 
 def test_a_view_without_truth_is_told(tmp_path: Path) -> None:
     gaussians, ids, view = discs(tmp_path)
-    with pytest.raises(InputError, match="no true mask"):
+    with pytest.raises(InputError, match="no label image"):
         evaluate_rendered(gaussians, ids, [view], tmp_path / "empty")
