@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -80,5 +81,5 @@ def test_a_map_whose_halves_are_known(tmp_path: Path) -> None:
 
 def test_a_view_without_truth_is_told(tmp_path: Path) -> None:
     gaussians, ids, view = discs(tmp_path)
-    with pytest.raises(InputError, match="no label image"):
-        evaluate_rendered(gaussians, ids, [view], tmp_path / "empty")
+    with pytest.raises(InputError, match="no label image for photo other"):
+        evaluate_rendered(gaussians, ids, [replace(view, name="other.jpg")], tmp_path)
