@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 
 from perception.demo.cameras import Camera
-from perception.demo.truth import FLIP, DemoTruth, Truth
+from perception.demo.truth import DemoTruth, Truth
+from perception.geometry import OPENCV_FROM_OPENGL
 from perception.io.cloud import read_cloud
 
 
@@ -19,7 +20,7 @@ def load_truth(folder: Path) -> DemoTruth:
     views = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
     K = np.array([[views["fl_x"], 0, views["cx"]], [0, views["fl_y"], views["cy"]], [0, 0, 1.0]])
     cameras = [
-        Camera(K, np.linalg.inv(np.array(frame["transform_matrix"]) @ FLIP), views["w"], views["h"])
+        Camera(K, np.linalg.inv(np.array(frame["transform_matrix"]) @ OPENCV_FROM_OPENGL), views["w"], views["h"])
         for frame in views["frames"]
     ]
     cloud = read_cloud(folder / "gt_points.ply")
