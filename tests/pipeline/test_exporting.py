@@ -32,5 +32,3 @@ def test_all_that_was_asked_for_is_written(tmp_path: Path) -> None:
     assert {p.name for p in folder.iterdir()} == {"out.ply", "out.json", "submission"}
     with pytest.raises(InputError, match=r"expected one of \.ply"):
         export_map(path, folder / "m.rrd", None, ExportOptions())
-    with pytest.raises(InputError, match="original or instance"):
-        export_map(path, folder / "x.ply", None, ExportOptions(), "red")
