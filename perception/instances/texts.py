@@ -1,9 +1,10 @@
 """Printed texts of instances: lines of text read in their best views, assigned by silhouette and fused over the views.
 
 A line belongs to the instance that covers most of its rectangle. Views read a text in part or with errors. Of all reads
-of an instance, the text with the largest support is kept, then those that agree with it are set aside, and so on:
-    s_v(t) = max over reads r in view v that agree with t of s_r · (1 − d(r, t) / max length),   d: edit distance
-    support(t) = Σ_v s_v(t)   score(t) = 1 − Π_v (1 − s_v(t))
+of an instance, the text that explains most characters is kept, those that agree with it are set aside, and so on. With
+the maxima over the reads r in view v that agree with t, d the edit distance, and d' that to the nearest stretch:
+    explained(t) = Σ_v max s_r · (l − d'(r, t) − UNREAD · (L − l))   l, L: lengths of the shorter and longer of r and t
+    score(t) = 1 − Π_v (1 − max s_r · (1 − d(r, t) / L))
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from perception.language.ocr import Line
 from perception.language.printed import edit_distance
 from perception.progress import Progress
 
-VIEWS = 3  # best views of an instance that are read
 MOST_VIEWS = 120  # most photos read for a map, those that are best for an instance first: bounds the time
 MOST_TEXTS = 20  # kept per instance, best supported first
 LEAST = 0.6  # score of a read, and of a text
 SINGLE = 0.8  # score of a text of under FEW characters, or read in one view only
 FEW = 4
+UNREAD = 0.5  # weight of characters beyond the ends of the shorter text, which may be cut off
 AGREE = 0.6  # share of the shorter of two texts that the longer must hold to be the same
 COVER = 0.5  # share of a line's rectangle that its instance must cover
 
@@ -46,12 +47,12 @@ def read_texts(
 ) -> list[list[dict[str, Any]]]:
     """Texts of the I instances, best supported first: entries {"text": str, "score": in [0, 1]}.
 
-    choices and load: as for `describe.describe_instances`. Only the first VIEWS views of an instance are read.
+    choices and load: as for `describe.describe_instances`.
     """
     rank: dict[int, int] = {}
     for views in choices:
-        for place, view in enumerate(views[:VIEWS]):
-            rank[int(view)] = min(place, rank.get(int(view), VIEWS))
+        for place, view in enumerate(views):
+            rank[int(view)] = min(place, rank.get(int(view), place))
     wanted = sorted(sorted(rank, key=lambda view: (rank[view], view))[:MOST_VIEWS])
     reads: list[list[Read]] = [[] for _ in choices]
     for done, view in enumerate(wanted, start=1):
@@ -91,23 +92,24 @@ def fuse(reads: Sequence[Read]) -> list[dict[str, Any]]:
     while left and len(texts) < MOST_TEXTS:
         candidates = sorted({text for _, text, _ in left})
         found = [_by_view([read for read in left if _agree(read[1], text)], text) for text in candidates]
-        chosen = int(np.argmax([sum(views.values()) for views in found]))
+        chosen = int(np.argmax([views[:, 0].sum() for views in found]))
         best, views = candidates[chosen], found[chosen]
-        score = 1.0 - float(np.prod([1.0 - value for value in views.values()]))
+        score = 1.0 - float(np.prod(1.0 - views[:, 1]))
         if score >= (SINGLE if len(views) == 1 or len(best) < FEW else LEAST):
             texts.append({"text": best, "score": round(min(score, 0.99), 2)})
         left = [read for read in left if not _agree(read[1], best)]
     return texts
 
 
-def _by_view(reads: Sequence[Read], text: str) -> dict[int, float]:
-    """Of each view, its best read's score times its similarity with `text`."""
-    best: dict[int, float] = {}
+def _by_view(reads: Sequence[Read], text: str) -> np.ndarray:
+    """[V, 2] of each view, the largest of its reads: characters of `text` explained, and similarity with it."""
+    best: dict[int, np.ndarray] = {}
     for view, other, score in reads:
-        a, b = _plain(text), _plain(other)
-        value = score * (1.0 - edit_distance(a, b) / max(len(a), len(b), 1))
-        best[view] = max(best.get(view, 0.0), value)
-    return best
+        short, long = sorted((_plain(text), _plain(other)), key=len)
+        explained = len(short) - edit_distance(short, long, inside=True) - UNREAD * (len(long) - len(short))
+        similarity = 1.0 - edit_distance(short, long) / max(len(long), 1)
+        best[view] = np.maximum(best.get(view, np.zeros(2)), score * np.array([explained, similarity]))
+    return np.array(list(best.values()))
 
 
 def _agree(a: str, b: str) -> bool:

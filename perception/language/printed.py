@@ -66,9 +66,9 @@ class Printed:
         return bool(self._lines)
 
     def quoted(self, text: str) -> np.ndarray:
-        """[I] in [0, 1]: how well each instance bears all words of `text`, weighted by their lengths."""
+        """[I] in [0, 1]: how well each instance bears `text`: as a whole, or its words, weighted by their lengths."""
         words = _folded(text)
-        return self._borne(words, [len(word) for word in words])
+        return np.maximum(self._borne(words, [len(word) for word in words]), self._borne(["".join(words)], [1]))
 
     def evidence(self, prompt: str) -> np.ndarray:
         """[I] in [0, 1]: share of the prompt's telling words that each instance bears; squared unless the prompt names
@@ -94,6 +94,8 @@ def match_quality(word: str, line: Sequence[str]) -> float:
     for other in line:
         if word == other:
             return 1.0
+        if len(word) > SHORT and (other.startswith(word) or other.endswith(word)):
+            best = max(best, QUALITY)  # run together with the next word
         if SHORT < len(other) < len(word) and other in word:
             best = max(best, len(other) / len(word) * (len(other) >= PART * len(word)))
         elif min(len(word), len(other)) > SHORT:

@@ -104,8 +104,7 @@ class TextRanking:
         check_encoder(identity, encoder.identity)
         labels = [entry.get("label") for entry in self._gmap.instances]
         sizes = extents(self._gmap) if self._gmap.metric else None
-        printed = printed_on(self._gmap) if self._texts else None
-        return Ranker(descriptions, encoder, labels, self._shapes, printed, sizes)
+        return Ranker(descriptions, encoder, labels, self._shapes, printed_on(self._gmap, self._texts), sizes)
 
     @cached_property
     def _places(self) -> Places | None:
@@ -140,9 +139,9 @@ def extents(gmap: Map) -> np.ndarray:
     return sides
 
 
-def printed_on(gmap: Map) -> Printed | None:
-    """The texts printed on the map's instances; None if nobody looked for any."""
-    read = gmap.info.get("instances", {}).get("texts") is not None
+def printed_on(gmap: Map, use: bool = True) -> Printed | None:
+    """The texts printed on the map's instances; None if nobody looked for any, or they are not to be used."""
+    read = use and gmap.info.get("instances", {}).get("texts") is not None
     return Printed([entry.get("texts", []) for entry in gmap.instances]) if read else None
 
 

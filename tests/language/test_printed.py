@@ -69,6 +69,15 @@ def _on(*texts: str) -> list[dict[str, object]]:
     return [{"text": text, "score": 1.0} for text in texts]
 
 
+def test_a_quoted_text_is_also_matched_as_a_whole() -> None:
+    """Short words that are cut off count with their neighbours; what OCR runs together holds the words at its ends."""
+    texts = [_on("BREADAND SAL"), _on("BREAD"), _on("BIRDSOF THE NORTH"), _on("A SNOWBIRDS' NEST")]
+    quoted = Printed(texts).quoted
+    assert quoted("BREAD AND SALT")[:2] == pytest.approx([11 / 12, 5 / 12 * 1])
+    assert quoted("BIRDS") == pytest.approx([0, 0, 0.75, 0.75])  # of Snowbirds too: "birds" ends it as well
+    assert quoted("NOW").max() == 0  # a short word must stand alone
+
+
 @pytest.mark.parametrize(
     ("prompt", "text", "least", "most"),
     [
@@ -92,7 +101,7 @@ def test_evidence_by_hand(prompt: str, text: str, least: float, most: float) -> 
 
 
 def test_quoted_words_weigh_by_length_and_read_score() -> None:
-    texts = [_on("BIRDS"), [{"text": "Birds of Europe", "score": 0.5}], []]
+    texts = [_on("BIRDS"), [{"text": "Europe: Birds of", "score": 0.5}], []]
     assert Printed(texts).quoted("birds of europe") == pytest.approx(
         [4 / 12, (0.5**5 * 4 + 0.5 * 8) / 12, 0]
     )  # "bird": singular, of, europe; half a match beside a full one counts 0.5⁴ of itself
@@ -129,6 +138,13 @@ def test_fusing_prefers_what_most_views_agree_on() -> None:
     assert [e["text"] for e in found] == ["MACARONI", "Cheese"]
     by_hand = 1 - (1 - 0.8) * (1 - 0.9 * 6 / 8) * (1 - 0.7 * 7 / 8)
     assert found[0]["score"] == pytest.approx(by_hand, abs=0.005) and fuse([]) == []
+
+
+def test_fusing_prefers_what_cut_off_reads_are_cut_from() -> None:
+    """By hand: PEAS explains 4 + 3 · 2.5 characters, EAS 2 · 3 + 2.5 + 2; OATSE 4.5 + 4 · 3.5, OATS 16 + 3.15."""
+    around = [(0, "EAS", 1.0), (1, "EAS", 1.0), (2, "PEAS", 1.0), (3, "PEA", 1.0)]
+    assert [e["text"] for e in fuse(around)] == ["PEAS"]
+    assert [e["text"] for e in fuse([(view, "OATS", 1.0) for view in range(4)] + [(4, "OATSE", 0.9)])] == ["OATS"]
 
 
 def test_a_line_belongs_to_what_covers_most_of_it() -> None:
