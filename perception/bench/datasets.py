@@ -170,26 +170,18 @@ class InstanceViews:
         """Accumulated rendering weight [H, W] float32 in [0, 1] of the instances' Gaussians, or the bool mask."""
         import torch
 
-        from perception.gaussians.rasterize import rasterize
+        from perception.gaussians.render import render
 
         own = torch.from_numpy(np.isin(self.gmap.instance_ids, instances))
-        g = self.gaussians
-        used = torch.ones_like(own) if self.occlusion else own
         if not own.any():
             return np.zeros((view.height, view.width), np.float32)
+        used = torch.arange(len(own)) if self.occlusion else own.nonzero()[:, 0]
+        camera, K = (torch.from_numpy(matrix.astype(np.float32)) for matrix in (view.camera_from_world, view.K))
+        shown = own[used].float()[:, None]
         with torch.no_grad():
-            out = rasterize(
-                g.means[used],
-                g.quats[used],
-                g.scales[used],
-                g.opacities[used],
-                own[used].float()[:, None].repeat(1, 3),
-                torch.from_numpy(view.camera_from_world.astype(np.float32))[None],
-                torch.from_numpy(view.K.astype(np.float32))[None],
-                view.width,
-                view.height,
-            )
-        weight: np.ndarray = out.colors[0, ..., 0].numpy()
+            out = render(self.gaussians.rows(used), camera, K, view.width, view.height, features=shown)
+        assert out.features is not None  # they were given
+        weight: np.ndarray = out.features[0, ..., 0].numpy()
         return weight if self.threshold is None else weight > self.threshold
 
     def write(self, target: Path, truths: Masks, photos: Mapping[str, str], chosen: Mapping[str, list[int]]) -> None:

@@ -17,8 +17,7 @@ import numpy as np
 from perception.bench.datasets import DatasetBench, link
 from perception.errors import InputError
 from perception.evaluate.layouts import instances_table, run_scannet
-from perception.export.formats import write_scannet
-from perception.export.transfer import ExportOptions, export_labels
+from perception.export.transfer import ExportOptions, export_labels, write_scannet
 from perception.io.atomic import atomic_file
 from perception.io.cloud import read_cloud, write_cloud
 from perception.io.photos import photo_size

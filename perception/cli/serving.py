@@ -60,7 +60,7 @@ def _node(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         if getattr(args, name) is not None:
             values[name] = getattr(args, name)
     config = node_config(values)
-    from perception.node.serving import serve_node, stop_on_signals
+    from perception.node.ros import serve_node, stop_on_signals
     from perception.progress import Progress
 
     with stop_on_signals() as stop:

@@ -1,21 +1,31 @@
-"""The rclpy transport of the node: the same messages through ROS 2, over any of its middlewares."""
+"""Runs the query node on rclpy: one process that serves a map until it is stopped, through ROS 2 over any of its
+middlewares.
+"""
 
 from __future__ import annotations
 
 import array
+import contextlib
 import importlib
+import importlib.util
 import re
+import signal
 import threading
 import time
+from collections.abc import Callable, Iterator
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from perception.errors import InputError
+from perception.language.base import Encoder
 from perception.node import answers
 from perception.node.answers import DEPTH, Channel
 from perception.node.config import NodeConfig
 from perception.node.core import Core, Message
+from perception.query import QueryEngine
 
 _SEQUENCE = re.compile(r"(?:sequence<)?(\w+/\w+)(?:, \d+)?>?(?:\[\d+\])?")
 _EXTRA_SECONDS = 1.0
@@ -162,3 +172,60 @@ def _qos(latched: bool) -> Any:
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
+
+
+def serve_node(
+    path: str | Path,
+    config: NodeConfig,
+    stop: threading.Event,
+    log: Callable[[str], None] = lambda _: None,
+    encoders: Callable[[str], Encoder | None] | None = None,
+) -> dict[str, Any]:
+    """Serves the map at `path` until `stop` is set; returns the engine's health figures.
+
+    InputError when the map cannot be used, rclpy cannot be imported, or another node of this name is running.
+    encoders: see QueryEngine.
+    """
+    if importlib.util.find_spec("rclpy") is None:
+        raise InputError("node: rclpy cannot be imported; install ROS 2 and source its setup file")
+    how = config.model_dump(include={"workers", "queue_size", "timeout", "watch"})
+    with (
+        contextlib.closing(RosTransport(config)) as transport,
+        QueryEngine(path, encoders=encoders, **how) as engine,
+    ):
+        others = transport.others()
+        if others:
+            raise InputError(
+                f"node: {others} other node(s) serve '{config.namespace}' on domain {config.domain_id} already; stop "
+                "them, or give this one another --namespace or --domain"
+            )
+        transport.open()
+        core = Core(engine, transport, config)
+        core.start()
+        held = engine.current
+        log(
+            f"serving {path} (map {held.map_id}, {len(held.instances)} instances) on domain {config.domain_id}, "
+            f"as /{config.namespace}"
+        )
+        transport.serve(core, stop)
+        return engine.health()
+
+
+@contextlib.contextmanager
+def stop_on_signals() -> Iterator[threading.Event]:
+    """An event that SIGINT and SIGTERM set, for an orderly stop; after SIGINT it ends in KeyboardInterrupt."""
+    stop, interrupted = threading.Event(), threading.Event()
+
+    def end(number: int, _: object) -> None:
+        if number == signal.SIGINT:
+            interrupted.set()
+        stop.set()
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if interrupted.is_set():
+        raise KeyboardInterrupt

@@ -13,8 +13,7 @@ from perception.config import MapConfig, load_config
 from perception.demo import DemoTruth, make_photos
 from perception.errors import InputError
 from perception.evaluate.instances import evaluate
-from perception.export.formats import write_export
-from perception.export.transfer import export_labels
+from perception.export.transfer import export_labels, write_export
 from perception.geometry import align_similarity, camera_centres
 from perception.io.store import Map
 from perception.pipeline.mapping import build_map

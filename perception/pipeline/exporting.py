@@ -16,8 +16,14 @@ from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
 from perception.export.align import align
 from perception.export.depth_views import DepthView, depth_views
-from perception.export.formats import write_export, write_scannet
-from perception.export.transfer import ExportOptions, check_overlap, export_labels, resolved
+from perception.export.transfer import (
+    ExportOptions,
+    check_overlap,
+    export_labels,
+    resolved,
+    write_export,
+    write_scannet,
+)
 from perception.geometry import check_similarity, move_points, scale_of
 from perception.io.cloud import read_cloud
 from perception.io.recentre import map_from_input
@@ -121,7 +127,9 @@ def export_map(
     means = move_points(np.linalg.inv(placed), gmap.means.astype(np.float64)) if moved else gmap.means
     began = time.perf_counter()
     if given is None:  # every point is its own nearest Gaussian
-        cloud, options = surface_points(gmap, means), ExportOptions(drop_noise=False, smooth=False)
+        rows = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY)
+        cloud = PointCloud(means[rows], rgb8_from_sh(gmap.sh[rows, 0]))
+        options = ExportOptions(drop_noise=False, smooth=False)
     else:
         cloud, options = given, resolved(options, means, ids)
     inside = check_overlap(means, cloud.points)
@@ -163,12 +171,6 @@ def at_granularity(gmap: Map, granularity: str) -> tuple[np.ndarray, dict[int, d
         ids[groups == group] = members[0]
         entries[members[0]] = {"label": None, "score": score, "instances": members}
     return ids, entries
-
-
-def surface_points(gmap: Map, means: np.ndarray | None = None) -> PointCloud:
-    """The means of opaque Gaussians with their colours; means [N, 3] replaces those of the map."""
-    rows = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY)
-    return PointCloud((gmap.means if means is None else means)[rows], rgb8_from_sh(gmap.sh[rows, 0]))
 
 
 def _table(result: dict[str, Any]) -> str:

@@ -18,7 +18,7 @@ from perception.evaluate.masks import (
     mask_boundary,
     mask_iou,
 )
-from perception.export.formats import write_scannet
+from perception.export.transfer import write_scannet
 from support.ap import evaluate_masks
 
 

@@ -9,8 +9,7 @@ import pytest
 
 from perception.boxes import oriented_box
 from perception.errors import InputError
-from perception.export.formats import write_export, write_scannet
-from perception.export.transfer import ExportOptions, check_overlap, export_labels
+from perception.export.transfer import ExportOptions, check_overlap, export_labels, write_export, write_scannet
 from perception.io.cloud import read_cloud
 from perception.types import PointCloud
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from perception.config import read_pairs
 from perception.errors import InputError
 from perception.node.config import node_config
-from perception.node.serving import serve_node, stop_on_signals
+from perception.node.ros import serve_node, stop_on_signals
 from support.node_maps import encoders
 
 if __name__ == "__main__":
