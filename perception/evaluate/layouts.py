@@ -19,7 +19,6 @@ import numpy as np
 from perception.errors import InputError
 from perception.evaluate.images import pictures
 from perception.evaluate.instances import Protocol, evaluate, evaluate_overlaps, get_protocol, mask_overlap
-from perception.evaluate.masks import mean_over_scenes
 from perception.io.cloud import read_cloud
 from perception.types import PointCloud
 
@@ -144,7 +143,7 @@ def read_lerf_polygons(folder: str | Path) -> dict[tuple[str, str], np.ndarray]:
 
 def scenes_result(scenes: dict[str, dict[str, Any]], keys: Sequence[str]) -> tuple[dict[str, Any], str]:
     """(result, table) of the results of a LERF evaluation by scene: the figures `keys` by scene, and their means."""
-    mean = mean_over_scenes(scenes)
+    mean = {key: float(np.mean([scene[key] for scene in scenes.values()])) for key in sorted(keys)}
     width = max(len(name) for name in [*scenes, "mean"]) + 2
     lines = [" " * width + "".join(f"{key:>10}" for key in keys)]
     lines += [f"{name:<{width}}" + "".join(f"{s[key]:>10.4f}" for key in keys) for name, s in scenes.items()]

@@ -111,14 +111,6 @@ def evaluate_lerf_ovs(predictions: Masks, truths: Masks, **switches: Any) -> dic
     }
 
 
-def mean_over_scenes(scenes: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Mean over scenes of each figure that all scenes have, with equal weight per scene."""
-    if not scenes:
-        raise InputError("there are no scenes to average")
-    keys = set.intersection(*({k for k, v in s.items() if isinstance(v, float)} for s in scenes.values()))
-    return {key: float(np.mean([s[key] for s in scenes.values()])) for key in sorted(keys)}
-
-
 def _fitted(mask: np.ndarray, shape: tuple[int, ...], threshold: float) -> np.ndarray:
     """A prediction as a bool mask of the true mask's size (nearest neighbour)."""
     found = mask if mask.dtype == bool else mask > threshold

@@ -30,6 +30,11 @@ class OtherMap(Exception):
     """The client's map_id is not that of the current map."""
 
 
+_STATUS: dict[type[Exception], int] = {UnknownInstance: 404, InputError: 400, OtherMap: 409}
+_STATUS |= {EngineBusy: 503, EngineClosed: 503, AnswerTimeout: 504}
+"""HTTP status by exception; UnknownInstance is an InputError too, and comes first."""
+
+
 def problem(status: int, line: str, headers: Mapping[str, str] | None = None) -> JSONResponse:
     """An error response as JSON."""
     text = " ".join(line.encode("utf-8", "backslashreplace").decode().split())
@@ -38,18 +43,11 @@ def problem(status: int, line: str, headers: Mapping[str, str] | None = None) ->
 
 async def answer_error(request: Request, error: Exception) -> JSONResponse:
     """The response to an exception that a handler raised."""
-    if isinstance(error, UnknownInstance):
-        return problem(404, str(error))
-    if isinstance(error, InputError):
-        return problem(400, str(error))
+    for kind, status in _STATUS.items():
+        if isinstance(error, kind):
+            return problem(status, str(error), {"Retry-After": "1"} if status == 503 else None)
     if isinstance(error, RequestValidationError):
         return _bad_request(error)
-    if isinstance(error, OtherMap):
-        return problem(409, str(error))
-    if isinstance(error, (EngineBusy, EngineClosed)):
-        return problem(503, str(error), {"Retry-After": "1"})
-    if isinstance(error, AnswerTimeout):
-        return problem(504, str(error))
     if isinstance(error, HTTPException):
         if error.status_code == 400:
             return problem(400, "the request is no JSON")
@@ -73,8 +71,7 @@ def _bad_request(error: RequestValidationError) -> JSONResponse:
     return problem(400, problem_line(error.errors()))
 
 
-_OURS = (InputError, OtherMap, EngineBusy, EngineClosed, AnswerTimeout)
-HANDLERS: dict[Any, Any] = dict.fromkeys((RequestValidationError, *_OURS, HTTPException, Exception), answer_error)
+HANDLERS: dict[Any, Any] = dict.fromkeys((RequestValidationError, *_STATUS, HTTPException, Exception), answer_error)
 
 
 OPEN = {"/openapi.json", "/health"}
