@@ -295,28 +295,6 @@ inline void store_record(const Worker<T> &w, int j, uint64_t slot, Scratch<T> &s
     const auto moved = 2 * load_channels<NF>(e, NF) * load_channels<NF>(from + kGeometry + NF, NF);
     store_channels(load_channels<NF>(from + kGeometry, NF) + moved, to + kGeometry, NF);
   }
-  scratch.touched[slot] = 1;
-}
-
-// Writes the records of one 64x64 tile to their slots, one a splat and tile it touches. Slots lie far apart in memory:
-// each is asked for some splats before it is written.
-template <class T, int NF, bool VAR>
-void store_records(const Frame<T> &f, int index, const Worker<T> &w, Scratch<T> &scratch) {
-  constexpr int kAhead = 8, kSize = kGeometry + NF;
-  const int tx = index % f.tiles_x, ty = index / f.tiles_x;
-  uint64_t slots[kAhead];
-  for (int j = 0; j < w.n + kAhead; ++j) {
-    uint64_t &slot = slots[j % kAhead];
-    if (j >= kAhead && w.touched[j - kAhead]) store_record<T, NF, VAR>(w, j - kAhead, slot, scratch);
-    if (j + kAhead < w.n) __builtin_prefetch(&scratch.slots[w.source[j + kAhead]]);
-    if (j >= w.n || !w.touched[j]) continue;
-    const Splat<T> &s = w.splats[j];
-    const uint64_t place = static_cast<uint64_t>(ty - s.y0) * (s.x1 - s.x0 + 1) + (tx - s.x0);
-    slot = scratch.slots[w.source[j]] + place - box_tiles_before(s, f.tiles_x, scratch.first_tile);
-    const T *record = scratch.records.data() + slot * kSize;
-    __builtin_prefetch(record, 1), __builtin_prefetch(record + kSize - 1, 1),
-        __builtin_prefetch(&scratch.touched[slot], 1);
-  }
 }
 
 template <class T, int NF, bool VAR>
@@ -348,7 +326,8 @@ void backward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int 
     backward_tile(w, grad.depths != nullptr, x, y, w.lists.data() + q * static_cast<std::size_t>(w.stride), w.counts[q],
                   tile);
   }
-  store_records<T, NF, VAR>(f, index, w, scratch);
+  for_each_slot(f, index, w, scratch, kGeometry + NF,
+                [&](int j, uint64_t slot) { store_record<T, NF, VAR>(w, j, slot, scratch); });
 }
 
 }  // namespace

@@ -125,7 +125,7 @@ struct Images {
     out.depths = checked("out depths", depths, {c, h, w});
     out.features = checked("out features", features, {c, h, w, in.dims});
     out.variance = checked("out feature_variance", variance, {c, h, w, in.dims});
-    if ((in.dims && !out.features) || (opt.variance && !out.variance))
+    if (opt.variance && !(out.features && out.variance))
       throw std::invalid_argument("features and feature_variance need outputs");
   }
 };
@@ -138,6 +138,7 @@ std::unique_ptr<Handle<T>> forward(Arguments<T> &a, Images<T> images, Array<uint
   const Level level = perception::parse_level(simd);
   perception::Outputs<T> out{};
   images.fill(in, opt, out);
+  if (in.dims && !out.features) throw std::invalid_argument("features need an output");
   out.visible = checked("out visible", visible, {in.cameras, in.n});
   out.radii = checked("out radii", radii, {in.cameras, in.n});
   perception::NonFinite bad;
@@ -156,7 +157,7 @@ void backward(Arguments<T> &a, Handle<T> &handle, Images<T> images, Optional<con
               Optional<const T> g_alphas, Optional<const T> g_depths, Optional<const T> g_features,
               Optional<const T> g_variance, Optional<T> means, Optional<T> quats, Optional<T> scales,
               Optional<T> opacities, Optional<T> colors, Optional<T> features, Optional<T> viewmats,
-              Optional<T> mean2d) {
+              Optional<T> mean2d, bool stored) {
   const perception::Inputs<T> in = a.inputs();
   const perception::Options opt = a.options(in);
   const perception::Frames<T> *frames = handle.frames.get();
@@ -166,6 +167,7 @@ void backward(Arguments<T> &a, Handle<T> &handle, Images<T> images, Optional<con
   const int64_t n = in.n, c = in.cameras, h = in.height, w = in.width, d = in.dims;
   perception::Outputs<T> out{};
   images.fill(in, opt, out);
+  if (stored && c != 1) throw std::invalid_argument("stored: expected one camera");
   perception::Cotangents<T> grad{};
   grad.colors = checked("colors' gradient", g_colors, {c, h, w, 3});
   grad.alphas = checked("alphas' gradient", g_alphas, {c, h, w});
@@ -182,6 +184,9 @@ void backward(Arguments<T> &a, Handle<T> &handle, Images<T> images, Optional<con
   result.features = checked("out features", features, {n, d});
   result.viewmats = checked("out viewmats", viewmats, {c, 4, 4});
   result.mean2d = checked("out mean2d", mean2d, {c, n, 2});
+  result.stored = stored;
+  if (in.dims && !out.features && !(result.features_alone() && !opt.variance))
+    throw std::invalid_argument("features: missing, gradients need them");
   nb::gil_scoped_release release;
   perception::rasterize_backward(in, opt, *handle.frames, out, grad, result);
 }
@@ -238,17 +243,18 @@ void bind(nb::module_ &m, const char *suffix) {
          Optional<T> features, Optional<T> variance, Optional<const T> g_colors, Optional<const T> g_alphas,
          Optional<const T> g_depths, Optional<const T> g_features, Optional<const T> g_variance, Optional<T> d_means,
          Optional<T> d_quats, Optional<T> d_scales, Optional<T> d_opacities, Optional<T> d_colors,
-         Optional<T> d_features, Optional<T> d_viewmats, Optional<T> d_mean2d) {
+         Optional<T> d_features, Optional<T> d_viewmats, Optional<T> d_mean2d, bool stored) {
         backward<T>(inputs, frames, {colors, alphas, depths, features, variance}, g_colors, g_alphas, g_depths,
                     g_features, g_variance, d_means, d_quats, d_scales, d_opacities, d_colors, d_features, d_viewmats,
-                    d_mean2d);
+                    d_mean2d, stored);
       },
       "inputs"_a, "frames"_a, "colors"_a.noconvert(), "alphas"_a.noconvert(), "depths"_a.noconvert().none(),
       "features"_a.noconvert().none(), "variance"_a.noconvert().none(), "g_colors"_a.noconvert().none(),
       "g_alphas"_a.noconvert().none(), "g_depths"_a.noconvert().none(), "g_features"_a.noconvert().none(),
       "g_variance"_a.noconvert().none(), "d_means"_a.noconvert().none(), "d_quats"_a.noconvert().none(),
       "d_scales"_a.noconvert().none(), "d_opacities"_a.noconvert().none(), "d_colors"_a.noconvert().none(),
-      "d_features"_a.noconvert().none(), "d_viewmats"_a.noconvert().none(), "d_mean2d"_a.noconvert().none());
+      "d_features"_a.noconvert().none(), "d_viewmats"_a.noconvert().none(), "d_mean2d"_a.noconvert().none(),
+      "stored"_a = false);
 }
 
 }  // namespace

@@ -1,22 +1,10 @@
 // Stage 4: front-to-back blending. Granule by granule, so that a granule's state stays in registers while its list
 // of splats runs by; feature channels follow as a product of the kept weights with the splats' feature rows.
-#include "kernels.h"
+#include "blend_list.h"
 #include "matrix.h"
-#include "supertile.h"
 
 namespace perception::PERCEPTION_LEVEL {
 namespace {
-
-// A 16x16 tile. Chunks of its list are worked on at a time.
-template <class T, bool FEATURES>
-struct ColorTile {
-  static constexpr int kChunk = FEATURES ? 128 : 256;
-  alignas(64) T px[16][16], py[16][16], transmittance[16][16];
-  alignas(64) T colors[16][4][16];  // red, green, blue, depth
-  uint32_t counts[16];
-  uint32_t lists[16][kChunk + 32];
-  alignas(64) T weights[FEATURES ? kChunk : 1][16];
-};
 
 template <class T, int NF, bool VAR>
 struct ForwardTile : ColorTile<T, (NF > 0)> {
@@ -25,48 +13,6 @@ struct ForwardTile : ColorTile<T, (NF > 0)> {
   T shift[16][NF ? NF : 1];
   alignas(64) T rows[NF ? ColorTile<T, (NF > 0)>::kChunk : 1][kRow ? kRow : 1];
 };
-
-// Runs some of a granule's pixels over a list of splats. False when none of them is open any more.
-template <bool DEPTH, class T, bool FEATURES>
-[[gnu::noinline]] bool blend_list(Worker<T> &w, int n, int g, int lane, ColorTile<T, FEATURES> &tile) {
-  using P = Pack<T>;
-  const Splat<T> *splats = w.splats.data();
-  uint16_t *touched = w.touched.data();
-  const uint32_t *list = tile.lists[g];
-  P px = P::load(tile.px[g] + lane);
-  const P py = P::load(tile.py[g] + lane);
-  P t = P::load(tile.transmittance[g] + lane);
-  P red = P::load(tile.colors[g][0] + lane), green = P::load(tile.colors[g][1] + lane),
-    blue = P::load(tile.colors[g][2] + lane), depth;
-  if constexpr (DEPTH) depth = P::load(tile.colors[g][3] + lane);
-  int i = 0, pairs = 0;
-  bool open = true;
-  while (i < n) {
-    const uint32_t at = list[i++];
-    const Splat<T> &s = splats[at];
-    bool stopped = false;
-    const Blend<T> b = blend(s, px, py, t, stopped);
-    t = b.next;
-    red = fma(b.weight, P(s.r), red), green = fma(b.weight, P(s.g), green), blue = fma(b.weight, P(s.b), blue);
-    if constexpr (DEPTH) depth = fma(b.weight, P(s.z), depth);
-    if constexpr (FEATURES) b.weight.store(tile.weights[i - 1] + lane);
-    const uint32_t mask = bits(b.on);
-    touched[at] |= static_cast<uint16_t>(mask);
-    pairs += __builtin_popcount(mask);
-    if (__builtin_expect(stopped, 0)) {
-      px.store(tile.px[g] + lane);
-      open = any(px < P(kFar<T>));
-      if (!open) break;
-    }
-  }
-  w.evaluated += static_cast<uint64_t>(i) * P::kLanes, w.contributing += pairs;
-  t.store(tile.transmittance[g] + lane);
-  red.store(tile.colors[g][0] + lane), green.store(tile.colors[g][1] + lane), blue.store(tile.colors[g][2] + lane);
-  if constexpr (DEPTH) depth.store(tile.colors[g][3] + lane);
-  if constexpr (FEATURES)
-    for (; i < n; ++i) P(T(0)).store(tile.weights[i] + lane);
-  return open;
-}
 
 // Adds granule g's list to its pixels' feature sums.
 template <class T, int NF, bool VAR>
@@ -81,21 +27,6 @@ inline void blend_features(const T *features, int n, int g, ForwardTile<T, NF, V
     for (int c = NF * (VAR ? 2 : 1); c < kFeatureRow<T, NF, VAR>; ++c) row[c] = 0;
   }
   add_weighted_rows<kFeatureRow<T, NF, VAR>>(tile.weights[0], tile.rows[0], n, tile.features[g][0]);
-}
-
-// Masks of the granules that splats [begin, end) of the list touch, appended to the granules' lists.
-template <class T>
-void list_granules(const Worker<T> &w, int x, int y, const uint32_t *list, int begin, int end, uint32_t *lists,
-                   int stride, uint32_t *counts) {
-  std::memset(counts, 0, 16 * sizeof *counts);
-  for (int i = begin; i < end; i += 16) {
-    uint16_t masks[16] = {};
-    for (int j = 0; j < 16 && i + j < end; ++j) {
-      const Splat<T> &s = w.splats[list[i + j]];
-      masks[j] = static_cast<uint16_t>(boxes_touched<T, 1>(s, s.x - x, s.y - y));
-    }
-    append_to_lists(masks, list + i, lists, stride, counts);
-  }
 }
 
 // (x, y): the 16x16 tile relative to its 64x64 tile. open: granules with a pixel in the image.
@@ -193,16 +124,9 @@ void forward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int i
   for (int q = 0; q < 16; ++q) {
     const int x = (q & 3) * 16, y = (q >> 2) * 16;
     if (x0 + x >= in.width || y0 + y >= in.height) continue;
-    std::memset(tile.colors, 0, sizeof tile.colors);
     std::memset(tile.shift, 0, sizeof tile.shift);
     if constexpr (NF > 0) std::memset(tile.features, 0, sizeof tile.features);
-    uint32_t open = 0;
-    for (int g = 0; g < 16; ++g) {
-      const uint32_t inside = pixels_inside(x0 + x, y0 + y, g, in.width, in.height);
-      open |= static_cast<uint32_t>(inside != 0) << g;
-      granule_pixels(x, y, g, inside, tile.px[g], tile.py[g]);
-      for (T &t : tile.transmittance[g]) t = 1;
-    }
+    const uint32_t open = start_tile(in, x0, y0, x, y, tile);
     forward_tile(w, depth, x, y, w.lists.data() + q * static_cast<std::size_t>(w.stride), w.counts[q], open, tile);
     write_tile(in, camera, x0 + x, y0 + y, slice, tile, out);
   }

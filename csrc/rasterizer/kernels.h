@@ -9,15 +9,22 @@
 
 namespace perception {
 
-// The slice of feature channels one pass blends.
+// The slice of feature channels one pass blends. alone: a backward pass gives the gradients of these channels only.
 struct Slice {
   int begin, count;
+  bool alone = false;
 };
 
 // Width of the kernel that a slice goes through.
 template <class T>
 constexpr int slice_width(Slice slice) {
   return slice.count == 0 ? 0 : slice.count <= 8 && sizeof(T) == 4 ? 8 : 16;
+}
+
+// Numbers of a gradient record.
+template <class T>
+constexpr int record_size(Slice slice) {
+  return (slice.alone ? 0 : kGeometry) + slice_width<T>(slice);
 }
 
 // Calls body(NF, VAR) with the shape of the kernel for a slice as compile-time constants. double has one shape with
@@ -40,8 +47,9 @@ inline __attribute__((always_inline)) void with_shape(Slice slice, bool variance
 //   whose colours or features are not (looked at where `check`).
 // forward: blends one slice of the channels of all tiles.
 // backward: the records of one slice, of the tiles in a range; scratch.slots say where they go.
+// backward_features: the same where only the features' gradients are wanted (slice.alone).
 // add_records: adds them, `size` numbers each, to one sum a splat.
-// reduce: from one slice's records (16 + width numbers) to gradients of the Gaussians and the camera.
+// reduce: from one slice's records (see record_size) to gradients of the Gaussians and the camera.
 #define PERCEPTION_RASTERIZER_KERNELS                                                                              \
   template <class T>                                                                                               \
   uint32_t project(const Inputs<T> &, const Frame<T> &, int64_t begin, int64_t end, bool check, DepthKey<T> *keys, \
@@ -53,9 +61,12 @@ inline __attribute__((always_inline)) void with_shape(Slice slice, bool variance
   void backward(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Slice, TileRange, Scratch<T> &,  \
                 const Outputs<T> &, const Cotangents<T> &);                                                        \
   template <class T>                                                                                               \
+  void backward_features(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Slice, TileRange,       \
+                         Scratch<T> &, const Outputs<T> &, const Cotangents<T> &);                                 \
+  template <class T>                                                                                               \
   void add_records(const Options &, const Frame<T> &, int size, Scratch<T> &);                                     \
   template <class T>                                                                                               \
-  void reduce(const Inputs<T> &, const Options &, const Frame<T> &, int camera, Slice, int width, Scratch<T> &,    \
+  void reduce(const Inputs<T> &, const Options &, const Frame<T> &, int camera, Slice, int size, Scratch<T> &,     \
               const Gradients<T> &);
 
 PERCEPTION_DECLARE_LEVELS(PERCEPTION_RASTERIZER_KERNELS)

@@ -37,7 +37,7 @@ template <class T>
 struct Kernels {
   decltype(&baseline::project<T>) project;
   decltype(&baseline::forward<T>) forward;
-  decltype(&baseline::backward<T>) backward;
+  decltype(&baseline::backward<T>) backward, backward_features;
   decltype(&baseline::add_records<T>) add_records;
   decltype(&baseline::reduce<T>) reduce;
 };
@@ -45,12 +45,12 @@ struct Kernels {
 template <class T>
 Kernels<T> kernels(Level level) {
   if constexpr (std::is_same_v<T, double>)
-    return {baseline::project<T>, baseline::forward<T>, baseline::backward<T>, baseline::add_records<T>,
-            baseline::reduce<T>};
+    return {baseline::project<T>, baseline::forward<T>, baseline::backward<T>, baseline::backward_features<T>,
+            baseline::add_records<T>, baseline::reduce<T>};
   else
     return {PERCEPTION_AT_LEVEL(level, project<T>), PERCEPTION_AT_LEVEL(level, forward<T>),
-            PERCEPTION_AT_LEVEL(level, backward<T>), PERCEPTION_AT_LEVEL(level, add_records<T>),
-            PERCEPTION_AT_LEVEL(level, reduce<T>)};
+            PERCEPTION_AT_LEVEL(level, backward<T>), PERCEPTION_AT_LEVEL(level, backward_features<T>),
+            PERCEPTION_AT_LEVEL(level, add_records<T>), PERCEPTION_AT_LEVEL(level, reduce<T>)};
 }
 
 // Objects whose buffers are worth keeping between calls. Never destroyed, so it is safe at exit.
@@ -167,8 +167,8 @@ NonFinite prepare(const Kernels<T> &kernels, const Inputs<T> &in, int camera, co
 // Any feature width goes through in slices of 16.
 template <class Body>
 void for_each_slice(int dims, Body &&body) {
-  if (dims == 0) return body(Slice{0, 0});
-  for (int begin = 0; begin < dims; begin += 16) body(Slice{begin, std::min(16, dims - begin)});
+  if (dims == 0) return body(Slice{0, 0, false});
+  for (int begin = 0; begin < dims; begin += 16) body(Slice{begin, std::min(16, dims - begin), false});
 }
 
 template <class T>
@@ -187,7 +187,7 @@ void blend(const Kernels<T> &kernels, const Inputs<T> &in, int camera, const Opt
 template <class T>
 void gather_records(const Kernels<T> &kernels, const Inputs<T> &in, int camera, const Options &opt, const Frame<T> &f,
                     Slice slice, Scratch<T> &scratch, const Outputs<T> &out, const Cotangents<T> &grad, Stats &stats) {
-  const int tiles = f.tiles_x * f.tiles_y, size = kGeometry + slice_width<T>(slice);
+  const int tiles = f.tiles_x * f.tiles_y, size = record_size<T>(slice);
   const uint64_t limit = opt.max_records > 0 ? opt.max_records : std::max<uint64_t>(1 << 20, 4 * uint64_t{f.count});
   const bool parts = next_range(f, 0, limit).end < tiles;
   if (parts) {
@@ -200,7 +200,7 @@ void gather_records(const Kernels<T> &kernels, const Inputs<T> &in, int camera, 
       const uint64_t slots = assign_slots(f, range, scratch);
       std::memset(scratch.touched.reserve(slots), 0, slots);
       scratch.records.reserve(slots * size);
-      kernels.backward(in, camera, opt, f, slice, range, scratch, out, grad);
+      (slice.alone ? kernels.backward_features : kernels.backward)(in, camera, opt, f, slice, range, scratch, out, grad);
     });
     if (parts) stats.timed(kReduce, [&] { kernels.add_records(opt, f, size, scratch); });
   }
@@ -246,9 +246,10 @@ void rasterize_backward(const Inputs<T> &in, const Options &opt, Frames<T> &fram
   for (int camera = 0; camera < in.cameras; ++camera)
     for_each_slice(in.dims, [&](Slice slice) {
       const Frame<T> &f = *frames.cameras[camera];
+      slice.alone = result.features_alone() && slice.count > 0;
       gather_records(k, in, camera, opt, f, slice, *scratch, out, grad, frames.stats);
       frames.stats.timed(kReduce,
-                         [&] { k.reduce(in, opt, f, camera, slice, slice_width<T>(slice), *scratch, result); });
+                         [&] { k.reduce(in, opt, f, camera, slice, record_size<T>(slice), *scratch, result); });
     });
 }
 

@@ -52,10 +52,17 @@ struct Cotangents {
 };
 
 // dL/d(input), added to what is there; null where not wanted.
+// stored: for one camera, those of a step of training. They are written instead of added, for visible Gaussians only, and
+// those of scales and opacities are with respect to the stored parameters, logarithms and logits.
 template <class T>
 struct Gradients {
   T *means, *quats, *scales, *opacities, *colors, *features, *viewmats;
   T *mean2d;  // [C,N,2] px
+  bool stored;
+
+  bool features_alone() const {
+    return features && !(means || quats || scales || opacities || colors || viewmats || mean2d);
+  }
 };
 
 // A Gaussian as one camera sees it. exponent in base 2: log2(alpha) = log_opacity + a (dx + k dy)² + d dy².

@@ -73,11 +73,17 @@ ProjectedGrad<T> picture_gradient(const Splat<T> &s, const T *r) {
   return g;
 }
 
+template <class T>
+inline void put(T &to, T value, bool write) {
+  to = write ? value : to + value;
+}
+
 // Colours, or SH coefficients and the direction they are seen from (which moves the mean and the camera).
 template <class T>
 void color_gradient(const Inputs<T> &in, const Camera<T> &cam, const Splat<T> &s, const T *g_rgb,
-                    const Gradients<T> &out, T *g_mean, T *g_R, T *g_t) {
+                    const Gradients<T> &out, bool write, T *g_mean, T *g_R, T *g_t) {
   const int64_t i = s.id;
+  if (out.colors && write) std::memset(out.colors + i * in.color_width(), 0, in.color_width() * sizeof(T));
   if (in.sh_degree < 0) {
     if (out.colors)
       for (int c = 0; c < 3; ++c) out.colors[3 * i + c] += g_rgb[c];
@@ -96,7 +102,7 @@ void color_gradient(const Inputs<T> &in, const Camera<T> &cam, const Splat<T> &s
 
 template <class T>
 void flush_block(const Inputs<T> &in, const Frame<T> &f, int camera, const T (*colors)[3], const Gradients<T> &out,
-                 GradientBlock<T> &b, double *camera_sum) {
+                 bool write, GradientBlock<T> &b, double *camera_sum) {
   if (!b.n) return;
   pad_block(b);
   vjp_block(f.camera, b);
@@ -106,15 +112,16 @@ void flush_block(const Inputs<T> &in, const Frame<T> &f, int camera, const T (*c
     T g_mean[3] = {b.out[0][j], b.out[1][j], b.out[2][j]}, g_R[9], g_t[3];
     for (int c = 0; c < 9; ++c) g_R[c] = b.camera[c][j];
     for (int c = 0; c < 3; ++c) g_t[c] = b.camera[9 + c][j];
-    color_gradient(in, f.camera, s, colors[j], out, g_mean, g_R, g_t);
+    color_gradient(in, f.camera, s, colors[j], out, write, g_mean, g_R, g_t);
     if (out.means)
-      for (int c = 0; c < 3; ++c) out.means[3 * i + c] += g_mean[c];
+      for (int c = 0; c < 3; ++c) put(out.means[3 * i + c], g_mean[c], write);
     if (out.quats)
-      for (int c = 0; c < 4; ++c) out.quats[4 * i + c] += b.out[3 + c][j];
+      for (int c = 0; c < 4; ++c) put(out.quats[4 * i + c], b.out[3 + c][j], write);
     if (out.scales)
-      for (int c = 0; c < 3; ++c) out.scales[3 * i + c] += b.out[7 + c][j];
+      for (int c = 0; c < 3; ++c)
+        put(out.scales[3 * i + c], out.stored ? b.out[7 + c][j] * b.in[7 + c][j] : b.out[7 + c][j], write);
     if (out.mean2d)
-      for (int c = 0; c < 2; ++c) out.mean2d[2 * (in.n * camera + i) + c] += b.picture[c][j];
+      for (int c = 0; c < 2; ++c) put(out.mean2d[2 * (in.n * camera + i) + c], b.picture[c][j], write);
     if (!out.viewmats) continue;
     for (int c = 0; c < 9; ++c) camera_sum[c] += g_R[c];
     for (int c = 0; c < 3; ++c) camera_sum[9 + c] += g_t[c];
@@ -142,9 +149,9 @@ void add_records(const Options &opt, const Frame<T> &f, int size, Scratch<T> &sc
 
 // Blocks of consecutive splats, each by one worker; the camera's gradient is summed over the blocks in order.
 template <class T>
-void reduce(const Inputs<T> &in, const Options &opt, const Frame<T> &f, int camera, Slice slice, int width,
+void reduce(const Inputs<T> &in, const Options &opt, const Frame<T> &f, int camera, Slice slice, int size,
             Scratch<T> &scratch, const Gradients<T> &out) {
-  const int size = kGeometry + width;
+  const bool write = out.stored && slice.begin == 0;  // the other slices add to the first
   const std::size_t blocks = (f.count + kBlock - 1) / kBlock;
   double *camera_sums = scratch.camera_sums.reserve(12 * (blocks + 1));
   parallel_for(opt.threads, blocks, [&](std::size_t block, int) {
@@ -156,18 +163,21 @@ void reduce(const Inputs<T> &in, const Options &opt, const Frame<T> &f, int came
     for (uint32_t i = static_cast<uint32_t>(block * kBlock); i < end; ++i) {
       if (!sum_records(scratch, i, size, sum)) continue;
       const Splat<T> &s = f.splats[i];
+      if (out.features)
+        for (int c = 0; c < slice.count; ++c)
+          put(out.features[static_cast<int64_t>(s.id) * in.dims + slice.begin + c],
+              sum[(slice.alone ? 0 : kGeometry) + c], out.stored);
+      if (slice.alone) continue;
       const ProjectedGrad<T> g = picture_gradient(s, sum);
       const T picture[6] = {g.x, g.y, g.z, g.cov_xx, g.cov_xy, g.cov_yy};
       for (int c = 0; c < 6; ++c) b.picture[c][b.n] = picture[c];
       for (int c = 0; c < 3; ++c) colors[b.n][c] = sum[6 + c];
       load_gaussian(in, s.id, b.n, b);
-      if (out.opacities) out.opacities[s.id] += sum[0] / in.opacities[s.id];
-      if (out.features)
-        for (int c = 0; c < slice.count; ++c)
-          out.features[static_cast<int64_t>(s.id) * in.dims + slice.begin + c] += sum[kGeometry + c];
+      if (out.opacities)  // sum[0] = o dL/do, and d o / d logit = o (1 - o)
+        put(out.opacities[s.id], out.stored ? sum[0] * (1 - in.opacities[s.id]) : sum[0] / in.opacities[s.id], write);
       b.splat[b.n++] = i;
     }
-    flush_block(in, f, camera, colors, out, b, camera_sum);
+    flush_block(in, f, camera, colors, out, write, b, camera_sum);
   });
   if (!out.viewmats) return;
   double total[12] = {};

@@ -3,6 +3,7 @@
 #pragma once
 #include "granule.h"
 #include "kernels.h"
+#include "records.h"
 
 namespace perception::PERCEPTION_LEVEL {
 
@@ -55,6 +56,30 @@ void load_supertile(const Inputs<T> &in, const Frame<T> &f, int tile, Slice slic
     append_to_lists(masks, ids, w.lists.data(), w.stride, w.counts);
   }
   w.n = kept;
+}
+
+// write(j, slot) for the splats of 64x64 tile `index` that were touched, and marks their slots: one a splat and tile it
+// touches, of `size` numbers. Slots lie far apart in memory: each is asked for some splats before it is written.
+template <class T, class Write>
+void for_each_slot(const Frame<T> &f, int index, const Worker<T> &w, Scratch<T> &scratch, int size, Write &&write) {
+  constexpr int kAhead = 8;
+  const int tx = index % f.tiles_x, ty = index / f.tiles_x;
+  uint64_t slots[kAhead];
+  for (int j = 0; j < w.n + kAhead; ++j) {
+    uint64_t &slot = slots[j % kAhead];
+    if (j >= kAhead && w.touched[j - kAhead]) {
+      write(j - kAhead, slot);
+      scratch.touched[slot] = 1;
+    }
+    if (j + kAhead < w.n) __builtin_prefetch(&scratch.slots[w.source[j + kAhead]]);
+    if (j >= w.n || !w.touched[j]) continue;
+    const Splat<T> &s = w.splats[j];
+    const uint64_t place = static_cast<uint64_t>(ty - s.y0) * (s.x1 - s.x0 + 1) + (tx - s.x0);
+    slot = scratch.slots[w.source[j]] + place - box_tiles_before(s, f.tiles_x, scratch.first_tile);
+    const T *record = scratch.records.data() + slot * size;
+    __builtin_prefetch(record, 1), __builtin_prefetch(record + size - 1, 1),
+        __builtin_prefetch(&scratch.touched[slot], 1);
+  }
 }
 
 }  // namespace perception::PERCEPTION_LEVEL

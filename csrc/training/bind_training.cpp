@@ -117,15 +117,24 @@ void spread(In<T, 2> features, In<int32_t, 1> slots, In<double, 2> means, In<dou
              push.data(), out.data(), {threads, parse_level(level)});
 }
 
-double separation(In<double, 2> a, std::optional<In<double, 2>> b, double margin, bool squared, Out<double, 2> grad_a,
-                  std::optional<Out<double, 2>> grad_b) {
-  require_aligned("a", a, "b", b, "grad_a", grad_a, "grad_b", grad_b);
-  require(same_shape(a, grad_a) && b.has_value() == grad_b.has_value(),
-          "grad_a, grad_b: expected the shape of a, and an array exactly where b is one");
-  require(!b || (same_shape(*b, *grad_b) && b->shape(1) == a.shape(1)), "b, grad_b: expected one shape, as wide as a");
+double separation(In<double, 2> points, double margin, Out<double, 2> gradient) {
+  require_aligned("points", points, "gradient", gradient);
+  require(same_shape(points, gradient), "gradient: expected the shape of points");
   nb::gil_scoped_release release;
-  return pt::separation(a.data(), a.shape(0), b ? b->data() : nullptr, b ? static_cast<int64_t>(b->shape(0)) : -1,
-                        a.shape(1), margin, squared, grad_a.data(), grad_b ? grad_b->data() : nullptr);
+  return pt::separation(points.data(), points.shape(0), points.shape(1), margin, gradient.data());
+}
+
+void add_statistics(In<float, 2> mean2d, In<float, 1> radii, In<uint8_t, 1> visible, Out<float, 1> gradient,
+                    Out<float, 1> seen, Out<float, 1> radius, double gradient_scale, double radius_scale,
+                    int threads) {
+  require_aligned("mean2d", mean2d, "radii", radii, "gradient", gradient, "seen", seen, "radius", radius);
+  require(mean2d.shape(0) == radii.shape(0) && mean2d.shape(1) == 2 && same_shape(radii, visible) &&
+              same_shape(radii, gradient) && same_shape(radii, seen) && same_shape(radii, radius),
+          "mean2d, visible, gradient, seen, radius: expected [N, 2] and [N] of radii [N]");
+  nb::gil_scoped_release release;
+  pt::add_statistics({mean2d.data(), radii.data(), visible.data(), gradient.data(), seen.data(), radius.data(),
+                      static_cast<int64_t>(radii.size()), float(gradient_scale), float(radius_scale)},
+                     threads);
 }
 
 template <class T>
@@ -192,9 +201,12 @@ void bind_training(nb::module_ &parent) {
         "Threads of calls that name none; 0 means all processors. Results do not depend on it.");
   m.def("assign", &assign, nb::arg("labels").noconvert(), "fraction"_a, "seed"_a, nb::arg("slots").noconvert(),
         "(ids, counts, first pixel) of the labels in use; slots gets each pixel's index into ids, or -1.");
-  m.def("separation", &separation, nb::arg("a").noconvert(), nb::arg("b").noconvert().none(), "margin"_a, "squared"_a,
-        nb::arg("grad_a").noconvert(), nb::arg("grad_b").noconvert().none(),
-        "Mean relu(margin - distance) over pairs within a, or between a and b.");
+  m.def("separation", &separation, nb::arg("points").noconvert(), "margin"_a, nb::arg("gradient").noconvert(),
+        "Mean relu(margin - squared distance) over the pairs of points [M, D], and its gradient.");
+  m.def("add_statistics", &add_statistics, nb::arg("mean2d").noconvert(), nb::arg("radii").noconvert(),
+        nb::arg("visible").noconvert(), nb::arg("gradient").noconvert(), nb::arg("seen").noconvert(),
+        nb::arg("radius").noconvert(), "gradient_scale"_a, "radius_scale"_a, "threads"_a = 0,
+        "Adds one view, where visible: |mean2d| to gradient, 1 to seen; radius becomes the larger one.");
   bind_precision<float>(m);
   bind_precision<double>(m);
 }

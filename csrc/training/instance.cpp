@@ -104,36 +104,28 @@ void spread(const T *features, const int32_t *slots, int64_t pixels, int64_t wid
   });
 }
 
-double separation(const double *a, int64_t rows, const double *b, int64_t others, int64_t width, double margin,
-                  bool squared, double *grad_a, double *grad_b) {
-  const bool within = others < 0;  // an empty b is another matter: its pointer may be null
-  const double *right = within ? a : b;
-  double *grad_right = within ? grad_a : grad_b;
-  const double pairs = within ? 0.5 * rows * (rows - 1) : double(rows) * others;
-  std::fill_n(grad_a, rows * width, 0.0);
-  if (!within) std::fill_n(grad_b, others * width, 0.0);
-  if (pairs < 1) return 0;
+double separation(const double *points, int64_t rows, int64_t width, double margin, double *gradient) {
+  const double pairs = 0.5 * rows * (rows - 1);
+  std::fill_n(gradient, rows * width, 0.0);
   double total = 0;
   std::vector<double> difference(width);
   for (int64_t i = 0; i < rows; ++i) {
-    for (int64_t j = within ? i + 1 : 0; j < (within ? rows : others); ++j) {
+    for (int64_t j = i + 1; j < rows; ++j) {
       double square = 0;
       for (int64_t k = 0; k < width; ++k) {
-        difference[k] = a[i * width + k] - right[j * width + k];
+        difference[k] = points[i * width + k] - points[j * width + k];
         square += difference[k] * difference[k];
       }
-      const double distance = squared ? square : std::sqrt(square);
-      if (!(distance < margin)) continue;
-      total += margin - distance;
-      const double slope = squared ? 2 : distance > 0 ? 1 / distance : 0;
+      if (!(square < margin)) continue;
+      total += margin - square;
       for (int64_t k = 0; k < width; ++k) {
-        const double g = slope * difference[k] / pairs;
-        grad_a[i * width + k] -= g;
-        grad_right[j * width + k] += g;
+        const double g = 2 * difference[k] / pairs;
+        gradient[i * width + k] -= g;
+        gradient[j * width + k] += g;
       }
     }
   }
-  return total / pairs;
+  return rows > 1 ? total / pairs : 0;
 }
 
 template void prototypes(const float *, const int32_t *, int64_t, int64_t, const int64_t *, const int64_t *, int64_t,

@@ -49,10 +49,19 @@ template <class T>
 void spread(const T *features, const int32_t *slots, int64_t pixels, int64_t width, const double *means,
             const double *pull, const double *push, T *out, const Execution &);
 
-// Mean over pairs of relu(margin - distance), distance = |a - b|^2 or |a - b|; pairs i < j within a (others < 0), or
-// all pairs of a and b. Gradients are written; that of |a - b| at 0 is taken as 0. No pair: value 0.
-double separation(const double *a, int64_t rows, const double *b, int64_t others, int64_t width, double margin,
-                  bool squared, double *grad_a, double *grad_b);
+// Mean over pairs i < j of relu(margin - |p_i - p_j|^2) of points [rows, width]; its gradient is written. No pair: 0.
+double separation(const double *points, int64_t rows, int64_t width, double margin, double *gradient);
+
+// Adds one view to the statistics of `rows` Gaussians, where visible: gradient += gradient_scale |mean2d|, seen += 1,
+// radius = max(radius, radius_scale radii). mean2d [rows, 2], all others [rows].
+struct StatisticsArguments {
+  const float *mean2d, *radii;
+  const uint8_t *visible;
+  float *gradient, *seen, *radius;
+  int64_t rows;
+  float gradient_scale, radius_scale;
+};
+void add_statistics(const StatisticsArguments &, int threads);
 
 template <class T>
 double sum(const T *values, int64_t n, bool squared, const Execution &);

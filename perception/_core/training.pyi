@@ -16,8 +16,15 @@ def assign(labels: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C'
     (ids, counts, first pixel) of the labels in use; slots gets each pixel's index into ids, or -1.
     """
 
-def separation(a: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu', writable=False)], b: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu', writable=False)] | None, margin: float, squared: bool, grad_a: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu')], grad_b: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu')] | None) -> float:
-    """Mean relu(margin - distance) over pairs within a, or between a and b."""
+def separation(points: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu', writable=False)], margin: float, gradient: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu')]) -> float:
+    """
+    Mean relu(margin - squared distance) over the pairs of points [M, D], and its gradient.
+    """
+
+def add_statistics(mean2d: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)], radii: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], visible: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu', writable=False)], gradient: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], seen: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], radius: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], gradient_scale: float, radius_scale: float, threads: int = 0) -> None:
+    """
+    Adds one view, where visible: |mean2d| to gradient, 1 to seen; radius becomes the larger one.
+    """
 
 @overload
 def photometric(render: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], target: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], weight: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)] | None, gradient: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], beta: float, threads: int = 0, level: str = 'auto') -> tuple: ...

@@ -8,11 +8,14 @@ preserve the rendered image (Rota Bulò et al. 2024, eq. 11). Opacities decay a 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
+from perception import _core
 from perception.gaussians.model import Gaussians, sigmoid
 
+_kernels: Any = _core.training  # takes tensors through DLPack where its stub says arrays
 START, STOP = 0.05, 0.6
 """Progress at which the number of Gaussians begins and ends to grow."""
 PERCENT_DENSE = 0.01
@@ -38,10 +41,10 @@ class Statistics:
         return Statistics(*(torch.zeros(count) for _ in range(3)))
 
     def add(self, gradient_px: torch.Tensor, radius_px: torch.Tensor, visible: torch.Tensor, long_side: int) -> None:
-        """Adds one view: gradient_px [N] per pixel, radius_px [N] pixels, visible [N] bool, long_side in pixels."""
-        self.gradient += torch.where(visible, gradient_px * (0.5 * long_side), 0.0)
-        self.seen += visible
-        self.radius = torch.maximum(self.radius, torch.where(visible, radius_px / long_side, 0.0))
+        """Adds one view: gradient_px [N, 2] of the 2D mean per pixel, radius_px [N] pixels, visible [N] uint8,
+        long_side in pixels. Rows that are not visible are not looked at."""
+        sums = (self.gradient, self.seen, self.radius)
+        _kernels.add_statistics(gradient_px, radius_px, visible, *sums, 0.5 * long_side, 1 / long_side)
 
     def mean_gradient(self) -> torch.Tensor:
         return self.gradient / self.seen.clamp(min=1)

@@ -2,9 +2,9 @@
 
     L = L_RGB + λ_inst2D (w_p L_pos + w_n L_neg) + λ_var L_var
 
-All losses take CPU tensors of float32 or float64, sum in float64 and are differentiable once. The kernels use
-all processors unless `_core.training.set_threads` limits them. The result does not depend on the number of
-threads, bit for bit. Set torch to one thread: idle workers of its OpenMP pool busy-wait for milliseconds.
+Every function returns a loss with its gradient with respect to the images; nothing is recorded for torch's autograd.
+All take CPU tensors of float32 or float64 and sum in float64. The kernels use all processors unless
+`_core.training.set_threads` limits them. The result does not depend on the number of threads, bit for bit.
 """
 
 from __future__ import annotations
@@ -15,8 +15,6 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd import Function
-from torch.autograd.function import once_differentiable
 
 from perception import _core
 from perception.errors import InputError
@@ -34,45 +32,17 @@ def _ready(name: str, tensor: Tensor) -> Tensor:
     return tensor.detach().contiguous()
 
 
-def _scaled(tensor: Tensor, factor: float) -> Tensor:
-    out = torch.empty_like(tensor)
-    _kernels.scale(tensor.detach().view(-1), factor, out.view(-1))
-    return out
-
-
 # ---------- photometric
 
 
 @dataclass(frozen=True)
 class PhotometricLoss:
-    """value: differentiable scalar (1 − β) L1 + β (1 − SSIM). ssim is NaN when β = 0 (not computed)."""
+    """value: (1 − β) L1 + β (1 − SSIM); gradient [H, W, C]: d value / d render; ssim is NaN (not computed) if β = 0."""
 
-    value: Tensor
+    value: float
+    gradient: Tensor
     l1: float
     ssim: float
-
-
-class _Photometric(Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        render: Tensor,
-        target: Tensor | np.ndarray,
-        beta: float,
-        weight: Tensor | None,
-        report: list[float],
-    ) -> Tensor:
-        gradient = torch.empty_like(render)
-        loss, *parts = _kernels.photometric(render.detach(), target, weight, gradient, beta)
-        report.extend(parts)
-        ctx.save_for_backward(gradient)
-        return render.new_tensor(loss)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
-        (gradient,) = ctx.saved_tensors
-        return (gradient if grad == 1 else _scaled(gradient, float(grad))), None, None, None, None
 
 
 def photometric(
@@ -95,16 +65,16 @@ def photometric(
         raise InputError(f"photometric loss: images are {list(render.shape)}, expected 1 to 16 channels, not empty")
     if not 0 <= beta <= 1:
         raise InputError(f"photometric loss: beta is {beta}, expected 0 to 1")
-    _ready("render", render)
+    render = _ready("render", render)
     if image.dtype != torch.uint8:
         image = _ready("target", image).to(render.dtype)
     if weight is not None:
         if weight.shape != render.shape[:2]:
             raise InputError(f"photometric loss: weight has shape {list(weight.shape)}, expected [H, W]")
         weight = weight.detach().to(render.dtype).contiguous()
-    parts: list[float] = []
-    value = _Photometric.apply(render.contiguous(), image.contiguous(), float(beta), weight, parts)
-    return PhotometricLoss(value, *parts)
+    gradient = torch.empty_like(render)
+    value, l1, ssim = _kernels.photometric(render, image.contiguous(), weight, gradient, float(beta))
+    return PhotometricLoss(value, gradient, l1, ssim)
 
 
 # ---------- depth
@@ -113,38 +83,27 @@ _DEPTH_NOISE = 0.01
 """Relative error of depth below which the loss is quadratic: the noise of a Kinect at 2 m is 0.7 cm."""
 
 
-class _Depth(Function):
-    @staticmethod
-    def forward(ctx: Any, depths: Tensor, alphas: Tensor, measured: Tensor) -> Tensor:
-        known = measured > 0
-        share = known.to(depths.dtype).div_(max(1, int(known.sum())))  # 1 / |M| at measured pixels
-        target = torch.where(known, measured, torch.ones_like(measured))
-        expected = depths / alphas.clamp(min=1e-6)
-        error = (expected / target).sub_(1)
-        length = (error * error).add_(_DEPTH_NOISE**2).sqrt_()
-        pull = error.div_(length).div_(target).mul_(share)
-        ctx.save_for_backward(pull, expected.mul_(pull).add_(share).neg_())
-        value = length.sub_(_DEPTH_NOISE + 1).mul_(alphas).add_(1).mul_(share)
-        return depths.new_tensor(_kernels.sum(value.reshape(-1), False))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
-        of_depths, of_alphas = ctx.saved_tensors
-        return of_depths * grad, of_alphas * grad, None
-
-
-def depth_loss(depths: Tensor, alphas: Tensor, measured: Tensor) -> Tensor:
+def depth_loss(depths: Tensor, alphas: Tensor, measured: Tensor) -> tuple[float, Tensor, Tensor]:
     """L_depth = 1/|M| Σ_{p ∈ M} [α̅ ρ(D / (α d) − 1) + 1 − α], ρ(e) = sqrt(e² + σ²) − σ, over the measured pixels M.
 
     depths, alphas: [H, W] D = Σ z w and α = Σ w as rendered. measured: [H, W] d, 0 = none, of the same dtype. D / α is
     the expected depth. Charbonnier's ρ of the relative error bounds the pull of wrong measurements. α̅ is α taken as
     constant, so that nearly empty pixels have no large gradients. 1 − α: what a sensor measured is opaque.
+    Returns the loss and its gradients with respect to depths and alphas.
     """
     if not depths.shape == alphas.shape == measured.shape or depths.ndim != 2:
         found = ", ".join(str(list(t.shape)) for t in (depths, alphas, measured))
         raise InputError(f"depth loss: found {found}, expected one shape [H, W]")
-    return _Depth.apply(depths.contiguous(), alphas.contiguous(), _ready("measured", measured))
+    depths, alphas, measured = _ready("depths", depths), _ready("alphas", alphas), _ready("measured", measured)
+    known = measured > 0
+    share = known.to(depths.dtype).div_(max(1, int(known.sum())))  # 1 / |M| at measured pixels
+    target = torch.where(known, measured, torch.ones_like(measured))
+    expected = depths / alphas.clamp(min=1e-6)
+    error = (expected / target).sub_(1)
+    length = (error * error).add_(_DEPTH_NOISE**2).sqrt_()
+    pull = error.div_(length).div_(target).mul_(share)
+    value = length.sub_(_DEPTH_NOISE + 1).mul_(alphas).add_(1).mul_(share)
+    return _kernels.sum(value.reshape(-1), False), pull, expected.mul_(pull).add_(share).neg_()
 
 
 # ---------- instance
@@ -193,69 +152,19 @@ def assign_labels(labels: Tensor | np.ndarray) -> LabelAssignment:
     )
 
 
-class _Prototypes(Function):
-    """features [P, D] -> (L_pos, prototypes [M, D])."""
-
-    @staticmethod
-    def forward(ctx: Any, features: Tensor, labels: LabelAssignment) -> tuple[Tensor, Tensor]:
-        count, width = len(labels.ids), features.shape[1]
-        means = torch.empty(count, width, dtype=torch.float64)
-        scatter = torch.empty(count, dtype=torch.float64)
-        _kernels.prototypes(features, labels.slots, labels.counts, labels.first, means, scatter)
-        pixels = labels.counts.to(torch.float64)
-        shares = 1 / (count * pixels)
-        ctx.save_for_backward(features, means, shares)
-        ctx.labels = labels
-        return features.new_tensor(float((shares * scatter).sum())), means.to(features.dtype)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_pos: Tensor, grad_means: Tensor) -> tuple[Tensor, None]:
-        # d L_pos / d F(p) = 2 share (F(p) − z): the part through z vanishes, as Σ_p (F(p) − z) = 0.
-        features, means, shares = ctx.saved_tensors
-        labels = ctx.labels
-        pull = 2 * shares * grad_pos.double()
-        push = grad_means.double() / labels.counts[:, None]
-        out = torch.empty_like(features)
-        _kernels.spread(features, labels.slots, means, pull, push, out)
-        return out, None
-
-
-class _Separation(Function):
-    @staticmethod
-    def forward(ctx: Any, z: Tensor, margin: float) -> Tensor:
-        a = z.detach().double().contiguous()
-        gradient = torch.empty_like(a)
-        value = _kernels.separation(a, None, margin, True, gradient, None)
-        ctx.gradient = gradient.to(z.dtype)
-        return z.new_tensor(value)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        return ctx.gradient * grad, None
-
-
-def separation_loss(prototypes: Tensor, margin: float = 1.0) -> Tensor:
-    """L_neg: mean over pairs i < j of ReLU(γ − ‖z_i − z_j‖²); prototypes [M, D]. Without pairs the loss is 0."""
-    if prototypes.ndim != 2:
-        raise InputError(f"separation loss: found {list(prototypes.shape)}, expected [M, D]")
-    return _Separation.apply(prototypes, float(margin))
-
-
 @dataclass(frozen=True)
 class InstanceLoss:
-    """value = w_pos pos + w_neg neg, all differentiable; so is prototypes [M, D], for further losses on them.
+    """value = w_pos pos + w_neg neg; gradient [H, W, D]: d value / d features.
 
-    labels: [M] int32 ids of the prototypes, ascending. counts: [M] int64 pixels each was averaged over.
+    prototypes [M, D] float64: z_i. labels: [M] int32 ids of the prototypes, ascending.
     """
 
-    value: Tensor
-    pos: Tensor
-    neg: Tensor
+    value: float
+    gradient: Tensor
+    pos: float
+    neg: float
     prototypes: Tensor
     labels: Tensor
-    counts: Tensor
 
 
 def instance_loss(
@@ -283,44 +192,41 @@ def instance_loss(
     if labels.shape != tuple(features.shape[:2]):
         found = f"{list(labels.shape)} and {list(features.shape)}"
         raise InputError(f"instance loss: labels and features have shapes {found}, expected [H, W] and [H, W, D]")
-    _ready("features", features)
-    flat = features.reshape(-1, features.shape[2]).contiguous()
-    pos, prototypes = _Prototypes.apply(flat, labels)
-    neg = separation_loss(prototypes, margin)
-    return InstanceLoss(w_pos * pos + w_neg * neg, pos, neg, prototypes, labels.ids, labels.counts)
+    features = _ready("features", features)
+    flat, counts = features.view(-1, features.shape[2]), labels.counts
+    means = torch.empty(len(counts), flat.shape[1], dtype=torch.float64)
+    scatter, apart = torch.empty(len(counts), dtype=torch.float64), torch.empty_like(means)
+    _kernels.prototypes(flat, labels.slots, counts, labels.first, means, scatter)
+    shares = 1 / (len(counts) * counts.double())
+    pos = float((shares * scatter).sum())
+    neg = _kernels.separation(means, float(margin), apart)
+    # d L_pos / d F(p) = 2 share (F(p) − z): the part through z vanishes, as Σ_p (F(p) − z) = 0.
+    gradient = torch.empty_like(features)
+    pull, push = 2 * w_pos * shares, w_neg * apart / counts[:, None]
+    _kernels.spread(flat, labels.slots, means, pull, push, gradient.view(flat.shape))
+    return InstanceLoss(w_pos * pos + w_neg * neg, gradient, pos, neg, means, labels.ids)
 
 
 # ---------- variance
 
 
-class _Variance(Function):
-    @staticmethod
-    def forward(ctx: Any, variance: Tensor, squared: bool, count: int) -> Tensor:
-        total = _kernels.sum(variance.detach().reshape(-1), squared)
-        ctx.save_for_backward(variance)
-        ctx.squared, ctx.count = squared, count
-        return variance.new_tensor(total / count if count else 0.0)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        (variance,) = ctx.saved_tensors
-        scale = float(grad) / max(1, ctx.count)
-        out = _scaled(variance, 2 * scale) if ctx.squared else torch.full_like(variance, scale)
-        return out, None, None
-
-
-def variance_loss(feature_variance: Tensor, form: VarianceForm = "paper") -> Tensor:
-    """L_var = 1/|I| Σ_p ‖Var(F(p))‖² of the rendered per-pixel variance, feature_variance [H, W, D].
+def variance_loss(feature_variance: Tensor, form: VarianceForm = "paper", weight: float = 1) -> tuple[float, Tensor]:
+    """weight · L_var, L_var = 1/|I| Σ_p ‖Var(F(p))‖² of the rendered per-pixel variance, feature_variance [H, W, D].
 
     form "paper": as above, summed over channels. "channels": the authors' released code, also averaged over
     the D channels. "plain": the mean of Var itself, over pixels and channels.
+    Returns the loss and its gradient [H, W, D].
     """
     if feature_variance.ndim != 3:
         raise InputError(f"variance loss: found {list(feature_variance.shape)}, expected [H, W, D]")
     if form not in ("paper", "channels", "plain"):
         raise InputError(f"variance loss: form is '{form}', expected paper, channels or plain")
-    _ready("feature_variance", feature_variance)
-    height, width, channels = feature_variance.shape
-    count = height * width * (1 if form == "paper" else channels)
-    return _Variance.apply(feature_variance.contiguous(), form != "plain", count)
+    variance = _ready("feature_variance", feature_variance)
+    height, width, channels = variance.shape
+    share = weight / max(1, height * width * (1 if form == "paper" else channels))
+    value = share * _kernels.sum(variance.view(-1), form != "plain")
+    if form == "plain":
+        return value, torch.full_like(variance, share)
+    gradient = torch.empty_like(variance)
+    _kernels.scale(variance.view(-1), 2 * share, gradient.view(-1))
+    return value, gradient

@@ -25,7 +25,8 @@ class RasterizationStats:
     """Per-Gaussian values for densification, in pixels, and the cost of the call.
 
     radii: [C, N] three standard deviations along the long axis of the 2D Gaussian, 0 where it is not in view.
-    mean2d_grad: [C, N] norm of the loss's gradient with respect to the 2D mean; None until backward has run.
+    mean2d_grad: [C, N] norm of the loss's gradient with respect to the 2D mean; None until backward has run, and
+        if it ran for the features alone.
     evaluated_pairs, contributing_pairs: (Gaussian, pixel) pairs over all cameras: those evaluated in SIMD
     registers (more on wider registers), and those that contributed colour. Speed is reported in the latter.
     seconds: wall clock by stage: project, sort, bin, blend, and from the backward pass blend_backward, reduce.
@@ -175,27 +176,34 @@ def rasterize_backward(
     forward: Forward,
     cotangents: tuple[Tensor | None, ...],
     wanted: tuple[bool, ...],
-) -> tuple[list[Tensor | None], Tensor]:
+    stored: list[Tensor | None] | None = None,
+) -> list[Tensor | None]:
     """One backward pass, no autograd.
 
     cotangents: dL/d colors, alphas, depths, features, feature_variance; None means zero. wanted: which of the
-    first seven inputs want a gradient. Returns those gradients and dL/d(2D mean) [C, N, 2] in pixels.
+    first seven inputs want a gradient. Returns those gradients and dL/d(2D mean) [C, N, 2] in pixels, None if `wanted`
+    names the features alone: this takes less time.
+    stored: such a list that the gradients of one camera are written to, for visible Gaussians only. Those of scales and
+    opacities are then with respect to their logarithms and logits.
     """
     means, viewmats = inputs[0], inputs[6]
     assert means is not None and viewmats is not None  # for the type checker
-    grads = [
+    grads = stored or [
         torch.zeros_like(t, memory_format=torch.contiguous_format) if t is not None and w else None
         for t, w in zip(inputs[:7], wanted, strict=True)
     ]
-    mean2d = means.new_zeros((viewmats.shape[0], means.shape[0], 2))
+    if stored is None:
+        alone = [index for index, w in enumerate(wanted) if w] == [5]
+        grads.append(None if alone else means.new_zeros((viewmats.shape[0], means.shape[0], 2)))
     images = (forward.colors, forward.alphas, forward.depths, forward.features, forward.feature_variance)
     contiguous = [None if g is None else g.contiguous() for g in cotangents]
     _core_function("rasterize_backward", means)(
         _core_inputs(inputs, background, settings),
         forward.frames,
-        *(_numpy(t) for t in (*images, *contiguous, *grads, mean2d)),
+        *(_numpy(t) for t in (*images, *contiguous, *grads)),
+        stored is not None,
     )
-    return grads, mean2d
+    return grads
 
 
 class _Rasterize(torch.autograd.Function):
@@ -226,8 +234,8 @@ class _Rasterize(torch.autograd.Function):
         wanted = tuple(ctx.needs_input_grad[3:10])
         none = images[0].new_empty(0)
         state = Forward(*images, visible=none, radii=none, frames=ctx.frames)  # type: ignore[misc]
-        grads, mean2d = rasterize_backward(inputs, background, ctx.settings, state, cotangents[:5], wanted)
-        ctx.stats.mean2d_grad = mean2d.norm(dim=-1)
+        *grads, mean2d = rasterize_backward(inputs, background, ctx.settings, state, cotangents[:5], wanted)
+        ctx.stats.mean2d_grad = None if mean2d is None else mean2d.norm(dim=-1)
         ctx.stats.seconds = ctx.frames.seconds
         shade = None
         if ctx.needs_input_grad[0] and cotangents[0] is not None:

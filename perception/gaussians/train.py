@@ -20,10 +20,17 @@ import torch
 
 from perception.config import MapConfig
 from perception.gaussians.densify import Statistics
-from perception.gaussians.losses import depth_loss, instance_loss, photometric, variance_loss
-from perception.gaussians.model import Gaussians, sigmoid
+from perception.gaussians.losses import (
+    LabelAssignment,
+    assign_labels,
+    depth_loss,
+    instance_loss,
+    photometric,
+    variance_loss,
+)
+from perception.gaussians.model import Gaussians
 from perception.gaussians.optimiser import SparseAdam
-from perception.gaussians.rasterize import Rasterization, rasterize, torch_on_one_thread
+from perception.gaussians.rasterize import Forward, Settings, rasterize_backward, rasterize_forward, torch_on_one_thread
 from perception.gaussians.rates import learning_rates
 from perception.gaussians.record import TrainRecord
 from perception.gaussians.schedule import Schedule
@@ -65,6 +72,7 @@ class Trainer:
         self.gaussians = gaussians
         self.statistics = Statistics.zeros(len(gaussians))
         self.optimiser = SparseAdam(vars(gaussians), self._rates(0.0))
+        self._sync()
         self.schedule = Schedule(self)
         self.show(views)
         self._since: float | None = None  # time.monotonic() at the start of `run`, None outside
@@ -72,6 +80,7 @@ class Trainer:
     def show(self, views: list[TrainingView]) -> None:
         """Sets the training views: the same photos as before, possibly with labels added."""
         self.views, self.coarse = views, [view.halved() for view in views]
+        self._assigned: dict[str, LabelAssignment] = {}  # of the views seen so far
         self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
 
     def run(self, observer: Observer | None = None, until: float = 1.0) -> TrainRecord:
@@ -106,66 +115,58 @@ class Trainer:
     def step(self, progress: float) -> float:
         """One iteration: renders a view, computes the loss and its gradient, takes an Adam step. Returns the loss."""
         view, with_features = self.schedule.next_view(progress)
-        params = {name: tensor.detach().requires_grad_() for name, tensor in vars(self.gaussians).items()}
+        height, width = view.photo.shape[:2]
+        g, measured = self.gaussians, view.depth is not None
+        settings = Settings(width, height, g.sh_degree, eps2d=view.eps2d, variance=with_features, depth=measured)
+        # On a random background colour, so that an empty region cannot fit the photo.
+        colors = np.random.default_rng([self.config.seed, self.iteration, 1]).random((1, 3), dtype=np.float32)
+        background = torch.from_numpy(colors)
         with self.record.timed("rasterizer forward"):
-            out = self._render(params, view, with_features)  # I (eq. 3), F (eq. 5) and Var F (eq. 12)
+            cameras = (view.camera_from_world[None], view.K[None])
+            features = g.features if with_features else None
+            inputs = (g.means, g.quats, g.scales, g.opacities, g.sh, features, *cameras)
+            out = rasterize_forward(inputs, background, settings)  # I (eq. 3), F (eq. 5) and Var F (eq. 12)
         with self.record.timed("losses"):
-            image = view.exposed(out.colors[0])
-            photo = target_photo(view, image)
-            loss = photometric(image, photo, SSIM_WEIGHT, view.weight).value  # L_RGB, eq. 4
-            if with_features:
-                loss = loss + self._feature_losses(view, out)
-            images = [image for image in (out.colors, out.features, out.feature_variance) if image is not None]
-            if view.depth is not None:
-                loss = loss + self.config.losses.depth_weight * depth_loss(out.depths[0], out.alphas[0], view.depth)
-                images += [out.depths, out.alphas]
-            cotangents = torch.autograd.grad(loss, images, allow_unused=True)
+            loss, cotangents = self._losses(view, out)
         with self.record.timed("rasterizer backward"):
-            used = [(image, grad) for image, grad in zip(images, cotangents, strict=True) if grad is not None]
-            torch.autograd.backward([image for image, _ in used], [grad for _, grad in used])
+            gradients = {
+                name: buffer for name, buffer in self._gradients.items() if with_features or name != "features"
+            }
+            stored = [gradients.get(name) for name in (*vars(g), "viewmats", "mean2d")]
+            rasterize_backward(inputs, background, settings, out, cotangents, (), stored)
         with self.record.timed("Adam"):
-            gradients = {name: tensor.grad for name, tensor in params.items() if tensor.grad is not None}
             self.optimiser.rates = self._rates(progress)
             self.record.skipped_gradients += sum(self.optimiser.step(out.visible[0], gradients).skipped.values())
-        if self.schedule.grows_at(progress) and out.stats.mean2d_grad is not None:
+        if self.schedule.grows_at(progress):
             with self.record.timed("densification"):
-                long_side = max(view.photo.shape[:2])
-                self.statistics.add(out.stats.mean2d_grad[0], out.stats.radii[0], out.visible[0], long_side)
-        self.record.pairs += out.stats.contributing_pairs
-        self.record.evaluated_pairs += out.stats.evaluated_pairs
+                mean2d, long_side = self._gradients["mean2d"][0], max(height, width)
+                self.statistics.add(mean2d, out.radii[0], out.visible[0], long_side)
+        self.record.pairs += out.frames.contributing
+        self.record.evaluated_pairs += out.frames.evaluated
         self.iteration += 1
-        return float(loss.detach())
+        return loss
 
-    def _render(self, params: dict[str, torch.Tensor], view: TrainingView, with_features: bool) -> Rasterization:
-        """Renders the view on a random background colour, so that an empty region cannot fit the photo."""
-        height, width = view.photo.shape[:2]
-        colors = np.random.default_rng([self.config.seed, self.iteration, 1]).random(3, dtype=np.float32)
-        return rasterize(
-            params["means"],
-            params["quats"],
-            params["log_scales"].exp(),
-            sigmoid(params["opacity_logits"]),
-            params["sh"],
-            view.camera_from_world[None],
-            view.K[None],
-            width,
-            height,
-            sh_degree=self.gaussians.sh_degree,
-            features=params["features"] if with_features else None,
-            background=torch.from_numpy(colors),
-            depth=view.depth is not None,
-            eps2d=view.eps2d,
-        )
-
-    def _feature_losses(self, view: TrainingView, out: Rasterization) -> torch.Tensor:
-        """λ_var L_var (eq. 13) + λ_inst2d L_inst2d (eqs. 6 to 9)."""
-        losses = self.config.losses
-        assert out.features is not None and out.feature_variance is not None
-        variance = out.feature_variance[0] if view.weight is None else out.feature_variance[0] * view.weight[..., None]
-        total = losses.variance_weight * variance_loss(variance, losses.variance_form)
-        if view.labels is None:
-            return total
-        return total + INSTANCE_WEIGHT * instance_loss(out.features[0], view.labels, margin=losses.margin).value
+    def _losses(self, view: TrainingView, out: Forward) -> tuple[float, tuple[torch.Tensor | None, ...]]:
+        """L (eq. 14) and its gradients with respect to colors, alphas, depths, features and their variance."""
+        losses, image = self.config.losses, view.exposed(out.colors[0])
+        rgb = photometric(image, target_photo(view, image), SSIM_WEIGHT, view.weight)  # L_RGB, eq. 4
+        total, colors = rgb.value, view.exposed(rgb.gradient)[None]
+        alphas = depths = features = variance = None
+        if view.depth is not None and out.depths is not None:
+            value, of_depths, of_alphas = depth_loss(out.depths[0], out.alphas[0], view.depth)
+            total += losses.depth_weight * value
+            depths, alphas = losses.depth_weight * of_depths[None], losses.depth_weight * of_alphas[None]
+        if out.features is not None and out.feature_variance is not None:
+            weight = 1.0 if view.weight is None else view.weight[..., None]
+            spread = out.feature_variance[0] if view.weight is None else out.feature_variance[0] * weight
+            value, variance = variance_loss(spread, losses.variance_form, losses.variance_weight)  # λ_var L_var, eq. 13
+            total, variance = total + value, (variance if view.weight is None else variance * weight)[None]
+            if view.labels is not None:
+                labels = self._assigned[view.name] = self._assigned.get(view.name) or assign_labels(view.labels)
+                w = INSTANCE_WEIGHT
+                found = instance_loss(out.features[0], labels, margin=losses.margin, w_pos=w, w_neg=w)  # eqs. 6 to 9
+                total, features = total + found.value, found.gradient[None]
+        return total, (colors, alphas, depths, features, variance)
 
     def _rates(self, progress: float) -> dict[str, float | torch.Tensor]:
         return learning_rates(progress, self.extent, self.gaussians.sh.shape[1])
@@ -233,8 +234,13 @@ class Trainer:
         self._sync()
 
     def _sync(self) -> None:
-        """Makes `gaussians` share the optimiser's tensors, which are replaced when rows are added or removed."""
+        """Makes `gaussians` share the optimiser's tensors, which are replaced when rows are added or removed.
+
+        The gradients' memory is kept from step to step: rows that a step does not see hold old values, not read.
+        """
         self.gaussians = Gaussians(**{name: tensor.detach() for name, tensor in self.optimiser.params.items()})
+        self._gradients = {name: torch.zeros_like(tensor) for name, tensor in vars(self.gaussians).items()}
+        self._gradients["mean2d"] = torch.zeros(1, len(self.gaussians), 2)
 
     # -------------------------------------------------------------- checkpoint
 

@@ -126,7 +126,7 @@ def _of_view(gaussians: Gaussians, view: TrainingView) -> tuple[sparse.csr_matri
         view.K[None].contiguous(),
     )
     settings = Settings(width, height, variance=False, depth=False, eps2d=view.eps2d)
-    forward = rasterize_forward(inputs, None, settings)
+    forward = rasterize_forward((*inputs[:5], None, *inputs[6:]), None, settings)
     seen = forward.visible[0].numpy().nonzero()[0]
     found: list[tuple[np.ndarray, ...]] = []
     for first in range(0, len(masks), BLOCK):
@@ -135,7 +135,7 @@ def _of_view(gaussians: Gaussians, view: TrainingView) -> tuple[sparse.csr_matri
         for channel, mask in enumerate(block):
             inside[0, ..., channel] = labels == mask
         wanted = tuple(name == 5 for name in range(7))  # the gradient of features, and no other
-        gradients, _ = rasterize_backward(inputs, None, settings, forward, (None, None, None, inside, None), wanted)
+        gradients = rasterize_backward(inputs, None, settings, forward, (None, None, None, inside, None), wanted)
         assert gradients[5] is not None  # wanted
         weights = gradients[5].numpy()[seen]
         row, column = np.nonzero(weights > FAINTEST)

@@ -110,7 +110,9 @@ def _rasterize(dice: Dice, spoil: Callable[[dict[str, Any]], None]) -> list[Call
     wanted = {f"d_{name}": guarded(a.shape, dtype) for name, a in list(arguments.items())[:7]
               if isinstance(a, np.ndarray)}  # fmt: skip
     wanted = {"d_features": None, **wanted, "d_mean2d": guarded((cameras, n, 2), dtype)}
-    backward = {"inputs": inputs, "frames": frames, **images, **grads, **wanted}
+    if dice.below(3) == 0:
+        wanted = {name: array if name == "d_features" else None for name, array in wanted.items()}
+    backward = {"inputs": inputs, "frames": frames, **images, **grads, **wanted, "stored": bool(dice.below(2))}
     if where == 3:
         spoil(backward)
     _called(getattr(_core, f"rasterize_backward_{suffix}"), backward)
@@ -154,11 +156,16 @@ def _spread(dice: Dice) -> Call:
 
 
 def _separation(dice: Dice) -> Call:
-    width, pair = dice.pick((3, 1, 8)), dice.below(2)
-    return _core.training.separation, {
-        "a": normal(dice, (4, width), np.float64), "b": normal(dice, (3, width), np.float64) if pair else None,
-        "margin": 1.0, "squared": bool(dice.below(2)), "grad_a": guarded((4, width), np.float64),
-        "grad_b": guarded((3, width), np.float64) if pair else None,
+    points = normal(dice, (4, dice.pick((3, 1, 8))), np.float64)
+    return _core.training.separation, {"points": points, "margin": 1.0, "gradient": guarded(points.shape, np.float64)}
+
+
+def _add_statistics(dice: Dice) -> Call:
+    n = dice.pick((5, 1, 0))
+    return _core.training.add_statistics, {
+        "mean2d": normal(dice, (n, 2), np.float32), "radii": normal(dice, (n,), np.float32),
+        "visible": np.ones(n, np.uint8), **{name: guarded((n,), np.float32) for name in ("gradient", "seen", "radius")},
+        "gradient_scale": 2.0, "radius_scale": 0.5,
     }  # fmt: skip
 
 
@@ -234,7 +241,19 @@ def _plane_sweep(dice: Dice) -> Call:
     }  # fmt: skip
 
 
-FUNCTIONS = [_photometric, _assign, _prototypes, _spread, _separation, _sum, _scale, _adam, _tree, _knn]
+FUNCTIONS = [
+    _photometric,
+    _assign,
+    _prototypes,
+    _spread,
+    _separation,
+    _add_statistics,
+    _sum,
+    _scale,
+    _adam,
+    _tree,
+    _knn,
+]
 FUNCTIONS += [_felzenszwalb, _undirected, _plane_normals, _plane_sweep]
 _LEVELLED = (_photometric, _prototypes, _spread, _sum, _adam, _plane_sweep)
 

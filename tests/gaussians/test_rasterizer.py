@@ -6,8 +6,9 @@ import pytest
 import torch
 
 import perception
+from perception.gaussians import rasterize as module
 from support import reference_rasterizer as reference
-from support.rasterizer import IMAGES, every_simd_level, grads_and_images, leaves, loss_of, scene  # noqa: F401
+from support.rasterizer import IMAGES, cast, every_simd_level, grads_and_images, leaves, loss_of, scene  # noqa: F401
 
 
 @pytest.mark.parametrize(
@@ -47,6 +48,65 @@ def test_gradcheck_of_the_double_build(sh_degree):
         return tuple(getattr(out, k) for k in IMAGES)
 
     assert torch.autograd.gradcheck(render, tensors, eps=1e-6, atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("variance", [True, False])
+@pytest.mark.parametrize("dims", [3, 8, 13, 21])
+def test_gradients_of_the_features_alone_equal_those_of_the_naive_rasterizer(dims, variance):
+    inputs = {**scene(n=80, width=70, height=45, dims=dims), "variance": variance}
+    names = ("features", "feature_variance")[: 2 if variance else 1]
+    theirs_in = leaves({k: v for k, v in inputs.items() if k != "variance"})
+    theirs = reference.rasterize(**theirs_in)
+    loss_of([theirs[name] for name in names]).backward()
+    expected = theirs_in["features"].grad
+    for dtype, relative in ((torch.float64, 1e-10), (torch.float32, 2e-4)):
+        ours_in = cast(inputs, dtype)
+        ours_in["features"] = ours_in["features"].requires_grad_()
+        results = []
+        for threads in (1, 2, 7):
+            ours = perception.rasterize(**ours_in, threads=threads)
+            (gradient,) = torch.autograd.grad(loss_of([getattr(ours, name) for name in names]), ours_in["features"])
+            assert ours.stats.mean2d_grad is None
+            results.append(gradient)
+        assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
+        atol = relative * float(expected.abs().max())
+        torch.testing.assert_close(results[0].double(), expected, rtol=relative, atol=atol)
+
+
+@pytest.mark.parametrize("sh_degree", [None, 2])
+@pytest.mark.parametrize("dims", [0, 8, 21])
+def test_stored_gradients_are_those_of_logarithms_and_logits_in_visible_rows(dims, sh_degree):
+    inputs = {**scene(n=80, width=70, height=45, dims=dims, cameras=1, sh_degree=sh_degree)}
+    names = ("means", "quats", "scales", "opacities", "colors", "features")
+    leaf = {name: inputs[name] for name in names if inputs[name] is not None}
+    leaf = {**leaf, "scales": leaf["scales"].log(), "opacities": leaf["opacities"].logit()}
+    leaf = {name: tensor.clone().requires_grad_() for name, tensor in leaf.items()}
+    activated = {**leaf, "scales": leaf["scales"].exp(), "opacities": leaf["opacities"].sigmoid()}
+    images = IMAGES if dims else IMAGES[:3]
+    theirs = reference.rasterize(**{**inputs, **activated})
+    pulls = torch.autograd.grad(
+        loss_of([theirs[name] for name in images]), [theirs[name] for name in images], retain_graph=True
+    )
+    torch.autograd.backward([theirs[name] for name in images], pulls)
+
+    arrays = [activated[n].detach() if n in activated else None for n in names]
+    arrays = (*arrays, inputs["viewmats"], inputs["Ks"])
+    settings = module.Settings(70, 45, -1 if sh_degree is None else sh_degree, threads=2)
+    out = module.rasterize_forward(arrays, inputs["background"], settings)
+    stored = [None if t is None else torch.full_like(t, 7.0) for t in arrays[:6]] + [
+        None,
+        torch.full((1, 80, 2), 7.0).double(),
+    ]
+    module.rasterize_backward(arrays, inputs["background"], settings, out, (*pulls, None, None)[:5], (), stored)
+    seen = theirs["visible"][0]
+    assert 0 < int(seen.sum()) < 80
+    for name, ours in zip(names, stored, strict=False):
+        if ours is not None:
+            expected = leaf[name].grad
+            atol = 1e-9 * float(expected.abs().max())
+            torch.testing.assert_close(ours[seen], expected[seen], rtol=1e-8, atol=atol, msg=name)
+            assert (ours[~seen] == 7).all()
+    assert (stored[7][0][~seen] == 7).all() and (stored[7][0][seen] != 7).any()
 
 
 def test_same_bits_for_any_number_of_threads():

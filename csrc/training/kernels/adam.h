@@ -24,7 +24,8 @@ bool all_finite(const T *values, int64_t n) {
 }
 
 // RateStep 0: one rate for all elements; 1: one per element. Selected: where select is 0 the factors become 1 and 0,
-// which leaves every finite number as it was (masked stores would be slow on some processors).
+// which leaves every finite number as it was (masked stores would be slow on some processors). Their gradients, which
+// may be left from an earlier step, are not looked at.
 template <class T, int RateStep, bool Selected = false>
 void update(const AdamRows<T> &a, int64_t from, int64_t n, const T *__restrict select = nullptr) {
   T *__restrict param = a.param + from, *__restrict first = a.first + from, *__restrict second = a.second + from;
@@ -34,7 +35,7 @@ void update(const AdamRows<T> &a, int64_t from, int64_t n, const T *__restrict s
 #pragma GCC ivdep
   for (int64_t i = 0; i < n; ++i) {
     const bool take = !Selected || select[i] != T(0);
-    const T g = grad[i];
+    const T g = take ? grad[i] : T(0);
     const T m = (take ? keep1 : T(1)) * first[i] + (take ? gain1 : T(0)) * g;
     const T v = (take ? keep2 : T(1)) * second[i] + (take ? gain2 : T(0)) * (g * g);
     first[i] = m;
