@@ -1,6 +1,7 @@
 // Stage 3: the list of splats of every 64x64-pixel tile, by bounding box, in depth order.
 #pragma once
 #include <algorithm>
+#include <atomic>
 #include <stdexcept>
 #include <string>
 
@@ -11,12 +12,16 @@ namespace perception {
 
 // How many tiles the splats' boxes touch in all; refuses more than the lists may hold.
 template <class T>
-uint64_t count_listed(const Frame<T> &f) {
-  uint64_t total = 0;
-  for (uint32_t i = 0; i < f.count; ++i) {
-    const Splat<T> &s = f.splats[i];
-    total += static_cast<uint64_t>(s.x1 - s.x0 + 1) * (s.y1 - s.y0 + 1);
-  }
+uint64_t count_listed(const Options &opt, const Frame<T> &f) {
+  std::atomic<uint64_t> total{0};
+  parallel_pieces(opt.threads, Pieces(f.count), [&](int64_t begin, int64_t end) {
+    uint64_t listed = 0;
+    for (int64_t i = begin; i < end; ++i) {
+      const Splat<T> &s = f.splats[i];
+      listed += static_cast<uint64_t>(s.x1 - s.x0 + 1) * (s.y1 - s.y0 + 1);
+    }
+    total += listed;
+  });
   if (total > kMaxListed)
     throw std::length_error(std::to_string(f.count) + " Gaussians in view touch " + std::to_string(total) +
                             " tiles of 64 x 64 pixels, expected at most " + std::to_string(kMaxListed) +
@@ -27,7 +32,7 @@ uint64_t count_listed(const Frame<T> &f) {
 template <class T>
 void bin_splats(const Options &opt, Frame<T> &f, Scratch<T> &scratch) {
   const int tiles = f.tiles_x * f.tiles_y;
-  uint32_t *list = f.list.reserve(count_listed(f));
+  uint32_t *list = f.list.reserve(count_listed(opt, f));
   const uint32_t n = f.count;
   const int parts = static_cast<int>(n / 16384 + 1 < static_cast<uint32_t>(opt.threads) ? n / 16384 + 1 : opt.threads);
   const uint32_t *order = scratch.order[0].data();

@@ -19,6 +19,8 @@ struct ProjectionBlock {
   alignas(64) T in[11][kBlock];
   alignas(64) T x[kBlock], y[kBlock], z[kBlock], var_x[kBlock], k[kBlock], var_y[kBlock], cov_xx[kBlock],
       cov_xy[kBlock], finite[kBlock];
+  alignas(64) T log_opacity[kBlock], a[kBlock], d[kBlock], reach[kBlock], slope[kBlock], radius[kBlock];
+  alignas(64) int32_t seen[kBlock], x0[kBlock], y0[kBlock], x1[kBlock], y1[kBlock];  // 64-pixel tiles, where seen
 };
 
 template <class T>
@@ -56,28 +58,43 @@ T radius(T cov_xx, T cov_xy, T cov_yy) {
   return 3 * std::sqrt(T(0.5) * (cov_xx + cov_yy) + std::sqrt(half * half + cov_xy * cov_xy));
 }
 
-// Fills the splat of lane j; false when no pixel centre can receive 1/255 of it.
+// Which Gaussians can give some pixel centre 1/255, and which tiles these touch.
 template <class T>
-bool make_splat(const Camera<T> &cam, const ProjectionBlock<T> &b, int j, Splat<T> &s) {
-  const T o = b.in[10][j], x = b.x[j], y = b.y[j], z = b.z[j];
-  if (!(z > cam.near_plane && o >= T(1) / 255)) return false;
-  const T log_opacity = std::log2(o), reach = log_opacity - kLogThreshold<T>;
-  const T q = clamp(reach, T(0), T(100)) * (2 / kLog2E<T>);
-  const T lx = std::sqrt(q * b.cov_xx[j]) * T(1.0001) + T(2e-3), ly = std::sqrt(q * b.var_y[j]) * T(1.0001) + T(2e-3);
+void bound_block(const Camera<T> &camera, int n, ProjectionBlock<T> &b) {
+  const Camera<T> cam = camera;
+  for (int j = 0; j < kBlock; ++j) {
+    b.seen[j] = j < n && b.z[j] > cam.near_plane && b.in[10][j] >= T(1) / 255;
+    b.log_opacity[j] = b.seen[j] ? std::log2(b.in[10][j]) : T(0);
+  }
   const T right = cam.width - T(0.5), bottom = cam.height - T(0.5);
-  // Written so that NaN (an overflow of the projection) fails.
-  if (!(x + lx >= T(0.5) && x - lx <= right && y + ly >= T(0.5) && y - ly <= bottom)) return false;
-  if (!(b.var_x[j] <= std::numeric_limits<T>::max())) return false;
-  s.x = x, s.y = y, s.z = z;
-  s.a = T(-0.5) * kLog2E<T> / b.var_x[j], s.k = b.k[j], s.d = T(-0.5) * kLog2E<T> / b.var_y[j];
-  s.log_opacity = log_opacity;
-  s.reach = reach + T(2e-3);
-  s.slope = b.cov_xy[j] / b.cov_xx[j];
-  s.x0 = static_cast<uint16_t>(static_cast<int>(clamp(x - lx - T(0.5), T(0), right)) >> 6);
-  s.x1 = static_cast<uint16_t>(static_cast<int>(clamp(x + lx - T(0.5), T(0), right)) >> 6);
-  s.y0 = static_cast<uint16_t>(static_cast<int>(clamp(y - ly - T(0.5), T(0), bottom)) >> 6);
-  s.y1 = static_cast<uint16_t>(static_cast<int>(clamp(y + ly - T(0.5), T(0), bottom)) >> 6);
-  return true;
+#pragma GCC ivdep
+  for (int j = 0; j < kBlock; ++j) {
+    const T x = b.x[j], y = b.y[j], reach = b.log_opacity[j] - kLogThreshold<T>;
+    const T q = clamp(reach, T(0), T(100)) * (2 / kLog2E<T>);
+    const T lx = std::sqrt(q * b.cov_xx[j]) * T(1.0001) + T(2e-3), ly = std::sqrt(q * b.var_y[j]) * T(1.0001) + T(2e-3);
+    // Written so that NaN (an overflow of the projection) fails.
+    const bool inside = (x + lx >= T(0.5)) & (x - lx <= right) & (y + ly >= T(0.5)) & (y - ly <= bottom) &
+                        (b.var_x[j] <= std::numeric_limits<T>::max());
+    b.seen[j] &= inside;
+    auto tile = [inside](T pixel, T last) {
+      return static_cast<int32_t>(inside ? clamp(pixel - T(0.5), T(0), last) : T(0)) >> 6;
+    };
+    b.x0[j] = tile(x - lx, right), b.x1[j] = tile(x + lx, right);
+    b.y0[j] = tile(y - ly, bottom), b.y1[j] = tile(y + ly, bottom);
+    b.a[j] = T(-0.5) * kLog2E<T> / b.var_x[j], b.d[j] = T(-0.5) * kLog2E<T> / b.var_y[j];
+    b.reach[j] = reach + T(2e-3);
+    b.slope[j] = b.cov_xy[j] / b.cov_xx[j];
+    b.radius[j] = radius(b.cov_xx[j], b.cov_xy[j], b.var_y[j]);
+  }
+}
+
+template <class T>
+void fill_splat(const ProjectionBlock<T> &b, int j, Splat<T> &s) {
+  s.x = b.x[j], s.y = b.y[j], s.z = b.z[j];
+  s.a = b.a[j], s.k = b.k[j], s.d = b.d[j], s.log_opacity = b.log_opacity[j];
+  s.reach = b.reach[j], s.slope = b.slope[j];
+  s.x0 = static_cast<uint16_t>(b.x0[j]), s.x1 = static_cast<uint16_t>(b.x1[j]);
+  s.y0 = static_cast<uint16_t>(b.y0[j]), s.y1 = static_cast<uint16_t>(b.y1[j]);
 }
 
 template <class T>
@@ -136,6 +153,7 @@ uint32_t project(const Inputs<T> &in, const Frame<T> &f, int64_t begin, int64_t 
     const int n = static_cast<int>(end - i0 < kBlock ? end - i0 : kBlock);
     load_block(in, i0, n, b);
     project_block(f.camera, b);
+    bound_block(f.camera, n, b);
     if (check && !attributes_finite(in, i0, n)) {
       bad = i0;
       return 0;
@@ -145,12 +163,13 @@ uint32_t project(const Inputs<T> &in, const Frame<T> &f, int64_t begin, int64_t 
         bad = i0 + j;
         return 0;
       }
+      if (!b.seen[j]) continue;
       Splat<T> &s = f.splats[out];
-      if (!make_splat(f.camera, b, j, s)) continue;
+      fill_splat(b, j, s);
       s.id = static_cast<int32_t>(i0 + j);
       set_color(in, f.camera, i0 + j, s);
       keys[out++] = depth_key(s.z);
-      if (radii) radii[i0 + j] = radius(b.cov_xx[j], b.cov_xy[j], b.var_y[j]);
+      if (radii) radii[i0 + j] = b.radius[j];
     }
   }
   return out - static_cast<uint32_t>(begin);

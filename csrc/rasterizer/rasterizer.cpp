@@ -197,7 +197,7 @@ void gather_records(const Kernels<T> &kernels, const Inputs<T> &in, int camera, 
   for (TileRange range{0, 0}; range.end < tiles;) {
     range = next_range(f, range.end, limit);
     stats.timed(kBlendBackward, [&] {
-      const uint64_t slots = assign_slots(f, range, scratch);
+      const uint64_t slots = assign_slots(opt, f, range, scratch);
       std::memset(scratch.touched.reserve(slots), 0, slots);
       scratch.records.reserve(slots * size);
       (slice.alone ? kernels.backward_features : kernels.backward)(in, camera, opt, f, slice, range, scratch, out, grad);

@@ -1,5 +1,6 @@
 // Gradient records: what one splat gathers over one 64x64 tile, in memory that is held for a range of tiles at a time.
 #pragma once
+#include "../common/parallel.h"
 #include "scratch.h"
 
 namespace perception {
@@ -25,16 +26,25 @@ inline __attribute__((always_inline)) uint64_t box_tiles_before(const Splat<T> &
 
 // Slots: splat i owns as many records as its box has tiles in the range. Returns how many there are.
 template <class T>
-uint64_t assign_slots(const Frame<T> &f, TileRange range, Scratch<T> &scratch) {
-  uint64_t *slots = scratch.slots.reserve(f.count + 1), total = 0;
+uint64_t assign_slots(const Options &opt, const Frame<T> &f, TileRange range, Scratch<T> &scratch) {
+  uint64_t *slots = scratch.slots.reserve(f.count + 1);
   scratch.first_tile = range.begin;
-  for (uint32_t i = 0; i < f.count; ++i) {
+  const Pieces pieces(f.count);
+  std::vector<uint64_t> before(pieces.count + 1);
+  auto owned = [&](int64_t i) {
     const Splat<T> &s = f.splats[i];
-    slots[i] = total;
-    total += box_tiles_before(s, f.tiles_x, range.end) - box_tiles_before(s, f.tiles_x, range.begin);
-  }
-  slots[f.count] = total;
-  return total;
+    return box_tiles_before(s, f.tiles_x, range.end) - box_tiles_before(s, f.tiles_x, range.begin);
+  };
+  parallel_for(opt.threads, pieces.count, [&](std::size_t piece, int) {
+    uint64_t total = 0;
+    for (int64_t i = pieces.begin(piece); i < pieces.end(piece); ++i) slots[i] = total, total += owned(i);
+    before[piece + 1] = total;
+  });
+  for (int64_t piece = 0; piece < pieces.count; ++piece) before[piece + 1] += before[piece];
+  parallel_pieces(opt.threads, pieces, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) slots[i] += before[begin / pieces.size];
+  });
+  return slots[f.count] = before[pieces.count];
 }
 
 // The longest range from `begin` on whose splats need no more than `limit` records; at least one tile.
