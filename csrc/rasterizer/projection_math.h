@@ -26,7 +26,7 @@ struct Camera {
 };
 
 template <class T>
-Camera<T> make_camera(const T *viewmat, const T *K, int width, int height, T near_plane, T eps2d) {
+PERCEPTION_HD Camera<T> make_camera(const T *viewmat, const T *K, int width, int height, T near_plane, T eps2d) {
   Camera<T> c;
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) c.R[3 * i + j] = viewmat[4 * i + j];

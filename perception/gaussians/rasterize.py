@@ -1,13 +1,13 @@
-"""Differentiable rasterization of 3D Gaussians on the CPU: the torch side of the compiled kernels.
+"""Differentiable rasterization of 3D Gaussians: the torch side of the compiled kernels of the CPU.
 
 Follows the 3DGS equations: 2D covariance J R Σ Rᵀ Jᵀ + 0.3 px² I, alpha = min(0.999, o·exp(−½ dᵀ Σ⁻¹ d)),
 contributions under 1/255 skipped, front to back by depth (equal depths by index), stop before the
-transmittance falls under 1e-4.
+transmittance falls under 1e-4. Tensors on a CUDA device go to perception/gaussians/cuda.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ class RasterizationStats:
     mean2d_grad: [C, N] norm of the loss's gradient with respect to the 2D mean; None until backward has run, and
         if it ran for the features alone.
     evaluated_pairs, contributing_pairs: (Gaussian, pixel) pairs over all cameras: those evaluated in SIMD
-    registers (more on wider registers), and those that contributed colour. Speed is reported in the latter.
+    registers (more on wider registers), and those that contributed colour. Speed is reported in the latter. CUDA: 0.
     seconds: wall clock by stage: project, sort, bin, blend, and from the backward pass blend_backward, reduce.
     """
 
@@ -118,6 +118,26 @@ class Forward:
     radii: Tensor
     frames: Any
 
+    @classmethod
+    def empty(cls, inputs: tuple[Tensor | None, ...], settings: Settings) -> Forward:
+        """Images to be written; Gaussians not visible, with radius 0."""
+        means, features, viewmats = inputs[0], inputs[5], inputs[6]
+        assert means is not None and viewmats is not None  # for the type checker
+        count, n = viewmats.shape[0], means.shape[0]
+        image = (count, settings.height, settings.width)
+        new = means.new_empty
+        dims = 0 if features is None else features.shape[1]
+        return cls(
+            colors=new((*image, 3)),
+            alphas=new(image),
+            depths=new(image) if settings.depth else None,
+            features=None if features is None else new((*image, dims)),
+            feature_variance=new((*image, dims)) if features is not None and settings.variance else None,
+            visible=means.new_zeros((count, n), dtype=torch.uint8),
+            radii=means.new_zeros((count, n)),
+            frames=None,
+        )
+
 
 def _core_inputs(inputs: tuple[Tensor | None, ...], background: Tensor | None, settings: Settings) -> Any:
     means, quats, scales, opacities, colors, features, viewmats, ks = inputs
@@ -143,25 +163,10 @@ def rasterize_forward(inputs: tuple[Tensor | None, ...], background: Tensor | No
     inputs: means [N,3], quats [N,4], scales [N,3], opacities [N], colors [N,3] or [N,K,3], features [N,D] or
     None, viewmats [C,4,4], Ks [C,3,3]: contiguous CPU tensors of one dtype. background: [C,3] or None.
     """
-    means, features, viewmats = inputs[0], inputs[5], inputs[6]
-    assert means is not None and viewmats is not None  # for the type checker
-    count, n = viewmats.shape[0], means.shape[0]
-    image = (count, settings.height, settings.width)
-    new = means.new_empty
-    dims = 0 if features is None else features.shape[1]
-    out = Forward(
-        colors=new((*image, 3)),
-        alphas=new(image),
-        depths=new(image) if settings.depth else None,
-        features=None if features is None else new((*image, dims)),
-        feature_variance=new((*image, dims)) if features is not None and settings.variance else None,
-        visible=torch.zeros((count, n), dtype=torch.uint8),
-        radii=means.new_zeros((count, n)),
-        frames=None,
-    )
+    out = Forward.empty(inputs, settings)
     images = (out.colors, out.alphas, out.depths, out.features, out.feature_variance, out.visible, out.radii)
     try:
-        out.frames = _core_function("rasterize_forward", means)(
+        out.frames = _core_function("rasterize_forward", out.colors)(
             _core_inputs(inputs, background, settings), *(_numpy(t) for t in images), settings.simd
         )
     except ValueError as error:
@@ -206,6 +211,15 @@ def rasterize_backward(
     return grads
 
 
+def passes(device: torch.device) -> tuple[Callable[..., Forward], Callable[..., Any]]:
+    """The forward and the backward pass for tensors on `device`."""
+    if device.type == "cuda":
+        from perception.gaussians.cuda import rasterize as on_device
+
+        return on_device.rasterize_forward, on_device.rasterize_backward
+    return rasterize_forward, rasterize_backward
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -213,7 +227,8 @@ class _Rasterize(torch.autograd.Function):
     ) -> Any:
         contiguous = tuple(None if t is None else t.detach().contiguous() for t in inputs)
         shade = None if background is None else background.detach().contiguous()
-        out = rasterize_forward(contiguous, shade, settings)
+        run, _ = passes(contiguous[0].device)  # type: ignore[union-attr]
+        out = run(contiguous, shade, settings)
         stats.radii = out.radii
         stats.evaluated_pairs, stats.contributing_pairs = out.frames.evaluated, out.frames.contributing
         stats.seconds = out.frames.seconds
@@ -234,7 +249,8 @@ class _Rasterize(torch.autograd.Function):
         wanted = tuple(ctx.needs_input_grad[3:10])
         none = images[0].new_empty(0)
         state = Forward(*images, visible=none, radii=none, frames=ctx.frames)  # type: ignore[misc]
-        *grads, mean2d = rasterize_backward(inputs, background, ctx.settings, state, cotangents[:5], wanted)
+        _, run = passes(images[0].device)
+        *grads, mean2d = run(inputs, background, ctx.settings, state, cotangents[:5], wanted)
         ctx.stats.mean2d_grad = None if mean2d is None else mean2d.norm(dim=-1)
         ctx.stats.seconds = ctx.frames.seconds
         shade = None
@@ -270,7 +286,7 @@ def rasterize(
     values), colors [N,3] RGB, or [N,K,3] spherical-harmonic coefficients of degree `sh_degree` (0 to 3,
     K ≥ (sh_degree+1)²; 0.5 added, clamped at 0),
     viewmats [C,4,4] camera_from_world, Ks [C,3,3] pixels (pixel centres at +0.5, no skew), features [N,D],
-    background [3] or [C,3]. float32 or float64, on the CPU. Gradients flow to all of them except Ks.
+    background [3] or [C,3]. float32 or float64 on the CPU, float32 on CUDA. Gradients flow to all of them except Ks.
 
     eps2d: px² added to the diagonal of every 2D covariance, the variance of the pixel's blur (named as in gsplat).
     variance=False and depth=False save time: `feature_variance` and `depths` are not computed (None).
@@ -303,8 +319,9 @@ def _check(
             continue
         if not isinstance(t, torch.Tensor):
             raise InputError(f"rasterize: {name} is {type(t).__name__}, expected a torch.Tensor")
-        if t.device.type != "cpu":
-            raise InputError(f"rasterize: {name} is on {t.device}, expected the CPU; call .cpu()")
+        if t.device.type not in ("cpu", "cuda") or (means is not None and t.device != means.device):
+            place = "cpu or cuda" if means is None or t is means else f"{means.device}, where means are"
+            raise InputError(f"rasterize: {name} is on {t.device}, expected {place}")
         if t.dtype not in (torch.float32, torch.float64) or (means is not None and t.dtype != means.dtype):
             wanted = "float32 or float64" if means is None or t is means else means.dtype
             raise InputError(f"rasterize: {name} is {t.dtype}, expected {wanted}")

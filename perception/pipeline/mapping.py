@@ -72,7 +72,7 @@ def build_map(
     """
     progress, stages, started = progress or Progress(quiet=True), Stages(), time.monotonic()
     if config.device == "cuda":
-        raise InputError("--device cuda: this build has no CUDA rasterizer; use --device cpu or auto")
+        raise InputError("--device cuda: training does not run on a GPU yet (docs/cuda.md); use --device cpu or auto")
     if resume and output.exists() and read_info(output).get("fingerprint") == fingerprint(source, config):
         progress.log(f"{output}: this run is finished")
         clear_work(output)

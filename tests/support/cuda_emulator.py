@@ -1,0 +1,112 @@
+"""The CUDA kernels on the CPU: csrc/cuda/emulator.cpp, built by the system's compiler, behind the host side that a GPU
+would run. A build takes seconds and serves the whole session."""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+
+import pytest
+import torch
+
+from perception.gaussians import rasterize as cpu
+from perception.gaussians.cuda import rasterize as on_device
+from perception.gaussians.cuda.compile import KernelOptions
+from perception.gaussians.cuda.launch import Kernels
+from support.rasterizer import grads_and_images, scene
+
+CSRC = Path(__file__).resolve().parents[2] / "csrc"
+FLAGS = (
+    "-std=c++17", "-O1", "-march=native", "-ffp-contract=off", "-fPIC", "-shared",
+    "-U_FORTIFY_SOURCE",  # its longjmp refuses to go to another stack
+)  # fmt: skip
+IN_ORDER, REVERSED = 0, 1
+KernelsFor = Callable[[KernelOptions, torch.device], Kernels]
+
+
+def find_compiler() -> str:
+    """The system's C++ compiler; the test is skipped where there is none."""
+    found = shutil.which(os.environ.get("CXX", "c++")) or shutil.which("g++") or shutil.which("clang++")
+    if found is None:
+        pytest.skip("no C++ compiler: set CXX or install one to run the CUDA kernels on the CPU")
+    return found
+
+
+@functools.cache
+def _folder() -> Path:
+    folder = tempfile.mkdtemp(prefix="perception-emulator-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+@functools.cache
+def build(options: KernelOptions, edit: tuple[str, str] | None) -> ctypes.CDLL:
+    """The emulator as a driver library. edit: (found, replaced) of a mutation test, once in the sources."""
+    target = Path(tempfile.mkdtemp(dir=_folder()))
+    texts = {file.name: file.read_text() for file in (CSRC / "cuda").iterdir()}
+    if edit is not None:
+        changed = [name for name, text in texts.items() if edit[0] in text]
+        assert len(changed) == 1 and texts[changed[0]].count(edit[0]) == 1, f"not exactly once in the sources: {edit}"
+        texts[changed[0]] = texts[changed[0]].replace(*edit)
+    for name, text in texts.items():
+        (target / name).write_text(text)
+    command = [find_compiler(), *FLAGS, *options.defines(), f"-I{CSRC / 'rasterizer'}"]
+    subprocess.run([*command, str(target / "emulator.cpp"), "-o", str(target / "emulator.so")], check=True)
+    return ctypes.CDLL(str(target / "emulator.so"))
+
+
+def emulated(lanes: int = IN_ORDER, edit: tuple[str, str] | None = None) -> KernelsFor:
+    """What stands for `device_kernels`. lanes: IN_ORDER, REVERSED or a seed of shuffles."""
+
+    def kernels_for(options: KernelOptions, device: torch.device) -> Kernels:
+        driver = build(options, edit)
+        driver.emulator_lane_order(ctypes.c_uint64(lanes))
+        return Kernels(driver, b"\x7fELF", lambda: nullcontext(0))
+
+    return kernels_for
+
+
+@contextmanager
+def on_emulator(kernels_for: KernelsFor) -> Iterator[None]:
+    """Within it `perception.rasterize` runs the CUDA kernels."""
+    forward, backward = cpu.rasterize_forward, cpu.rasterize_backward
+    cpu.rasterize_forward = lambda *given: on_device.rasterize_forward(*given, kernels_for)
+    cpu.rasterize_backward = on_device.rasterize_backward
+    try:
+        yield
+    finally:
+        cpu.rasterize_forward, cpu.rasterize_backward = forward, backward
+
+
+def emulate(inputs, lanes=IN_ORDER, edit=None, **options):
+    """`grads_and_images` by the CUDA kernels."""
+    with on_emulator(emulated(lanes, edit)):
+        return grads_and_images(inputs, **options)
+
+
+def worst(found, expected):
+    """The largest error of any image or gradient, of its largest value; infinite where a mask or NaN differs."""
+    errors = []
+    for a, b in zip(found, expected, strict=True):
+        if a.dtype == torch.bool or not bool(a.isfinite().all()):
+            errors.append(0.0 if torch.equal(a, b) else float("inf"))
+        elif b.numel():
+            errors.append(float((a - b).abs().max()) / (float(b.abs().max()) or 1.0))
+    return max(errors)
+
+
+def wide_scene(**options):
+    """Some Gaussians over all of 10 × 13 tiles, listed and summed by whole warps, among others of every size."""
+    inputs = scene(**{"n": 80, "width": 200, "height": 150, "cameras": 1, **options})
+    inputs["Ks"] = torch.tensor([[[160.0, 0, 107.0], [0, 173.0, 68.0], [0, 0, 1]]], dtype=inputs["means"].dtype)
+    inputs["scales"][::10] = 3.0
+    inputs["opacities"][::10] *= 0.2
+    return inputs
