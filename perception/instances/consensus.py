@@ -149,9 +149,14 @@ def merge_tree(table: Table, prototypes: np.ndarray, sizes: np.ndarray, near: np
         i, j = min(top, other), max(top, other)
         affinity.append(float(best[top]))
         children.append((node[i], node[j]))
+        before = state.a[:, [i, j]].max(axis=1)
         state.merge(i, j)
         node[i] = count + len(children) - 1
-        best = state.a.max(axis=1)
+        # Only columns i and j have changed: rows whose largest value stood there are searched anew.
+        anew = np.flatnonzero(before >= best)
+        best = np.maximum(best, state.a[:, i])
+        best[anew] = state.a[anew].max(axis=1)
+        best[[i, j]] = state.a[[i, j]].max(axis=1)
     return MergeTree(count, np.array(children, np.int64).reshape(-1, 2), np.array(affinity))
 
 

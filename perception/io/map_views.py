@@ -144,14 +144,15 @@ def _lens_of(entry: list[Any] | None) -> Lens | None:
 def views_of_facts(info: dict[str, Any], file: Path, cameras: dict[str, np.ndarray]) -> list[StoredView]:
     """The views that map.json records, `info` being its content and `file` its name for messages.
 
-    cameras: the arrays of cameras.npz. Format version 1 stores there which views were held out. InputError when the
-    record is malformed.
+    cameras: the arrays of cameras.npz. Format version 1 stores there which views were held out; the oldest maps store
+    all views there. InputError when the record is malformed.
     """
     try:
+        entries = info.get("views") or _entries_of_arrays(cameras)
         held = {
             str(name) for name, out in zip(cameras.get("names", ()), cameras.get("held_out", ()), strict=False) if out
         }
-        return [view_from_json({"held_out": entry["name"] in held, **entry}) for entry in info.get("views", [])]
+        return [view_from_json({"held_out": entry["name"] in held, **entry}) for entry in entries]
     except (ValueError, TypeError, KeyError, IndexError, OverflowError, AttributeError) as error:
         raise InputError(f"{file}: its views cannot be understood ({error}); the map is damaged") from error
 
@@ -161,3 +162,15 @@ def check_names(info: dict[str, Any], file: Path) -> None:
     views = info.get("views", [])
     for entry in views if isinstance(views, list) else []:
         safe_name(entry.get("name") if isinstance(entry, dict) else entry, file)
+
+
+def _entries_of_arrays(cameras: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    fields = ("names", "photos", "K", "sizes", "camera_from_world")
+    if not all(name in cameras for name in fields):
+        return []
+    entries = []
+    for name, photo, K, (width, height), pose in zip(*(cameras[field] for field in fields), strict=True):
+        safe_name(str(name), "cameras.npz")
+        entry = {"name": str(name), "photo": str(photo), "K": K, "width": width, "height": height}
+        entries.append({**entry, "camera_from_world": pose})
+    return entries

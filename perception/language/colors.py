@@ -90,10 +90,9 @@ def palette(pixels: np.ndarray) -> np.ndarray:
     if not len(pixels):
         return out
     lab = lab_of(pixels)
-    cells, inverse = np.unique(np.floor(lab / BIN).astype(np.int64), axis=0, return_inverse=True)
-    inverse = inverse.reshape(-1)
-    counts = np.bincount(inverse, minlength=len(cells))
-    sums = np.stack([np.bincount(inverse, lab[:, c], minlength=len(cells)) for c in range(3)], axis=1)
+    cells = np.floor(lab / BIN).astype(np.int64) @ np.array([1 << 20, 1 << 10, 1])  # a and b lie within ±2^9 cells
+    _, inverse, counts = np.unique(cells, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(inverse, lab[:, c], minlength=len(counts)) for c in range(3)], axis=1)
     top = np.argsort(-counts, kind="stable")[:PALETTE]
     out[: len(top), :3] = sums[top] / counts[top, None]
     out[: len(top), 3] = counts[top] / counts[top].sum()

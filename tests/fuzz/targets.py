@@ -525,9 +525,10 @@ def map_store() -> Target:
     loose = json.dumps({key: value for key, value in info.items() if key not in ("files", "sha256")}).encode()
     files = {f"sealed/{k}": v for k, v in sealed.items()} | {f"loose/{k}": v for k, v in sealed.items()}
     files["loose/map.json"] = loose
-    # Format version 1: cameras.npz tells which views were held out.
+    # Format version 1 without `views` in map.json: cameras.npz alone has them.
     old = {file.name: file.read_bytes() for file in (MAPS / "v1.gsmap").iterdir()}
-    facts = {key: value for key, value in json.loads(old["map.json"]).items() if key not in ("files", "sha256")}
+    left_out = ("files", "sha256", "views")
+    facts = {key: value for key, value in json.loads(old["map.json"]).items() if key not in left_out}
     old["map.json"] = json.dumps(facts).encode()
     files |= {f"old/{name}": raw for name, raw in old.items()}
     variants: list[tuple[str, Callable[[bytes], bytes], bytes]] = [
