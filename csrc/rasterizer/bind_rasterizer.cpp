@@ -130,6 +130,11 @@ struct Images {
   }
 };
 
+void throw_if(const perception::NonFinite &bad) {
+  if (bad.argument)
+    throw std::invalid_argument(std::string(bad.argument) + "[" + std::to_string(bad.index) + "] is not finite");
+}
+
 template <class T>
 std::unique_ptr<Handle<T>> forward(Arguments<T> &a, Images<T> images, Array<uint8_t> visible, Optional<T> radii,
                                    const std::string &simd) {
@@ -147,9 +152,35 @@ std::unique_ptr<Handle<T>> forward(Arguments<T> &a, Images<T> images, Array<uint
     nb::gil_scoped_release release;
     handle->frames = perception::rasterize_forward(in, opt, level, out, bad);
   }
-  if (bad.argument)
-    throw std::invalid_argument(std::string(bad.argument) + "[" + std::to_string(bad.index) + "] is not finite");
+  throw_if(bad);
   return handle;
+}
+
+template <class T>
+void label(Arguments<T> &a, Array<const int32_t> labels, double least, Array<int32_t> images, Array<uint8_t> visible,
+           const std::string &simd) {
+  const perception::Inputs<T> in = a.inputs();
+  const perception::Options opt = a.options(in);
+  const Level level = perception::parse_level(simd);
+  if (in.cameras != 1) throw std::invalid_argument("viewmats: expected one camera");
+  if (labels.ndim() != 2 || labels.shape(0) > perception::kMaxLabellings)
+    throw std::invalid_argument("labels: expected [L, N] with at most 8 labellings");
+  const int64_t count = static_cast<int64_t>(labels.shape(0));
+  perception::Labels found{};
+  found.count = static_cast<int>(count), found.least = least;
+  found.of = checked("labels", labels, {count, in.n});
+  found.images = checked("out images", images, {count, in.height, in.width});
+  uint8_t *seen = checked("out visible", visible, {in.n});
+  int32_t largest = -1;
+  for (int64_t i = 0; i < count * in.n; ++i) largest = std::max(largest, found.of[i]);
+  if (largest >= 1 << 24) throw std::invalid_argument("labels: expected less than 16777216");
+  found.most = largest + 1;
+  perception::NonFinite bad;
+  {
+    nb::gil_scoped_release release;
+    bad = perception::rasterize_labels(in, opt, level, found, seen);
+  }
+  throw_if(bad);
 }
 
 template <class T>
@@ -237,6 +268,8 @@ void bind(nb::module_ &m, const char *suffix) {
       "inputs"_a, "colors"_a.noconvert(), "alphas"_a.noconvert(), "depths"_a.noconvert().none(),
       "features"_a.noconvert().none(), "variance"_a.noconvert().none(), "visible"_a.noconvert(),
       "radii"_a.noconvert().none(), "simd"_a);
+  m.def(name("rasterize_labels").c_str(), &label<T>, "inputs"_a, "labels"_a.noconvert(), "least"_a,
+        "images"_a.noconvert(), "visible"_a.noconvert(), "simd"_a);
   m.def(
       name("rasterize_backward").c_str(),
       [](Arguments<T> &inputs, Handle<T> &frames, Array<T> colors, Array<T> alphas, Optional<T> depths,

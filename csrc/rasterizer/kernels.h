@@ -49,6 +49,7 @@ inline __attribute__((always_inline)) void with_shape(Slice slice, bool variance
 // backward: the records of one slice, of the tiles in a range; scratch.slots say where they go.
 // backward_features: the same where only the features' gradients are wanted (slice.alone).
 // add_records: adds them, `size` numbers each, to one sum a splat.
+// label_pixels: the images of labels, of one camera.
 // reduce: from one slice's records (see record_size) to gradients of the Gaussians and the camera.
 #define PERCEPTION_RASTERIZER_KERNELS                                                                              \
   template <class T>                                                                                               \
@@ -63,6 +64,9 @@ inline __attribute__((always_inline)) void with_shape(Slice slice, bool variance
   template <class T>                                                                                               \
   void backward_features(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Slice, TileRange,       \
                          Scratch<T> &, const Outputs<T> &, const Cotangents<T> &);                                 \
+  template <class T>                                                                                               \
+  void label_pixels(const Inputs<T> &, const Options &, const Frame<T> &, const Labels &, Scratch<T> &,            \
+                    uint8_t *visible);                                                                             \
   template <class T>                                                                                               \
   void add_records(const Options &, const Frame<T> &, int size, Scratch<T> &);                                     \
   template <class T>                                                                                               \

@@ -37,6 +37,7 @@ template <class T>
 struct Kernels {
   decltype(&baseline::project<T>) project;
   decltype(&baseline::forward<T>) forward;
+  decltype(&baseline::label_pixels<T>) label_pixels;
   decltype(&baseline::backward<T>) backward, backward_features;
   decltype(&baseline::add_records<T>) add_records;
   decltype(&baseline::reduce<T>) reduce;
@@ -45,10 +46,11 @@ struct Kernels {
 template <class T>
 Kernels<T> kernels(Level level) {
   if constexpr (std::is_same_v<T, double>)
-    return {baseline::project<T>, baseline::forward<T>, baseline::backward<T>, baseline::backward_features<T>,
-            baseline::add_records<T>, baseline::reduce<T>};
+    return {baseline::project<T>, baseline::forward<T>, baseline::label_pixels<T>, baseline::backward<T>,
+            baseline::backward_features<T>, baseline::add_records<T>, baseline::reduce<T>};
   else
     return {PERCEPTION_AT_LEVEL(level, project<T>), PERCEPTION_AT_LEVEL(level, forward<T>),
+            PERCEPTION_AT_LEVEL(level, label_pixels<T>),
             PERCEPTION_AT_LEVEL(level, backward<T>), PERCEPTION_AT_LEVEL(level, backward_features<T>),
             PERCEPTION_AT_LEVEL(level, add_records<T>), PERCEPTION_AT_LEVEL(level, reduce<T>)};
 }
@@ -239,6 +241,21 @@ FramesPtr<T> rasterize_forward(const Inputs<T> &in, const Options &opt, Level le
 }
 
 template <class T>
+NonFinite rasterize_labels(const Inputs<T> &in, const Options &opt, Level level, const Labels &labels,
+                           uint8_t *visible) {
+  NonFinite bad = check_cameras(in);
+  if (bad.argument) return bad;
+  const Kernels<T> k = kernels<T>(level);
+  const ScratchPtr<T> scratch = take_scratch<T>(opt.threads);
+  FramesPtr<T> frames(new Frames<T>{{}, level, in.n, in.width, in.height, {}});
+  frames->cameras.push_back(ObjectPool<Frame<T>>::get().take());
+  Frame<T> &f = *frames->cameras[0];
+  bad = prepare(k, in, 0, opt, f, *scratch, Outputs<T>{}, frames->stats);
+  if (!bad.argument) k.label_pixels(in, opt, f, labels, *scratch, visible);
+  return bad;
+}
+
+template <class T>
 void rasterize_backward(const Inputs<T> &in, const Options &opt, Frames<T> &frames, const Outputs<T> &out,
                         const Cotangents<T> &grad, const Gradients<T> &result) {
   const Kernels<T> k = kernels<T>(frames.level);
@@ -264,6 +281,7 @@ void release_memory() {
   template struct ScratchDelete<T>;                                                                                    \
   template struct FramesDelete<T>;                                                                                     \
   template FramesPtr<T> rasterize_forward(const Inputs<T> &, const Options &, Level, const Outputs<T> &, NonFinite &); \
+  template NonFinite rasterize_labels(const Inputs<T> &, const Options &, Level, const Labels &, uint8_t *);             \
   template void rasterize_backward(const Inputs<T> &, const Options &, Frames<T> &, const Outputs<T> &,                \
                                    const Cotangents<T> &, const Gradients<T> &);
 INSTANTIATE(float)

@@ -113,6 +113,16 @@ struct Options {
   int64_t max_records = 0;  // gradient records held at once; 0: 4 a splat, at least 2^20
 };
 
+constexpr int kMaxLabellings = 8;
+
+// Labellings of the Gaussians, and for each the image of the label with the largest weight in every pixel.
+struct Labels {
+  const int32_t *of;  // [L,N] -1 for none
+  int count, most;    // L; every label is below `most`
+  double least;       // weight that a label must exceed
+  int32_t *images;    // [L,H,W] -1 where none does
+};
+
 // Where the first non-finite value was found.
 struct NonFinite {
   const char *argument = nullptr;
@@ -143,6 +153,10 @@ FramesPtr<T> rasterize_forward(const Inputs<T> &, const Options &, Level, const 
 template <class T>
 void rasterize_backward(const Inputs<T> &, const Options &, Frames<T> &, const Outputs<T> &, const Cotangents<T> &,
                         const Gradients<T> &);
+
+// One camera's images of labels. visible: [N], zero on entry.
+template <class T>
+NonFinite rasterize_labels(const Inputs<T> &, const Options &, Level, const Labels &, uint8_t *visible);
 
 // Memory beyond the arrays passed in, all of it kept and reused: a splat takes 64 bytes and 4 for every 64x64-pixel
 // tile its box touches, of which there may be kMaxListed; a backward pass adds max_records records of 4 (16 + features)

@@ -22,6 +22,7 @@ struct Worker {
   int n = 0;
   Buffer<uint16_t> touched;                  // [n] pixels of some granule, 0 for none
   Buffer<T> records;                         // [n, record]
+  Buffer<int32_t> labels;                    // of the splats, and the sums they go to
   Buffer<T> tile;                            // per-pixel state
   uint64_t evaluated = 0, contributing = 0;  // pairs of the forward pass
 };

@@ -35,7 +35,7 @@ def evaluate_rendered(
         for view in views:
             pose = torch.from_numpy(view.camera_from_world.astype(np.float32))
             K = torch.from_numpy(view.K.astype(np.float32))
-            found = render_silhouettes(gaussians, ids, pose, K, view.width, view.height)
+            found = render_silhouettes(gaussians, [ids], pose, K, view.width, view.height)[0]
             yield found.ids, truths.label_image(view, found.ids)
 
     if not views:

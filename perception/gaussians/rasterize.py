@@ -13,6 +13,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -172,6 +173,27 @@ def rasterize_forward(inputs: tuple[Tensor | None, ...], background: Tensor | No
     except ValueError as error:
         raise InputError(f"rasterize: {error}") from None
     return out
+
+
+def label_images(
+    inputs: tuple[Tensor | None, ...], labels: np.ndarray, least: float, settings: Settings
+) -> tuple[np.ndarray, np.ndarray]:
+    """For each of up to 8 labellings, the label with the largest weight in every pixel of one camera (C = 1).
+
+    inputs: as for `rasterize_forward`. labels [L, N] int32, −1 = none, < 2^24. A label's weight in a pixel is the sum
+    of alpha · transmittance over its Gaussians. Of equal weights the smaller label wins. Returns images [L, H, W]
+    int32, −1 where no weight exceeds `least`, and [N] bool: whether each Gaussian contributes to some pixel.
+    """
+    means = inputs[0]
+    assert means is not None  # for the type checker
+    images = np.empty((len(labels), settings.height, settings.width), np.int32)
+    visible = np.zeros(len(means), np.uint8)
+    core = _core_function("rasterize_labels", means)
+    try:
+        core(_core_inputs(inputs, None, settings), np.ascontiguousarray(labels), least, images, visible, settings.simd)
+    except ValueError as error:
+        raise InputError(f"rasterize: {error}") from None
+    return images, visible.view(bool)
 
 
 def rasterize_backward(

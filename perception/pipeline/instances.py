@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from perception import _core
 from perception.boxes import oriented_box
 from perception.config import LanguageConfig, MapConfig
 from perception.gaussians.model import Gaussians
@@ -87,7 +88,10 @@ def describe(
     if grouped is None:
         report = {"warnings": ["no photo has masks"]}
         return FoundInstances(np.full(count, -1, np.int32), np.zeros(count, np.float32), report=report)
-    seen = _silhouettes(gaussians, grouped.ids, views, "silhouettes", progress) if grouped.count else []
+    local = np.where(grouped.part_ids >= 0, grouped.part_ids - grouped.count, -1).astype(np.int32)
+    together = np.append(grouped.groups, -1).astype(np.int32)
+    levels = [grouped.ids, local, together[grouped.ids] if len(grouped.group_scores) else np.full_like(local, -1)]
+    seen, parts_seen, groups_seen = _silhouettes(gaussians, levels, views, progress) if grouped.count else ([], [], [])
     found = FoundInstances(grouped.ids, grouped.membership, _entries(grouped, gaussians, seen))
     if encoder is not None and grouped.count:
         found.language = _embed(encoder, grouped.ids, seen, views, words.views, words.zooms, progress)
@@ -96,19 +100,17 @@ def describe(
         texts = read_texts(reader, choices, lambda n: _shown(views[n], seen[n]), progress)
         store_texts(found.instances, texts)
 
-    def language_of(ids: np.ndarray, what: str) -> dict[str, np.ndarray]:
+    def language_of(ids: np.ndarray, seen: list[Silhouettes]) -> dict[str, np.ndarray]:
         if encoder is None:
             return {}
-        seen = _silhouettes(gaussians, ids, views, f"silhouettes of {what}", progress)
         arrays = _embed(encoder, ids, seen, views, min(2, words.views), 1, progress)
         return {PART + name: array for name, array in arrays.items()}
 
     if grouped.parents:
-        local = np.where(grouped.part_ids >= 0, grouped.part_ids - grouped.count, -1).astype(np.int32)
-        found.parts = {"ids": grouped.part_ids, **language_of(local, "parts")}
+        found.parts = {"ids": grouped.part_ids, **language_of(local, parts_seen)}
     if len(grouped.group_scores):
-        of = np.append(grouped.groups, -1).astype(np.int32)
-        found.groups = {"of": of[:-1], "scores": grouped.group_scores, **language_of(of[grouped.ids], "groups")}
+        language = language_of(levels[2], groups_seen)
+        found.groups = {"of": together[:-1], "scores": grouped.group_scores, **language}
     found.report = {
         "count": grouped.count,
         "parts": len(grouped.parents),
@@ -122,22 +124,20 @@ def describe(
 
 
 def _silhouettes(
-    gaussians: Gaussians, ids: np.ndarray, views: list[TrainingView], what: str, progress: Progress
-) -> list[Silhouettes]:
+    gaussians: Gaussians, levels: list[np.ndarray], views: list[TrainingView], progress: Progress
+) -> list[list[Silhouettes]]:
+    """Of each level, the silhouettes of all views."""
     seen = []
     for done, view in enumerate(views, start=1):
         height, width = view.photo.shape[:2]
         K, eps2d = view.K, view.eps2d
         if max(height, width) >= HALVED_FROM:  # as in `TrainingView.halved`
-            height, width, K, eps2d = (
-                height // 2,
-                width // 2,
-                K * torch.tensor([[0.5], [0.5], [1.0]]),
-                (eps2d + 0.25) / 4,
-            )
-        seen.append(render_silhouettes(gaussians, ids, view.camera_from_world, K, width, height, eps2d=eps2d))
-        progress.update(what, done, len(views))
-    return seen
+            height, width, eps2d = height // 2, width // 2, (eps2d + 0.25) / 4
+            K = K * torch.tensor([[0.5], [0.5], [1.0]])
+        seen.append(render_silhouettes(gaussians, levels, view.camera_from_world, K, width, height, eps2d=eps2d))
+        progress.update("silhouettes", done, len(views))
+    _core.rasterizer_release_memory()  # hundreds of MiB, next to which the encoder's activations would lie
+    return [list(level) for level in zip(*seen, strict=True)]
 
 
 def _shown(view: TrainingView, seen: Silhouettes) -> tuple[np.ndarray, np.ndarray]:

@@ -110,7 +110,7 @@ def _picture(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarr
     pose = torch.from_numpy(view.camera_from_world.astype(np.float32))
     K = torch.from_numpy(view.K.astype(np.float32))
     if kind == "instances":
-        found = render_silhouettes(gaussians, gmap.instance_ids, pose, K, view.width, view.height)
+        found = render_silhouettes(gaussians, [gmap.instance_ids], pose, K, view.width, view.height)[0]
         return (found.ids + 1).astype(np.uint16)
     if kind == "depth":
         depth = depth_image(gaussians, pose, K, view.width, view.height)

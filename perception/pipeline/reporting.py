@@ -192,7 +192,7 @@ class _Album:
 
     def _ids(self, name: str) -> np.ndarray:
         """[h, w] instance ids rendered from the camera of the photo, −1 = none."""
-        return render_silhouettes(self.gaussians, self.gmap.instance_ids, *self._camera(name)).ids
+        return render_silhouettes(self.gaussians, [self.gmap.instance_ids], *self._camera(name))[0].ids
 
     def features(self, name: str) -> np.ndarray:
         """[h, w, 3] uint8: rendered features, first three principal components as RGB."""

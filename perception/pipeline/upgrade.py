@@ -136,7 +136,7 @@ def _shown(
     def load(n: int) -> tuple[np.ndarray, np.ndarray]:
         view = training_view(located[n], side)
         height, width = view.photo.shape[:2]
-        seen = render_silhouettes(gaussians, positions, view.camera_from_world, view.K, width, height)
+        seen = render_silhouettes(gaussians, [positions], view.camera_from_world, view.K, width, height)[0]
         return view.photo.numpy(), seen.ids
 
     return [np.array([number[name] for name in d.views], np.int64) for d in descriptions], load

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -107,6 +108,32 @@ def test_stored_gradients_are_those_of_logarithms_and_logits_in_visible_rows(dim
             torch.testing.assert_close(ours[seen], expected[seen], rtol=1e-8, atol=atol, msg=name)
             assert (ours[~seen] == 7).all()
     assert (stored[7][0][~seen] == 7).all() and (stored[7][0][seen] != 7).any()
+
+
+def test_label_images_are_the_largest_sums_of_the_naive_rasterizer():
+    from perception.gaussians.rasterize import Settings, label_images, simd_levels
+
+    count, width, height, least = 90, 70, 45, 0.2
+    given = scene(n=count, width=width, height=height, dims=0, cameras=1)
+    names = ("means", "quats", "scales", "opacities", "colors", "features", "viewmats", "Ks")
+    rng = np.random.default_rng(5)
+    labels = np.stack([rng.integers(-1, 40, count), rng.integers(-1, 3, count), np.full(count, -1)]).astype(np.int32)
+    one_hot = torch.from_numpy(labels[:2, :, None] == np.arange(40)).permute(1, 0, 2).reshape(count, 80).double()
+    naive = reference.rasterize(**{**given, "features": one_hot})
+    sums = naive["features"][0].reshape(height, width, 2, 40).permute(2, 0, 1, 3)
+    best, expected = sums.max(dim=-1)
+    expected = torch.where(best > least, expected, -1)
+    clear = (best - sums.topk(2, dim=-1).values[..., 1] > 1e-5) | (best < least)  # of sums in other orders too
+    clear &= (best - least).abs() > 1e-5
+    assert clear.double().mean() > 0.9 and len(torch.unique(expected)) > 20
+    images, visible = label_images([given.get(name) for name in names], labels, least, Settings(width, height))
+    assert (images[2] == -1).all() and np.array_equal(visible, naive["visible"][0].numpy())
+    assert torch.equal(torch.from_numpy(images[:2]).long()[clear], expected[clear])
+    single = [None if given.get(name) is None else given[name].float() for name in names]
+    for simd in simd_levels():
+        for threads in (1, 3):
+            found, _ = label_images(single, labels, least, Settings(width, height, threads=threads, simd=simd))
+            assert torch.equal(torch.from_numpy(found[:2]).long()[clear], expected[clear]), simd
 
 
 def test_same_bits_for_any_number_of_threads():

@@ -64,7 +64,7 @@ def make_scene(
     views = []
     for number, (eye, target) in enumerate(cameras):
         pose = torch.from_numpy(look_at(np.asarray(eye, float), np.asarray(target, float)).astype(np.float32))
-        seen = render_silhouettes(gaussians, truth, pose, K, width, height, threshold=0.5).ids
+        seen = render_silhouettes(gaussians, [truth], pose, K, width, height, threshold=0.5)[0].ids
         names = np.concatenate([[0], 1 + rng.permutation(len(centres))]).astype(np.int32)
         photo = torch.zeros((height, width, 3), dtype=torch.uint8)
         views.append(TrainingView(f"{number:03d}.jpg", photo, torch.from_numpy(names[seen + 1]), K, pose))

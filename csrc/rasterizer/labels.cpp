@@ -1,0 +1,139 @@
+// Every pixel's label of largest weight, for several labellings of the Gaussians at once. A label's weight in a pixel is
+// the sum of the weights of its Gaussians there, so one pass serves any number of labels.
+#include "blend_list.h"
+#include "matrix.h"
+
+namespace perception::PERCEPTION_LEVEL {
+namespace {
+
+constexpr int kPixels = 16 * 16;  // of a tile, granule by granule
+
+// Where the splats of a 64x64 tile add their weights. Arrays in the worker's memory, refilled for every 16x16 tile but
+// for `own`.
+struct Slots {
+  int32_t *own;    // [L, n] label of every splat
+  int32_t *place;  // [L, n] slot of every splat in the tile's list, -1 without a label
+  int32_t *slot;   // [most] slot of every label, -1 for none yet
+  int32_t *name;   // [slots] label of every slot
+  int begin[kMaxLabellings + 1];  // first slot of every labelling
+};
+
+template <class T>
+Slots load_labels(const Labels &labels, int64_t n, Worker<T> &w) {
+  const std::size_t size = static_cast<std::size_t>(labels.count) * w.n, most = labels.most;
+  int32_t *memory = w.labels.reserve(2 * size + (labels.count + 1) * most + 1);
+  const Slots slots{memory, memory + size, memory + 2 * size, memory + 2 * size + most, {}};
+  for (int l = 0; l < labels.count; ++l)
+    for (int j = 0; j < w.n; ++j) slots.own[l * w.n + j] = labels.of[l * n + w.splats[j].id];
+  return slots;
+}
+
+// Numbers the labels of the tile's list in the order in which they appear.
+template <class T>
+void number_labels(const Labels &labels, const Worker<T> &w, const uint32_t *list, int n, Slots &slots) {
+  int used = 0;
+  for (int l = 0; l < labels.count; ++l) {
+    slots.begin[l] = used;
+    std::memset(slots.slot, -1, labels.most * sizeof(int32_t));
+    for (int i = 0; i < n; ++i) {
+      const int32_t label = slots.own[l * w.n + list[i]];
+      if (label >= 0 && slots.slot[label] < 0) slots.slot[label] = used, slots.name[used++] = label;
+      slots.place[l * w.n + list[i]] = label < 0 ? -1 : slots.slot[label];
+    }
+  }
+  slots.begin[labels.count] = used;
+}
+
+// (x, y): the 16x16 tile relative to its 64x64 tile. open: granules with a pixel in the image. sums: [slots, 16, 16].
+template <class T>
+void sum_weights(const Labels &labels, Worker<T> &w, int x, int y, const uint32_t *list, int n, uint32_t open,
+                 const Slots &slots, ColorTile<T, true> &tile, T *sums) {
+  constexpr int kChunk = ColorTile<T, true>::kChunk;
+  for (int begin = 0; begin < n && open; begin += kChunk) {
+    list_granules(w, x, y, list, begin, n < begin + kChunk ? n : begin + kChunk, tile.lists[0], kChunk + 32,
+                  tile.counts);
+    for (uint32_t rest = open; rest; rest &= rest - 1) {
+      const int g = __builtin_ctz(rest), count = static_cast<int>(tile.counts[g]);
+      if (!count) continue;
+      bool still_open = false;
+      for (int lane = 0; lane < 16; lane += Pack<T>::kLanes) still_open |= blend_list<false>(w, count, g, lane, tile);
+      for (int k = 0; k < count; ++k) {
+        const auto weights = load_channels<16>(tile.weights[k], 16);
+        for (int l = 0; l < labels.count; ++l) {
+          const int32_t place = slots.place[l * w.n + tile.lists[g][k]];
+          if (place < 0) continue;
+          T *sum = sums + place * kPixels + 16 * g;
+          store_channels(load_channels<16>(sum, 16) + weights, sum, 16);
+        }
+      }
+      if (!still_open) open &= ~(1u << g);
+    }
+  }
+}
+
+// (x, y): of the tile in the image. Of equal weights the smaller label wins.
+template <class T>
+void write_labels(const Inputs<T> &in, const Labels &labels, int x, int y, const Slots &slots, const T *sums) {
+  for (int l = 0; l < labels.count; ++l) {
+    T best[kPixels];
+    int32_t label[kPixels];
+    for (int p = 0; p < kPixels; ++p) best[p] = T(labels.least), label[p] = -1;
+    for (int s = slots.begin[l]; s < slots.begin[l + 1]; ++s) {
+      const T *sum = sums + static_cast<std::size_t>(s) * kPixels;
+      const int32_t name = slots.name[s];
+      for (int p = 0; p < kPixels; ++p) {
+        const bool wins = sum[p] > best[p] || (sum[p] == best[p] && name < label[p]);
+        best[p] = wins ? sum[p] : best[p], label[p] = wins ? name : label[p];
+      }
+    }
+    for (int row = 0; row < 16 && y + row < in.height; ++row)
+      for (int i = 0; i < 16 && x + i < in.width; ++i)
+        labels.images[(static_cast<int64_t>(l) * in.height + y + row) * in.width + x + i] =
+            label[((row >> 2) * 4 + (i >> 2)) * 16 + (row & 3) * 4 + (i & 3)];
+  }
+}
+
+template <class T>
+void label_supertile(const Inputs<T> &in, const Frame<T> &f, int index, const Labels &labels, Worker<T> &w,
+                     uint8_t *visible) {
+  using Tile = ColorTile<T, true>;
+  load_supertile<0, 0>(in, f, index, Slice{0, 0, false}, w);
+  std::memset(w.touched.reserve(w.n + 1), 0, w.n * sizeof(uint16_t));
+  Tile &tile = *reinterpret_cast<Tile *>(w.tile.reserve(sizeof(Tile) / sizeof(T) + 1));
+  Slots slots = load_labels(labels, in.n, w);
+  const int x0 = index % f.tiles_x * 64, y0 = index / f.tiles_x * 64;
+  for (int q = 0; q < 16; ++q) {
+    const int x = (q & 3) * 16, y = (q >> 2) * 16, n = static_cast<int>(w.counts[q]);
+    if (x0 + x >= in.width || y0 + y >= in.height) continue;
+    const uint32_t *list = w.lists.data() + q * static_cast<std::size_t>(w.stride);
+    number_labels(labels, w, list, n, slots);
+    const std::size_t size = static_cast<std::size_t>(slots.begin[labels.count]) * kPixels;
+    T *sums = w.records.reserve(size + 1);
+    std::memset(sums, 0, size * sizeof(T));
+    const uint32_t open = start_tile(in, x0, y0, x, y, tile);
+    sum_weights(labels, w, x, y, list, n, open, slots, tile, sums);
+    write_labels(in, labels, x0 + x, y0 + y, slots, sums);
+  }
+  for (int j = 0; j < w.n; ++j)
+    if (w.touched[j]) __atomic_store_n(&visible[w.splats[j].id], 1, __ATOMIC_RELAXED);
+}
+
+}  // namespace
+
+template <class T>
+void label_pixels(const Inputs<T> &in, const Options &opt, const Frame<T> &f, const Labels &labels, Scratch<T> &scratch,
+                  uint8_t *visible) {
+  parallel_for(opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
+    label_supertile(in, f, f.tile_order[i], labels, scratch.workers[worker], visible);
+  });
+}
+
+#define INSTANTIATE(T)                                                                                       \
+  template void label_pixels(const Inputs<T> &, const Options &, const Frame<T> &, const Labels &, Scratch<T> &, \
+                             uint8_t *);
+INSTANTIATE(float)
+#ifdef PERCEPTION_LEVEL_baseline
+INSTANTIATE(double)
+#endif
+
+}  // namespace perception::PERCEPTION_LEVEL
