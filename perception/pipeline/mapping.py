@@ -117,7 +117,8 @@ def build_map(
         # Optimise colours and features together: L_RGB + λ_inst2d L_inst2d + λ_var L_var (§3.1 to 3.2.3, eq. 14).
         with stages("train"):
             trainer.run(observer)
-        gaussians = trainer.gaussians
+        gaussians, trained = trainer.gaussians, trainer.record
+        del trainer, observer, mask_source, depth  # with the optimiser's moments and the photos' depth
 
         # Group the Gaussians by their features into instances (§3.2.1), describe these from their best views (§3.2.2).
         with stages("instances"):
@@ -139,7 +140,7 @@ def build_map(
             "scene": {key: fact for key, fact in scene.report.items() if key not in FRAME_FACTS},
             "masks": mask_report,
             "depth": depth_used(views),
-            "training": vars(trainer.record),
+            "training": vars(trained),
             "instances": found.report,
             "quality": quality,
             "seconds": {**stages.seconds, "total": round(time.monotonic() - started, 2)},
