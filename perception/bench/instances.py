@@ -19,7 +19,9 @@ from perception.types import PointCloud
 
 
 def read_scene(scene: Path) -> dict[str, Any]:
-    """The content of scene.json, which a scene with truth holds. Raises InputError when the file is missing."""
+    """The content of scene.json. Raises InputError when the file is missing."""
+    if not (scene / "scene.json").is_file():
+        raise InputError(f"{scene}: no scene.json there; expected the folder of a scene with truth")
     return dict(read_json(scene / "scene.json"))
 
 
