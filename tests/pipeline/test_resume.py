@@ -66,7 +66,7 @@ def test_at_most_seven_frames_from_main_to_the_loss(
     words = ["map", str(small_scene / "transforms.json"), "-o", str(tmp_path / "m.gsmap")]
     words += [f"--set={pair}" for pair in [*SETTINGS, f"masks=labels:{small_scene / 'labels'}"]]
     assert main(words) == 2
-    assert found[0] == ["photometric", "step", "run", "build_map", "_map", "main"]
+    assert found[0] == ["photometric", "_losses", "step", "run", "build_map", "_map", "main"]
 
 
 @pytest.mark.parametrize(
