@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -93,12 +94,13 @@ def describe(
     levels = [grouped.ids, local, together[grouped.ids] if len(grouped.group_scores) else np.full_like(local, -1)]
     seen, parts_seen, groups_seen = _silhouettes(gaussians, levels, views, progress) if grouped.count else ([], [], [])
     found = FoundInstances(grouped.ids, grouped.membership, _entries(grouped, gaussians, seen))
-    if encoder is not None and grouped.count:
-        found.language = _embed(encoder, grouped.ids, seen, views, words.views, words.zooms, progress)
     if reader is not None and grouped.count:
         choices = _best_views(grouped.ids, seen, words.views)
-        texts = read_texts(reader, choices, lambda n: _shown(views[n], seen[n]), progress)
+        # The networks of the copy are freed with it, before the encoder needs as much memory.
+        texts = read_texts(copy(reader), choices, lambda n: _shown(views[n], seen[n]), progress)
         store_texts(found.instances, texts)
+    if encoder is not None and grouped.count:
+        found.language = _embed(encoder, grouped.ids, seen, views, words.views, words.zooms, progress)
 
     def language_of(ids: np.ndarray, seen: list[Silhouettes]) -> dict[str, np.ndarray]:
         if encoder is None:
