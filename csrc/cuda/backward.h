@@ -114,7 +114,7 @@ static __device__ inline bool sum_warps(const WarpMemory *warps, int j, int c, c
 // records [slots, kRecord], zero on entry: a splat's sums over one tile, of h, h u, h dy, h u², h u dy, h dy², w g_rgb,
 // w g_z and w times the gradient with respect to each feature.
 extern "C" __global__ void __launch_bounds__(kThreads)
-    backward_kernel(Scene scene, Strip strip, Lists lists, Images images, Cotangents grad, T *records) {
+    backward_kernel(Scene scene, Strip strip, Lists lists, Images images, Cotangents grad, Results records) {
   __shared__ WarpMemory warps[kWarps];
   __shared__ SHARED(T) splats[kGroup][kSplat];
   __shared__ SHARED(T) features[kGroup][kFeatures];  // less the shift
@@ -132,8 +132,7 @@ extern "C" __global__ void __launch_bounds__(kThreads)
     if (!__syncthreads_or(open)) break;  // also: the last group's sums have been read
     const int n = end - at < kGroup ? static_cast<int>(end - at) : kGroup;
     for (int i = threadIdx.x; i < n * kSplat; i += kThreads)
-      splats[i / kSplat][i % kSplat] =
-          reinterpret_cast<const T *>(strip.splats + lists.ids[at + i / kSplat])[i % kSplat];
+      splats[i / kSplat][i % kSplat] = splat_number(strip, lists.ids[at + i / kSplat], i % kSplat);
     for (int i = threadIdx.x; i < n * NF; i += kThreads)
       features[i / kFeatures][i % kFeatures] =
           scene.features[static_cast<Index>(lists.ids[at + i / kFeatures]) * scene.dims + i % kFeatures] -

@@ -7,7 +7,8 @@
 #ifndef __CUDACC__
 #include "emulate.h"
 #else
-#define SHARED(Type) Type  // the emulator tracks who reads and writes the elements
+#define SHARED(Type) Type    // the emulator tracks who reads and writes the elements
+#define GLOBAL(Type) Type *  // and checks that they lie within the arrays given
 #endif
 #include "constants.h"
 #include "projection_math.h"
@@ -17,6 +18,8 @@ namespace perception {
 
 using T = REAL;
 using Index = long long;
+using Reals = GLOBAL(const T);
+using Results = GLOBAL(T);
 
 constexpr int kWarp = 32, kThreads = 256, kWarps = kThreads / kWarp;
 constexpr int kTile = 16;                             // pixels; a thread block works on one tile
@@ -43,7 +46,7 @@ struct Box {
 
 // The Gaussians (rasterizer.h has the shapes) and one camera. features: this slice's first channel, in rows of `dims`.
 struct Scene {
-  const T *means, *quats, *scales, *opacities, *colors, *features, *viewmat, *K, *background;
+  Reals means, quats, scales, opacities, colors, features, viewmat, K, background;
   int n, sh_degree, sh_stride, dims, width, height;
   T near_plane, eps2d;
 };
@@ -51,42 +54,43 @@ struct Scene {
 // Written by project_kernel. depths is infinite and radii zero on entry; first_bad: N on entry, then the lowest index
 // of a Gaussian with a parameter that is not finite, or -1 if the camera has one.
 struct Projection {
-  Splat *splats;
-  Box *boxes;
-  T *depths, *radii;
-  int *first_bad;
+  GLOBAL(Splat) splats;
+  GLOBAL(Box) boxes;
+  Results depths, radii;
+  GLOBAL(int) first_bad;
 };
 
 // Tile rows [first_row, end_row) of the image. Memory that grows with the number of (Gaussian, tile) pairs is held for
 // one strip at a time.
 struct Strip {
-  const Splat *splats;
-  const Box *boxes;
-  const int *front_to_back;  // [N] Gaussians by depth
-  const Index *ends;         // [N] end of their slots, in that order; a Gaussian has a slot for every tile it touches
+  GLOBAL(const Splat) splats;
+  GLOBAL(const Box) boxes;
+  GLOBAL(const int) front_to_back;  // [N] Gaussians by depth
+  GLOBAL(const Index) ends;  // [N] end of their slots, in that order; a Gaussian has a slot for every tile it touches
   int n, first_row, end_row, tiles_x;
 };
 
 // The splats of tile t of the strip, front to back: ids[starts[t]] to ids[starts[t + 1] - 1], and their slots.
 struct Lists {
-  const int *ids;
-  const Index *slots, *starts;
+  GLOBAL(const int) ids;
+  GLOBAL(const Index) slots;
+  GLOBAL(const Index) starts;
 };
 
 // Of one camera, channels last. colors, alphas, depths and visible are null but for the first slice.
 struct Images {
-  T *colors, *alphas, *depths, *features, *variance;
-  unsigned char *visible;  // [N]
+  Results colors, alphas, depths, features, variance;
+  GLOBAL(unsigned char) visible;  // [N]
 };
 
 // dL/d(image); null means zero.
 struct Cotangents {
-  const T *colors, *alphas, *depths, *features, *variance;
+  Reals colors, alphas, depths, features, variance;
 };
 
 // dL/d(input), added to what is there; null where not wanted. camera: [N,12] each Gaussian's dL/dR, dL/dt.
 struct Gradients {
-  T *means, *quats, *scales, *opacities, *colors, *features, *camera, *mean2d;
+  Results means, quats, scales, opacities, colors, features, camera, mean2d;
 };
 
 static __device__ inline T lower(T a, T b) { return a < b ? a : b; }
@@ -109,6 +113,11 @@ static __device__ inline float fast_ratio(float x, float y) { return __fdividef(
 inline float fast_exp2(float x) { return exp2(x); }
 inline float fast_ratio(float x, float y) { return x / y; }
 #endif
+
+// Number c of a Gaussian's splat.
+static __device__ inline T splat_number(const Strip &strip, int id, int c) {
+  return reinterpret_cast<const T *>(&strip.splats[id])[c];
+}
 
 static __device__ inline Splat read_splat(const SHARED(T) * v) {
   return {v[0], v[1], v[2], v[3], v[4], v[5], {v[6], v[7], v[8]}, v[9], v[10], v[11]};

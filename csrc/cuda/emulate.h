@@ -4,7 +4,10 @@
 //   - every element of shared memory (SHARED): read before it was written in this block, or touched by two threads, one
 //     of them writing, with no barrier between. Only __syncthreads and __syncwarp order memory; ballots and shuffles do
 //     not. So a missing barrier is found in any order of the lanes.
-// Not modelled: the memory of other blocks, caches, timing, the hardware's approximate functions.
+//   - every element of an array in global memory (GLOBAL): outside of the arrays that emulator_memory was told of.
+//   Reads
+//     by the headers shared with the CPU are not checked.
+// Not modelled: races between blocks, caches, timing, the hardware's approximate functions.
 #pragma once
 #include <setjmp.h>
 #include <ucontext.h>
@@ -15,6 +18,8 @@
 #include <cstdio>
 #include <cstring>
 #include <functional>
+#include <iterator>
+#include <map>
 #include <utility>
 #include <vector>
 
@@ -23,6 +28,7 @@
 #define __launch_bounds__(...)
 #define __shared__ static
 #define SHARED(Type) emulation::Tracked<Type>
+#define GLOBAL(Type) emulation::Global<Type>
 using std::exp2;
 using std::fma;
 using std::log2;
@@ -194,6 +200,47 @@ class Tracked {
  private:
   V value_;
   mutable Accesses accesses_;
+};
+
+inline std::map<uintptr_t, uintptr_t> memory;  // begin -> end of the arrays given; none: nothing is checked
+
+inline void check_inside(const void *at, std::size_t size) {
+  if (memory.empty()) return;
+  const uintptr_t begin = reinterpret_cast<uintptr_t>(at);
+  const auto after = memory.upper_bound(begin);
+  if (after == memory.begin() || begin + size > std::prev(after)->second)
+    fail("accesses memory outside of the arrays given");
+}
+
+// Arrays that lay there before are gone.
+inline void give_memory(uintptr_t begin, uintptr_t end) {
+  auto at = memory.lower_bound(begin);
+  if (at != memory.begin() && std::prev(at)->second > begin) --at;
+  while (at != memory.end() && at->first < end) at = memory.erase(at);
+  memory[begin] = end;
+}
+
+// A pointer to global memory.
+template <class V>
+class Global {
+ public:
+  Global() = default;
+  Global(std::nullptr_t) : at_(nullptr) {}
+  template <class W>
+  Global(Global<W> other) : at_(other) {}  // to const
+  V &operator[](long long i) const {
+    check_inside(at_ + i, sizeof(V));
+    return at_[i];
+  }
+  Global operator+(long long i) const {
+    Global moved;
+    moved.at_ = at_ + i;
+    return moved;
+  }
+  operator V *() const { return at_; }
+
+ private:
+  V *at_;
 };
 
 inline void run_fiber() {

@@ -34,6 +34,7 @@ enum Result { kSuccess = 0, kInvalidImage = 200, kNotFound = 500, kLaunchFailed 
 
 extern "C" {
 void emulator_lane_order(uint64_t order) { lane_order = order; }
+void emulator_memory(uint64_t begin, uint64_t bytes) { emulation::give_memory(begin, begin + bytes); }
 int emulator_struct_size(int which) {
   using namespace perception;
   const int sizes[] = {sizeof(Scene),  sizeof(Projection), sizeof(Strip),    sizeof(Lists),

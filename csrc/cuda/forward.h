@@ -50,8 +50,7 @@ extern "C" __global__ void __launch_bounds__(kThreads)
     if (!__syncthreads_or(open)) break;  // also: the last batch has been read
     const int n = end - at < kBatch ? static_cast<int>(end - at) : kBatch;
     for (int i = threadIdx.x; i < n * kSplat; i += kThreads)
-      splats[i / kSplat][i % kSplat] =
-          reinterpret_cast<const T *>(strip.splats + lists.ids[at + i / kSplat])[i % kSplat];
+      splats[i / kSplat][i % kSplat] = splat_number(strip, lists.ids[at + i / kSplat], i % kSplat);
     for (int i = threadIdx.x; i < n * NF; i += kThreads)
       features[i / kFeatures][i % kFeatures] =
           scene.features[static_cast<Index>(lists.ids[at + i / kFeatures]) * scene.dims + i % kFeatures];

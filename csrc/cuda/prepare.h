@@ -5,7 +5,8 @@
 namespace perception {
 
 // 0 if all are finite, else NaN.
-static __device__ inline T finite_sum(const T *values, Index n) {
+template <class Values>
+static __device__ inline T finite_sum(Values values, Index n) {
   T sum = 0;
   for (Index i = 0; i < n; ++i) sum += values[i] * T(0);
   return sum;
@@ -30,8 +31,8 @@ static __device__ inline void set_color(const Scene &scene, const Camera<T> &cam
     for (int c = 0; c < 3; ++c) rgb[c] = scene.colors[3 * i + c];
   } else {
     T v[3];
-    view_vector(cam, scene.means + 3 * i, v);
-    sh_color(scene.sh_degree, v, scene.colors + 3 * i * scene.sh_stride, rgb);
+    view_vector<T>(cam, scene.means + 3 * i, v);
+    sh_color<T>(scene.sh_degree, v, scene.colors + 3 * i * scene.sh_stride, rgb);
   }
 }
 
@@ -40,7 +41,7 @@ extern "C" __global__ void __launch_bounds__(kThreads) project_kernel(Scene scen
   const Index i = static_cast<Index>(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= scene.n) return;
   out.boxes[i] = {0, 0, -1, -1};
-  const T *m = scene.means + 3 * i, *q = scene.quats + 4 * i, *scales = scene.scales + 3 * i;
+  const Reals m = scene.means + 3 * i, q = scene.quats + 4 * i, scales = scene.scales + 3 * i;
   const T opacity = scene.opacities[i];
   const int color_width = scene.sh_degree < 0 ? 3 : 3 * scene.sh_stride;
   const T sum = finite_sum(m, 3) + finite_sum(q, 4) + finite_sum(scales, 3) + finite_sum(&opacity, 1) +
@@ -56,7 +57,7 @@ extern "C" __global__ void __launch_bounds__(kThreads) project_kernel(Scene scen
     atomicMin(out.first_bad, -1);
   const Camera<T> cam =
       make_camera<T>(scene.viewmat, scene.K, scene.width, scene.height, scene.near_plane, scene.eps2d);
-  const Projected<T> p = project(cam, m, q, scales);
+  const Projected<T> p = project<T>(cam, m, q, scales);
   if (!(p.z > cam.near_plane && opacity >= T(1) / 255 && p.var_x - p.var_x == 0)) return;
   Splat s;
   s.x = p.x, s.y = p.y, s.z = p.z;
@@ -92,7 +93,7 @@ static __device__ inline int touched_tile(const Strip &strip, const Splat &s, co
 
 // Visits the tiles that Gaussian `id` (-1: none) touches, the whole warp those of Gaussians with many. Returns how many
 // there are; where `tiles` is given they are written from `slot` on.
-static __device__ inline int list_tiles(const Strip &strip, int id, Index slot, int *tiles, int *ids) {
+static __device__ inline int list_tiles(const Strip &strip, int id, Index slot, GLOBAL(int) tiles, GLOBAL(int) ids) {
   const int lane = threadIdx.x % kWarp;
   const TileBox own = id < 0 ? TileBox{0, 0, 0, 0} : tiles_of(strip, id);
   int found = 0;
@@ -124,14 +125,14 @@ static __device__ inline int list_tiles(const Strip &strip, int id, Index slot, 
 }
 
 // A thread a Gaussian, by depth: how many tiles of the strip it touches.
-extern "C" __global__ void __launch_bounds__(kThreads) count_kernel(Strip strip, int *counts) {
+extern "C" __global__ void __launch_bounds__(kThreads) count_kernel(Strip strip, GLOBAL(int) counts) {
   const Index rank = static_cast<Index>(blockIdx.x) * kThreads + threadIdx.x;
   const int found = list_tiles(strip, rank < strip.n ? strip.front_to_back[rank] : -1, 0, nullptr, nullptr);
   if (rank < strip.n) counts[rank] = found;
 }
 
 // Which tiles these are, and whose.
-extern "C" __global__ void __launch_bounds__(kThreads) emit_kernel(Strip strip, int *tiles, int *ids) {
+extern "C" __global__ void __launch_bounds__(kThreads) emit_kernel(Strip strip, GLOBAL(int) tiles, GLOBAL(int) ids) {
   const Index rank = static_cast<Index>(blockIdx.x) * kThreads + threadIdx.x;
   const bool some = rank < strip.n;
   list_tiles(strip, some ? strip.front_to_back[rank] : -1, some && rank ? strip.ends[rank - 1] : 0, tiles, ids);

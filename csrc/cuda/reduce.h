@@ -5,14 +5,14 @@
 
 namespace perception {
 
-static __device__ inline void add_records(const T *records, Index begin, Index end, Index step, T *sum) {
+static __device__ inline void add_records(Reals records, Index begin, Index end, Index step, T *sum) {
   for (int c = 0; c < kRecord; ++c) sum[c] = 0;
   for (Index slot = begin; slot < end; slot += step)
     for (int c = 0; c < kRecord; ++c) sum[c] += records[slot * kRecord + c];
 }
 
 // Sum of the records [begin, end), in an order that depends on their number alone.
-static __device__ inline void sum_records(const T *records, Index begin, Index end, T *sum) {
+static __device__ inline void sum_records(Reals records, Index begin, Index end, T *sum) {
   const int lane = threadIdx.x % kWarp;
   const bool wide = end - begin > kWide;
   add_records(records, begin, wide ? begin : end, 1, sum);
@@ -41,7 +41,7 @@ static __device__ inline ProjectedGrad<T> picture_gradient(const Splat &s, const
 
 // Colours, or harmonics and the direction they are seen from (which moves the mean and the camera).
 static __device__ inline void color_gradient(const Scene &scene, const Camera<T> &cam, Index i, const Splat &s,
-                                             const T *g_rgb, T *out, T *g_mean, T *g_R, T *g_t) {
+                                             const T *g_rgb, Results out, T *g_mean, T *g_R, T *g_t) {
   if (scene.sh_degree < 0) {
     if (out)
       for (int c = 0; c < 3; ++c) out[3 * i + c] += g_rgb[c];
@@ -49,23 +49,24 @@ static __device__ inline void color_gradient(const Scene &scene, const Camera<T>
   }
   T v[3], gv[3], gated[3];
   for (int c = 0; c < 3; ++c) gated[c] = s.rgb[c] > 0 ? g_rgb[c] : T(0);
-  view_vector(cam, scene.means + 3 * i, v);
+  view_vector<T>(cam, scene.means + 3 * i, v);
   const Index row = 3 * i * scene.sh_stride;
-  sh_color_vjp(scene.sh_degree, v, scene.colors + row, gated, out ? out + row : nullptr, gv);
+  T *written = out ? static_cast<T *>(out + row) : nullptr;
+  sh_color_vjp<T>(scene.sh_degree, v, scene.colors + row, gated, written, gv);
   for (int c = 0; c < 3; ++c) {  // v = mean + Rᵀ t
     g_mean[c] += gv[c];
     for (int k = 0; k < 3; ++k) g_R[3 * k + c] += cam.t[k] * gv[c], g_t[k] += cam.R[3 * k + c] * gv[c];
   }
 }
 
-static __device__ inline void add(T *out, Index row, const T *values, int n) {
+static __device__ inline void add(Results out, Index row, const T *values, int n) {
   if (out)
     for (int c = 0; c < n; ++c) out[row * n + c] += values[c];
 }
 
 // A thread a Gaussian, by depth: its records, then back to its own parameters and the camera. visible [N].
 extern "C" __global__ void __launch_bounds__(kThreads)
-    reduce_kernel(Scene scene, Strip strip, const unsigned char *visible, const T *records, Gradients out) {
+    reduce_kernel(Scene scene, Strip strip, GLOBAL(const unsigned char) visible, Reals records, Gradients out) {
   const Index rank = static_cast<Index>(blockIdx.x) * kThreads + threadIdx.x;
   const Index i = rank < strip.n ? strip.front_to_back[rank] : 0;
   const bool seen = rank < strip.n && visible[i];
@@ -78,8 +79,8 @@ extern "C" __global__ void __launch_bounds__(kThreads)
   const Splat s = strip.splats[i];
   const ProjectedGrad<T> g = picture_gradient(s, r);
   T g_mean[3], g_quat[4], g_scale[3], g_camera[12];  // dL/dR, dL/dt
-  project_vjp(cam, scene.means + 3 * i, scene.quats + 4 * i, scene.scales + 3 * i, g, g_mean, g_quat, g_scale, g_camera,
-              g_camera + 9);
+  project_vjp<T>(cam, scene.means + 3 * i, scene.quats + 4 * i, scene.scales + 3 * i, g, g_mean, g_quat, g_scale,
+                 g_camera, g_camera + 9);
   color_gradient(scene, cam, i, s, r + 6, out.colors, g_mean, g_camera, g_camera + 9);
   const T g_opacity = r[0] / scene.opacities[i], g_mean2d[2] = {g.x, g.y};
   add(out.means, i, g_mean, 3), add(out.quats, i, g_quat, 4), add(out.scales, i, g_scale, 3);

@@ -60,7 +60,29 @@ def build(options: KernelOptions, edit: tuple[str, str] | None) -> ctypes.CDLL:
         (target / name).write_text(text)
     command = [find_compiler(), *FLAGS, *options.defines(), f"-I{CSRC / 'rasterizer'}"]
     subprocess.run([*command, str(target / "emulator.cpp"), "-o", str(target / "emulator.so")], check=True)
-    return ctypes.CDLL(str(target / "emulator.so"))
+    library = ctypes.CDLL(str(target / "emulator.so"))
+    _libraries.append(library)
+    for begin, size in _memory.items():
+        library.emulator_memory(ctypes.c_uint64(begin), ctypes.c_uint64(size))
+    return library
+
+
+_fill, _libraries, _memory = on_device._filled, list[ctypes.CDLL](), dict[int, int]()
+
+
+def _fill_and_tell(structure, *values):
+    """Tells the emulators which memory the kernels may use: that of every tensor whose address they are given."""
+    for value in values:
+        if isinstance(value, torch.Tensor) and value.untyped_storage().nbytes():
+            begin, size = value.untyped_storage().data_ptr(), value.untyped_storage().nbytes()
+            _memory.pop(begin, None)
+            _memory[begin] = size  # the latest last
+            for library in _libraries:
+                library.emulator_memory(ctypes.c_uint64(begin), ctypes.c_uint64(size))
+    return _fill(structure, *values)
+
+
+on_device._filled = _fill_and_tell
 
 
 def emulated(lanes: int = IN_ORDER, edit: tuple[str, str] | None = None) -> KernelsFor:

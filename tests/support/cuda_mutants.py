@@ -1,20 +1,12 @@
-"""Slips in the CUDA kernels that their tests must notice: removed barriers, wrong indices and bounds.
-
-    python -m support.cuda_mutants INDEX
-
-runs SLIPS[INDEX] in a process of its own, which may write anywhere, and exits with NOTICED if the slip is noticed.
-"""
+"""Slips in the CUDA kernels that their tests must notice: removed barriers, wrong indices and bounds."""
 
 from __future__ import annotations
-
-import sys
 
 import torch
 
 from support.cuda_emulator import emulate, wide_scene, worst
 from support.rasterizer import grads_and_images
 
-NOTICED = 3
 BARRIERS = [
     ("    if (!__syncthreads_or(open)) break;  // also: the last batch has been read\n", ""),
     (
@@ -73,7 +65,3 @@ def is_noticed(edit):
     except RuntimeError as error:
         return "CUDA error 719" in str(error)
     return worst(found, grads_and_images(inputs)) > 1e-9
-
-
-if __name__ == "__main__":
-    sys.exit(NOTICED if is_noticed(SLIPS[int(sys.argv[1])]) else 0)
