@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perception.cli import main
@@ -126,6 +126,7 @@ VALUES = st.one_of(NUMBERS.map(str), st.text(max_size=8), st.sampled_from(["none
 
 
 @pytest.mark.slow
+@settings(deadline=None)  # a busy machine may pause it
 @given(pairs=st.lists(st.tuples(st.sampled_from(sorted(KEYS)) | st.text(max_size=12), VALUES), max_size=4))
 def test_any_pairs_are_settings_in_range_or_one_line(pairs: list[tuple[str, str]]) -> None:
     config: MapConfig | None = None
