@@ -140,7 +140,7 @@ def extents(gmap: Map) -> np.ndarray:
 
 
 def printed_on(gmap: Map, use: bool = True) -> Printed | None:
-    """The texts printed on the map's instances; None if nobody looked for any, or they are not to be used."""
+    """The texts printed on the map's instances; None if the map was made without reading texts, or `use` is false."""
     read = use and gmap.info.get("instances", {}).get("texts") is not None
     return Printed([entry.get("texts", []) for entry in gmap.instances]) if read else None
 

@@ -1,7 +1,7 @@
 """The host side of csrc/cuda: the same two passes as the CPU's, on tensors of one device.
 
-Every sum has one order. `Settings.max_records` bounds the memory: an image with more (Gaussian, 16 × 16-pixel tile)
-pairs is worked on in strips of tile rows, whose gradients are added up (which rounds differently).
+Sums are always made in the same order. `Settings.max_records` limits the memory: an image with more pairs of a Gaussian
+and a tile of 16 × 16 pixels is computed in strips of tile rows. Their gradients are added, which rounds differently.
 """
 
 from __future__ import annotations
