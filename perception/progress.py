@@ -49,14 +49,16 @@ class Progress:
     def _draw(self, stage: str, done: int, total: int, words: tuple[str, ...]) -> None:
         from tqdm import tqdm
 
-        if self._bar is None or self._bar.desc != f"{stage}: ":
+        starts = self._bar is None or self._bar.desc != f"{stage}: "
+        if starts:
             self.close()
             self._bar = tqdm(total=total, desc=f"{stage}: ", file=self.stream, dynamic_ncols=True, bar_format=LINE)
         self._bar.total = total
         self._bar.set_postfix_str(", ".join(words or (f"{done}/{total}",)), refresh=False)
         self._bar.update(done - self._bar.n)
-        if done >= total:
+        if starts or done >= total:  # tqdm itself draws nothing in a bar's first tenth of a second
             self._bar.refresh()
+        if done >= total:
             self.close()
 
     def close(self) -> None:

@@ -69,7 +69,7 @@ class Terminal:
 @pytest.mark.slow
 def test_a_live_line_then_ctrl_c_then_the_printed_command_goes_on(small_scene: Path, tmp_path: Path) -> None:
     words = ["map", str(small_scene / "transforms.json"), "-o", "k.gsmap", "--masks", f"labels:{small_scene}/labels"]
-    words += ["--iterations", "300", "--budget", "1500"]
+    words += ["--iterations", "2000", "--budget", "1500"]  # several draws, each half a second, on any machine
     words += ["--set", "language.encoder=none", "--set", "train.exchange_db=0"]
     first = Terminal(words, tmp_path)
     try:
@@ -97,7 +97,7 @@ def test_a_live_line_then_ctrl_c_then_the_printed_command_goes_on(small_scene: P
     finally:
         again.close()
     resumed = re.search(r"resuming at iteration (\d+)", again.text)
-    assert resumed is not None and 0 < int(resumed[1]) < 300
+    assert resumed is not None and 0 < int(resumed[1]) < 2000
     assert (tmp_path / "k.gsmap" / "map.json").is_file()
 
 
