@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import sparse
 
 from perception.instances.votes import MaskVotes, Table
 
-CHUNK = 20_000
+CHUNK, ENTRIES = 20_000, 10_000_000  # Gaussians, and their affinities with all instances, at once
 NEIGHBOURS = 8
 LEAST_AGREEMENT = 0.5
 MARGIN = 0.15
 
 
-def mask_shares(table: Table) -> np.ndarray:
+def mask_shares(table: Table) -> sparse.csr_matrix:
     """[K, M]: of the pixels of instance k under masks of a view, the fraction in each mask of that view."""
-    return table.pixels / np.maximum(table.by_view[:, table.view], 1e-12)
+    _, _, first, labelled = table.runs()
+    shares = table.pixels.copy()
+    shares.data /= np.maximum(table.per_entry(first, labelled), 1e-12).astype(np.float32)
+    return shares
 
 
-def affinities(votes: MaskVotes, shares: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def affinities(votes: MaskVotes, shares: sparse.csr_matrix, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean of `shares` over the pixels of each Gaussian [R, K], and its number of pixels under masks [R]."""
     weights = votes.weights[rows]
     pixels = np.asarray(weights.sum(axis=1)).reshape(-1)
-    return np.asarray(weights @ shares.T) / np.maximum(pixels, 1e-12)[:, None], pixels
+    return (weights @ shares.T).toarray() / np.maximum(pixels, 1e-12)[:, None], pixels
 
 
 def memberships(ids: np.ndarray, votes: MaskVotes) -> np.ndarray:
@@ -29,8 +33,9 @@ def memberships(ids: np.ndarray, votes: MaskVotes) -> np.ndarray:
     count = int(ids.max(initial=-1)) + 1
     shares = mask_shares(votes.table(ids, count))
     found = np.zeros(len(ids), np.float32)
-    for begin in range(0, len(ids), CHUNK):
-        rows = begin + np.flatnonzero(ids[begin : begin + CHUNK] >= 0)
+    chunk = min(CHUNK, ENTRIES // max(count, 1) + 1)
+    for begin in range(0, len(ids), chunk):
+        rows = begin + np.flatnonzero(ids[begin : begin + chunk] >= 0)
         if len(rows):
             found[rows] = affinities(votes, shares, rows)[0][np.arange(len(rows)), ids[rows]]
     return np.clip(found, 0, 1)
@@ -57,8 +62,9 @@ def reassign(
     tree = cKDTree(means[voters])
     near = min(NEIGHBOURS + 1, len(voters))
     finite = np.flatnonzero(np.isfinite(means).all(axis=1))
-    for begin in range(0, len(finite), CHUNK):
-        rows = finite[begin : begin + CHUNK]
+    chunk = min(CHUNK, ENTRIES // count + 1)
+    for begin in range(0, len(finite), chunk):
+        rows = finite[begin : begin + chunk]
         affinity, pixels = affinities(votes, shares, rows)
         _, found = tree.query(means[rows], k=near, workers=-1)
         around = ids[voters[found]]

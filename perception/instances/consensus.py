@@ -28,7 +28,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
+from perception import _core
 from perception.instances.votes import Table
 
 LEAST_SHARE = 0.1  # relative to its best view; a view that shows less of a segment is ignored
@@ -39,6 +41,7 @@ SUPPORT = 0.6  # IoU with a mask from which a photo supports a group
 LEAST_PIXELS = 8.0  # pixels under masks from which a view shows a group
 LARGEST_PART = 0.8  # share of the whole's pixels; a larger part is nearly the whole
 PART_VIEWS = 2  # photos that must support a part
+AT_ONCE = 64  # nodes whose tables are held together
 
 
 @dataclass(frozen=True)
@@ -66,114 +69,40 @@ class MergeTree:
         return sorted(found)
 
 
-class _Affinities:
-    """Affinities a_ij of all pairs of S segments, updated after every merge.
+def merge_tree(table: Table, prototypes: np.ndarray, sizes: np.ndarray, near: sparse.csr_matrix) -> MergeTree:
+    """Repeatedly merges the pair with the largest affinity, until none reaches LOWEST (csrc/graph/merge.cpp).
 
-    P [M, S], B, s and l [V, S] have segments as columns, so the few masks of a segment select whole rows; z [S, D].
-    unit: P_im / |P_i|_v. Merged segments have a_ij = −1.
+    table: of the S segments; prototypes [S, D]: z; sizes [S]: Gaussian counts; near [S, S]: nonzero for spatial
+    neighbours. Only pairs that are near or share a mask have an affinity, so only these are held.
     """
-
-    def __init__(self, table: Table, z: np.ndarray, sizes: np.ndarray, near: np.ndarray):
-        count, self.views = table.void.shape
-        self.view = table.view
-        self.P = np.array(table.pixels.T, np.float32, order="C")  # a copy: `merge` writes into it
-        self.B = np.array(table.void.T, np.float32, order="C")
-        self.unlabelled = np.zeros_like(self.B)
-        self.unit = np.zeros_like(self.P)
-        self.s = np.zeros((self.views, count), np.float32)
-        self.z, self.sizes, self.near = z.astype(np.float64), sizes.astype(np.float64), near.copy()
-        self.alive = np.ones(count, bool)
-        for i in range(count):
-            self._update(i)
-        self.a = np.stack([self._row(i) for i in range(count)]) if count else np.zeros((0, 0))
-
-    def _update(self, i: int) -> None:
-        """Updates unit, s and 1 − l of segment i from its P and B."""
-        P, B = self.P[:, i], self.B[:, i]
-        T = np.bincount(self.view, P, self.views) + B
-        norm = np.sqrt(np.bincount(self.view, P**2, self.views))
-        self.unit[:, i] = P / np.maximum(norm[self.view], 1e-12)
-        self.s[:, i] = T / max(float(T.max(initial=0)), 1e-12)
-        self.unlabelled[:, i] = B / np.maximum(T, 1e-12)
-
-    def _row(self, i: int) -> np.ndarray:
-        """a_ij [S] of segment i with every j."""
-        shows = self.s[:, i] > LEAST_SHARE  # w is 0 in the other views
-        masks = np.flatnonzero((self.unit[:, i] > 0) & shows[self.view])
-        s = self.s[shows]
-        c = np.zeros_like(s)
-        if len(masks):
-            views, first = np.unique(self.view[masks], return_index=True)
-            row = np.cumsum(shows)[views] - 1
-            c[row] = np.add.reduceat(self.unit[masks] * self.unit[masks, i][:, None], first, axis=0)
-        w = np.minimum(s, s[:, i][:, None])
-        w[w <= LEAST_SHARE] = 0
-        l_j = 1 - self.unlabelled[shows]
-        l_i = l_j[:, i][:, None]
-        both, one = l_i * l_j, l_i + l_j - 2 * l_i * l_j
-        p = np.clip(1 - ((self.z - self.z[i]) ** 2).sum(axis=1), 0, 1) * self.near[i]
-        agreement, weight = (w * both * c).sum(axis=0), (w * (both + ONE_SIDED * one)).sum(axis=0)
-        a = (agreement + PRIOR * p) / (weight + PRIOR)
-        a[~self.alive] = -1
-        a[i] = -1
-        return a
-
-    def merge(self, i: int, j: int) -> None:
-        """Merges segment j into segment i."""
-        size = self.sizes[i] + self.sizes[j]
-        self.z[i] = (self.z[i] * self.sizes[i] + self.z[j] * self.sizes[j]) / size
-        self.sizes[i] = size
-        self.P[:, i] += self.P[:, j]
-        self.B[:, i] += self.B[:, j]
-        self.near[i] |= self.near[j]
-        self.near[:, i] |= self.near[:, j]
-        self.unit[:, j] = self.s[:, j] = 0
-        self.alive[j] = False
-        self._update(i)
-        self.a[j] = self.a[:, j] = -1
-        self.a[i] = self.a[:, i] = self._row(i)
-
-
-def merge_tree(table: Table, prototypes: np.ndarray, sizes: np.ndarray, near: np.ndarray) -> MergeTree:
-    """Repeatedly merges the pair with the largest affinity, until none reaches LOWEST.
-
-    table: of the S segments; prototypes [S, D]: z; sizes [S]: Gaussian counts; near [S, S] bool: spatial neighbours.
-    """
-    state = _Affinities(table, prototypes, sizes, near)
     count = len(sizes)
-    node = np.arange(count)
-    best = state.a.max(axis=1, initial=-1)
-    children, affinity = [], []
-    while len(best) and (top := int(best.argmax())) >= 0 and best[top] >= LOWEST:
-        other = int(state.a[top].argmax())
-        i, j = min(top, other), max(top, other)
-        affinity.append(float(best[top]))
-        children.append((node[i], node[j]))
-        before = state.a[:, [i, j]].max(axis=1)
-        state.merge(i, j)
-        node[i] = count + len(children) - 1
-        # Only columns i and j have changed: rows whose largest value stood there are searched anew.
-        anew = np.flatnonzero(before >= best)
-        best = np.maximum(best, state.a[:, i])
-        best[anew] = state.a[anew].max(axis=1)
-        best[[i, j]] = state.a[[i, j]].max(axis=1)
-    return MergeTree(count, np.array(children, np.int64).reshape(-1, 2), np.array(affinity))
+    if count == 0:
+        return MergeTree(0, np.zeros((0, 2), np.int64), np.zeros(0))
+    children, affinity = np.zeros((count - 1, 2), np.int32), np.zeros(count - 1)
+    rows = [(m.indptr.astype(np.int64), m.indices.astype(np.int32)) for m in (table.pixels, table.void, near)]
+    values = [m.data.astype(np.float32) for m in (table.pixels, table.void)]
+    z, weights = np.ascontiguousarray(prototypes, np.float64), np.ascontiguousarray(sizes, np.float64)
+    merges = _core.merge_segments(
+        *(*rows[0], values[0], *rows[1], values[1], table.view.astype(np.int32), table.void.shape[1], *rows[2]),
+        *(z, weights, LEAST_SHARE, ONE_SIDED, PRIOR, LOWEST, children, affinity),
+    )
+    return MergeTree(count, children[:merges].astype(np.int64), affinity[:merges])
 
 
 @dataclass(frozen=True)
 class Evidence:
     """Evidence of G groups. pixels [G]: Σ_m P_gm; matched [G]: see the module; views [G] int: number that show it;
-    fit [G, V]: the largest IoU_gm of each view, 0 where the view does not show the group."""
+    fit [G, V] sparse: the largest IoU_gm of each view, 0 where the view does not show the group."""
 
     pixels: np.ndarray
     matched: np.ndarray
     views: np.ndarray
-    fit: np.ndarray
+    fit: sparse.csr_matrix
 
     @property
     def support(self) -> np.ndarray:
         """[G] number of views in which one mask has an IoU of at least SUPPORT with the group."""
-        return np.asarray((self.fit >= SUPPORT).sum(axis=1))
+        return np.diff((self.fit >= SUPPORT).tocsr().indptr)
 
     @property
     def agreement(self) -> np.ndarray:
@@ -188,26 +117,26 @@ def evidence(table: Table) -> Evidence:
     match of the large object below it. T_gv includes unlabelled pixels, so a mask that ends at the border of an
     unlabelled object is evidence for that border.
     """
-    if table.pixels.shape[1] == 0:
-        none = np.zeros(len(table.pixels))
-        return Evidence(none, none, none.astype(np.int64), none.reshape(-1, 1)[:, :0])
-    P, labelled = table.pixels.astype(np.float64), table.by_view.astype(np.float64)
-    T = (labelled + table.void)[:, table.view]
-    iou = P / np.maximum(T + table.area - P, 1e-12)
+    count, views = table.void.shape
+    row, view, first, labelled = table.runs()
+    P = table.pixels.data.astype(np.float64)
+    T = table.per_entry(first, labelled + np.asarray(table.void[row, view]).reshape(-1))
+    iou = P / np.maximum(T + table.area[table.pixels.indices] - P, 1e-12)
     shown = labelled >= LEAST_PIXELS
-    fit = np.where(shown, np.maximum.reduceat(iou, table.starts, axis=1), 0)
-    return Evidence(labelled.sum(axis=1), (P * iou).sum(axis=1), shown.sum(axis=1), fit)
+    best = np.maximum.reduceat(iou, first)[shown] if len(first) else np.zeros(0)
+    fit = sparse.csr_matrix((best, (row[shown], view[shown])), shape=(count, views))
+    matched = np.bincount(table.per_entry(first, row), P * iou, minlength=count)
+    return Evidence(np.bincount(row, labelled, minlength=count), matched, np.bincount(row[shown], minlength=count), fit)
 
 
 def node_evidence(tree: MergeTree, table: Table) -> Evidence:
     """Evidence of all nodes of a tree, from the table of its leaves."""
-    whole = [evidence(table)]
-    rows = {leaf: table.row(leaf) for leaf in range(tree.leaves)}
-    for number, (a, b) in enumerate(tree.children.tolist()):
-        joined = rows[tree.leaves + number] = rows.pop(a) + rows.pop(b)
-        whole.append(evidence(joined))
-    names = ("pixels", "matched", "views", "fit")
-    return Evidence(*(np.concatenate([getattr(part, name) for part in whole]) for name in names))
+    leaves = [np.array([leaf], np.int32) for leaf in range(tree.leaves)]
+    for a, b in tree.children.tolist():
+        leaves.append(np.concatenate([leaves[a], leaves[b]]))
+    found = [evidence(table.pooled(leaves[at : at + AT_ONCE])) for at in range(0, len(leaves), AT_ONCE)]
+    numbers = {name: np.concatenate([vars(part)[name] for part in found]) for name in ("pixels", "matched", "views")}
+    return Evidence(**numbers, fit=sparse.vstack([part.fit for part in found], format="csr"))
 
 
 def best_cut(tree: MergeTree, matched: np.ndarray) -> list[int]:
@@ -235,7 +164,8 @@ def parts_of(tree: MergeTree, node: int, found: Evidence) -> list[int]:
     parts, stack = [], tree.children_of(node)
     while stack:
         at = stack.pop()
-        single = (found.fit[at] >= SUPPORT) & (found.fit[at] > found.fit[node])
+        fit, whole = found.fit[[at, node]].toarray()
+        single = (fit >= SUPPORT) & (fit > whole)
         if single.sum() >= PART_VIEWS and found.pixels[at] <= LARGEST_PART * found.pixels[node]:
             parts.append(at)
         else:

@@ -23,7 +23,7 @@ from perception.instances.segments import over_segment, touching
 from perception.instances.votes import MaskVotes
 
 PER_SEGMENT = 16  # Gaussians; smaller segments have too little evidence in the photos
-MAX_SEGMENTS = 1000  # the merge tree compares all pairs of segments
+MAX_SEGMENTS, PER_SEGMENT_BEYOND = 1000, 300  # a larger map has one segment per 300 Gaussians instead
 LEAST = 4  # Gaussians; smaller groups are dropped even if masks support them
 
 
@@ -93,7 +93,8 @@ def _by_consensus(
     solid = np.flatnonzero((opacities >= MIN_OPACITY) & np.isfinite(means).all(axis=1))
     if len(solid) == 0:
         return ids, parts, np.zeros(0, np.int64)
-    wanted = int(np.clip(len(solid) // PER_SEGMENT, min(32, len(solid)), MAX_SEGMENTS))
+    most = max(MAX_SEGMENTS, len(solid) // PER_SEGMENT_BEYOND)
+    wanted = int(np.clip(len(solid) // PER_SEGMENT, min(32, len(solid)), most))
     segments = over_segment(means[solid], features[solid], wanted, seed)
     count = int(segments.max()) + 1
     everywhere = np.full(len(means), -1, np.int64)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import sparse
 
 ROUNDS = 12  # iterations of Lloyd's algorithm; groups are merged later, so convergence is not needed
 SAMPLE = 50_000  # rows from which the centres are computed; all rows are then assigned to the nearest centre
+TOGETHER = 1000  # groups of one k-means
 CHUNK = 1 << 11  # rows; their distances to all centres stay in the cache
 
 
@@ -14,7 +16,16 @@ def over_segment(means: np.ndarray, features: np.ndarray, count: int, seed: int 
 
     means [N, 3], features [N, D]. Positions are scaled so that 90 % of the Gaussians lie within 1 of the median. This
     is also the loss's margin between features, so distant Gaussians are separated even if their features agree.
+    For more than TOGETHER groups, the Gaussians are halved at the median of the axis on which they extend farthest.
     """
+    if count > TOGETHER:
+        axis = int(np.ptp(np.quantile(means, [0.05, 0.95], axis=0), axis=0).argmax())
+        order = np.argsort(means[:, axis], kind="stable")
+        halves = np.array_split(order, 2)
+        found = [over_segment(means[half], features[half], -(-count // 2), seed) for half in halves]
+        groups = np.empty(len(means), np.int64)
+        groups[order] = np.concatenate([found[0], found[1] + found[0].max() + 1])
+        return groups
     centred = means - np.median(means, axis=0)
     radius = float(np.quantile(np.linalg.norm(centred, axis=1), 0.9)) if len(means) else 1.0
     rows = np.concatenate([features, centred / max(radius, 1e-12)], axis=1).astype(np.float32)
@@ -38,8 +49,10 @@ def _nearest(rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
     return owner
 
 
-def touching(means: np.ndarray, groups: np.ndarray, count: int, neighbours: int = 7, least: int = 3) -> np.ndarray:
-    """[S, S] bool: whether at least `least` pairs of nearby Gaussians connect the two groups.
+def touching(
+    means: np.ndarray, groups: np.ndarray, count: int, neighbours: int = 7, least: int = 3
+) -> sparse.csr_matrix:
+    """[S, S] bool, sparse: whether at least `least` pairs of nearby Gaussians connect the two groups.
 
     Nearby: among the `neighbours` nearest, and within 3 × max(nearest-neighbour distance of the Gaussian, its median
     over all Gaussians).
@@ -47,12 +60,11 @@ def touching(means: np.ndarray, groups: np.ndarray, count: int, neighbours: int 
     from scipy.spatial import cKDTree
 
     k = min(neighbours + 1, len(means))
-    across = np.zeros((count, count), np.int64)
     if k < 2:
-        return across > 0
+        return sparse.csr_matrix((count, count), dtype=bool)
     distance, neighbour = cKDTree(means).query(means, k=k, workers=-1)
     reach = 3 * np.maximum(distance[:, 1:2], np.median(distance[:, 1]))
     row, column = np.nonzero(distance[:, 1:] <= reach)
     a, b = groups[row], groups[neighbour[row, column + 1]]
-    np.add.at(across, (a[a != b], b[a != b]), 1)
-    return (across + across.T) >= least
+    pairs = sparse.csr_matrix((np.ones((a != b).sum(), np.int64), (a[a != b], b[a != b])), shape=(count, count))
+    return (pairs + pairs.T >= least).tocsr()

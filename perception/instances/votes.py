@@ -25,31 +25,33 @@ FAINTEST = 0.02  # pixels; smaller weights are dropped to keep the matrix sparse
 
 @dataclass(frozen=True)
 class Table:
-    """Pixels that R groups fill: [R, M] per mask, void [R, V] per view without a mask. view, area: as in MaskVotes."""
+    """Pixels that R groups fill, sparse: [R, M] per mask, void [R, V] per view without a mask. view, area: as in
+    MaskVotes. The columns of each row ascend."""
 
-    pixels: np.ndarray
-    void: np.ndarray
+    pixels: sparse.csr_matrix
+    void: sparse.csr_matrix
     view: np.ndarray
     area: np.ndarray
 
-    def __add__(self, other: Table) -> Table:
-        return Table(self.pixels + other.pixels, self.void + other.void, self.view, self.area)
+    def pooled(self, groups: Sequence[np.ndarray]) -> Table:
+        """The table of G unions of rows; groups: the rows of each."""
+        ends = np.cumsum([0, *map(len, groups)])
+        gather = (np.ones(ends[-1], np.float32), np.concatenate(groups), ends)
+        shape = (len(groups), self.pixels.shape[0])
+        return summed(sparse.csr_matrix(gather, shape=shape), self.pixels, self.void, self.view, self.area)
 
-    def row(self, group: int) -> Table:
-        """The table of one group; the first axis is kept."""
-        return Table(self.pixels[group : group + 1], self.void[group : group + 1], self.view, self.area)
+    def runs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """(row, view) [L] of each group and view with masks of it, the first of its entries in `pixels.data` [L], and
+        the pixels under its masks [L] float64."""
+        row = np.repeat(np.arange(self.pixels.shape[0]), np.diff(self.pixels.indptr))
+        view = self.view[self.pixels.indices]
+        first = np.flatnonzero((np.diff(row, prepend=-1) != 0) | (np.diff(view, prepend=-1) != 0))
+        sums = np.add.reduceat(self.pixels.data.astype(np.float64), first) if len(first) else np.zeros(0)
+        return row[first], view[first], first, sums
 
-    @property
-    def starts(self) -> np.ndarray:
-        """[V] index of the first mask of each view, for `reduceat`."""
-        return np.flatnonzero(np.diff(self.view, prepend=-1) > 0)
-
-    @property
-    def by_view(self) -> np.ndarray:
-        """[R, V] pixels under masks."""
-        if self.pixels.shape[1] == 0:
-            return np.zeros((len(self.pixels), 0), np.float32)
-        return np.add.reduceat(self.pixels, self.starts, axis=1)
+    def per_entry(self, first: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """`values` [L] of `runs` repeated for each entry of `pixels.data`."""
+        return np.repeat(values, np.diff(first, append=self.pixels.nnz))
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,17 @@ class MaskVotes:
         rows = np.flatnonzero(ids >= 0)
         ones = np.ones(len(rows), np.float32)
         gather = sparse.csr_matrix((ones, (ids[rows], rows)), shape=(count, len(ids)))
-        return Table((gather @ self.weights).toarray(), (gather @ self.void).toarray(), self.view, self.area)
+        return summed(gather, self.weights, self.void, self.view, self.area)
+
+
+def summed(
+    gather: sparse.csr_matrix, pixels: sparse.csr_matrix, void: sparse.csr_matrix, view: np.ndarray, area: np.ndarray
+) -> Table:
+    """The table of the groups that `gather` [R, N] makes of N rows of `pixels` [N, M] and `void` [N, V]."""
+    tables = gather @ pixels, gather @ void
+    for table in tables:
+        table.sort_indices()
+    return Table(*tables, view, area)
 
 
 @torch_on_one_thread()

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy import sparse
 
 from perception import _core
 
@@ -214,6 +215,26 @@ def _felzenszwalb(dice: Dice) -> Call:
     }  # fmt: skip
 
 
+def _merge_segments(dice: Dice) -> Call:
+    rng, count, views = np.random.default_rng(dice.below(256)), dice.pick((7, 1, 30)), dice.pick((3, 1))
+    masks = dice.pick((8, 0))
+
+    def rows(columns: int, filled: float) -> sparse.csr_matrix:
+        return sparse.csr_matrix(rng.random((count, columns)) * (rng.random((count, columns)) < filled))
+
+    pixels, blank, near = rows(masks, 0.5), rows(views, 0.5), rows(count, 0.3)
+    return _core.merge_segments, {
+        "mask_starts": pixels.indptr.astype(np.int64), "masks": pixels.indices,
+        "pixels": pixels.data.astype(np.float32),
+        "blank_starts": blank.indptr.astype(np.int64), "blank_views": blank.indices,
+        "blank": blank.data.astype(np.float32), "view": np.sort(rng.integers(0, views, masks)).astype(np.int32),
+        "views": views, "near_starts": near.indptr.astype(np.int64), "near": near.indices,
+        "z": rng.normal(size=(count, dice.pick((3, 1)))), "sizes": np.ones(count), "least_share": 0.1,
+        "one_sided": 0.5, "prior": 0.5, "lowest": 0.05, "children": guarded((count - 1, 2), np.int32),
+        "affinity": guarded((count - 1,), np.float64),
+    }  # fmt: skip
+
+
 def _undirected(dice: Dice) -> Call:
     lists = _neighbors(dice, 6)
     return _core.undirected, {"neighbors": lists, "edges": guarded((lists.size, 2), np.int32)}
@@ -254,7 +275,7 @@ FUNCTIONS = [
     _tree,
     _knn,
 ]
-FUNCTIONS += [_felzenszwalb, _undirected, _plane_normals, _plane_sweep]
+FUNCTIONS += [_felzenszwalb, _merge_segments, _undirected, _plane_normals, _plane_sweep]
 _LEVELLED = (_photometric, _prototypes, _spread, _sum, _adam, _plane_sweep)
 
 # ------------------------------------------------------------------ spoiling

@@ -4,29 +4,30 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import sparse
 
-from perception.instances.consensus import LEAST_SHARE, ONE_SIDED, PRIOR, evidence, merge_tree
+from perception.instances.consensus import LEAST_SHARE, LOWEST, ONE_SIDED, PRIOR, evidence, merge_tree, node_evidence
 from perception.instances.votes import Table
 
 
-def a_table(seed: int, segments: int, views: int) -> Table:
+def a_table(seed: int, segments: int, views: int, filled: float = 0.5) -> Table:
     rng = np.random.default_rng(seed)
     view = np.sort(np.concatenate([np.arange(views), rng.integers(0, views, 2 * views)]))
-    pixels = rng.uniform(0, 100, (segments, len(view))) * (rng.random((segments, len(view))) < 0.5)
+    pixels = rng.uniform(0, 100, (segments, len(view))) * (rng.random((segments, len(view))) < filled)
     void = rng.uniform(0, 60, (segments, views)) * (rng.random((segments, views)) < 0.4)
     area = pixels.sum(axis=0) + rng.uniform(0, 50, len(view))
-    return Table(pixels.astype(np.float32), void.astype(np.float32), view, area)
+    return Table(*(sparse.csr_matrix(a.astype(np.float32)) for a in (pixels, void)), view, area)
 
 
 def affinity(table: Table, z: np.ndarray, near: np.ndarray, i: int, j: int) -> float:
     """a_ij as the module's docstring has it."""
-    P, B = table.pixels.astype(np.float64), table.void.astype(np.float64)
+    P, B = (a.toarray().astype(np.float64) for a in (table.pixels, table.void))
     views = range(B.shape[1])
     T = np.array([[P[k, table.view == v].sum() + B[k, v] for v in views] for k in (i, j)])
     p = float(near[i, j]) * max(0.0, 1 - float(((z[i] - z[j]) ** 2).sum()))
     agreed, weight = PRIOR * p, PRIOR
     for v in views:
-        w = min(T[0, v] / T[0].max(), T[1, v] / T[1].max())
+        w = min(T[0, v] / max(T[0].max(), 1e-12), T[1, v] / max(T[1].max(), 1e-12))
         if w <= LEAST_SHARE:
             continue
         l_i, l_j = (1 - B[k, v] / T[row, v] for row, k in enumerate((i, j)))
@@ -37,37 +38,90 @@ def affinity(table: Table, z: np.ndarray, near: np.ndarray, i: int, j: int) -> f
     return float(agreed / weight)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_first_merge_joins_the_pair_of_largest_affinity(seed: int) -> None:
-    table, rng = a_table(seed, 7, 5), np.random.default_rng(seed)
-    z, near = rng.normal(0, 0.3, (7, 3)), rng.random((7, 7)) < 0.5
+def merged_by_hand(
+    table: Table, z: np.ndarray, sizes: np.ndarray, near: np.ndarray
+) -> tuple[list[tuple[int, int]], list[float]]:
+    """Nodes and affinities of all merges: every pair anew after each, on pooled dense tables."""
+    P, B = (a.toarray().astype(np.float64) for a in (table.pixels, table.void))
+    z, sizes, near, node = z.copy(), sizes.astype(float), near.copy(), list(range(len(z)))
+    children, values = [], []
+    while len(node) > 1:
+        pooled = Table(sparse.csr_matrix(P), sparse.csr_matrix(B), table.view, table.area)
+        pairs = [(i, j) for i in range(len(node)) for j in range(i + 1, len(node))]
+        found = [affinity(pooled, z, near, i, j) for i, j in pairs]
+        best = int(np.argmax(found))
+        if found[best] < LOWEST:
+            break
+        i, j = pairs[best]
+        children.append((node[i], node[j]))
+        values.append(found[best])
+        node[i] = len(table.pixels.toarray()) + len(children) - 1
+        z[i] = (sizes[i] * z[i] + sizes[j] * z[j]) / (sizes[i] + sizes[j])
+        sizes[i] += sizes[j]
+        P[i] += P[j]
+        B[i] += B[j]
+        near[i] |= near[j]
+        near[:, i] |= near[:, j]
+        left = np.arange(len(node)) != j
+        P, B, z, sizes, near = P[left], B[left], z[left], sizes[left], near[left][:, left]
+        del node[j]
+    return children, values
+
+
+@pytest.mark.parametrize(("seed", "filled"), [(0, 0.5), (1, 0.5), (2, 0.15), (3, 0.15), (4, 0.05), (5, 0.0)])
+def test_merges_are_those_of_a_dense_search_in_float64(seed: int, filled: float) -> None:
+    """Also where few pairs share a mask, and where none does and features alone join neighbours."""
+    table, rng = a_table(seed, 12, 5, filled), np.random.default_rng(seed)
+    z, near = rng.normal(0, 0.3, (12, 3)), rng.random((12, 12)) < 0.2
     near |= near.T
-    pairs = {(i, j): affinity(table, z, near, i, j) for i in range(7) for j in range(i + 1, 7)}
-    best = max(pairs, key=lambda pair: pairs[pair])
-    tree = merge_tree(table, z, np.full(7, 10), near)
-    assert tuple(tree.children[0]) == best
-    assert tree.affinity[0] == pytest.approx(pairs[best], rel=1e-5)
+    np.fill_diagonal(near, False)
+    sizes = rng.integers(1, 50, 12)
+    children, values = merged_by_hand(table, z, sizes, near)
+    tree = merge_tree(table, z, sizes, sparse.csr_matrix(near))
+    assert [tuple(pair) for pair in tree.children.tolist()] == children and len(children) > 3
+    np.testing.assert_allclose(tree.affinity, values, rtol=1e-6)
+
+
+def test_of_equal_affinities_the_first_pair_is_merged() -> None:
+    none = sparse.csr_matrix((4, 0), dtype=np.float32)
+    table = Table(none, none, np.zeros(0, np.int64), np.zeros(0))
+    near = np.array([[0, 0, 0, 1], [0, 0, 1, 0], [0, 1, 0, 0], [1, 0, 0, 0]], bool)
+    tree = merge_tree(table, np.zeros((4, 2)), np.ones(4), sparse.csr_matrix(near))
+    assert tree.children.tolist() == [[0, 3], [1, 2]] and tree.affinity.tolist() == [1, 1]
 
 
 def test_merging_leaves_the_table_as_it_was() -> None:
-    """Also where there is one view, whose columns need no reordering."""
     table = a_table(3, 6, 1)
-    pixels, void = table.pixels.copy(), table.void.copy()
-    merge_tree(table, np.zeros((6, 2)), np.ones(6), np.ones((6, 6), bool))
-    np.testing.assert_array_equal(table.pixels, pixels)
-    np.testing.assert_array_equal(table.void, void)
+    pixels, void = table.pixels.toarray(), table.void.toarray()
+    merge_tree(table, np.zeros((6, 2)), np.ones(6), sparse.csr_matrix(np.ones((6, 6), bool)))
+    np.testing.assert_array_equal(table.pixels.toarray(), pixels)
+    np.testing.assert_array_equal(table.void.toarray(), void)
 
 
 def test_evidence_is_the_formula() -> None:
     table = a_table(4, 3, 4)
     found = evidence(table)
+    P, void = table.pixels.toarray(), table.void.toarray()
     for g in range(3):
-        labelled = [table.pixels[g, table.view == v].sum() for v in range(4)]
+        labelled = [P[g, table.view == v].sum() for v in range(4)]
         iou = [
-            P / (labelled[v] + table.void[g, v] + area - P)
-            for P, v, area in zip(table.pixels[g], table.view, table.area, strict=True)
+            pixels / (labelled[v] + void[g, v] + area - pixels)
+            for pixels, v, area in zip(P[g], table.view, table.area, strict=True)
         ]
-        assert found.matched[g] == pytest.approx(float(table.pixels[g] @ np.array(iou)), rel=1e-5)
+        assert found.matched[g] == pytest.approx(float(P[g] @ np.array(iou)), rel=1e-5)
         fit = [max(x for x, of in zip(iou, table.view, strict=True) if of == v) for v in range(4)]
         expected = [best if shown >= 8 else 0 for best, shown in zip(fit, labelled, strict=True)]
-        np.testing.assert_allclose(found.fit[g], expected, rtol=1e-5)
+        np.testing.assert_allclose(found.fit[g].toarray()[0], expected, rtol=1e-5)
+
+
+def test_evidence_of_a_node_is_that_of_its_leaves_together() -> None:
+    table = a_table(6, 9, 4, 0.3)
+    tree = merge_tree(table, np.zeros((9, 2)), np.ones(9), sparse.csr_matrix(np.ones((9, 9), bool)))
+    found = node_evidence(tree, table)
+    for node in range(9 + len(tree.children)):
+        leaves = tree.leaves_of(node)
+        sums = [sparse.csr_matrix(a.toarray()[leaves].sum(axis=0)) for a in (table.pixels, table.void)]
+        alone = evidence(Table(*sums, table.view, table.area))
+        assert found.matched[node] == pytest.approx(alone.matched[0], rel=1e-5)
+        assert found.pixels[node] == pytest.approx(alone.pixels[0], rel=1e-5)
+        assert (found.views[node], found.support[node]) == (alone.views[0], alone.support[0])
