@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import hashlib
+import os
 import shutil
+import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlparse
 
-from perception.errors import InputError
+from perception.errors import InputError, missing_extra
 from perception.io.atomic import atomic_directory
 from perception.io.checksums import facts_of, sha256
+from perception.io.documents import brief
 from perception.io.model_store import (
     RECORD,
+    Entry,
     StoredModel,
     catalogue,
     check_name,
-    download,
     find_model,
-    is_url,
     known_names,
     models_folder,
     set_default,
@@ -142,41 +142,22 @@ def list_models() -> list[dict[str, Any]]:
     ]
 
 
-def add_model(
-    name: str,
-    sources: Sequence[str],
-    *,
-    sha256: Sequence[str | None] = (),
-    default: bool = False,
-    progress: Progress | None = None,
-) -> StoredModel:
-    """Adds files (or all files of a folder, or URLs) to the store under `name`, all or none.
+def add_model(name: str, sources: Sequence[str], *, default: bool = False) -> StoredModel:
+    """Adds files (or all files of a folder) to the store under `name`, all or none.
 
-    sha256: expected digests, as many as sources or none. A URL that is already stored under that name is not downloaded
-    again. default: `--masks auto` uses this model from now on.
+    default: `--masks auto` uses this model from now on.
     """
     check_name(name)
-    if sha256 and len(sha256) != len(sources):
-        raise InputError(f"--sha256: {len(sha256)} digests for {len(sources)} files; give one for each, in order")
-    expected = {source: digest.lower() for source, digest in zip(sources, sha256, strict=False) if digest is not None}
-    for digest in expected.values():
-        if len(digest) != 64 or set(digest) - set("0123456789abcdef"):
-            raise InputError(f"--sha256 {digest[:70]}: expected 64 hexadecimal digits")
-    known = find_model(name)
-    if known is None or not _same(known, sources, expected):
-        files = [file for source in sources for file in _local(source, expected.get(source), progress)]
-        known = _install(name, files)
-        for source in sources:
-            _part(source).unlink(missing_ok=True)
+    known = _install(name, [file for source in sources for file in _local(source)])
     if default:
         set_default(known)
     return known
 
 
 def get_model(name: str, *, default: bool = False, progress: Progress | None = None) -> StoredModel:
-    """Fetches an entry of the catalogue into the store under its name, resumed and verified by size and digest.
+    """Fetches an entry of the catalogue from the Hugging Face hub into the store under its name, unless it is there.
 
-    What is fetched is told before.
+    What is fetched is told before. HF_ENDPOINT names a mirror of the hub. Files are verified by their known digests.
     """
     entry = catalogue().get(name)
     if entry is None:
@@ -186,27 +167,49 @@ def get_model(name: str, *, default: bool = False, progress: Progress | None = N
         size = f", {sum(sizes) / 1e6:.1f} MB" if None not in sizes else ""
         told = f"{len(sizes)} files{size}, of {entry.repository} at {entry.revision[:12]}"
         progress.log(f"{name}: {told}, licence {entry.licence}, to {models_folder() / name}")
-    digests = entry.addresses()
-    return add_model(name, list(digests), sha256=list(digests.values()), default=default, progress=progress)
+    known = find_model(name)
+    if known is None or not _holds(known, entry):
+        parts = models_folder() / ".parts" / name
+        known = _install(name, [_fetched(entry, path, parts) for path in entry.files])
+        shutil.rmtree(parts)
+    if default:
+        set_default(known)
+    return known
 
 
-def _same(model: StoredModel, sources: Sequence[str], expected: dict[str, str]) -> bool:
-    """Whether the stored model was made from the same URLs, with the same digests."""
-    if not all(is_url(source) for source in sources) or [f["source"] for f in model.files] != list(sources):
-        return False
-    whole = all((model.folder / f["name"]).is_file() for f in model.files)
-    return whole and all(expected.get(f["source"], f["sha256"]) == f["sha256"] for f in model.files)
+def _holds(model: StoredModel, entry: Entry) -> bool:
+    """Whether the stored model has all files of a catalogue entry, with the known digests."""
+    held = {file["name"]: file["sha256"] for file in model.files if (model.folder / file["name"]).is_file()}
+    wanted = {Path(path).name: digest for path, (_, digest) in entry.files.items()}
+    return all(name in held and digest in (None, held[name]) for name, digest in wanted.items())
 
 
-def _local(source: str, expected: str | None, progress: Progress | None) -> list[tuple[str, Path, str]]:
-    """(file name, current path, source) of a download, a file with its side files, or the files of a folder."""
-    if is_url(source):
-        file_name = Path(unquote(urlparse(source).path)).name.lstrip(".") or "model.onnx"
-        part = download(source, _part(source), progress, file_name)
-        if expected not in (None, found := sha256(part)):
-            part.unlink()
-            raise InputError(f"{source}: sha256 is {found}, expected {expected}; what was fetched is thrown away")
-        return [(file_name, part, source)]
+def _fetched(entry: Entry, path: str, folder: Path) -> tuple[str, Path, str]:
+    """(file name, path below `folder`, address) of a downloaded file; what an interrupted call received is kept."""
+    try:
+        import huggingface_hub as hub
+        from huggingface_hub.utils import disable_progress_bars
+    except ImportError as error:
+        raise missing_extra("huggingface-hub", "demo") from error
+    if not sys.stderr.isatty():
+        disable_progress_bars()
+    endpoint = os.environ.get("HF_ENDPOINT") or None  # the library reads it once, when it is imported
+    address = hub.hf_hub_url(entry.repository, path, revision=entry.revision, endpoint=endpoint)
+    try:
+        told = hub.hf_hub_download(entry.repository, path, revision=entry.revision, local_dir=folder, endpoint=endpoint)
+    except (OSError, ValueError, RuntimeError) as error:  # its own and its HTTP library's errors among them
+        reason = brief(error.__cause__ or error, 200)
+        raise InputError(f"{address}: cannot be fetched ({reason}); run the command again to go on") from error
+    file = Path(told)
+    expected = entry.files[path][1]
+    if expected not in (None, found := sha256(file)):
+        file.unlink()
+        raise InputError(f"{address}: sha256 is {found}, expected {expected}; what was fetched is thrown away")
+    return file.name, file, address
+
+
+def _local(source: str) -> list[tuple[str, Path, str]]:
+    """(file name, path, source) of a file with its side files, or of the files of a folder."""
     path = Path(source).expanduser()
     if path.is_dir():
         root, graphs = model_root(path), model_graphs(path)[0]
@@ -214,9 +217,7 @@ def _local(source: str, expected: str | None, progress: Progress | None) -> list
         files += [f for f in sorted(root.rglob("*")) if f.is_file() and f.suffix in _KEPT and f.name != RECORD]
         return [(str(f.relative_to(root)), f, str(f)) for f in files]
     if not path.is_file():
-        raise InputError(f"{source}: no such file or folder, and no http(s) address")
-    if expected not in (None, found := sha256(path)):
-        raise InputError(f"{source}: sha256 is {found}, expected {expected}; is it the right file?")
+        raise InputError(f"{source}: no such file or folder")
     beside = side_files(path) if path.suffix == ".onnx" else []
     return [(str(p.relative_to(path.parent)), p, str(p)) for p in [path, *beside] if p.is_file()]
 
@@ -238,7 +239,3 @@ def _install(name: str, files: Sequence[tuple[str, Path, str]]) -> StoredModel:
         family, purpose, _ = judge([describe_graph(graph) for graph in sorted(folder.rglob("*.onnx"))])
         write_record(folder, family, purpose, entries)
     return StoredModel(name, models_folder() / name, family, purpose, entries)
-
-
-def _part(source: str) -> Path:
-    return models_folder() / ".parts" / f"{hashlib.sha256(source.encode()).hexdigest()[:24]}.part"

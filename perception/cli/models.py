@@ -16,10 +16,9 @@ def register(commands: Any) -> None:
     command(kinds, "list", _list, "the models in the store")
     p = command(kinds, "check", _check, "family, inputs, outputs and providers really in use of an ONNX file")
     p.add_argument("file", metavar="FILE", help="an ONNX file, a folder of them, or a name of the store")
-    p = command(kinds, "add", _add, "put a model into the store, from files or web addresses")
+    p = command(kinds, "add", _add, "put a model into the store, from files")
     p.add_argument("name", metavar="NAME", help="use it as --masks sam:NAME or language.encoder=clip:NAME")
-    p.add_argument("source", nargs="+", metavar="FILE-or-URL", help="encoder and decoder, or a folder")
-    p.add_argument("--sha256", action="append", default=[], metavar="HEX", help="expected digest, one a source")
+    p.add_argument("source", nargs="+", metavar="FILE", help="encoder and decoder, or a folder")
     p.add_argument("--default", action="store_true", help="--masks auto takes this model from now on")
     p = command(kinds, "get", _get, "fetch a model of the catalogue from the Hugging Face hub, or list the catalogue")
     p.add_argument("name", metavar="NAME", nargs="?", help="an entry of the catalogue; none: list it")
@@ -66,12 +65,8 @@ def _get(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _add(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.models import add_model
-    from perception.progress import Progress
 
-    model = add_model(
-        args.name, args.source, sha256=args.sha256, default=args.default, progress=Progress(quiet=args.json)
-    )
-    return _told(model)
+    return _told(add_model(args.name, args.source, default=args.default))
 
 
 def _told(model: Any) -> tuple[dict[str, Any], str]:
