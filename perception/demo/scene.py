@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from perception.demo import clutter, room, tabletop
+from perception.demo import room, tabletop
 from perception.demo.cameras import Camera
 from perception.demo.light import WORKERS, Scene
 from perception.demo.render import Picture, cast
@@ -21,7 +21,7 @@ from perception.errors import InputError
 
 __all__ = ["SCENES", "DemoTruth", "make_photos"]
 
-SCENES = {"tabletop": tabletop, "room": room, "clutter": clutter}
+SCENES = {"tabletop": tabletop, "room": room}
 LEAST_POINTS = 1200  # minimum per object, before points that fewer than two photos see are dropped
 NOISE = 1.6  # standard deviation of the sensor noise in 8-bit steps
 QUALITY = 92

@@ -1,6 +1,6 @@
 """The learned part of the built-in masks: small neural networks whose weights come with the package.
 
-`python -m perception.bench.masks_training` makes the packaged file from rendered worlds alone, see docs/masks.md.
+`python tests/training/masks.py` makes the packaged file from rendered worlds alone, see docs/masks.md.
 """
 
 from __future__ import annotations

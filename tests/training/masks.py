@@ -1,4 +1,4 @@
-"""Trains the merge model of the built-in masks on rendered worlds: `python -m perception.bench.masks_training WORK`.
+"""Trains the merge model of the built-in masks on rendered worlds: `python tests/training/masks.py WORK`.
 
 Worlds are clutter, rooms and tabletops by seed, in sets of four: twelve sets train, two choose the cost and the
 calibration, two are for testing. Each world is read twice, as maps with and without depth images see its surface. Pairs
@@ -13,6 +13,7 @@ import argparse
 import json
 import os
 import pickle
+import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -22,12 +23,17 @@ from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 from perception.bench.output import Column, table
+from perception.demo import scene as scenes
 from perception.masks.merge_model import WEIGHTS, MergeModel, Network
 from perception.masks.merging import SMALLEST, MergeTree, divided, merge_tree, tree_by
 from perception.masks.surface import FOOTPRINTS
 from perception.masks.surface_graph import SurfaceGraph
+from training import clutter
 
+scenes.SCENES["clutter"] = clutter
 SCENES = (("clutter", 3100, 2), ("clutter", 3101, 2), ("room", 2000, 1), ("tabletop", 1000, 1))  # first seed, step
 KEPT = {"validation": (8, 18), "test": (9, 19)}  # numbers of sets that are not trained on
 PAIRS, LEAST = 8000, 20  # pairs of one world and round; voxels of a region that is learned from
@@ -125,14 +131,12 @@ def _noisy(depth: np.ndarray, stereo: bool, share: float, rng: np.random.Generat
 
 def make_world(folder: Path, stereo: bool) -> World:
     """The scene SCENE_SEED, rendered unless it is there. The tabletop's three walls count as three."""
-    from perception.demo.scene import make_photos
-
     file = folder.with_suffix(".stereo" if stereo else ".sensor")
     if not file.is_file():
         scene, seed = folder.name.split("_")
         if not (folder / "scene.json").is_file():
             size = {"width": 320, "height": 240, "views": 26 if scene == "room" else 20, "light_samples": 6}
-            make_photos(folder / "images", scene=scene, seed=int(seed), truth_folder=folder, **size)
+            scenes.make_photos(folder / "images", scene=scene, seed=int(seed), truth_folder=folder, **size)
         world, names = read_world(folder, stereo), json.loads((folder / "scene.json").read_text("utf-8"))["instances"]
         for wall in [entry["id"] for entry in names if entry["name"] == "wall"] if scene == "tabletop" else []:
             across = world.graph.surface.points[:, 0] * (world.truth == wall)
@@ -270,7 +274,7 @@ def report(model: MergeModel, groups: dict[str, list[World]]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(prog="python -m perception.bench.masks_training", description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("work", type=Path, metavar="WORK", help="folder of the worlds")
     parser.add_argument("--worlds", type=int, default=12, metavar="N", help="sets of four to train on (default 12)")
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="SCENE", help="more scenes to test on")

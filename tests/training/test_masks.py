@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from perception.bench.masks_training import fit, learn, make_world, pairs_of, plain_rule
 from perception.demo.scene import make_photos
+from training.masks import fit, learn, make_world, pairs_of, plain_rule
 
 
 @pytest.fixture(scope="module")
