@@ -84,7 +84,7 @@ COLUMNS: tuple[Column, ...] = (("AP", "ap", ".3f"), ("AP50", "ap50", ".3f"), ("A
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Prints the tables; JSON and the picture go to the output folder."""
+    """Prints the tables; JSON goes to the output folder."""
     options, pairs = parse_pairs(bench_parser("instances", __doc__), "SCENE MAP", arguments)
     results = [score_map(scene, gmap) for scene, gmap in pairs]
     lines = []

@@ -43,7 +43,7 @@ HOUSEHOLD = (
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Prints one figure per line; JSON and the picture go to the output folder."""
+    """Prints one figure per line; JSON goes to the output folder."""
     options, pairs = parse_pairs(bench_parser("queries", __doc__), "MAP SCENE", arguments)
     reports, lines = [measure(gmap, scene) for gmap, scene in pairs], []
     for report in reports:
