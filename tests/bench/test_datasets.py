@@ -153,7 +153,7 @@ def test_a_made_scene_is_a_truth_scene(ovs_run: Path, small_scene: Path, tmp_pat
     asked = json.loads((tmp_path / "queries.json").read_text())
     assert asked["prompts"] > 20 and asked["absent_prompts"] == 30
     assert asked["reliability"]["count"] == 30 + asked["prompts"] + asked["household_absent_prompts"]
-    assert found["reliability"]["count"] > 3 and (tmp_path / "instances.png").is_file()
+    assert found["reliability"]["count"] > 3
     (tmp_path / "bare").mkdir()
     with pytest.raises(InputError, match=r"no scene\.json"):
         queries.main([gmap, str(tmp_path / "bare")])
