@@ -22,6 +22,7 @@ from perception.bench.instances import read_scene, read_truth_cloud
 from perception.bench.output import SCORED, bench_parser, finish_reliability, parse_pairs
 from perception.errors import InputError
 from perception.language.ranking import Answer, Ranker, answering
+from perception.language.shape_words import singular
 from perception.query import QueryMap, load_map
 from perception.query.text_ranking import TextRanking
 
@@ -161,8 +162,3 @@ def accuracy(ranked: list[list[int]], right: list[set[int]]) -> tuple[float, flo
     pairs = list(zip(ranked, right, strict=True))
     top1, top3 = (float(np.mean([bool(answers & set(order[:k])) for order, answers in pairs])) for k in (1, 3))
     return round(top1, 3), round(top3, 3)
-
-
-def singular(word: str) -> str:
-    """The word without its plural s."""
-    return word[:-1] if word.endswith("s") and not word.endswith("ss") else word

@@ -101,18 +101,9 @@ def palette(pixels: np.ndarray) -> np.ndarray:
 
 def lab_of(pixels: np.ndarray) -> np.ndarray:
     """sRGB [P, 3] uint8 → CIELAB (D65) [P, 3] float64."""
-    c = np.asarray(pixels, np.float64) / 255.0
-    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-    xyz_from_rgb = np.array(
-        [
-            [0.4124564, 0.3575761, 0.1804375],
-            [0.2126729, 0.7151522, 0.0721750],
-            [0.0193339, 0.1191920, 0.9503041],
-        ]
-    )
-    xyz = linear @ xyz_from_rgb.T / xyz_from_rgb.sum(axis=1)
-    f = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
-    return np.stack([116 * f[:, 1] - 16, 500 * (f[:, 0] - f[:, 1]), 200 * (f[:, 1] - f[:, 2])], axis=1)
+    from skimage.color import rgb2lab
+
+    return np.asarray(rgb2lab(np.asarray(pixels, np.uint8)))
 
 
 def color_share(palettes: np.ndarray, word: str) -> np.ndarray:

