@@ -22,12 +22,7 @@ def register(commands: Any) -> None:
     )
     p.add_argument("-o", "--output", type=Path, metavar="OUT", help=".ply, .pcd or .npz")
     p.add_argument("--smooth", action=argparse.BooleanOptionalAction, default=True)
-    p.add_argument(
-        "--max-distance",
-        type=_length,
-        metavar="D",
-        help="points farther than D from any Gaussian stay -1 (auto: by the map's own spacing)",
-    )
+    p.add_argument("--max-distance", type=float, metavar="D", help="points farther from any Gaussian stay -1")
     p.add_argument("--segments", type=Path, metavar="X.segs.json", help="ScanNet's segments, or scannet: by its rules")
     p.add_argument(
         "--granularity", choices=("parts", "default", "groups"), default="default", help="parts of things, or groups"
@@ -43,10 +38,6 @@ def register(commands: Any) -> None:
     p.add_argument("--cameras", type=Path, metavar="transforms.json", help="default: the map's held-out views")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
     p.add_argument("--what", default="rgb", metavar="KINDS", help="comma-separated: rgb, depth, instances, features")
-
-
-def _length(text: str) -> float | str:
-    return text if text == "auto" else float(text)
 
 
 def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

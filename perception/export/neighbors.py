@@ -73,21 +73,6 @@ def nearest_gaussian(
     return result
 
 
-def auto_distance(means: np.ndarray) -> float | None:
-    """Distance limit from the map itself: twice the 99th percentile of the spacing of neighbouring means [N, 3].
-
-    Even in sparse regions a point on the mapped surface is within half that spacing of a mean; the limit is four times
-    this. Points beyond it were not mapped. None (no limit) for fewer than two distinct means.
-    """
-    means = means[np.isfinite(means).all(axis=1)]
-    if len(means) < 2:
-        return None
-    chosen = means[:: max(len(means) // 50_000, 1)]
-    gaps = Neighbors(means).query(chosen, 2)[1][:, 1]
-    gaps = gaps[gaps > 0]
-    return 2 * float(np.quantile(gaps, 0.99)) if len(gaps) else None
-
-
 def mesh_edges(faces: np.ndarray) -> np.ndarray:
     """Edges [E, 2] int32 of triangles [F, 3], three per face as ScanNet's segmentator lists them: 12, 13, 32.
 

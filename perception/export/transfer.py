@@ -6,14 +6,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from perception.errors import InputError
-from perception.export.neighbors import auto_distance, nearest_gaussian
+from perception.export.neighbors import nearest_gaussian
 from perception.export.smooth import read_segments, segment_cloud, vote
 from perception.io.atomic import replacing
 from perception.io.cloud import write_cloud
@@ -27,13 +27,13 @@ class ExportOptions:
     """How labels are transferred; the defaults are the paper's.
 
     drop_noise: Gaussians without an instance are ignored, so every point gets a label (as in the released code).
-    max_distance: in map units; None = no limit; "auto" = computed from the map's spacing (`auto_distance`).
+    max_distance: in map units, beyond which points stay unlabelled; None = no limit.
     smooth: superpoint vote, on or off. segments: a ScanNet *.segs.json to use instead of our own segmentation, or
     SCANNET for the one that ScanNet's segmentator makes of a mesh.
     """
 
     drop_noise: bool = True
-    max_distance: float | str | None = None
+    max_distance: float | None = None
     smooth: bool = True
     segments: Path | None = None
 
@@ -45,9 +45,10 @@ def export_labels(
 
     means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise).
     """
-    options = resolved(options or ExportOptions(), means, instance_ids)
+    options = options or ExportOptions()
     limit = options.max_distance
-    assert not isinstance(limit, str)  # resolved
+    if limit is not None and not limit >= 0:
+        raise InputError(f"max_distance is {limit}; expected a length that is not negative")
     used = np.isfinite(means).all(axis=1) & ((instance_ids >= 0) | (not options.drop_noise))
     nearest = nearest_gaussian(cloud.points, means[used], max_distance=limit)
     labels = np.append(instance_ids[used], -1).astype(np.int32)[nearest]
@@ -62,17 +63,6 @@ def export_labels(
     if limit is not None:
         smoothed[labels < 0] = -1  # points beyond the map stay unlabelled
     return np.where(np.isfinite(cloud.points).all(axis=1), smoothed, -1).astype(np.int32)
-
-
-def resolved(options: ExportOptions, means: np.ndarray, instance_ids: np.ndarray) -> ExportOptions:
-    """The options with `max_distance` as a number or None."""
-    limit = options.max_distance
-    if limit is None or (isinstance(limit, float | int) and limit >= 0):
-        return options
-    if limit != "auto":
-        raise InputError(f"max_distance is {limit}; expected a length that is not negative, or auto")
-    used = means[instance_ids >= 0] if options.drop_noise else means
-    return replace(options, max_distance=auto_distance(used))
 
 
 def check_overlap(means: np.ndarray, points: np.ndarray) -> float:

@@ -16,14 +16,7 @@ from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
 from perception.export.align import align
 from perception.export.depth_views import DepthView, depth_views
-from perception.export.transfer import (
-    ExportOptions,
-    check_overlap,
-    export_labels,
-    resolved,
-    write_export,
-    write_scannet,
-)
+from perception.export.transfer import ExportOptions, check_overlap, export_labels, write_export, write_scannet
 from perception.geometry import check_similarity, move_points, scale_of
 from perception.io.cloud import read_cloud
 from perception.io.recentre import map_from_input
@@ -131,7 +124,7 @@ def export_map(
         cloud = PointCloud(means[rows], rgb8_from_sh(gmap.sh[rows, 0]))
         options = ExportOptions(drop_noise=False, smooth=False)
     else:
-        cloud, options = given, resolved(options, means, ids)
+        cloud = given
     inside = check_overlap(means, cloud.points)
     labels = export_labels(means, ids, cloud, options)
     if color == "instance":

@@ -10,28 +10,20 @@ import pytest
 
 from perception.cli import main
 from perception.errors import InputError
-from perception.export.neighbors import auto_distance
 from perception.export.transfer import ExportOptions, export_labels
 from perception.io.cloud import read_cloud, write_cloud
 from perception.types import PointCloud
 
 
-def test_auto_distance_is_twice_the_spacing_of_a_grid() -> None:
-    grid = np.stack(np.meshgrid(*[np.arange(12.0)] * 3), axis=-1).reshape(-1, 3) * 0.25
-    assert auto_distance(grid) == pytest.approx(0.5, rel=1e-6)
-    assert auto_distance(grid * 8) == pytest.approx(4.0, rel=1e-6)  # in the map's own unit
-    assert auto_distance(grid[:1]) is None and auto_distance(np.ones((5, 3))) is None
-
-
-def test_points_beyond_the_map_stay_unlabelled_under_auto() -> None:
+def test_points_beyond_the_limit_stay_unlabelled() -> None:
     grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), axis=-1).reshape(-1, 3)
     ids = (grid[:, 0] > 3).astype(np.int32)
     points = np.array([[0, 0, 0], [7, 7, 7], [3.5, 3.5, 3.5], [7, 7, 8.9], [7, 7, 9.2], [-40, 0, 0]], np.float32)
-    labels = export_labels(grid, ids, PointCloud(points), ExportOptions(max_distance="auto", smooth=False))
+    labels = export_labels(grid, ids, PointCloud(points), ExportOptions(max_distance=2.0, smooth=False))
     assert labels.tolist()[:2] == [0, 1] and labels[3] == 1 and labels.tolist()[4:] == [-1, -1]
     unlimited = export_labels(grid, ids, PointCloud(points), ExportOptions(smooth=False))
     assert (unlimited >= 0).all()  # off by default, as in the paper
-    for bad in ("far", -1.0):
+    for bad in (float("nan"), -1.0):
         with pytest.raises(InputError, match="max_distance"):
             export_labels(grid, ids, PointCloud(points), ExportOptions(max_distance=bad))
 
