@@ -50,6 +50,17 @@ class PhotoConfig(Settings):
         "auto", description="given poses: refined where matched features show that they are wrong, kept, or refined"
     )
     strict: bool = Field(False, description="refuse a damaged photo instead of leaving it out")
+    memory: str | None = Field(
+        None,
+        pattern=r"^[1-9][0-9]*[MG]$",
+        title="a size such as 500M or 8G",
+        description="that photos, labels and depth may fill, others are on disk; none: a quarter of the machine's",
+    )
+
+    @property
+    def memory_bytes(self) -> int | None:
+        """`memory` in bytes."""
+        return None if self.memory is None else int(self.memory[:-1]) << {"M": 20, "G": 30}[self.memory[-1]]
 
 
 class FrameConfig(Settings):

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from perception import _core
 from perception.errors import InputError
+from perception.io.disk_arrays import Keep
 
 _kernels: Any = _core.training  # takes tensors through DLPack where its stub says arrays
 _LARGEST_ID = 2**31 - 1
@@ -124,8 +125,8 @@ class LabelAssignment:
     shape: tuple[int, ...]
 
 
-def assign_labels(labels: Tensor | np.ndarray) -> LabelAssignment:
-    """Indexes label image `labels` [H, W] of any integer type (0 = unlabelled, ids need not be dense).
+def assign_labels(labels: Tensor | np.ndarray, keep: Keep = np.asarray) -> LabelAssignment:
+    """Indexes label image `labels` [H, W] of any integer type (0 = unlabelled, ids need not be dense). keep: for slots.
 
     InputError for other types and ids.
     """
@@ -147,7 +148,7 @@ def assign_labels(labels: Tensor | np.ndarray) -> LabelAssignment:
         torch.tensor(ids, dtype=torch.int32),
         torch.tensor(counts, dtype=long),
         torch.tensor(first, dtype=long),
-        slots,
+        torch.from_numpy(keep(slots.numpy())),
         tuple(image.shape),
     )
 

@@ -79,7 +79,7 @@ class Trainer:
 
     def show(self, views: list[TrainingView]) -> None:
         """Sets the training views: the same photos as before, possibly with labels added."""
-        self.views, self.coarse = views, [view.halved() for view in views]
+        self.views, self.coarse = views, [view.halved().stored() for view in views]
         self._assigned: dict[str, LabelAssignment] = {}  # of the views seen so far
         self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
 
@@ -162,7 +162,8 @@ class Trainer:
             value, variance = variance_loss(spread, losses.variance_form, losses.variance_weight)  # λ_var L_var, eq. 13
             total, variance = total + value, (variance if view.weight is None else variance * weight)[None]
             if view.labels is not None:
-                labels = self._assigned[view.name] = self._assigned.get(view.name) or assign_labels(view.labels)
+                labels = self._assigned.get(view.name) or assign_labels(view.labels, view.keep)
+                self._assigned[view.name] = labels
                 w = INSTANCE_WEIGHT
                 found = instance_loss(out.features[0], labels, margin=losses.margin, w_pos=w, w_neg=w)  # eqs. 6 to 9
                 total, features = total + found.value, found.gradient[None]

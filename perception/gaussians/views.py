@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ import torch
 from perception.gaussians.model import Gaussians
 from perception.gaussians.rasterize import Rasterization
 from perception.gaussians.render import render
+from perception.io.disk_arrays import Keep
 
 BEST_PSNR = 100.0
 """PSNR in dB of two equal images, as in `evaluate.images`: finite, so that means and JSON stay valid."""
@@ -17,11 +19,11 @@ BEST_PSNR = 100.0
 
 @dataclass(frozen=True)
 class TrainingView:
-    """One photo as used in training. photo [H, W, 3] uint8; labels [H, W] int32 (0 = unlabelled) or None;
+    """One photo as used in training. photo [H, W, 3] uint8; labels [H, W] integers (0 = unlabelled) or None;
     K [3, 3] and camera_from_world [4, 4] float32; eps2d: see `rasterize`; weight [H, W] float32: 0 = pixel is ignored,
     None = all pixels count; depth [H, W] float32, what a sensor measured along the optical axis without its edges
     (`io.depth.without_edges`), in scene units, 0 = none; or None; gain [3] float32: colours of the
-    photo over those of the scene, None = 1."""
+    photo over those of the scene, None = 1. keep: where `stored` puts the images."""
 
     name: str
     photo: torch.Tensor
@@ -32,6 +34,15 @@ class TrainingView:
     weight: torch.Tensor | None = None
     depth: torch.Tensor | None = None
     gain: torch.Tensor | None = None
+    keep: Keep = np.asarray
+
+    def stored(self) -> TrainingView:
+        """The view with its images where `keep` puts them."""
+        kept: dict[str, Any] = {}
+        for name in ("photo", "labels", "weight", "depth"):
+            if (image := getattr(self, name)) is not None:
+                kept[name] = torch.from_numpy(self.keep(image.numpy()))
+        return replace(self, **kept)
 
     def halved(self) -> TrainingView:
         """The same view at half the resolution: photo averaged 2 × 2, labels taken at every other pixel. A pixel is

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,12 +15,18 @@ from perception.gaussians.rasterize import Settings, label_images
 
 @dataclass(frozen=True)
 class Silhouettes:
-    """One view. ids [H, W] int32: the instance with the largest weight in a pixel, −1 if it is below `threshold`;
-    pixels [M]: number of pixels per instance; visible [M]: Gaussians per instance that contribute to any pixel."""
+    """One view of shape (H, W). packed: `ids`, compressed; pixels [M]: number of pixels per instance; visible [M]:
+    Gaussians per instance that contribute to any pixel."""
 
-    ids: np.ndarray
+    packed: bytes
+    shape: tuple[int, ...]
     pixels: np.ndarray
     visible: np.ndarray
+
+    @property
+    def ids(self) -> np.ndarray:
+        """[H, W] int32: the instance with the largest weight in a pixel, −1 if it is below `threshold`."""
+        return np.frombuffer(zlib.decompress(self.packed), np.int32).reshape(self.shape)
 
 
 @torch.no_grad()
@@ -55,5 +62,6 @@ def render_silhouettes(
         count = int(ids.max(initial=-1)) + 1
         shown = ids[visible & (ids >= 0)]
         pixels = np.bincount(image[image >= 0], minlength=count)
-        found.append(Silhouettes(image, pixels, np.bincount(shown, minlength=count)))
+        packed = zlib.compress(image.astype(np.int32).tobytes(), 1)
+        found.append(Silhouettes(packed, image.shape, pixels, np.bincount(shown, minlength=count)))
     return found

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.disk_arrays import Keep
 from perception.masks.merging import Segmentation, segmentation
 from perception.masks.stereo import measure_depths
 from perception.masks.stereo_views import StereoView, make_stereo_view
@@ -49,12 +50,13 @@ class BuiltinSegmentation:
         load_photo: Callable[[View], np.ndarray],
         load_depth: Callable[[View], np.ndarray],
         progress: Progress | None = None,
+        keep: Keep = np.asarray,
     ) -> Segmentation | None:
         """Segments the surface seen by all photos jointly. load_depth: view -> [h, w] z-depth, 0 = none.
 
         There are no segments, None, if fewer than two photos have depth, or if no depths agree.
         """
-        made = [make_stereo_view(view, load_photo(view), load_depth(view)) for view in views]
+        made = [make_stereo_view(view, load_photo(view), load_depth(view), keep) for view in views]
         found = [view for view in made if view is not None]
         if len(found) < 2:
             return None
@@ -63,7 +65,9 @@ class BuiltinSegmentation:
         if len(surface) < _LEAST_VOXELS:
             return None
         cuts = segmentation(surface_graph(found, surface))
-        self._segment, self._views = cuts.segment, {view.name: view for view in found}
+        for seen in found:
+            seen.store(lambda image: image[:0].copy())  # `voxel` is what label images need
+        self._segment, self._views = cuts.segment, {seen.name: seen for seen in found}
         return cuts
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
@@ -92,7 +96,7 @@ def surface_graph(views: list[StereoView], surface: Surface) -> SurfaceGraph:
     graph = SurfaceGraph(surface, patches(surface, edges), edges)
     for view in views:
         photo, depth = view.cues()
-        view.voxel = surface.voxel_of(to_world(depth.points, view.world_from_camera))
+        view.voxel = view.keep(surface.voxel_of(to_world(depth.points, view.world_from_camera)))
         graph.add(np.where(view.voxel >= 0, graph.patch[view.voxel], -1), photo, depth)
     graph.link()
     return graph

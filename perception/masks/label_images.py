@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.disk_arrays import Keep
 from perception.io.documents import brief, safe_name
 from perception.masks.merging import Segmentation
 from perception.masks.source import GeometryMaskSource, MaskSource
@@ -39,12 +40,13 @@ def compute_masks(
     progress: Progress | None = None,
     load_depth: Callable[[View], np.ndarray] | None = None,
     depth_key: str = "",
+    keep: Keep = np.asarray,
 ) -> dict[str, Any]:
     """Writes the label image of every view below `folder`, skipping up-to-date files, and SEGMENTATION if the source
     finds segments of a surface. Returns a report.
 
     load_photo: view -> [h, w, 3] uint8 RGB, undistorted. load_depth: view -> [h, w] z-depth, 0 = none; required by a
-    GeometryMaskSource. depth_key: a string that changes whenever the depth changes.
+    GeometryMaskSource. depth_key: a string that changes whenever the depth changes. keep: where its images are kept.
     Report: source, identity, photos, skipped, seconds, masks (mean per photo), empty (names), warnings.
     """
     warnings = source.check(views)
@@ -53,7 +55,7 @@ def compute_masks(
         if load_depth is None:
             raise ValueError(f"masks from {source.name} need load_depth")
         if any(stored_key(label_file(folder, view)) != _key(view, source, depth_key) for view in views):
-            found = source.survey(views, load_photo, load_depth, progress)
+            found = source.survey(views, load_photo, load_depth, progress, keep)
             (folder / SEGMENTATION).unlink(missing_ok=True)
             if found is not None:
                 folder.mkdir(parents=True, exist_ok=True)

@@ -11,6 +11,7 @@ import numpy as np
 
 from perception.config import SamConfig
 from perception.errors import InputError
+from perception.io.disk_arrays import Keep
 from perception.io.model_store import default_model
 from perception.masks.merging import Segmentation
 from perception.progress import Progress
@@ -46,9 +47,10 @@ class GeometryMaskSource(MaskSource, Protocol):
         load_photo: Callable[[View], np.ndarray],
         load_depth: Callable[[View], np.ndarray],
         progress: Progress | None = None,
+        keep: Keep = np.asarray,
     ) -> Segmentation | None:
-        """Processes all photos jointly, once. load_depth: view -> [h, w] z-depth, 0 = none. Returns the segments of
-        the surface whose numbers the label images hold, if it has any."""
+        """Processes all photos jointly, once. load_depth: view -> [h, w] z-depth, 0 = none. keep: where images of all
+        photos are kept. Returns the segments of the surface whose numbers the label images hold, if it has any."""
         ...
 
 

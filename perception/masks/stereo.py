@@ -28,13 +28,14 @@ def measure_depths(views: list[StereoView], progress: Progress | None = None) ->
     chosen = choose_neighbours(views)
     depths = []
     for i, (view, near) in enumerate(zip(views, chosen, strict=True), start=1):
-        depths.append(sweep(view, [views[j] for j in near]) if near and not view.measured else view.depth)
+        swept = near and not view.measured
+        depths.append(view.keep(sweep(view, [views[j] for j in near])) if swept else view.depth)
         if progress is not None:
             progress.update("masks (stereo)", i, len(views))
     for view, depth, near in zip(views, depths, chosen, strict=True):
         if near:
             agreeing, mean = confirmed(depth, view, [views[j] for j in near], [depths[j] for j in near])
-            view.depth, view.confirmed = mean, agreeing >= min(_CONFIRMED, len(near))
+            view.depth, view.confirmed = view.keep(mean), view.keep(agreeing >= min(_CONFIRMED, len(near)))
 
 
 def sweep(view: StereoView, others: list[StereoView]) -> np.ndarray:

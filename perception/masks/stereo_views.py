@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from perception.io.disk_arrays import Keep
 from perception.masks.cues import DepthCues, PhotoCues, depth_cues, filled_depth, photo_cues
 from perception.types import View
 
@@ -19,7 +20,7 @@ class StereoView:
 
     prior: [h, w] depth known before stereo, 0 = none. depth: [h, w] current best depth. confirmed: [h, w] bool, pixels
     whose depth other photos agree with. measured: the prior comes from a sensor. voxel: [h, w] int32, the voxel of the
-    surface that each pixel shows, −1 = none, set by `surface_graph`.
+    surface that each pixel shows, −1 = none, set by `surface_graph`. keep: where images that are made later are kept.
     """
 
     name: str
@@ -32,6 +33,12 @@ class StereoView:
     confirmed: np.ndarray
     measured: bool = False
     voxel: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.int32))
+    keep: Keep = np.asarray
+
+    def store(self, keep: Keep) -> None:
+        """Puts the images but `voxel` where `keep` puts them."""
+        for name in ("photo", "grey", "prior", "depth", "confirmed"):
+            setattr(self, name, keep(getattr(self, name)))
 
     @property
     def center(self) -> np.ndarray:
@@ -48,7 +55,7 @@ class StereoView:
         return photo_cues(self.photo), depth_cues(self.depth, self.K)
 
 
-def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray) -> StereoView | None:
+def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray, keep: Keep = np.asarray) -> StereoView | None:
     """photo: [H, W, 3] uint8 RGB; depth: [H, W] prior, 0 = none. Returns None if too few pixels have depth."""
     import cv2
 
@@ -64,4 +71,6 @@ def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray) -> Stereo
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     pose = np.asarray(view.camera_from_world, np.float64)
     measured = view.depth is not None
-    return StereoView(view.name, small, grey, K, pose, prior, filled_depth(prior), prior > 0, measured)
+    made = StereoView(view.name, small, grey, K, pose, prior, filled_depth(prior), prior > 0, measured, keep=keep)
+    made.store(keep)
+    return made

@@ -46,10 +46,9 @@ LATER = ("masks", "instances", "language")
 
 
 def fingerprint(source: Path, config: MapConfig) -> str:
-    """Hash of the input path and all settings that change the map, without time_limit and stop_psnr."""
+    """Hash of the input path and all settings that change the map, without memory, time_limit and stop_psnr."""
     settings = config.to_json()
-    for name in ("time_limit", "stop_psnr"):
-        del settings["train"][name]
+    del settings["photos"]["memory"], settings["train"]["time_limit"], settings["train"]["stop_psnr"]
     return _digest(str(source.resolve()), settings)
 
 

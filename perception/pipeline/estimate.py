@@ -15,19 +15,24 @@ from perception.errors import InputError
 from perception.io.inputs import PhotoSizes, photo_sizes
 
 BASE_BYTES, BYTES_PER_GAUSSIAN, BYTES_PER_PIXEL, DEPTH_BYTES = 900 << 20, 2400, 7, 5
-"""Program and libraries; parameters, gradients and moments of a Gaussian; a decoded photo (3) and its labels (4); its
-depth in all resolutions."""
+"""Program and libraries; parameters, gradients and moments of a Gaussian; a decoded photo (3), its
+labels (2) and both at half the size (2); its depth in all resolutions."""
 STEP_BYTES_PER_PIXEL, DECODE_BYTES_PER_PIXEL, READERS = 200, 12, 4
 """Images and gradients of one training step; a photo of full size in one of the threads that read photos."""
 
 
-def needed_bytes(photos: PhotoSizes, max_side: int, budget: int) -> int:
-    """Peak memory of a run in bytes."""
+def image_memory(config: MapConfig, limit: int | None) -> int:
+    """Bytes that the photos, labels and depth of a run may fill: as set, or a quarter of the `limit` of the process."""
+    return config.photos.memory_bytes or (1 << 62 if limit is None else limit // 4)
+
+
+def needed_bytes(photos: PhotoSizes, max_side: int, budget: int, memory: int = 1 << 62) -> int:
+    """Peak memory of a run in bytes. memory: see `image_memory`."""
     pixels = [w * h * min(1.0, max_side / max(w, h)) ** 2 for w, h in photos.sizes]
     largest = max((w * h for w, h in photos.sizes), default=0)
     per_pixel = BYTES_PER_PIXEL + (DEPTH_BYTES if photos.depth else 0)
     at_once = max(STEP_BYTES_PER_PIXEL * max(pixels, default=0), DECODE_BYTES_PER_PIXEL * READERS * largest)
-    return int(BASE_BYTES + budget * BYTES_PER_GAUSSIAN + per_pixel * sum(pixels) + at_once)
+    return int(BASE_BYTES + budget * BYTES_PER_GAUSSIAN + min(per_pixel * sum(pixels), memory) + at_once)
 
 
 def log_estimate(source: Path, config: MapConfig, log: Callable[[str], None]) -> None:
@@ -35,7 +40,8 @@ def log_estimate(source: Path, config: MapConfig, log: Callable[[str], None]) ->
     photos = photo_sizes(source)
     if photos.sizes:
         check_memory(photos, config)
-        needed = needed_bytes(photos, config.photos.max_side, config.train.budget)
+        memory = image_memory(config, memory_limit())
+        needed = needed_bytes(photos, config.photos.max_side, config.train.budget, memory)
         log(f"{photos.what}, trained at up to {config.photos.max_side} pixels: about {needed / 2**30:.1f} GiB")
 
 
@@ -45,12 +51,12 @@ def check_memory(photos: PhotoSizes, config: MapConfig, limit: int | None = None
     limit None: the memory available to this process; nothing is checked if that is unknown.
     """
     limit = memory_limit() if limit is None else limit
-    side, budget = config.photos.max_side, config.train.budget
-    needed = needed_bytes(photos, side, budget)
+    side, budget, memory = config.photos.max_side, config.train.budget, image_memory(config, limit)
+    needed = needed_bytes(photos, side, budget, memory)
     if limit is None or needed <= limit:
         return
     smaller = [(max(64, int(side * share)), max(1000, int(budget * share))) for share in (0.75, 0.5, 0.35, 0.2, 0.1)]
-    fitting = next((pair for pair in smaller if needed_bytes(photos, *pair) <= limit), None)
+    fitting = next((pair for pair in smaller if needed_bytes(photos, *pair, memory) <= limit), None)
     advice = "give fewer or smaller photos, or use a machine with more memory"
     raise InputError(
         f"{photos.what} need about {needed / 2**30:.1f} GiB with --max-side {side} --budget {budget}, and there are "

@@ -145,7 +145,7 @@ def _silhouettes(
 def _shown(view: TrainingView, seen: Silhouettes) -> tuple[np.ndarray, np.ndarray]:
     """photo [H, W, 3] uint8 and instance image [H, W] int32; each pixel of halved silhouettes fills 2 × 2."""
     photo = view.photo.numpy()
-    y, x = (np.arange(side) * small // side for side, small in zip(photo.shape[:2], seen.ids.shape, strict=True))
+    y, x = (np.arange(side) * small // side for side, small in zip(photo.shape[:2], seen.shape, strict=True))
     return photo, seen.ids[y[:, None], x]
 
 
@@ -208,5 +208,5 @@ def _best_views(ids: np.ndarray, seen: list[Silhouettes], best: int) -> list[np.
     pixels = np.stack([view.pixels for view in seen], axis=1)
     total = np.maximum(np.bincount(ids[ids >= 0], minlength=len(pixels)), 1)
     visible = np.stack([view.visible for view in seen], axis=1) / total[:, None]
-    sizes = np.array([view.ids.size for view in seen])
+    sizes = np.array([int(np.prod(view.shape)) for view in seen])
     return choose_views(view_scores(pixels, sizes, visible), best)

@@ -20,6 +20,7 @@ from perception.gaussians.depth_start import start_on_surface
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
 from perception.gaussians.transients import train_without_transients
+from perception.io.disk_arrays import DiskArrays, Keep
 from perception.io.inputs import load_saved_scene, load_scene, save_scene
 from perception.io.map_files import read_info
 from perception.io.map_views import stored_view
@@ -41,7 +42,7 @@ from perception.pipeline.checkpoint import (
     training_mark,
     working,
 )
-from perception.pipeline.estimate import log_estimate
+from perception.pipeline.estimate import image_memory, log_estimate, memory_limit
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
 from perception.pipeline.photos import exposed_as_neighbours, load_all, split_views, with_labels
 from perception.pipeline.record import Stages, depth_errors, depth_used, finite, peak_memory_mib, versions
@@ -91,8 +92,9 @@ def build_map(
         training, held_out = split_views(scene.views, config.photos.holdout, config.photos.held_out)
         held_out = exposed_as_neighbours(held_out, training)
         with stages("photos"):
-            views = load_all(training, config.photos.max_side, progress)
-            held = load_all(held_out, config.photos.max_side, progress)
+            keep = DiskArrays(work, image_memory(config, memory_limit())).keep
+            views = load_all(training, config.photos.max_side, progress, keep)
+            held = load_all(held_out, config.photos.max_side, progress, keep)
 
         trainer = Trainer(initial_gaussians(scene, config, views), views, config, held)
         from_geometry = isinstance(mask_source, GeometryMaskSource)
@@ -110,7 +112,8 @@ def build_map(
                 trainer.run(observer, until=GEOMETRY_START)
         with stages("masks"):
             depth = trainer.depth if from_geometry else None
-            mask_report = _masks(training, mask_source, work, config, depth, mark, progress)
+            mask_report = _masks(training, mask_source, work, config, depth, mark, progress, keep)
+            del mask_source, depth  # with the views of stereo
             views = [with_labels(view, of, work / "masks") for view, of in zip(views, training, strict=True)]
             trainer.show(views)
 
@@ -118,7 +121,7 @@ def build_map(
         with stages("train"):
             trainer.run(observer)
         gaussians, trained = trainer.gaussians, trainer.record
-        del trainer, observer, mask_source, depth  # with the optimiser's moments and the photos' depth
+        del trainer, observer  # with the optimiser's moments
 
         # Group the Gaussians by their features into instances (§3.2.1), describe these from their best views (§3.2.2).
         with stages("instances"):
@@ -208,6 +211,7 @@ def _masks(
     depth: Callable[[str], np.ndarray] | None,
     mark: str,
     progress: Progress,
+    keep: Keep,
 ) -> dict[str, Any]:
     report = compute_masks(
         views,
@@ -217,6 +221,7 @@ def _masks(
         progress,
         load_depth=None if depth is None else lambda view: depth(view.name),
         depth_key=f"{config.photos.max_side} px" if depth is None else f"{mark} at progress {GEOMETRY_START}",
+        keep=keep,
     )
     for warning in report["warnings"]:
         progress.log(f"warning: {warning}")

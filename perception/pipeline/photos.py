@@ -12,6 +12,7 @@ import torch
 from perception.errors import InputError
 from perception.gaussians.train import TrainingView
 from perception.io.depth import load_depth, without_edges
+from perception.io.disk_arrays import Keep
 from perception.io.ignore_masks import load_weight
 from perception.io.photos import load_photo, scaled_K
 from perception.masks.label_images import load_labels
@@ -81,17 +82,19 @@ def training_view(view: View, max_side: int) -> TrainingView:
 
 
 def with_labels(decoded: TrainingView, view: View, folder: Path) -> TrainingView:
-    """The decoded photo with its label image from `folder`; ignored pixels are unlabelled."""
-    labels = np.ascontiguousarray(load_labels(folder, view), dtype=np.int32)
+    """The decoded photo with its label image from `folder`, in the smallest type; ignored pixels are unlabelled."""
+    labels = load_labels(folder, view)
+    most = int(labels.max(initial=0))
+    labels = labels.astype(np.uint8 if most < 256 else np.int16 if most < 1 << 15 else np.int32)
     if decoded.weight is not None:
         labels[decoded.weight.numpy() == 0] = 0
-    return replace(decoded, labels=torch.from_numpy(labels))
+    return replace(decoded, labels=torch.from_numpy(decoded.keep(labels)))
 
 
-def load_all(views: list[View], max_side: int, progress: Progress) -> list[TrainingView]:
-    """Decodes all `views`; takes 3 bytes of memory per pixel, and 4 more with depth."""
+def load_all(views: list[View], max_side: int, progress: Progress, keep: Keep = np.asarray) -> list[TrainingView]:
+    """Decodes all `views`; `keep` takes 3 bytes per pixel, and 4 more with depth."""
     loaded = []
     for done, view in enumerate(views, start=1):
-        loaded.append(training_view(view, max_side))
+        loaded.append(replace(training_view(view, max_side), keep=keep).stored())
         progress.update("photos", done, len(views))
     return loaded

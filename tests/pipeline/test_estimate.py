@@ -32,12 +32,13 @@ def test_what_grows_the_estimate() -> None:
     assert needed_bytes(base, 800, 200_000) - small == 100_000 * 2400
     assert needed_bytes(replace(base, depth=True), 800, 100_000) - small == 50 * 640 * 480 * 5
     assert needed_bytes(base, 320, 100_000) < small
+    assert small - needed_bytes(base, 800, 100_000, 5 << 20) == 50 * 640 * 480 * 7 - (5 << 20)  # the others: on disk
 
 
 def test_a_run_that_cannot_fit_says_what_to_change() -> None:
     """It was ended by the system after hours, without a word."""
     photos = PhotoSizes([(4032, 3024)] * 3000, False, "3000 photos")
-    words = ["photos.max_side=2000", "train.budget=1000000"]
+    words = ["photos.max_side=2000", "train.budget=1000000", "photos.memory=90G"]
     with pytest.raises(InputError, match=r"^3000 photos need about [\d.]+ GiB with .* give --max-side \d+") as told:
         check_memory(photos, load_config(None, words), 6 * GIB)
     options = str(told.value).rpartition("give ")[2].replace("--max-side ", "photos.max_side=")
