@@ -15,7 +15,7 @@ from perception import __version__
 from perception.cli.parser import Parser
 from perception.errors import InputError
 
-_MODULES = ("mapping", "maps", "clouds", "scoring", "serving", "models", "robot_inputs")
+_MODULES = ("mapping", "maps", "scoring", "serving", "models")
 """Files of this package that add subcommands, in the order of --help."""
 
 
