@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib
 import io
+import pkgutil
 import re
 import shlex
 import shutil
@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from perception.bench import BENCHES
 from perception.cli import build_parser, main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -69,7 +70,6 @@ def runnable() -> list[str]:
 
 def test_documented_options_and_settings_exist() -> None:
     """Every `--option` in running text is one of some command, every `--set KEY=VALUE` can be set."""
-    from perception.bench import BENCHES
     from perception.config import load_config
 
     options, settings = set(), set()
@@ -89,7 +89,7 @@ def _bench_help(name: str) -> str:
     """The `bench` commands parse their own arguments."""
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
-        importlib.import_module(f"perception.bench.{name.replace('-', '_')}").main(["--help"])
+        pkgutil.resolve_name(f"perception.bench.{BENCHES[name]}")(["--help"])
     return text.getvalue()
 
 

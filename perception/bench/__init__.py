@@ -1,4 +1,7 @@
-"""Benchmarks: `perception bench NAME`. Each module has `main(arguments)`."""
+"""Benchmarks: `perception bench NAME`."""
 
-BENCHES = ("rasterizer", "map", "instances", "queries", "lerf-mask", "lerf-ovs", "scannetpp")
-"""Benchmark names on the command line. A dash in a name is an underscore in the module name."""
+BENCHES = {
+    **{name: f"{name}:main" for name in ("rasterizer", "map", "instances", "queries")},
+    **{"lerf-mask": "lerf:LerfMask.main", "lerf-ovs": "lerf:LerfOvs.main", "scannetpp": "scannetpp:ScanNetPP.main"},
+}
+"""Name on the command line -> module of this package and function in it, which takes the arguments."""

@@ -218,6 +218,3 @@ def _read(path: Path, key: str) -> Any:
         raise InputError(
             f"{path}: expected a JSON object with '{key}' ({error!r}); download the scene's files again"
         ) from error
-
-
-main = ScanNetPP.main

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import importlib
+import pkgutil
 from pathlib import Path
 from typing import Any
 
@@ -83,5 +83,5 @@ def _eval_masks(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 def _bench(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if args.name not in BENCHES:
         raise InputError(f"bench: found '{args.name}', expected one of: {', '.join(BENCHES)}")
-    importlib.import_module(f"perception.bench.{args.name.replace('-', '_')}").main(args.rest)
+    pkgutil.resolve_name(f"perception.bench.{BENCHES[args.name]}")(args.rest)
     return {}, ""

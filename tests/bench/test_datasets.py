@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception.bench import instances, lerf_mask, lerf_ovs, queries, scannetpp
+from perception.bench import instances, queries, scannetpp
 from perception.bench.datasets import by_words
+from perception.bench.lerf import LerfMask, LerfOvs
+from perception.bench.scannetpp import ScanNetPP
 from perception.cli import main
 from perception.errors import InputError
 from perception.io.cloud import read_cloud, write_cloud
@@ -99,7 +101,7 @@ def ovs_run(downloads: Path, small_scene: Path, truth, tmp_path_factory: pytest.
     work = tmp_path_factory.mktemp("ovs")
     masks = f"labels:{small_scene / 'labels'}"
     brief = ["--set", "language.views=1", "--set", "language.zooms=1"]
-    lerf_ovs.main([str(downloads / "lerf_ovs"), "-o", str(work), "--masks", masks, *QUICK, *brief])
+    LerfOvs.main([str(downloads / "lerf_ovs"), "-o", str(work), "--masks", masks, *QUICK, *brief])
     path = work / "maps" / "table.gsmap" / "instances.json"
     found = json.loads(path.read_text())
     ball = next(thing for thing in things(truth) if "ball" in thing.name)
@@ -119,11 +121,11 @@ def test_lerf_ovs_from_download_to_table(ovs_run: Path, downloads: Path, capsys:
     for picture in (ovs_run / "predictions").rglob("*.png"):
         cv2.imwrite(str(picture), np.zeros((96, 128), np.uint8))
     again = [str(downloads / "lerf_ovs"), "-o", str(ovs_run)]
-    lerf_ovs.main(again)
+    LerfOvs.main(again)
     assert json.loads((ovs_run / "lerf_ovs.json").read_text())["result"]["mean"]["miou"] == 0
     # Without them they are made again from the map, where the ball now has its name.
     shutil.rmtree(ovs_run / "predictions")
-    lerf_ovs.main(again)
+    LerfOvs.main(again)
     result = json.loads((ovs_run / "lerf_ovs.json").read_text())["result"]
     assert result["mean"]["miou"] > 0.5 and result["mean"]["macc25"] == 1.0
     protocol = result["protocol"]
@@ -211,7 +213,7 @@ def test_scannetpp_from_download_to_table(
     labels = f"labels:{small_scene / 'labels'}"
     quick = ["--set", "language.views=1", "--set", "language.zooms=1", "--set", "photos.max_side=128", *QUICK]
     words = [str(tmp_path / "spp"), "-o", str(tmp_path / "w"), "--masks", labels, "--no-train-on-test", *quick]
-    scannetpp.main(words)
+    ScanNetPP.main(words)
     facts = json.loads((tmp_path / "w" / "scannetpp.json").read_text())
     assert facts["result"]["ap50"] > 0.3
     photos = facts["maps"]["0a1b"]["config"]["photos"]
@@ -241,7 +243,7 @@ def test_scannetpp_from_download_to_table(
             lines.append(f"{mask} {names.index(name) if right else 0} {score}\n")
         (tmp_path / "w/predictions/0a1b/0a1b.txt").write_text("".join(lines))
         shutil.rmtree(tmp_path / "w/submission")
-        scannetpp.main(words)
+        ScanNetPP.main(words)
         found = json.loads((tmp_path / "w" / "scannetpp.json").read_text())["result"]
         assert found["ap50"] == facts["result"]["ap50"]
         assert (found["open_vocabulary"]["ap50"] > 0.2) == right
@@ -308,8 +310,8 @@ def test_scannetpp_truth_is_the_toolkits(seed: int, tmp_path: Path) -> None:
 
 
 def test_what_is_not_a_dataset_is_told(tmp_path: Path, downloads: Path) -> None:
-    for bench, word in ((lerf_mask, "test_mask"), (lerf_ovs, "label"), (scannetpp, "scans")):
+    for bench, word in ((LerfMask, "test_mask"), (LerfOvs, "label"), (ScanNetPP, "scans")):
         with pytest.raises(InputError, match=word):
             bench.main([str(tmp_path), "-o", str(tmp_path / "w")])
     with pytest.raises(InputError, match="no scene 'ramen'; found broken, table"):
-        lerf_mask.main([str(downloads / "lerf_mask"), "-o", str(tmp_path / "w"), "--scenes", "ramen"])
+        LerfMask.main([str(downloads / "lerf_mask"), "-o", str(tmp_path / "w"), "--scenes", "ramen"])
