@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import sys
@@ -15,17 +16,15 @@ from perception.io.atomic import atomic_directory
 from perception.io.checksums import facts_of, sha256
 from perception.io.documents import brief
 from perception.io.model_store import (
+    NAME,
     RECORD,
     Entry,
     StoredModel,
     catalogue,
-    check_name,
     find_model,
     known_names,
     models_folder,
     set_default,
-    stored_models,
-    write_record,
 )
 from perception.io.onnx_sessions import model_graphs, model_root, side_files
 from perception.progress import Progress
@@ -132,22 +131,13 @@ def judge(found: Sequence[dict[str, Any]]) -> tuple[str | None, str | None, str]
     return family, purpose, f"the {' and '.join(sorted(lacking))} is missing; both are needed" if lacking else ""
 
 
-def list_models() -> list[dict[str, Any]]:
-    """Name, family, purpose, bytes and folder of each stored model."""
-    fields = ("name", "family", "purpose", "files")
-    return [
-        {field: getattr(model, field) for field in fields}
-        | {"bytes": sum(int(entry["bytes"]) for entry in model.files), "folder": str(model.folder)}
-        for model in stored_models()
-    ]
-
-
 def add_model(name: str, sources: Sequence[str], *, default: bool = False) -> StoredModel:
     """Adds files (or all files of a folder) to the store under `name`, all or none.
 
     default: `--masks auto` uses this model from now on.
     """
-    check_name(name)
+    if not NAME.fullmatch(name):
+        raise InputError(f"model name '{name}': expected letters, digits, '.', '_' or '-', as in mobile-sam")
     known = _install(name, [file for source in sources for file in _local(source)])
     if default:
         set_default(known)
@@ -237,5 +227,6 @@ def _install(name: str, files: Sequence[tuple[str, Path, str]]) -> StoredModel:
             shutil.copyfile(path, target)
             entries.append({"name": file_name, "source": source, **facts_of(target)})
         family, purpose, _ = judge([describe_graph(graph) for graph in sorted(folder.rglob("*.onnx"))])
-        write_record(folder, family, purpose, entries)
+        record = json.dumps({"family": family, "purpose": purpose, "files": entries}, indent=1)
+        (folder / RECORD).write_text(record + "\n", encoding="utf-8")
     return StoredModel(name, models_folder() / name, family, purpose, entries)

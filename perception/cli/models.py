@@ -26,10 +26,13 @@ def register(commands: Any) -> None:
 
 
 def _list(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.model_store import models_folder
-    from perception.models import list_models
+    from perception.io.model_store import models_folder, stored_models
 
-    found = list_models()
+    found = [
+        {name: getattr(model, name) for name in ("name", "family", "purpose", "files")}
+        | {"bytes": sum(int(entry["bytes"]) for entry in model.files), "folder": str(model.folder)}
+        for model in stored_models()
+    ]
     lines = [
         f"{m['name']:24} {m['purpose'] or '-':5} {m['family'] or 'unknown':14} {m['bytes'] / 1e6:9.1f} MB"
         for m in found

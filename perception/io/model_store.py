@@ -16,7 +16,7 @@ from perception.io.atomic import atomic_file
 from perception.io.documents import read_json
 
 RECORD = "perception.json"
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _DEFAULTS = "defaults.json"
 
 
@@ -61,13 +61,6 @@ def models_folder() -> Path:
     return cache_folder() / "models"
 
 
-def check_name(name: str) -> str:
-    """Returns `name`; InputError unless it is a valid folder name that is not a path."""
-    if not _NAME.fullmatch(name):
-        raise InputError(f"model name '{name}': expected letters, digits, '.', '_' or '-', as in mobile-sam")
-    return name
-
-
 def stored_models() -> list[StoredModel]:
     """All stored models, sorted by name."""
     if not models_folder().is_dir():
@@ -78,7 +71,7 @@ def stored_models() -> list[StoredModel]:
 
 def find_model(name: str) -> StoredModel | None:
     """The stored model `name`, or None. InputError for a damaged record."""
-    if not _NAME.fullmatch(name):
+    if not NAME.fullmatch(name):
         return None
     folder = models_folder() / name
     if not (folder / RECORD).is_file():
@@ -102,12 +95,6 @@ def known_names() -> str:
     """Names of the stored models, for messages."""
     names = ", ".join(model.name for model in stored_models())
     return f"the store holds {names}" if names else "the store is empty (see perception models add)"
-
-
-def write_record(folder: Path, family: str | None, purpose: str | None, files: list[dict[str, Any]]) -> None:
-    """Writes the model's record into its folder."""
-    text = json.dumps({"family": family, "purpose": purpose, "files": files}, indent=1)
-    (folder / RECORD).write_text(text + "\n", encoding="utf-8")
 
 
 def default_model(purpose: str) -> str | None:
