@@ -85,7 +85,6 @@ class SamConfig(Settings):
 class TrainConfig(Settings):
     iterations: int = Field(3000, ge=1, le=10**8, description="iterations of training; all schedules scale with them")
     time_limit: float | None = Field(None, gt=0, description="seconds of training; all schedules shrink to fit")
-    stop_psnr: float | None = Field(None, gt=0, le=100, description="dB of held-out PSNR at which training ends")
     exchange_db: float = Field(
         0.03,
         ge=0,

@@ -98,7 +98,6 @@ _SHORTCUTS = {
     "train.budget": ("N", "most Gaussians the map may have"),
     "train.iterations": ("N", None),
     "train.time_limit": ("S", "seconds of training; all schedules shrink to fit"),
-    "train.stop_psnr": ("DB", "held-out PSNR at which training ends"),
     "photos.memory": ("SIZE", "such as 8G: that photos, labels and depth may fill; others are on disk"),
     "photos.holdout": ("N", "every N-th view is kept for scoring, 0 trains on all"),
     "seed": ("S", None),

@@ -161,16 +161,11 @@ class Schedule:
                 trainer.set_degree(degree)
 
     def _stop_early(self) -> None:
-        """Skips to the cool-down when the target PSNR is reached or more training gains too little."""
+        """Skips to the cool-down when more training gains too little."""
         trainer, stopping, progress = self.trainer, self.stopping, self.trainer.progress
-        if stopping.finished or not self._may_stop(progress):
+        if stopping.finished or not stopping.degree_decided or progress < STOP or not self._may_stop(progress):
             return
-        target, reason = self.config.train.stop_psnr, None
-        if target is not None and stopping.scores and stopping.scores[-1] >= target:
-            reason = f"stop: held-out PSNR {stopping.scores[-1]:.2f} dB, {target:g} were asked"
-        elif stopping.degree_decided and progress >= STOP:
-            reason = stopping.plateau(progress)
-        if reason is not None:
+        if (reason := stopping.plateau(progress)) is not None:
             stopping.finished, stopping.growing = True, False
             left = 1.0 - COOLDOWN - progress
             trainer.skip(left)

@@ -9,7 +9,7 @@ repeats only what has changed.
     group      optimise, instances.*                                      nothing: it takes seconds
     describe   group, language.*                                          nothing
 
-train.time_limit and train.stop_psnr are not part of the dependencies, so that a stopped run can be continued with more
+train.time_limit is not part of the dependencies, so that a stopped run can be continued with more
 time. If other optimisation settings have changed, the checkpoint is an error and not discarded, as it may be hours of
 work. With changed masks, training restarts at the point where masks are first used.
 """
@@ -46,9 +46,9 @@ LATER = ("masks", "instances", "language")
 
 
 def fingerprint(source: Path, config: MapConfig) -> str:
-    """Hash of the input path and all settings that change the map, without memory, time_limit and stop_psnr."""
+    """Hash of the input path and all settings that change the map, without memory and time_limit."""
     settings = config.to_json()
-    del settings["photos"]["memory"], settings["train"]["time_limit"], settings["train"]["stop_psnr"]
+    del settings["photos"]["memory"], settings["train"]["time_limit"]
     return _digest(str(source.resolve()), settings)
 
 

@@ -84,18 +84,6 @@ def test_rates_cool_down_over_the_last_share_only() -> None:
 SMALL = ["train.budget=3000", "densify.every=20", "language.encoder=none", "photos.holdout=6"]
 
 
-def test_a_run_stops_at_the_quality_that_was_asked(small_scene: Path, tmp_path: Path) -> None:
-    source, labels = small_scene / "transforms.json", f"masks=labels:{small_scene / 'labels'}"
-    pairs = [*SMALL, labels, "train.iterations=200", "densify.every=10"]
-    whole = build_map(source, tmp_path / "whole.gsmap", load_config(None, [*pairs, "train.exchange_db=0"]))
-    asked = max(point["psnr"] for point in whole.info["training"]["curve"][:-2]) - 1.5
-    early = build_map(source, tmp_path / "early.gsmap", load_config(None, [*pairs, f"train.stop_psnr={asked}"]))
-    training = early.info["training"]
-    assert training["iterations"] < whole.info["training"]["iterations"] == 200
-    assert any(text.startswith("stop: held-out PSNR") for text in training["decisions"])
-    assert early.info["quality"]["psnr"] >= asked - 0.2 and len(early.instances) > 3
-
-
 def test_growth_and_training_end_where_they_do_not_pay(small_scene: Path, tmp_path: Path) -> None:
     scene = tmp_path / "scene"
     shutil.copytree(small_scene, scene)
