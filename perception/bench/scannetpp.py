@@ -64,7 +64,6 @@ class ScanNetPP(DatasetBench):
             help="objects of the 84 instance classes (the toolkit), or all annotations, walls too (Segment3D)",
         )
         parser.add_argument("--smooth", action=argparse.BooleanOptionalAction, default=True)
-        parser.add_argument("--max-distance", type=float, metavar="D")
         parser.add_argument("--train-on-test", action=argparse.BooleanOptionalAction, default=True)
 
     def scenes(self) -> dict[str, Path]:
@@ -86,7 +85,7 @@ class ScanNetPP(DatasetBench):
         mesh = read_cloud(scene / "scans" / f"{MESH}.ply")
         gmap = self.map(name, photos[0].parent.parent, tests, self._settings(name, scene, photos[0], mesh))
         segments = scene / "scans" / "segments.json"
-        options = ExportOptions(max_distance=self.args.max_distance, smooth=self.args.smooth, segments=segments)
+        options = ExportOptions(smooth=self.args.smooth, segments=segments)
         labels = export_labels(gmap.means, gmap.instance_ids, mesh, options)
         classes = None
         if named is not None and gmap.instances and (opened := QueryMap.of(gmap)).problem is None:
@@ -154,7 +153,6 @@ class ScanNetPP(DatasetBench):
             else f"objects of {len(classes.instance)} instance classes of {len(classes.names)}; labels mapped by "
             "map_benchmark.csv; the smallest object holds a vertex; the first annotation is void (toolkit)",
             "smoothing": "the data set's segments (segments.json)" if self.args.smooth else "off",
-            "max_distance": self.args.max_distance,
             "test_photos": "trained on" if self.args.train_on_test else "held out",
         }
         result["protocol"] |= switches
