@@ -16,16 +16,13 @@ def colorize_instances(ids: np.ndarray) -> np.ndarray:
     return instance_palette(present)[inverse.reshape(ids.shape)]
 
 
-def _colormap(level: np.ndarray, name: int) -> np.ndarray:
-    return cv2.applyColorMap(np.round(255 * level).astype(np.uint8), name)[..., ::-1].copy()
-
-
 def error_map(a: np.ndarray, b: np.ndarray, full: float = 0.25) -> np.ndarray:
     """Difference of two images (uint8, or float in [0, 1]): black = equal, brightest = `full` or more (of 1)."""
     if a.shape != b.shape:
         raise ValueError(f"error_map: pictures of shapes {a.shape} and {b.shape}; they must agree")
     difference = np.abs(_unit(a) - _unit(b)).mean(-1)
-    return _colormap(np.clip(difference / full, 0, 1), cv2.COLORMAP_INFERNO)
+    level = np.round(255 * np.clip(difference / full, 0, 1)).astype(np.uint8)
+    return cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1].copy()
 
 
 def _unit(picture: np.ndarray) -> np.ndarray:

@@ -121,7 +121,8 @@ class Ranker:
         self._usual_spreads = [float(self._spreads(texts, part).mean()) for part in self._parts]
         self._null = self._best_of_absent(texts)
         self._label_rows = self._encode([self._names[i] for i in self._named])
-        self._label_null = _middle_and_spread(self._label_rows @ texts.T)
+        fits = self._label_rows @ texts.T
+        self._label_null = fits.mean(axis=1), np.maximum(fits.std(axis=1), 1e-6)
 
     def over(self, descriptions: Sequence[InstanceDescription], shapes: np.ndarray | None = None) -> Ranker:
         """A Ranker with the same encoder for other instances, without labels. shapes: as `self.shapes`, for these."""
@@ -250,11 +251,6 @@ class Ranker:
 def probes() -> list[str]:
     """Objects that are rarely in a scene, one per line in probes.txt."""
     return (Path(__file__).parent / "probes.txt").read_text(encoding="utf-8").split("\n")[:-1]
-
-
-def _middle_and_spread(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of each row."""
-    return x.mean(axis=1), np.maximum(x.std(axis=1), 1e-6)
 
 
 def _phi(z: float) -> float:

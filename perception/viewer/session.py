@@ -22,18 +22,13 @@ MODES = ("photo", "instances", "parts", "features")
 HIGHLIGHT = np.array([255, 214, 10], np.uint8)
 
 
-def base_colors(gmap: Map) -> np.ndarray:
-    """[N, 3] uint8: the part of each Gaussian's colour that does not depend on the view (harmonic of degree 0)."""
-    return rgb8_from_sh(gmap.sh[:, 0])
-
-
 def paint(gmap: Map, ids: np.ndarray, mode: str) -> np.ndarray:
     """[N, 3] uint8 colours in a mode of MODES; ids [N]: instance (or part) of each Gaussian, −1 = none (grey)."""
     if mode in ("instances", "parts"):
         return instance_palette(ids)
     if mode == "features":
         return features_to_rgb(gmap.features[None])[0]
-    return base_colors(gmap)
+    return rgb8_from_sh(gmap.sh[:, 0])  # the part that does not depend on the view
 
 
 def highlight(colors: np.ndarray, ids: np.ndarray, chosen: Collection[int]) -> np.ndarray:
