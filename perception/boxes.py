@@ -1,12 +1,16 @@
-"""Oriented boxes around point sets."""
+"""Oriented boxes around point sets, and the geometry of instances."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from perception.geometry import scale_of
 from perception.types import OrientedBox
 
+BOX_TRIM = 0.01
+"""Share of an instance's Gaussians left out of its oriented box at either end of each axis, as outliers."""
 SAMPLE = 4096
 """Maximum number of points from which the axes of a trimmed box are chosen."""
 
@@ -104,3 +108,20 @@ def move_box(a_from_b: np.ndarray, box: OrientedBox) -> OrientedBox:
     rotation = np.asarray(box.rotation, np.float64) @ (a_from_b[:3, :3] / scale).T  # rows are axes
     center = a_from_b[:3, :3] @ np.asarray(box.center, np.float64) + a_from_b[:3, 3]
     return OrientedBox(center, rotation, np.asarray(box.extent, np.float64) * scale)
+
+
+def instance_entry(
+    instance: int, points: np.ndarray, weights: np.ndarray, score: float, views: int, label: str | None = None
+) -> dict[str, Any]:
+    """The entry in instances.json of Gaussians at points [G, 3] float64 with opacities `weights` [G]; views: number of
+    photos that show it."""
+    return {
+        "id": instance,
+        "label": label,
+        "score": score,
+        "num_gaussians": len(points),
+        "views": views,
+        "centroid": (weights @ points / max(weights.sum(), 1e-12)).tolist(),
+        "obb": oriented_box(points, BOX_TRIM).to_json(),
+        "aabb": {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()},
+    }

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from perception.boxes import oriented_box
+from perception.boxes import instance_entry
 from perception.config import FrameConfig, InstanceConfig
 from perception.errors import InputError
 from perception.frame.scaled_map import scale_map
@@ -170,8 +170,8 @@ class Editor:
         entries = [self.instances[place] for place in places]
         weights = np.array([entry["num_gaussians"] for entry in entries], np.float64)
         label = next((entry["label"] for entry in entries if entry.get("label")), None)
-        merged = self._entry(new, ids, label, float(weights @ [e["score"] for e in entries] / weights.sum()))
-        merged["views"] = max(int(entry.get("views", 0)) for entry in entries)
+        score = float(weights @ [entry["score"] for entry in entries] / weights.sum())
+        merged = self._entry(new, ids, score, max(int(entry.get("views", 0)) for entry in entries), label)
         if texts := [text for entry in entries for text in entry.get("texts", [])]:
             merged["texts"] = texts
         self._replace(f"merged {', '.join(map(str, chosen))} into {new}", places, ids, [merged], _joined)
@@ -195,7 +195,7 @@ class Editor:
         ids[rows] = _nearest_filled(gmap.means[rows], found) + first
         news = list(range(first, first + int(found.max()) + 1))
         entry = self.instances[place]
-        parts = [{**self._entry(new, ids, None, entry["score"]), "views": entry.get("views", 0)} for new in news]
+        parts = [self._entry(new, ids, entry["score"], entry.get("views", 0)) for new in news]
         self._replace(f"split {instance} into {len(parts)}", [place], ids, parts, lambda descriptions: descriptions[0])
         return news
 
@@ -279,19 +279,10 @@ class Editor:
         entries = [entry for state in (*self._past, *self._future) for entry in state.instances]
         return 1 + max((e["id"] for entry in entries for e in (entry, *entry.get("parts", []))), default=-1)
 
-    def _entry(self, instance: int, ids: np.ndarray, label: str | None, score: float) -> dict[str, Any]:
-        rows = ids == instance
-        points = self.original.means[rows].astype(np.float64)
-        weights = self.original.opacities[rows].astype(np.float64)
-        return {
-            "id": instance,
-            "label": label,
-            "score": score,
-            "num_gaussians": int(rows.sum()),
-            "centroid": (weights @ points / max(weights.sum(), 1e-12)).tolist(),
-            "obb": oriented_box(points).to_json(),
-            "aabb": {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()},
-        }
+    def _entry(self, instance: int, ids: np.ndarray, score: float, views: int, label: Any = None) -> dict[str, Any]:
+        gmap, rows = self.original, ids == instance
+        points, weights = gmap.means[rows].astype(np.float64), gmap.opacities[rows].astype(np.float64)
+        return instance_entry(instance, points, weights, score, views, label)
 
     def _replace(
         self,

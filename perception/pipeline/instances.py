@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from perception import _core
-from perception.boxes import oriented_box
+from perception.boxes import instance_entry
 from perception.config import LanguageConfig, MapConfig
 from perception.gaussians.model import Gaussians
 from perception.gaussians.train import TrainingView
@@ -27,8 +27,6 @@ from perception.language.description import to_arrays
 from perception.masks.merging import Segmentation
 from perception.progress import Progress
 
-BOX_TRIM = 0.01
-"""Share of an instance's Gaussians left out of its oriented box at either end of each axis, as outliers."""
 HALVED_FROM = 480
 """Long side in pixels from which silhouettes are rendered at half the resolution, at a third of the time."""
 
@@ -155,7 +153,7 @@ def _entries(grouped: Grouping, gaussians: Gaussians, seen: list[Silhouettes]) -
     points, weights = (t.detach().numpy().astype(np.float64) for t in (gaussians.means, gaussians.opacities))
 
     def entry(number: int, ids: np.ndarray, score: float, shown: int) -> dict[str, Any]:
-        return _entry(number, points[ids == number], weights[ids == number], score, shown)
+        return instance_entry(number, points[ids == number], weights[ids == number], score, shown)
 
     entries = [entry(i, grouped.ids, float(grouped.scores[i]), int(views[i])) for i in range(grouped.count)]
     for number, parent in enumerate(grouped.parents):
@@ -163,20 +161,6 @@ def _entries(grouped: Grouping, gaussians: Gaussians, seen: list[Silhouettes]) -
         part = entry(grouped.count + number, grouped.part_ids, score, shown)
         entries[parent].setdefault("parts", []).append({**part, "parent": parent})
     return entries
-
-
-def _entry(instance: int, points: np.ndarray, weights: np.ndarray, score: float, views: int) -> dict[str, Any]:
-    """instances.json's entry of Gaussians at points [G, 3] with opacities `weights` [G]; lengths in world units."""
-    return {
-        "id": instance,
-        "label": None,
-        "score": score,
-        "num_gaussians": len(points),
-        "views": views,
-        "centroid": (weights @ points / weights.sum()).tolist(),
-        "obb": oriented_box(points, BOX_TRIM).to_json(),
-        "aabb": {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()},
-    }
 
 
 def _embed(
