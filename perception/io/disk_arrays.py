@@ -21,34 +21,40 @@ Keep = Callable[[np.ndarray], np.ndarray]
 
 
 class DiskArrays:
-    """Keeps arrays, the first of together `limit` / 2 bytes in memory, the others in unnamed mapped files of `folder`.
+    """Keeps arrays, those of the first `limit` / 2 bytes in memory, the others in unnamed mapped files of `folder`.
 
     A thread drops the files' pages from memory when more than `limit` / 2 bytes of them are resident. That is safe at
     any time: the numbers are in the file, and mostly in the system's cache, from which a page returns in less than a
     microsecond. Files vanish with the last array, or with the process. OSError when the disk is full.
+
+    Memory is taken in blocks of CHUNK bytes, apart from the allocator's, whose space kept arrays would split.
     """
 
     def __init__(self, folder: Path, limit: int) -> None:
         self.folder, self.most = folder, limit // 2
-        self._held = self._used = 0  # bytes of arrays in memory, and of the last file
+        self._held = 0  # bytes of blocks in memory
+        self._block, self._used = mmap.mmap(-1, 1), 1  # the block that is being filled, and its bytes in use
         self._files: list[mmap.mmap] = []
         self._before = mapped_bytes()
 
     def keep(self, array: np.ndarray) -> np.ndarray:
-        """The array, or a copy on disk."""
-        self._held += array.nbytes
-        if self._held <= self.most:
-            return array
-        if not self._files:
-            threading.Thread(target=_watch, args=(weakref.ref(self),), daemon=True).start()
+        """A copy of the array."""
         needed = -(-array.nbytes // 64) * 64  # compiled loops rely on aligned numbers
-        if not self._files or self._used + needed > len(self._files[-1]):
-            self._files.append(_new_file(self.folder, max(CHUNK, needed)))
-            self._used = 0
-        flat = np.frombuffer(self._files[-1], array.dtype, array.size, self._used)
+        if self._used + needed > len(self._block):
+            self._block, self._used = self._new_block(max(CHUNK, needed)), 0
+        flat = np.frombuffer(self._block, array.dtype, array.size, self._used)
         self._used += needed
         flat[:] = array.reshape(-1)
         return flat.reshape(array.shape)
+
+    def _new_block(self, size: int) -> mmap.mmap:
+        if self._held + size <= self.most:
+            self._held += size
+            return mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        if not self._files:
+            threading.Thread(target=_watch, args=(weakref.ref(self),), daemon=True).start()
+        self._files.append(_new_file(self.folder, size))
+        return self._files[-1]
 
     def trim(self) -> None:
         """Drops the pages of all files if there are too many."""

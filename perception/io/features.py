@@ -22,6 +22,7 @@ import numpy as np
 from PIL import Image
 
 from perception.io.atomic import atomic_directory, recover
+from perception.io.cloud_memory import cores
 from perception.io.ignore_masks import stage_masks
 from perception.io.lens import load_pycolmap
 from perception.io.photos import exif_of, open_photo, photo_size, read_photo
@@ -92,6 +93,10 @@ NEIGHBORS = 4
 COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS = 256, 4, 0.7, 6
 """Preemptive matching. The strict ratio rejects pairs that share repeated textures only; these give wrong models.
 Every photo keeps its PARTNERS best pairs, so that the match graph stays connected."""
+RETRIEVED_ABOVE, RETRIEVED, WORDS = 200, 40, 64
+"""Of more photos, only the RETRIEVED most similar of each are compared, by a global descriptor of WORDS centres."""
+PAIRS_AT_ONCE = 2000
+"""Pairs between two steps of the progress bar, for that many photos."""
 POSED_PARTNERS = 12
 """With given poses no model has to be found: each photo is matched with this many photos at most, the best pairs."""
 AT_ONCE = 64
@@ -240,9 +245,8 @@ def _match(
     database: Path, pair_file: Path, names: list[str], seed: int, most: int, progress: Progress
 ) -> tuple[int, int]:
     pycolmap = load_pycolmap()
-    pairs = _select_pairs(database, names, most)
-    pair_file.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs))
-    progress.update("poses: matching", 0, 1)
+    pairs = _select_pairs(database, names, most, progress)
+    progress.update("poses: matching", 0, len(pairs))
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     # The index of descriptors is trained with OpenBLAS, in pycolmap's wheel one without threads or locks. With several
@@ -255,28 +259,70 @@ def _match(
     verification.min_num_inliers = MIN_INLIERS
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = pair_file
-    pycolmap.match_image_pairs(database, matching, pairing)
-    pycolmap.verify_matches(database, pair_file, verification)
-    progress.update("poses: matching", 1, 1)
+    at_once = PAIRS_AT_ONCE if len(names) > RETRIEVED_ABOVE else max(len(pairs), 1)
+    for first in range(0, len(pairs), at_once):
+        some = pairs[first : first + at_once]
+        pair_file.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in some))
+        pycolmap.match_image_pairs(database, matching, pairing)
+        pycolmap.verify_matches(database, pair_file, verification)
+        progress.update("poses: matching", first + len(some), len(pairs))
     return len(pairs), len(names) * (len(names) - 1) // 2
 
 
-def _select_pairs(database: Path, names: list[str], most: int) -> list[tuple[int, int]]:
+def _select_pairs(database: Path, names: list[str], most: int, progress: Progress) -> list[tuple[int, int]]:
     """All pairs of a small set; else neighbours by name and pairs whose largest features match, of these the `most`
     best pairs of each photo.
 
     Preemptive matching (Wu, "Towards Linear-time Incremental Structure from Motion", 3DV 2013, section 3): the
     few largest-scale features predict whether a pair overlaps. This also finds loop closures without a vocabulary.
+    Of a large set, not all pairs are compared, but those of `similar_photos`.
     """
     count = len(names)
-    every = list(combinations(range(count), 2))
     if count < EXHAUSTIVE_BELOW:
-        return every
+        return list(combinations(range(count), 2))
     descriptors = _largest_features(database, names)
-    votes = _coarse_votes(descriptors)
+    compared = similar_photos(descriptors) if count > RETRIEVED_ABOVE else np.ones((count, count), bool)
+    votes = _coarse_votes(descriptors, compared, progress)
     rank = np.argsort(np.argsort(-votes, axis=1, kind="stable"), axis=1)
     keep = (rank < most) & (votes >= np.where(rank < PARTNERS, 1, COARSE_MIN_MATCHES))
-    return [(i, j) for i, j in every if j - i <= NEIGHBORS or keep[i, j] or keep[j, i]]
+    near = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) <= NEIGHBORS
+    return [(i, j) for i, j in np.argwhere(np.triu(near | keep | keep.T, 1)).tolist()]
+
+
+def similar_photos(descriptors: list[np.ndarray]) -> np.ndarray:
+    """[n, n] bool, symmetric: whether one of two photos is among the RETRIEVED most similar of the other.
+
+    descriptors: unit features [F, 128] of each photo. Similarity is the cosine of two VLADs (Jégou et al., "Aggregating
+    local descriptors into a compact image representation", CVPR 2010): sums of the residuals of a photo's features to
+    the nearest of WORDS k-means centres, each sum at unit length (Arandjelović and Zisserman, CVPR 2013).
+    """
+    from scipy.cluster.vq import kmeans2
+    from scipy.sparse import csr_matrix
+
+    every = np.concatenate(descriptors)
+    sample = np.sort(np.random.default_rng(0).permutation(len(every))[: 200 * WORDS])
+    if len(sample) < WORDS:
+        return np.ones((len(descriptors), len(descriptors)), bool)
+    centres = kmeans2(every[sample], WORDS, iter=10, minit="points", seed=0)[0].astype(np.float32)
+    half = 0.5 * (centres**2).sum(axis=1)
+    count = len(descriptors)
+    vlads = np.zeros((count, WORDS, 128), np.float32)
+    for first in range(0, count, AT_ONCE):
+        some = descriptors[first : first + AT_ONCE]
+        features = np.concatenate(some)
+        word = (features @ centres.T - half).argmax(axis=1)  # the nearest centre
+        place = np.repeat(np.arange(len(some)), [len(each) for each in some]) * WORDS + word
+        entries = (np.ones(len(place), np.float32), (place, np.arange(len(place))))
+        sums = csr_matrix(entries, shape=(len(some) * WORDS, len(place))) @ (features - centres[word])
+        vlads[first : first + AT_ONCE] = sums.reshape(-1, WORDS, 128)
+    vlads /= np.maximum(np.linalg.norm(vlads, axis=2, keepdims=True), 1e-9)
+    rows = vlads.reshape(count, -1)
+    rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
+    similar = np.zeros((count, count), bool)
+    for first in range(0, count, AT_ONCE):
+        order = np.argsort(-(rows[first : first + AT_ONCE] @ rows.T), axis=1, kind="stable")
+        np.put_along_axis(similar[first : first + AT_ONCE], order[:, : RETRIEVED + 1], True, axis=1)
+    return similar | similar.T | np.eye(count, dtype=bool)
 
 
 def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
@@ -296,15 +342,22 @@ def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
     return result
 
 
-def _coarse_votes(descriptors: list[np.ndarray]) -> np.ndarray:
-    """[n, n] number of matches of each pair of photos, from unit descriptors [F, 128] of each."""
-    votes = np.zeros((len(descriptors), len(descriptors)), np.int64)
-    for i, mine in enumerate(descriptors):
-        for first in range(i + 1, len(descriptors), AT_ONCE):
-            others = descriptors[first : first + AT_ONCE]
-            similarity = mine @ np.concatenate(others).T
+def _coarse_votes(descriptors: list[np.ndarray], compared: np.ndarray, progress: Progress) -> np.ndarray:
+    """[n, n] number of matches of each pair of photos in `compared` [n, n], from unit descriptors [F, 128] of each."""
+    count = len(descriptors)
+    votes = np.zeros((count, count), np.int64)
+
+    def compare(i: int) -> None:
+        later = i + 1 + np.flatnonzero(compared[i, i + 1 :])
+        for chosen in (later[first : first + AT_ONCE] for first in range(0, len(later), AT_ONCE)):
+            others = [descriptors[j] for j in chosen]
+            similarity = descriptors[i] @ np.concatenate(others).T
             blocks = np.split(similarity, np.cumsum([len(other) for other in others])[:-1], axis=1)
-            votes[i, first : first + AT_ONCE] = [_mutual_matches(block) for block in blocks]
+            votes[i, chosen] = [_mutual_matches(block) for block in blocks]
+
+    with ThreadPoolExecutor(cores() if count > RETRIEVED_ABOVE else 1) as pool:
+        for done, _ in enumerate(pool.map(compare, range(count)), start=1):
+            progress.update("poses: pairing", done, count)
     return votes + votes.T
 
 
@@ -327,5 +380,15 @@ def _key(photos: list[Path], lenses: list[Lens | None], how: tuple[int, int], ma
     paths = [*photos, *(mask for mask in masks or () if mask is not None)]
     files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
     extraction = (MAX_IMAGE_SIDE, MAX_FEATURES, MIN_FEATURES, PEAK_THRESHOLD)
-    pairing = (EXHAUSTIVE_BELOW, NEIGHBORS, COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS, MIN_INLIERS)
+    pairing: tuple[float, ...] = (
+        EXHAUSTIVE_BELOW,
+        NEIGHBORS,
+        COARSE_FEATURES,
+        COARSE_MIN_MATCHES,
+        COARSE_RATIO,
+        PARTNERS,
+        MIN_INLIERS,
+    )
+    if len(photos) > RETRIEVED_ABOVE:
+        pairing += (RETRIEVED_ABOVE, RETRIEVED, WORDS)
     return hashlib.sha256(repr((files, lenses, extraction, pairing, how)).encode()).hexdigest()[:12]
