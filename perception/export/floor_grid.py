@@ -32,7 +32,7 @@ def floor_grid(gmap: Map, resolution: float, step: float = 0.1, height: float = 
     for lacking, what in ((not gmap.metric, "metric scale"), (down is None, "gravity"), (not gmap.views, "cameras")):
         if lacking:
             raise InputError(f"{gmap.path}: has no {what}, expected a map in metres with gravity and cameras")
-    up = -np.asarray(down, np.float64) / np.linalg.norm(down)
+    up = -np.asarray(down, np.float64) / np.linalg.norm(np.asarray(down, np.float64))
     x = np.cross(np.cross(up, np.eye(3)[int(abs(up[0]) > 0.9)]), up)
     axes = np.stack([x, np.cross(up, x), up], axis=1) / [np.linalg.norm(x), np.linalg.norm(x), 1]  # map_from_grid
     solid = gmap.opacities >= OPAQUE

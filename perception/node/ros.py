@@ -1,6 +1,4 @@
-"""Runs the query node on rclpy: one process that serves a map until it is stopped, through ROS 2 over any of its
-middlewares.
-"""
+"""The query node on rclpy: `RosTransport` on any node, and `serve_node`, one process that serves one map."""
 
 from __future__ import annotations
 
@@ -12,7 +10,7 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -33,36 +31,29 @@ _EXTRA_SECONDS = 1.0
 
 
 class RosTransport:
-    """Publishers, subscription and services of one rclpy node. `serve` blocks."""
+    """Publishers of `outputs`, subscription and services of an rclpy node, which the caller spins (`spin`)."""
 
-    def __init__(self, config: NodeConfig) -> None:
-        import rclpy
-        from rclpy.signals import SignalHandlerOptions
-
-        self._config = config
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context, domain_id=config.domain_id, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node("node", namespace=f"/{config.namespace}", context=self._context)
-        self._answer_name = f"/{config.namespace}/{answers.ANSWER.name}"
+    def __init__(self, node: Any, config: NodeConfig, outputs: Iterable[Channel] = answers.OUTPUTS) -> None:
+        self._node, self.config, self._outputs = node, config, outputs
         self._publishers: dict[Channel, Any] = {}
         self._absent: list[str] = []
 
     def others(self) -> int:
         """The number of other nodes of this name that are discovered within `discovery_seconds`."""
-        end = time.monotonic() + self._config.discovery_seconds
+        end = time.monotonic() + self.config.discovery_seconds
         while time.monotonic() < end and not self._answerers():
             time.sleep(0.02)
         return self._answerers()
 
     def _answerers(self) -> int:
-        own = 1 if answers.ANSWER in self._publishers else 0
-        return max(0, len(self._node.get_publishers_info_by_topic(self._answer_name)) - own)
+        found = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(answers.ANSWER.name))
+        return max(0, len(found) - (answers.ANSWER in self._publishers))
 
     def open(self) -> None:
         """Creates the publishers. A topic whose type is not installed (vision_msgs) is skipped; see `figures`."""
-        for topic in answers.OUTPUTS:
+        for topic in self._outputs:
             try:
-                kind = _class(topic.kind)
+                kind = message_class(topic.kind)
             except ImportError:
                 self._absent.append(f"{topic.name} is not published: {topic.kind.split('/')[0]} is not installed")
                 continue
@@ -72,45 +63,37 @@ class RosTransport:
         """Sends a message; unless latched, it is not built when there is no subscriber."""
         publisher = self._publishers.get(topic)
         if publisher is not None and (topic.latched or publisher.get_subscription_count()):
-            publisher.publish(fill(_class(topic.kind)(), message))
+            publisher.publish(fill(message_class(topic.kind)(), message))
 
     def warnings(self) -> list[str]:
         """Present problems, one text each."""
         others = self._answerers()
-        return [f"{others} other node(s) answer on {self._config.namespace}"] if others else []
+        return [f"{others} other node(s) answer on {self.config.namespace}"] if others else []
 
     def figures(self) -> dict[str, Any]:
         """The topics that are not published, with the reason."""
         return {"left_out": "; ".join(self._absent)} if self._absent else {}
 
-    def serve(self, core: Core, stop: threading.Event) -> None:
-        """Passes received messages to the core and publishes health messages, until `stop` is set."""
+    def listen(self, core: Core) -> None:
+        """Passes received messages to the core and publishes health messages, while the node is spun."""
         from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
-        from rclpy.executors import MultiThreadedExecutor
 
-        calls = ReentrantCallbackGroup()
-        self._node.create_subscription(
-            _class(answers.PROMPT.kind),
+        calls, node = ReentrantCallbackGroup(), self._node
+        node.create_subscription(
+            message_class(answers.PROMPT.kind),
             answers.PROMPT.name,
             lambda message: core.prompt(message.data),
             _qos(False),
             callback_group=MutuallyExclusiveCallbackGroup(),
         )
         for service, answer in ((answers.QUERY, self._query), (answers.RELOAD, self._reload)):
-            self._node.create_service(
-                _class(service.kind),
+            node.create_service(
+                message_class(service.kind),
                 service.name,
                 lambda request, response, answer=answer: answer(core, request, response),  # type: ignore[misc]
                 callback_group=calls,
             )
-        self._node.create_timer(
-            self._config.health_seconds, core.send_health, callback_group=MutuallyExclusiveCallbackGroup()
-        )
-        executor = MultiThreadedExecutor(num_threads=self._config.workers + 3, context=self._context)
-        executor.add_node(self._node)
-        while not stop.is_set():
-            executor.spin_once(timeout_sec=0.1)
-        executor.shutdown(timeout_sec=self._config.timeout)
+        node.create_timer(self.config.health_seconds, core.send_health, callback_group=MutuallyExclusiveCallbackGroup())
 
     def _query(self, core: Core, request: Any, response: Any) -> Any:
         done, answered = threading.Event(), []
@@ -120,17 +103,39 @@ class RosTransport:
             done.set()
 
         core.query(list(request.names), finish)
-        done.wait(self._config.timeout + _EXTRA_SECONDS)
+        done.wait(self.config.timeout + _EXTRA_SECONDS)
         return fill(response, answered[0]) if answered else response
 
     def _reload(self, core: Core, request: Any, response: Any) -> Any:
         del request
         return fill(response, core.reload())
 
-    def close(self) -> None:
-        """Leaves the network."""
-        self._node.destroy_node()
-        self._context.try_shutdown()
+
+def spin(node: Any, config: NodeConfig, stop: threading.Event) -> None:
+    """Calls the node's callbacks in threads until `stop` is set."""
+    from rclpy.executors import MultiThreadedExecutor
+
+    executor = MultiThreadedExecutor(num_threads=config.workers + 3, context=node.context)
+    executor.add_node(node)
+    while not stop.is_set():
+        executor.spin_once(timeout_sec=0.1)
+    executor.shutdown(timeout_sec=config.timeout)
+
+
+@contextlib.contextmanager
+def _node(config: NodeConfig) -> Iterator[Any]:
+    """An rclpy node in a context of its own."""
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=config.domain_id, signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node("node", namespace=f"/{config.namespace}", context=context)
+    try:
+        yield node
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
 
 
 def fill(message: Any, values: Message) -> Any:
@@ -152,13 +157,13 @@ def _converted(kind: str, current: Any, value: Any) -> Any:
         inner = _SEQUENCE.fullmatch(kind)
         if inner is None:
             raise KeyError(kind)
-        made = _class(inner[1].replace("/", "/msg/"))
+        made = message_class(inner[1].replace("/", "/msg/"))
         return [fill(made(), item) for item in value]
     return value
 
 
 @cache
-def _class(kind: str) -> Any:
+def message_class(kind: str) -> Any:
     """The Python class of `sensor_msgs/msg/PointCloud2` or `std_srvs/srv/Trigger`; ImportError when not installed."""
     package, space, name = kind.split("/")
     return getattr(importlib.import_module(f"{package}.{space}"), name)
@@ -189,10 +194,8 @@ def serve_node(
     if importlib.util.find_spec("rclpy") is None:
         raise InputError("node: rclpy cannot be imported; install ROS 2 and source its setup file")
     how = config.model_dump(include={"workers", "queue_size", "timeout", "watch"})
-    with (
-        contextlib.closing(RosTransport(config)) as transport,
-        QueryEngine(path, encoders=encoders, **how) as engine,
-    ):
+    with _node(config) as node, QueryEngine(path, encoders=encoders, **how) as engine:
+        transport = RosTransport(node, config)
         others = transport.others()
         if others:
             raise InputError(
@@ -207,7 +210,8 @@ def serve_node(
             f"serving {path} (map {held.map_id}, {len(held.instances)} instances) on domain {config.domain_id}, "
             f"as /{config.namespace}"
         )
-        transport.serve(core, stop)
+        transport.listen(core)
+        spin(node, config, stop)
         return engine.health()
 
 

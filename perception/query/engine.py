@@ -71,7 +71,7 @@ class QueryEngine:
         self.path, self.timeout = Path(path), timeout
         self._encoders = _Shared(encoders or make_encoder)
         self._signature = map_signature(self.path)
-        self._map = self._open()
+        self._map = self.open_map()
         self._counters = Counters()
         self._queue = RequestQueue(queue_size, self._drop)
         self._reloading = threading.Lock()
@@ -151,7 +151,7 @@ class QueryEngine:
                 signature = map_signature(self.path)
                 if signature == self._signature and self._problem is None:
                     return False
-                fresh = self._open()
+                fresh = self.open_map()
             except InputError as error:
                 self._problem = str(error)
                 raise
@@ -168,7 +168,8 @@ class QueryEngine:
         """Registers `listener(new map)`, called after each swap by the thread that reloaded; it must not raise."""
         self._listeners.append(listener)
 
-    def _open(self) -> QueryMap:
+    def open_map(self) -> QueryMap:
+        """The map now at the path, ready for its first query; a subclass may change it."""
         gmap = load_map(self.path, encoders=self._encoders)
         gmap.warm()
         return gmap

@@ -45,6 +45,8 @@ def ros_actions(monkeypatch: pytest.MonkeyPatch, **given: str) -> list[Any]:
         ],
         "launch.event_handlers": ["OnProcessExit"],
         "launch.substitutions": [],
+        "launch_ros": [],
+        "launch_ros.actions": ["Node"],
     }
     for module, inside in names.items():
         made = types.ModuleType(module)
@@ -61,7 +63,9 @@ def ros_actions(monkeypatch: pytest.MonkeyPatch, **given: str) -> list[Any]:
             return values[self.name]
 
     sys.modules["launch.substitutions"].LaunchConfiguration = LaunchConfiguration  # type: ignore[attr-defined]
-    spec = importlib.util.spec_from_file_location("perception_launch", LAUNCH / "perception.launch.py")
+    spec = importlib.util.spec_from_file_location(
+        "perception_launch", LAUNCH / "perception/launch/perception.launch.py"
+    )
     assert spec is not None and spec.loader is not None
     file = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(file)
@@ -87,7 +91,9 @@ def test_ros_launch_makes_the_map_first_and_keeps_node_and_viewer_running(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     path = str(tmp_path / "a.gsmap")
-    actions = ros_actions(monkeypatch, map=path, photos="p", map_args="--preset fast", node_args="--domain 5")
+    actions = ros_actions(
+        monkeypatch, map=path, photos="p", map_args="--preset fast", node="plain", node_args="--domain 5"
+    )
     (mapper,) = processes(actions)
     assert not mapper.kwargs["respawn"]
     made = build_parser().parse_args(mapper.kwargs["cmd"][1:])
@@ -106,9 +112,25 @@ def test_ros_launch_makes_the_map_first_and_keeps_node_and_viewer_running(
 def test_ros_launch_with_a_map_starts_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "map.json").write_text("{}")
     (node,) = processes(
-        ros_actions(monkeypatch, map=str(tmp_path), photos="p", view="false", perception="/v/perception")
+        ros_actions(monkeypatch, map=str(tmp_path), photos="p", node="plain", view="false", perception="/v/perception")
     )
-    assert node.kwargs["cmd"] == ["/v/perception", "node", str(tmp_path)]
+    assert node.kwargs["cmd"] == ["/v/perception", "node", str(tmp_path), "--namespace", "perception"]
+
+
+def test_ros_launch_starts_the_lifecycle_node_and_rviz(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "map.json").write_text("{}")
+    actions = ros_actions(
+        monkeypatch, map=str(tmp_path), frame_file="f.yaml", namespace="arm", view="false", rviz="true"
+    )
+    node, viewer = [one for one in actions if type(one).__name__ == "Node"]
+    assert (node.kwargs["package"], node.kwargs["executable"], node.kwargs["namespace"]) == (
+        "perception",
+        "node",
+        "arm",
+    )
+    assert node.kwargs["parameters"] == [{"map": str(tmp_path), "frame_file": "f.yaml", "autostart": True}]
+    assert [type(one).__name__ for one in ends(actions, node, 2)] == ["Shutdown"]
+    assert Path(viewer.kwargs["arguments"][1]) == LAUNCH / "perception/rviz/perception.rviz"
 
 
 def test_ros_launch_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -116,6 +138,8 @@ def test_ros_launch_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_pa
         ros_actions(monkeypatch)
     with pytest.raises(RuntimeError, match="photos:="):
         ros_actions(monkeypatch, map=str(tmp_path))
+    with pytest.raises(RuntimeError, match="lifecycle, plain or false"):
+        ros_actions(monkeypatch, map=str(tmp_path), node="yes")
 
 
 def environment() -> dict[str, str]:

@@ -1,0 +1,66 @@
+"""frame.yaml: where a map lies in the robot's world."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import yaml
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from perception.config import Settings, settings_from
+from perception.errors import InputError
+from perception.io.map import Map
+from perception.query import Frame, QueryMap
+
+
+class FrameFile(Settings):
+    """parent_from_child is rigid; a point of the map, times `scale`, is a point of the child in metres."""
+
+    parent: str = Field("map", min_length=1, description="the robot's fixed frame")
+    child: str | None = Field(None, min_length=1, description="name of the map's frame; none: the map's own")
+    scale: float | None = Field(None, gt=1e-9, lt=1e9, description="metres per unit of the map")
+    translation: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="three numbers")
+    rotation: tuple[float, float, float, float] = Field((0.0, 0.0, 0.0, 1.0), description="quaternion x y z w")
+
+    def placed(self, gmap: QueryMap) -> QueryMap:
+        """The map in the child frame, in metres. InputError when its unit is unknown or the frames have one name."""
+        child = self.child or gmap.frame
+        if child == self.parent:
+            raise InputError(f"frame file: parent and child are both '{child}'; give the child another name")
+        if not gmap.metric and self.scale is None:
+            raise InputError(
+                f"{gmap.path}: its unit is unknown; frame file: expected scale, metres per unit of the map"
+            )
+        held: Map = gmap
+        if self.scale not in (None, 1.0):
+            from perception.frame.scaled_map import scaled
+
+            held = scaled(gmap, self.scale)
+        made = QueryMap.of(held, info={**held.info, "frame": child, "metric": True})
+        made.encoders = gmap.encoders
+        made.warm()
+        return made
+
+    def parent_frame(self) -> Frame:
+        """The parent as a frame of queries on the placed map."""
+        parent_from_child = np.eye(4)
+        parent_from_child[:3, :3] = Rotation.from_quat(self.rotation).as_matrix()
+        parent_from_child[:3, 3] = self.translation
+        return Frame(self.parent, parent_from_child)
+
+
+def read_frame(path: Path) -> FrameFile:
+    """The frame file at `path`; InputError, with the line or the setting, when it is not one."""
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f"{path}: cannot be read as YAML ({' '.join(str(error).split())})") from error
+    if not isinstance(values, dict):
+        raise InputError(f"{path}: found {type(values).__name__}, expected settings such as 'parent: map'")
+    read = settings_from(FrameFile, {str(key): (value, str(path)) for key, value in values.items()})
+    length = float(np.linalg.norm(read.rotation))
+    if abs(length - 1) > 1e-3:
+        raise InputError(f"{path} rotation: found a quaternion of length {length:g}, expected 1")
+    return read
