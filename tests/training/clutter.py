@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -19,11 +20,23 @@ Group = list[tuple[Body, float]]  # bodies about the origin, and the radius of t
 
 def build(seed: int, light_samples: int = 20) -> Scene:
     """The painted and lit scene. light_samples: rays per texel of the light maps."""
-    rng = np.random.default_rng((seed, 30))
+    return scene_of(np.random.default_rng((seed, 30)), light_samples, random_group, (16, 36), paint_of, 60)
+
+
+def scene_of(
+    rng: np.random.Generator,
+    light_samples: int,
+    draw: Callable[[np.random.Generator], Group],
+    count: tuple[int, int],
+    picture: Callable[[np.random.Generator], np.ndarray],
+    texels: int,
+) -> Scene:
+    """Groups that `draw` makes on a ground between walls, under a lamp. count: of things, from and to; picture: paint
+    of the pictures on the walls; texels: rows and columns of the ground's light map."""
     placed: Group = []
-    wanted = rng.integers(16, 36)
+    wanted = rng.integers(*count)
     while len(placed) < wanted:
-        group = _group(rng)
+        group = draw(rng)
         for _ in range(60):  # a place that is free
             spot = rng.uniform(-REACH, REACH, 2)
             gaps = [np.hypot(*(spot - body.parts[0].shape.origin[:2])) - radius for body, radius in placed]
@@ -31,16 +44,16 @@ def build(seed: int, light_samples: int = 20) -> Scene:
                 break
         turn = rng.uniform(0, 360)
         placed += [(body.placed(turn, np.array([*spot, 0.0])), radius) for body, radius in group]
-    bodies = [body for body, _ in placed] + _ground(rng)
+    bodies = [body for body, _ in placed] + _ground(rng, picture, texels)
     lamp = Lamp(np.array([*rng.uniform(-1, 1, 2), 1.6]), rng.uniform(0.02, 0.4), rng.uniform(0.8, 1, 3) * 6)
     lighting = Lighting([lamp], np.full(3, rng.uniform(0.2, 0.5)))
     bake_all(bodies, lighting, rng, light_samples)
     return Scene(bodies, lighting, partial(orbit, focal_35mm=FOCAL_35MM), [])
 
 
-def _ground(rng: np.random.Generator) -> list[Body]:
+def _ground(rng: np.random.Generator, picture: Callable[[np.random.Generator], np.ndarray], texels: int) -> list[Body]:
     """A floor, or a table over a floor, and three walls with pictures. They are often painted alike."""
-    paints = [_paint(rng) for _ in range(5)]
+    paints = [paint_of(rng) for _ in range(5)]
     for k in (2, 3, 4):
         paints[k] = paints[int(rng.integers(k + 1))]
     back, side, low = rng.uniform(0.5, 0.9), rng.uniform(0.9, 1.5), -0.7 if rng.random() < 0.5 else 0.0
@@ -50,35 +63,35 @@ def _ground(rng: np.random.Generator) -> list[Body]:
         center = np.array([x * side, back - 2 + y, low + (k > 0)])
         width, height = 4 if x else 2 * side, 2 if k else 4
         paint = tex.crop(rng, paints[k], 700, 700)
-        parts = [Part(Sheet(width, height, axes, center), paint, 0.0, (60, 60), False)]
+        parts = [Part(Sheet(width, height, axes, center), paint, 0.0, (60, 60) if k else (texels, texels), False)]
         bodies.append(Body("wall" if k else "ground", [], parts, is_stuff=True))
         if k and rng.random() < 0.6:
             at = center + axes @ [rng.uniform(-0.3, 0.3), rng.uniform(-0.4, 0), rng.uniform(0.002, 0.02)]
             sheet = Sheet(rng.uniform(0.3, 0.7), rng.uniform(0.3, 0.7), axes, np.minimum(at, [9, 0.4 if x else 9, 9]))
-            bodies.append(Body("picture", [], [Part(sheet, _paint(rng), 0.0, (24, 24), False)], is_stuff=True))
+            bodies.append(Body("picture", [], [Part(sheet, picture(rng), 0.0, (24, 24), False)], is_stuff=True))
     if low < 0:
         plate = block(rng, (1.15, 1.0, 0.05), (0, 0, -0.025), paints[4])
-        plate.light_texels = (360, 60)
+        plate.light_texels = (6 * texels, texels)
         bodies.append(Body("table", [], [plate], is_stuff=True))
     return bodies
 
 
-def _group(rng: np.random.Generator) -> Group:
+def random_group(rng: np.random.Generator) -> Group:
     """One thing, some things that touch, a row of books, or a pile."""
     kind, count = rng.integers(8), int(rng.integers(3, 7))
     if kind < 3:
-        return [_thing(rng, _paint(rng), int(rng.integers(5)))]
+        return [_thing(rng, paint_of(rng), int(rng.integers(5)))]
     bodies, reach = [], 0.0
     if kind < 5:
         for _ in range(count):
-            body, radius = _thing(rng, _paint(rng), int(rng.choice([0, 0, 3, 4])), upright=True)
+            body, radius = _thing(rng, paint_of(rng), int(rng.choice([0, 0, 3, 4])), upright=True)
             bodies.append(body.placed(0, np.array([reach + radius, rng.uniform(-0.02, 0.02), 0])))
             reach += 2 * radius
         return [(body.placed(0, np.array([-reach / 2, 0, 0])), reach / 2) for body in bodies]
     x, y, z = rng.uniform([0.08, 0.012, 0.10], [0.2, 0.04, 0.22])
-    paint, pile = _paint(rng), kind == 7
+    paint, pile = paint_of(rng), kind == 7
     for _ in range(count):
-        paint = paint if rng.random() < (0.5 if kind == 5 else 0.1) else _paint(rng)
+        paint = paint if rng.random() < (0.5 if kind == 5 else 0.1) else paint_of(rng)
         thick = y * rng.uniform(0.6, 1.4) * (0.4 if pile else 1)
         long, wide = (x, z) * rng.uniform(0.7 if pile else 0.9, 1, 2)
         size = (long, wide, thick) if pile else (long, thick, wide)
@@ -92,7 +105,7 @@ def _group(rng: np.random.Generator) -> Group:
 def _thing(rng: np.random.Generator, paint: np.ndarray, kind: int, upright: bool = False) -> tuple[Body, float]:
     """A box (0), some balls as one body (1), a rod (2), or a turned vessel (3), with a handle (4); with its radius."""
     gloss, size = rng.uniform(0, 0.8), rng.uniform(0.03, 0.08 if upright else 0.1)
-    second = _paint(rng) if rng.random() < 0.4 else paint
+    second = paint_of(rng) if rng.random() < 0.4 else paint
     if kind == 0:
         extent = (size * rng.uniform([0.6, 0.6, 0.8], [2, 2, 3])).tolist()
         part = block(rng, extent, (0, 0, extent[2] / 2), paint, gloss, top=second)
@@ -121,7 +134,7 @@ def _thing(rng: np.random.Generator, paint: np.ndarray, kind: int, upright: bool
     return Body("vessel", [], parts), float(radius.max())
 
 
-def _paint(rng: np.random.Generator) -> np.ndarray:
+def paint_of(rng: np.random.Generator) -> np.ndarray:
     """A texture of random colours: plain, mottled, dotted, striped, wooden, woven, printed, or a mosaic."""
     tint = rng.uniform(0.1, 1) * (1 - rng.uniform(0, 1) * rng.uniform(0, 1, 3))  # from grey to saturated
     one, two, three = (tex.rgb_code(c.clip(0.03, 0.95)) for c in (tint, tint + rng.normal(0, 0.15, 3), rng.random(3)))

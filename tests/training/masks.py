@@ -4,7 +4,9 @@ Worlds are clutter, rooms and tabletops by seed, in sets of four: twelve sets tr
 calibration, two are for testing. Each world is read twice, as maps with and without depth images see its surface. Pairs
 of patches are gathered along merges that the truth permits, in the order of a plain rule, then of the model so far
 (Nunez-Iglesias et al. 2013). WORK keeps the worlds, so that a run that was stopped goes on. A world takes 20 s of a
-core, learning 3 min. Equal seeds give equal weights. The packaged ones are those of this command.
+core, learning 3 min. Equal seeds give equal weights. The packaged ones are those of this command. Four
+worlds of patchwork, things of several colours and look-alikes that touch, are for testing too; `--patchwork` also
+trains and tunes on such worlds, two more in each set.
 """
 
 from __future__ import annotations
@@ -31,10 +33,11 @@ from perception.masks.merge_model import WEIGHTS, MergeModel, Network
 from perception.masks.merging import SMALLEST, MergeTree, divided, merge_tree, tree_by
 from perception.masks.surface import FOOTPRINTS
 from perception.masks.surface_graph import SurfaceGraph
-from training import clutter
+from training import clutter, patchwork
 
-scenes.SCENES["clutter"] = clutter
+scenes.SCENES |= {"clutter": clutter, "patchwork": patchwork}
 SCENES = (("clutter", 3100, 2), ("clutter", 3101, 2), ("room", 2000, 1), ("tabletop", 1000, 1))  # first seed, step
+PATCHWORK = (("patchwork", 4000, 2), ("patchwork", 4001, 2))
 KEPT = {"validation": (8, 18), "test": (9, 19)}  # numbers of sets that are not trained on
 PAIRS, LEAST = 8000, 20  # pairs of one world and round; voxels of a region that is learned from
 MEMBERS = 3  # networks of an ensemble for pairs; twice as many for regions, of which there are fewer
@@ -277,16 +280,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("work", type=Path, metavar="WORK", help="folder of the worlds")
     parser.add_argument("--worlds", type=int, default=12, metavar="N", help="sets of four to train on (default 12)")
+    parser.add_argument("--patchwork", action="store_true", help="train and tune on patchwork too")
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="SCENE", help="more scenes to test on")
     parser.add_argument("-o", "--output", type=Path, default=WEIGHTS, metavar="NPZ", help="default: the package's file")
     options = parser.parse_args(arguments)
     options.work.mkdir(parents=True, exist_ok=True)
     numbers = {"training": [k for k in range(2 * options.worlds) if k % 10 < 8][: options.worlds], **KEPT}
+    plan = [(name, sets, SCENES + PATCHWORK * (options.patchwork and name != "test")) for name, sets in numbers.items()]
     jobs = [
         (name, options.work / f"{scene}_{first + step * k}", stereo)
-        for name, sets in numbers.items()
+        for name, sets, kinds in [*plan, ("patchwork", KEPT["test"], PATCHWORK)]
         for k in sets
-        for scene, first, step in SCENES
+        for scene, first, step in kinds
         for stereo in (False, True)
     ]
     with ProcessPoolExecutor(os.cpu_count()) as pool:

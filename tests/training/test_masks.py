@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from perception.demo.scene import make_photos
+from training import patchwork
 from training.masks import fit, learn, make_world, pairs_of, plain_rule
 
 
@@ -48,3 +49,23 @@ def test_networks_learn_a_rule_that_is_not_linear():
     y = (np.abs(x[:, :1] - 3) > 1.5) != (x[:, 1:2] > 3)
     network = fit([(x[:5000], y[:5000], np.ones(5000))], {}, 60, 0)
     assert ((network(x[5000:]) > 0) == y[5000:]).mean() > 0.9
+
+
+def test_things_of_a_group_in_patchwork_touch_and_do_not_share_space():
+    """Boxes of one orientation along the row: their extents may meet, not overlap."""
+    for seed in range(20):
+        bodies = [body for body, _ in patchwork.books(np.random.default_rng(seed))]
+        middle, thick = (
+            np.array([getattr(body.parts[0].shape, name)[0] for body in bodies]) for name in ("origin", "extent")
+        )
+        gaps = (middle[1:] - thick[1:] / 2) - (middle[:-1] + thick[:-1] / 2)
+        assert len(bodies) >= 4 and (gaps > -1e-9).all() and (gaps < 0.0025).all()
+
+
+def test_a_patchwork_animal_is_one_body_of_at_least_three_paints():
+    for seed in range(5):
+        body, _ = patchwork.animal(np.random.default_rng(seed))
+        means = np.array([part.paint.mean(axis=(0, 1)) for part in body.parts])
+        assert len(np.unique(means.round(6), axis=0)) >= 3
+        low = min(float(part.shape.origin[2] - part.shape.radii[2]) for part in body.parts)
+        assert abs(low) < 0.03  # it stands on the ground
