@@ -49,24 +49,14 @@ void load_cotangents(const Inputs<T> &in, int camera, int x, int y, Slice slice,
 // Adds to the splats' records, of kRow numbers, Σ over the tile's pixels of the weight times the pixel's row.
 template <class T, int NF, bool VAR>
 void add_tile(Worker<T> &w, int x, int y, const uint32_t *list, int n, uint32_t open, FeatureTile<T, NF, VAR> &tile) {
-  constexpr int kChunk = FeatureTile<T, NF, VAR>::kChunk, kRow = FeatureTile<T, NF, VAR>::kRow;
-  for (int begin = 0; begin < n && open; begin += kChunk) {
-    list_granules(w, x, y, list, begin, n < begin + kChunk ? n : begin + kChunk, tile.lists[0], kChunk + 32,
-                  tile.counts);
-    for (uint32_t rest = open; rest; rest &= rest - 1) {
-      const int g = __builtin_ctz(rest), count = static_cast<int>(tile.counts[g]);
-      if (!count) continue;
-      bool still_open = false;
-      for (int lane = 0; lane < 16; lane += Pack<T>::kLanes)
-        still_open |= blend_list<false, T, true>(w, count, g, lane, tile);
-      uint32_t *splats = tile.lists[g];
-      for (int k = 0; k < 8; ++k) splats[count + k] = w.n;  // a spare record
-      multiply_rows<16, kRow, true>(
-          count, [&](int k) { return tile.weights[k]; }, tile.by_pixel[g][0],
-          [&](int k) { return w.records.data() + static_cast<std::size_t>(splats[k]) * kRow; });
-      if (!still_open) open &= ~(1u << g);
-    }
-  }
+  constexpr int kRow = FeatureTile<T, NF, VAR>::kRow;
+  blend_tile(w, false, x, y, list, n, open, static_cast<ColorTile<T, true> &>(tile), [&](int g, int count) {
+    uint32_t *splats = tile.lists[g];
+    for (int k = 0; k < 8; ++k) splats[count + k] = w.n;  // a spare record
+    multiply_rows<16, kRow, true>(
+        count, [&](int k) { return tile.weights[k]; }, tile.by_pixel[g][0],
+        [&](int k) { return w.records.data() + static_cast<std::size_t>(splats[k]) * kRow; });
+  });
 }
 
 template <class T, int NF, bool VAR>
@@ -77,18 +67,14 @@ void features_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int 
   if (!w.n) return;
   T shift[NF] = {};
   if constexpr (VAR) std::memcpy(shift, w.features.data(), sizeof shift);
-  std::memset(w.touched.reserve(w.n + 1), 0, w.n * sizeof(uint16_t));
   const std::size_t size = static_cast<std::size_t>(w.n + 1) * Tile::kRow;
   std::memset(w.records.reserve(size), 0, size * sizeof(T));
-  Tile &tile = *reinterpret_cast<Tile *>(w.tile.reserve(sizeof(Tile) / sizeof(T) + 1));
-  const int x0 = index % f.tiles_x * 64, y0 = index / f.tiles_x * 64;
-  for (int q = 0; q < 16; ++q) {
-    const int x = (q & 3) * 16, y = (q >> 2) * 16;
-    if (x0 + x >= in.width || y0 + y >= in.height || !w.counts[q]) continue;
+  for_each_tile<Tile>(in, f, index, w, [&](int x0, int y0, int x, int y, const uint32_t *list, int n, Tile &tile) {
+    if (!n) return;
     load_cotangents(in, camera, x0 + x, y0 + y, slice, shift, out, grad, tile);
     const uint32_t open = start_tile(in, x0, y0, x, y, static_cast<ColorTile<T, true> &>(tile));
-    add_tile(w, x, y, w.lists.data() + q * static_cast<std::size_t>(w.stride), w.counts[q], open, tile);
-  }
+    add_tile(w, x, y, list, n, open, tile);
+  });
   for_each_slot(f, index, w, scratch, NF, [&](int j, uint64_t slot) {
     const T *from = w.records.data() + static_cast<std::size_t>(j) * Tile::kRow;
     auto gradient = load_channels<NF>(from, NF);

@@ -89,5 +89,27 @@ void list_granules(const Worker<T> &w, int x, int y, const uint32_t *list, int b
   }
 }
 
+// Blends a tile's list chunk by chunk; body(g, count) when tile.lists[g] holds granule g's `count` splats of the chunk
+// and, with FEATURES, tile.weights their weights. (x, y): the tile relative to its 64x64 tile. open: granules with a
+// pixel in the image.
+template <class T, bool FEATURES, class Body>
+inline void blend_tile(Worker<T> &w, bool depth, int x, int y, const uint32_t *list, int n, uint32_t open,
+                       ColorTile<T, FEATURES> &tile, Body &&body) {
+  constexpr int kChunk = ColorTile<T, FEATURES>::kChunk;
+  for (int begin = 0; begin < n && open; begin += kChunk) {
+    list_granules(w, x, y, list, begin, n < begin + kChunk ? n : begin + kChunk, tile.lists[0], kChunk + 32,
+                  tile.counts);
+    for (uint32_t rest = open; rest; rest &= rest - 1) {
+      const int g = __builtin_ctz(rest), count = static_cast<int>(tile.counts[g]);
+      if (!count) continue;
+      bool still_open = false;
+      for (int lane = 0; lane < 16; lane += Pack<T>::kLanes)
+        still_open |= depth ? blend_list<true>(w, count, g, lane, tile) : blend_list<false>(w, count, g, lane, tile);
+      body(g, count);
+      if (!still_open) open &= ~(1u << g);
+    }
+  }
+}
+
 }  // namespace
 }  // namespace perception::PERCEPTION_LEVEL

@@ -33,30 +33,16 @@ inline void blend_features(const T *features, int n, int g, ForwardTile<T, NF, V
 template <class T, int NF, bool VAR>
 void forward_tile(Worker<T> &w, bool depth, int x, int y, const uint32_t *list, int n, uint32_t open,
                   ForwardTile<T, NF, VAR> &tile) {
-  constexpr int kChunk = ForwardTile<T, NF, VAR>::kChunk;
   uint32_t fresh = 0xffff;  // granules that have no shift yet
-  for (int begin = 0; begin < n && open; begin += kChunk) {
-    list_granules(w, x, y, list, begin, n < begin + kChunk ? n : begin + kChunk, tile.lists[0], kChunk + 32,
-                  tile.counts);
-    for (uint32_t rest = open; rest; rest &= rest - 1) {
-      const int g = __builtin_ctz(rest), count = static_cast<int>(tile.counts[g]);
-      if (!count) continue;
-      bool still_open = false;
-      for (int lane = 0; lane < 16; lane += Pack<T>::kLanes) {
-        auto &colors = static_cast<ColorTile<T, (NF > 0)> &>(tile);
-        still_open |=
-            depth ? blend_list<true>(w, count, g, lane, colors) : blend_list<false>(w, count, g, lane, colors);
-      }
-      if constexpr (NF > 0) {
-        if (fresh >> g & 1)
-          std::memcpy(tile.shift[g], w.features.data() + static_cast<std::size_t>(tile.lists[g][0]) * NF,
-                      NF * sizeof(T));
-        fresh &= ~(1u << g);
-        blend_features(w.features.data(), count, g, tile);
-      }
-      if (!still_open) open &= ~(1u << g);
+  auto &colors = static_cast<ColorTile<T, (NF > 0)> &>(tile);
+  blend_tile(w, depth, x, y, list, n, open, colors, [&]([[maybe_unused]] int g, [[maybe_unused]] int count) {
+    if constexpr (NF > 0) {
+      if (fresh >> g & 1)
+        std::memcpy(tile.shift[g], w.features.data() + static_cast<std::size_t>(tile.lists[g][0]) * NF, NF * sizeof(T));
+      fresh &= ~(1u << g);
+      blend_features(w.features.data(), count, g, tile);
     }
-  }
+  });
 }
 
 // Feature sums and variances of one pixel, from the sums about a shift: with the mean m and the centred second moment
@@ -118,18 +104,13 @@ void forward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int i
                        Worker<T> &w, const Outputs<T> &out) {
   using Tile = ForwardTile<T, NF, VAR>;
   load_supertile<NF, NF>(in, f, index, slice, w);
-  std::memset(w.touched.reserve(w.n + 1), 0, w.n * sizeof(uint16_t));
-  Tile &tile = *reinterpret_cast<Tile *>(w.tile.reserve(sizeof(Tile) / sizeof(T) + 1));
-  const int x0 = index % f.tiles_x * 64, y0 = index / f.tiles_x * 64;
-  for (int q = 0; q < 16; ++q) {
-    const int x = (q & 3) * 16, y = (q >> 2) * 16;
-    if (x0 + x >= in.width || y0 + y >= in.height) continue;
+  for_each_tile<Tile>(in, f, index, w, [&](int x0, int y0, int x, int y, const uint32_t *list, int n, Tile &tile) {
     std::memset(tile.shift, 0, sizeof tile.shift);
     if constexpr (NF > 0) std::memset(tile.features, 0, sizeof tile.features);
     const uint32_t open = start_tile(in, x0, y0, x, y, tile);
-    forward_tile(w, depth, x, y, w.lists.data() + q * static_cast<std::size_t>(w.stride), w.counts[q], open, tile);
+    forward_tile(w, depth, x, y, list, n, open, tile);
     write_tile(in, camera, x0 + x, y0 + y, slice, tile, out);
-  }
+  });
   for (int j = 0; j < w.n; ++j)
     if (w.touched[j]) __atomic_store_n(&out.visible[in.n * camera + w.splats[j].id], 1, __ATOMIC_RELAXED);
 }

@@ -48,27 +48,17 @@ void number_labels(const Labels &labels, const Worker<T> &w, const uint32_t *lis
 template <class T>
 void sum_weights(const Labels &labels, Worker<T> &w, int x, int y, const uint32_t *list, int n, uint32_t open,
                  const Slots &slots, ColorTile<T, true> &tile, T *sums) {
-  constexpr int kChunk = ColorTile<T, true>::kChunk;
-  for (int begin = 0; begin < n && open; begin += kChunk) {
-    list_granules(w, x, y, list, begin, n < begin + kChunk ? n : begin + kChunk, tile.lists[0], kChunk + 32,
-                  tile.counts);
-    for (uint32_t rest = open; rest; rest &= rest - 1) {
-      const int g = __builtin_ctz(rest), count = static_cast<int>(tile.counts[g]);
-      if (!count) continue;
-      bool still_open = false;
-      for (int lane = 0; lane < 16; lane += Pack<T>::kLanes) still_open |= blend_list<false>(w, count, g, lane, tile);
-      for (int k = 0; k < count; ++k) {
-        const auto weights = load_channels<16>(tile.weights[k], 16);
-        for (int l = 0; l < labels.count; ++l) {
-          const int32_t place = slots.place[l * w.n + tile.lists[g][k]];
-          if (place < 0) continue;
-          T *sum = sums + place * kPixels + 16 * g;
-          store_channels(load_channels<16>(sum, 16) + weights, sum, 16);
-        }
+  blend_tile(w, false, x, y, list, n, open, tile, [&](int g, int count) {
+    for (int k = 0; k < count; ++k) {
+      const auto weights = load_channels<16>(tile.weights[k], 16);
+      for (int l = 0; l < labels.count; ++l) {
+        const int32_t place = slots.place[l * w.n + tile.lists[g][k]];
+        if (place < 0) continue;
+        T *sum = sums + place * kPixels + 16 * g;
+        store_channels(load_channels<16>(sum, 16) + weights, sum, 16);
       }
-      if (!still_open) open &= ~(1u << g);
     }
-  }
+  });
 }
 
 // (x, y): of the tile in the image. Of equal weights the smaller label wins.
@@ -98,14 +88,8 @@ void label_supertile(const Inputs<T> &in, const Frame<T> &f, int index, const La
                      uint8_t *visible) {
   using Tile = ColorTile<T, true>;
   load_supertile<0, 0>(in, f, index, Slice{0, 0, false}, w);
-  std::memset(w.touched.reserve(w.n + 1), 0, w.n * sizeof(uint16_t));
-  Tile &tile = *reinterpret_cast<Tile *>(w.tile.reserve(sizeof(Tile) / sizeof(T) + 1));
   Slots slots = load_labels(labels, in.n, w);
-  const int x0 = index % f.tiles_x * 64, y0 = index / f.tiles_x * 64;
-  for (int q = 0; q < 16; ++q) {
-    const int x = (q & 3) * 16, y = (q >> 2) * 16, n = static_cast<int>(w.counts[q]);
-    if (x0 + x >= in.width || y0 + y >= in.height) continue;
-    const uint32_t *list = w.lists.data() + q * static_cast<std::size_t>(w.stride);
+  for_each_tile<Tile>(in, f, index, w, [&](int x0, int y0, int x, int y, const uint32_t *list, int n, Tile &tile) {
     number_labels(labels, w, list, n, slots);
     const std::size_t size = static_cast<std::size_t>(slots.begin[labels.count]) * kPixels;
     T *sums = w.records.reserve(size + 1);
@@ -113,7 +97,7 @@ void label_supertile(const Inputs<T> &in, const Frame<T> &f, int index, const La
     const uint32_t open = start_tile(in, x0, y0, x, y, tile);
     sum_weights(labels, w, x, y, list, n, open, slots, tile, sums);
     write_labels(in, labels, x0 + x, y0 + y, slots, sums);
-  }
+  });
   for (int j = 0; j < w.n; ++j)
     if (w.touched[j]) __atomic_store_n(&visible[w.splats[j].id], 1, __ATOMIC_RELAXED);
 }

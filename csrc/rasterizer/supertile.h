@@ -58,6 +58,20 @@ void load_supertile(const Inputs<T> &in, const Frame<T> &f, int tile, Slice slic
   w.n = kept;
 }
 
+// Marks no splat as touched; then body(x0, y0, x, y, list, n, tile) for the 16x16 tiles in the image, at (x, y) of the
+// 64x64 tile `index` at (x0, y0), with the n splats of their list. tile: in the worker's memory.
+template <class Tile, class T, class Body>
+inline void for_each_tile(const Inputs<T> &in, const Frame<T> &f, int index, Worker<T> &w, Body &&body) {
+  std::memset(w.touched.reserve(w.n + 1), 0, w.n * sizeof(uint16_t));
+  Tile &tile = *reinterpret_cast<Tile *>(w.tile.reserve(sizeof(Tile) / sizeof(T) + 1));
+  const int x0 = index % f.tiles_x * 64, y0 = index / f.tiles_x * 64;
+  for (int q = 0; q < 16; ++q) {
+    const int x = (q & 3) * 16, y = (q >> 2) * 16;
+    if (x0 + x >= in.width || y0 + y >= in.height) continue;
+    body(x0, y0, x, y, w.lists.data() + q * static_cast<std::size_t>(w.stride), static_cast<int>(w.counts[q]), tile);
+  }
+}
+
 // write(j, slot) for the splats of 64x64 tile `index` that were touched, and marks their slots: one a splat and tile it
 // touches, of `size` numbers. Slots lie far apart in memory: each is asked for some splats before it is written.
 template <class T, class Write>
