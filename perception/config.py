@@ -109,6 +109,9 @@ class LossConfig(Settings):
     feature_dim: int = Field(8, ge=1, le=64, description="dimensions D of the instance features")
     variance_weight: float = Field(0.5, ge=0, le=1000, description="weight λ_var of the variance loss (eq. 13)")
     margin: float = Field(1.0, gt=0, le=1000, description="margin γ of L_neg (eq. 8), in units of ‖z‖²")
+    variance_form: Literal["paper", "channels", "plain"] = Field(
+        "paper", description="L_var as in the paper, averaged over channels (the authors' code), or the mean variance"
+    )
     depth_weight: float = Field(
         0.5, ge=0, le=1000, description="weight of the depth loss of photos with depth images; 0: depth is not used"
     )
@@ -176,6 +179,7 @@ PAPER: dict[str, Any] = {
     "losses.feature_dim": 8,
     "losses.variance_weight": 0.5,
     "losses.margin": 1.0,
+    "losses.variance_form": "paper",
     "losses.depth_weight": 0.0,
     "losses.start": 0.0,
     "losses.every": 1,

@@ -10,7 +10,7 @@ All take CPU tensors of float32 or float64 and sum in float64. The kernels use a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from perception.io.disk_arrays import Keep
 
 _kernels: Any = _core.training  # takes tensors through DLPack where its stub says arrays
 _LARGEST_ID = 2**31 - 1
+VarianceForm = Literal["paper", "channels", "plain"]
 
 
 def _ready(name: str, tensor: Tensor) -> Tensor:
@@ -210,17 +211,23 @@ def instance_loss(
 # ---------- variance
 
 
-def variance_loss(feature_variance: Tensor, weight: float = 1) -> tuple[float, Tensor]:
+def variance_loss(feature_variance: Tensor, form: VarianceForm = "paper", weight: float = 1) -> tuple[float, Tensor]:
     """weight · L_var, L_var = 1/|I| Σ_p ‖Var(F(p))‖² of the rendered per-pixel variance, feature_variance [H, W, D].
 
-    The authors' released code also averages over the D channels, as a weight of 1/D does here.
+    form "paper": as above, summed over channels. "channels": the authors' released code, also averaged over
+    the D channels. "plain": the mean of Var itself, over pixels and channels.
     Returns the loss and its gradient [H, W, D].
     """
     if feature_variance.ndim != 3:
         raise InputError(f"variance loss: found {list(feature_variance.shape)}, expected [H, W, D]")
+    if form not in ("paper", "channels", "plain"):
+        raise InputError(f"variance loss: form is '{form}', expected paper, channels or plain")
     variance = _ready("feature_variance", feature_variance)
-    share = weight / max(1, variance.shape[0] * variance.shape[1])
-    value = share * _kernels.sum(variance.view(-1), True)
+    height, width, channels = variance.shape
+    share = weight / max(1, height * width * (1 if form == "paper" else channels))
+    value = share * _kernels.sum(variance.view(-1), form != "plain")
+    if form == "plain":
+        return value, torch.full_like(variance, share)
     gradient = torch.empty_like(variance)
     _kernels.scale(variance.view(-1), 2 * share, gradient.view(-1))
     return value, gradient
