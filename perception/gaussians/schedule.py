@@ -1,11 +1,11 @@
 """Training schedule as a function of progress: next view, densification, spherical harmonics, early stopping.
 
-progress   0 ─ .05 ─ .15 ──── .3 ──── .6 ────────── .9 ── 1
-photos     half size │ full size
-features             │       rendered every 2nd step (`losses.start`, `losses.every`)
+progress   0 ─ .05 ───── .3 ─ .4 ─── .6 ────────── .9 ── 1
+photos     half size          │ full size
+features                 │      rendered every 2nd step (`losses.start`, `losses.every`)
 growth         densified every 100 steps, holes filled
-harmonics                             one more degree per trial, then unneeded degrees are removed
-rates                                               cool down
+harmonics                            one more degree per trial, then unneeded degrees are removed
+rates                                              cool down
 """
 
 from __future__ import annotations
@@ -26,8 +26,11 @@ from perception.gaussians.views import TrainingView, psnr, render_view, visible_
 if TYPE_CHECKING:
     from perception.gaussians.train import Trainer
 
-COARSE_UNTIL = 0.15
-"""Progress until which photos of half the resolution are used: steps are cheaper, and large structures are fitted."""
+COARSE_UNTIL = 0.4
+"""Progress until which photos of half the resolution are used: steps are cheaper, and large structures are fitted.
+Until .15 instead, three scenes took 28 % more (Gaussian, pixel) pairs for .1 to .4 dB less."""
+JUDGED_FROM = 0.25
+"""Progress from which growth may end."""
 FILL_EVERY = 5
 """Every FILL_EVERY-th densification also adds Gaussians in image regions that the map leaves empty."""
 FEATURES_NEED = 0.35
@@ -146,7 +149,7 @@ class Schedule:
         stopping.scores.append(reached)
         stopping.counts.append(count)
         if self.grows_at(progress):
-            if progress > COARSE_UNTIL + 2 * TRIAL:
+            if progress > JUDGED_FROM:
                 self._tell(stopping.growth_pays(self._allowed(progress + TRIAL)))
             return
         if stopping.growing:
