@@ -25,7 +25,7 @@ from perception.io.atomic import atomic_directory, recover
 from perception.io.cloud_memory import cores
 from perception.io.ignore_masks import stage_masks
 from perception.io.lens import load_pycolmap
-from perception.io.photos import exif_of, open_photo, photo_size, read_photo
+from perception.io.photos import LARGE_PIXELS, exif_of, open_photo, photo_size, read_photo
 from perception.progress import Progress
 from perception.types import Lens
 
@@ -60,7 +60,8 @@ def stage_photos(folder: Path, photos: list[Path], progress: Progress) -> list[s
 def _plain_suffix(photo: Path) -> str | None:
     with open_photo(photo) as image:
         plain = exif_of(image, photo).get(0x0112, 1) == 1 and image.mode in ("RGB", "L")
-        return _PLAIN.get(image.format or "") if plain else None
+        small = image.width * image.height <= LARGE_PIXELS
+        return _PLAIN.get(image.format or "") if plain and small else None
 
 
 def _link(photo: Path, target: Path) -> None:

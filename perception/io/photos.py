@@ -18,8 +18,10 @@ from perception.types import View
 
 HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
 SUFFIXES = HEIF_SUFFIXES | {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+LARGE_PIXELS = 200_000_000
+"""Photos of more pixels are read at 1/2, 1/4 or 1/8 of their size; `photo_size` returns the reduced size."""
 MOST_DECODED = 400_000_000
-"""Maximum number of pixels of a photo: twice those of the largest cameras."""
+"""Maximum number of pixels to decode; JPEG is decoded at the reduced size, other formats at full size."""
 DECODE_ERRORS = (
     OSError,
     SyntaxError,
@@ -41,18 +43,31 @@ DECODE_ERRORS = (
 
 
 def photo_size(path: Path) -> tuple[int, int]:
-    """(width, height) of what read_photo returns, from the header: EXIF rotation applied."""
+    """(width, height) of what read_photo returns, from the header: EXIF rotation applied, large photos reduced."""
     with open_photo(path) as image:
         tags = getattr(image, "tag_v2", {})  # depending on its version, Pillow has rotated the size of a TIFF
-        size = int(tags.get(0x0100, image.width)), int(tags.get(0x0101, image.height))
+        size = reduced_size(int(tags.get(0x0100, image.width)), int(tags.get(0x0101, image.height)), _reduction(image))
         turned = exif_of(image, path).get(0x0112) in (5, 6, 7, 8)  # other values do not swap the sides
         return size[::-1] if turned else size
 
 
 def stored_size(path: Path) -> tuple[int, int]:
-    """(width, height) in the file's header: without EXIF rotation."""
+    """(width, height) in the file's header: without EXIF rotation, not reduced."""
     with open_photo(path) as image:
         return image.size
+
+
+def reduced_size(width: int, height: int, factor: int) -> tuple[int, int]:
+    """The size of a photo read at 1 / factor: rounded up, as Pillow's JPEG decoder and `reduce` do."""
+    return -(-width // factor), -(-height // factor)
+
+
+def _reduction(image: Image.Image) -> int:
+    """The power of two by which a photo is reduced to at most LARGE_PIXELS; 1 for smaller photos."""
+    factor = 1
+    while image.width * image.height > LARGE_PIXELS * factor**2:
+        factor *= 2
+    return factor
 
 
 def exif_of(image: Image.Image, path: Path) -> Image.Exif:
@@ -79,7 +94,7 @@ def why_left_out(path: Path, strict: bool = False) -> str | None:
     """The error that reading the whole photo raises, or None; strict: raised. JPEG is read at 1/8 size: every byte."""
     try:
         with open_photo(path) as image:
-            image.draft("RGB", (-(-image.width // 8), -(-image.height // 8)))  # rounded up, as Pillow does
+            image.draft("RGB", reduced_size(*image.size, 8))
             decode(image, path)
     except InputError as error:
         if strict:
@@ -95,8 +110,20 @@ def read_photo(path: Path) -> np.ndarray:
     are composited on black. Floating-point images are refused. HEIC needs pillow-heif (extra "heic").
     """
     with open_photo(path) as image:
+        factor = _draft(image)
         decode(image, path)
-        return to_rgb(upright(image, path), path)
+        photo = to_rgb(upright(image, path), path)
+    return photo if factor == 1 else np.array(Image.fromarray(photo).reduce(factor))
+
+
+def _draft(image: Image.Image) -> int:
+    """Prepares an open photo to be decoded at its reduced size if its format can; returns the factor that remains."""
+    factor = _reduction(image)
+    if factor > 1:
+        width, height = image.size
+        image.draft(None, (width // factor, height // factor))
+        factor = max(1, round(factor * image.width / width))
+    return factor
 
 
 def scaled_size(view: View, max_side: int | None) -> tuple[int, int]:
@@ -193,7 +220,7 @@ def open_photo(path: Path) -> Image.Image:
             raise ValueError("no file")  # to open a FIFO would mean to wait for its writer
         with path.open("rb") as file:
             file.read(_HEADER)  # on a disk that hangs, this waits, without the lock that other photos need
-        with _OPENING:  # Pillow's limit is global and lower; MOST_DECODED is checked instead
+        with _OPENING:  # Pillow's limit is global and lies below LARGE_PIXELS; MOST_DECODED is checked instead
             limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
             try:
                 return Image.open(path)

@@ -9,7 +9,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import nearest_rotation
 from perception.io.lens import is_pinhole, pinhole_from_lens, rescale_lens
-from perception.io.photos import photo_size, stored_size
+from perception.io.photos import photo_size, reduced_size, stored_size
 from perception.types import Lens, View
 
 FARTHEST = 1e12
@@ -39,11 +39,14 @@ def rigid_pose(matrix: np.ndarray, what: str) -> np.ndarray:
 
 
 def fit_lens(lens: Lens, photo: Path, source: Path) -> tuple[Lens, str | None]:
-    """The lens scaled to the photo's size, and a note if it was scaled; InputError if the aspect ratio differs."""
+    """The lens scaled to the photo's size, and a note if it was scaled; InputError if the aspect ratio differs.
+
+    For a large photo that is read at 1/2, 1/4 or 1/8, the lens of the full size is scaled in the same way.
+    """
     size, whole = photo_size(photo), (lens.width, lens.height)
-    if whole in (size, stored_size(photo)):
+    if whole in (size, stored_size(photo)) and max(whole) <= max(size):
         return lens, None
-    if size[0] * lens.height == size[1] * lens.width:
+    if size[0] * lens.height == size[1] * lens.width or size in (reduced_size(*whole, k) for k in (2, 4, 8)):
         note = f"{photo.name}: photo {size[0]}×{size[1]}, camera {lens.width}×{lens.height}: intrinsics scaled"
         return rescale_lens(lens, *size), note
     raise InputError(

@@ -24,6 +24,8 @@ from perception.io.lens import load_pycolmap
 from perception.io.photo_folder import choose_photos, list_photos, view_name
 from perception.io.photos import photo_size, read_photo, why_left_out
 from perception.io.reading import Reading
+from perception.io.views import fit_lens
+from perception.types import Lens
 from support.progress import Told
 
 
@@ -158,13 +160,28 @@ def test_videos_beside_photos_are_told(tmp_path: Path) -> None:
     assert note.startswith("3 videos beside the photos are not read, 2 of them belong to Live Photos")
 
 
-def test_photos_of_too_many_pixels_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pillow's own limit, which is lower, does not count."""
+def test_photos_above_the_limit_are_reduced_alike_everywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Photos over Pillow's limit were refused as unreadable."""
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 10_000)  # refused above twice as many
-    file = save(tmp_path / "a.png", 0, (301, 203))
-    assert why_left_out(file) is None and read_photo(file).shape == (203, 301, 3)
+    monkeypatch.setattr(photos_module, "LARGE_PIXELS", 20_000)
+    for name, options in (("a.jpg", {"quality": 95}), ("a.png", {})):
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        file = save(tmp_path / name, 0, (301, 203), exif=exif, **options)
+        assert why_left_out(file) is None
+        photo = read_photo(file)
+        assert photo_size(file) == (102, 151) == photo.shape[1::-1]
+        if name == "a.png":
+            whole = np.rot90(texture(0, (301, 203)), -1)[:300, :202].astype(float)
+            means = whole.reshape(150, 2, 101, 2, 3).mean((1, 3))
+            assert np.abs(photo[:150, :101] - means).max() <= 1
+    lens = Lens("PINHOLE", (200.0, 200.0, 101.5, 150.5), 203, 301)
+    scaled, note = fit_lens(lens, file, tmp_path)
+    assert (scaled.width, scaled.height) == (102, 151) and note is not None
+    assert scaled.params[0] == pytest.approx(200 * 102 / 203)
     monkeypatch.setattr(photos_module, "MOST_DECODED", 50_000)
-    assert "301×203 pixels" in str(why_left_out(file))
+    assert "301×203 pixels" in str(why_left_out(tmp_path / "a.png"))
+    assert why_left_out(tmp_path / "a.jpg") is None  # JPEG is decoded at the smaller size
 
 
 def test_turned_photos_are_staged_with_their_very_pixels(tmp_path: Path) -> None:
