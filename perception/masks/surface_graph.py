@@ -165,7 +165,7 @@ class SurfaceGraph:
         )
 
     def region_features(self, a: int, sibling: int | None) -> np.ndarray:
-        """[18] features for the decision whether `a` is a whole object: area and extents, all its borders together,
+        """[17] features for the decision whether `a` is a whole object: area and extents, all its borders together,
         texture and variety of colour, and size and contact of the neighbour that it would be merged with next."""
         sums, links = self.sums[a], self.borders[a]
         voxels, pixels, depth = sums[_VOXELS], max(sums[_AREA], 1), max(self.depth(a), 1e-9)
