@@ -19,6 +19,7 @@ from perception.io.photos import load_photo, read_photo, scaled_K, warp_labels
 from perception.io.reading import Reading
 from perception.io.transforms import read_frames
 from perception.io.views import make_view
+from perception.progress import Progress
 from perception.types import Lens, View
 from support.rotations import rotation_from_quaternion
 
@@ -235,7 +236,8 @@ def test_mutual_matches_count_the_planted_ones():
     b = rng.normal(size=(40, 128)).astype(np.float32)
     b[:7] = a[10:17]
     unit = [x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b)]
-    assert features._coarse_votes(unit).tolist() == [[0, 7], [7, 0]]
+    votes = features._coarse_votes(unit, np.ones((2, 2), bool), Progress(quiet=True))
+    assert votes.tolist() == [[0, 7], [7, 0]]
 
 
 def test_atomic_writes_leave_old_or_new(tmp_path):

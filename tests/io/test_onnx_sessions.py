@@ -57,7 +57,7 @@ def test_weights_beside_the_graph_are_named_when_they_are_missing(tmp_path: Path
     _write(path, 1, weights.name)
     assert side_files(path) == [weights] and open_session(path).get_inputs()[0].name == "x"
     before = fingerprint(path)
-    assert [name for name, _, _ in _local(str(path), None, None)] == [path.name, weights.name]
+    assert [name for name, _, _ in _local(str(path))] == [path.name, weights.name]
     weights.write_bytes(bytes(weights.stat().st_size))
     assert fingerprint(path) != before
     weights.unlink()
