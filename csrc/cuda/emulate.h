@@ -5,8 +5,7 @@
 //     of them writing, with no barrier between. Only __syncthreads and __syncwarp order memory; ballots and shuffles do
 //     not. So a missing barrier is found in any order of the lanes.
 //   - every element of an array in global memory (GLOBAL): outside of the arrays that emulator_memory was told of.
-//   Reads
-//     by the headers shared with the CPU are not checked.
+//     Reads by the headers shared with the CPU are not checked.
 // Not modelled: races between blocks, caches, timing, the hardware's approximate functions.
 #pragma once
 #include <setjmp.h>
