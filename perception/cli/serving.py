@@ -33,18 +33,14 @@ def register(commands: Any) -> None:
 
 
 def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.config import settings_from
     from perception.listening import read_token
     from perception.serve.settings import ServeSettings
 
-    settings = ServeSettings(
-        host=args.host,
-        port=args.port,
-        token=None if args.token_file is None else read_token(args.token_file),
-        timeout=args.timeout,
-        workers=args.workers,
-        queue_size=args.queue,
-        watch=args.watch,
-    )
+    given = {name: (getattr(args, name), "serve") for name in ("host", "port", "timeout", "workers", "watch")}
+    given["queue_size"] = (args.queue, "serve")
+    given["token"] = (None if args.token_file is None else read_token(args.token_file), "serve")
+    settings = settings_from(ServeSettings, given)
     from perception.serve.server import serve
 
     serve(args.map, settings)

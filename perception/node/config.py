@@ -8,11 +8,12 @@ from typing import Any
 
 from pydantic import Field
 
-from perception.config import Settings, settings_from
+from perception.config import settings_from
 from perception.errors import InputError
+from perception.query.requests import EngineSettings
 
 
-class NodeConfig(Settings):
+class NodeConfig(EngineSettings):
     """How one process serves one map."""
 
     namespace: str = Field(
@@ -22,14 +23,10 @@ class NodeConfig(Settings):
         description="stands before every topic and service",
     )
     domain: int | None = Field(None, ge=0, le=232, description="ROS domain; none: ROS_DOMAIN_ID or 0")
-    workers: int = Field(2, ge=1, le=64, description="queries answered at the same time")
-    queue_size: int = Field(64, ge=1, le=10_000, description="requests that may wait")
-    timeout: float = Field(10.0, gt=0, le=3600, description="seconds until a request is given up")
     map_points: int = Field(
         1_000_000, ge=0, description="most points of the latched cloud, evenly thinned; 0: no cloud of the map"
     )
     health_seconds: float = Field(1.0, ge=0.05, le=3600, description="seconds between two health messages")
-    watch: float = Field(1.0, ge=0.01, le=3600, description="seconds between two looks for a new map")
     discovery_seconds: float = Field(
         1.0, ge=0, le=60, description="seconds in which another node of this name is looked for"
     )

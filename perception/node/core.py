@@ -11,18 +11,17 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 from perception.errors import InputError
 from perception.node import answers
 from perception.node.config import NodeConfig
-from perception.query import AnswerTimeout, EngineBusy, EngineClosed, QueryEngine, QueryMap, Reply, Request
+from perception.query import EngineBusy, EngineClosed, QueryEngine, QueryMap, Reply, Request
 from perception.query.bodies import QueryBody, parse
+from perception.query.requests import MAX_BYTES, error_kind, error_line
 
-MAX_BYTES = 64 * 1024
-"""Largest prompt in bytes, JSON included; larger ones are rejected before parsing."""
 _SHOWN = 80
 
 
@@ -67,24 +66,12 @@ def identity_of(data: str) -> str | None:
 
 
 def error_json(error: BaseException, text: str, identity: str | None) -> dict[str, Any]:
-    """The JSON that is sent instead of an answer; kind: bad_input, busy, timeout, closed or failed."""
+    """The JSON that is sent instead of an answer; kind: see `error_kind`."""
     return {
         "id": identity,
         "text": text if len(text) <= _SHOWN else text[:_SHOWN] + "…",
-        "error": {"kind": error_kind(error), "message": " ".join(str(error).split()) or type(error).__name__},
+        "error": {"kind": error_kind(error), "message": error_line(error)},
     }
-
-
-def error_kind(error: BaseException) -> str:
-    """bad_input: change the request; busy, timeout: retry later; closed: use another node; failed: a defect here."""
-    kinds: tuple[tuple[type[BaseException], str], ...] = (
-        (InputError, "bad_input"),
-        (EngineBusy, "busy"),
-        (AnswerTimeout, "timeout"),
-        (EngineClosed, "closed"),
-        (CancelledError, "timeout"),
-    )
-    return next((name for kind, name in kinds if isinstance(error, kind)), "failed")
 
 
 Message = dict[str, Any]
@@ -197,7 +184,7 @@ class Core:
         try:
             changed = self._engine.reload()
         except InputError as error:
-            return {"success": False, "message": " ".join(str(error).split())}
+            return {"success": False, "message": error_line(error)}
         identity = self._engine.current.map_id
         return {"success": True, "message": f"map {identity}" + ("" if changed else ", which was serving already")}
 

@@ -193,8 +193,7 @@ def serve_node(
     """
     if importlib.util.find_spec("rclpy") is None:
         raise InputError("node: rclpy cannot be imported; install ROS 2 and source its setup file")
-    how = config.model_dump(include={"workers", "queue_size", "timeout", "watch"})
-    with _node(config) as node, QueryEngine(path, encoders=encoders, **how) as engine:
+    with _node(config) as node, QueryEngine(path, encoders=encoders, **config.of_engine()) as engine:
         transport = RosTransport(node, config)
         others = transport.others()
         if others:

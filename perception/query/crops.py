@@ -9,7 +9,8 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.map import Map
-from perception.query.query_map import QueryMap, UnknownInstance
+from perception.query.query_map import QueryMap
+from perception.query.requests import UnknownInstance
 from perception.types import View
 
 MARGIN = 0.15

@@ -14,17 +14,19 @@ from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeout
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+from perception.config import settings_from
 from perception.errors import InputError
 from perception.io.map_files import map_signature
 from perception.language.base import Encoder
 from perception.language.encoders import make_encoder
 from perception.query.query_map import QueryMap, load_map
-from perception.query.requests import Reply, Request
+from perception.query.requests import AnswerTimeout, EngineBusy, EngineClosed, EngineSettings, OtherMap, Reply, Request
 
 T = TypeVar("T")
 _SELDOM = 32
@@ -33,25 +35,13 @@ _REMEMBERED = 1000
 """Number of latencies kept for `health`."""
 
 
-class EngineBusy(RuntimeError):
-    """The request queue is full: retry later, or use another server."""
-
-
-class AnswerTimeout(TimeoutError):
-    """No answer within the time-out; a request that had not started is dropped."""
-
-
-class EngineClosed(RuntimeError):
-    """The engine has been closed."""
-
-
 class QueryEngine:
     """Answers requests on the map at `path` in `workers` threads, and reloads the map when it changes on disk.
 
     At most `queue_size` requests wait; further ones raise EngineBusy. A request without an answer after `timeout`
-    seconds raises AnswerTimeout. Every `watch` seconds (None: never) the map's directory is checked. A changed map, or
-    changed labels, is loaded beside the current map and then swapped in atomically: each answer comes from one map
-    only. When a new map cannot be read, `health` reports it and the current map stays in use. The directory may be
+    seconds raises AnswerTimeout. Every `watch` seconds (0 or None: never) the map's directory is checked. A changed
+    map, or changed labels, is loaded beside the current map and then swapped in atomically: each answer comes from one
+    map only. When a new map cannot be read, `health` reports it and the current map stays in use. The directory may be
     deleted meanwhile: queries use only data in memory. Thread-safe; a context manager.
     """
 
@@ -59,29 +49,26 @@ class QueryEngine:
         self,
         path: str | Path,
         *,
-        workers: int = 2,
-        queue_size: int = 64,
-        timeout: float = 10.0,
-        watch: float | None = 1.0,
         encoders: Callable[[str], Encoder | None] | None = None,
+        **settings: Any,
     ) -> None:
-        for name, value, least in (("workers", workers, 1), ("queue_size", queue_size, 1), ("timeout", timeout, 1e-3)):
-            if not value >= least:
-                raise InputError(f"engine: {name} is {value}, expected at least {least}")
-        self.path, self.timeout = Path(path), timeout
+        """settings: the fields of `EngineSettings`; InputError when one is unknown or out of range."""
+        chosen = settings_from(EngineSettings, {name: (value, "engine") for name, value in settings.items()})
+        self.path, self.timeout = Path(path), chosen.timeout
         self._encoders = _Shared(encoders or make_encoder)
         self._signature = map_signature(self.path)
         self._map = self.open_map()
         self._counters = Counters()
-        self._queue = RequestQueue(queue_size, self._drop)
+        self._queue = RequestQueue(chosen.queue_size, self._drop)
         self._reloading = threading.Lock()
         self._listeners: list[Callable[[QueryMap], None]] = []
         self._problem: str | None = None
         self._busy_since: dict[int, float] = {}
         self._closed = threading.Event()
-        self._threads = [threading.Thread(target=self._work, name=f"query-{n}", daemon=True) for n in range(workers)]
-        if watch is not None:
-            self._threads.append(threading.Thread(target=self._watch, args=(watch,), name="query-watch", daemon=True))
+        tasks = {f"query-{n}": self._work for n in range(chosen.workers)}
+        if chosen.watch:
+            tasks["query-watch"] = partial(self._watch, chosen.watch)
+        self._threads = [threading.Thread(target=task, name=name, daemon=True) for name, task in tasks.items()]
         for thread in self._threads:
             thread.start()
 
@@ -103,12 +90,13 @@ class QueryEngine:
 
         return self.run(lambda gmap: item.answered(gmap, asked), timeout)
 
-    def run(self, work: Callable[[QueryMap], T], timeout: float | None = None) -> Future[T]:
-        """Queues `work`, which a worker thread calls with the current map. EngineBusy when the queue is full."""
+    def run(self, work: Callable[[QueryMap], T], timeout: float | None = None, map_id: str | None = None) -> Future[T]:
+        """Queues `work`, which a worker thread calls with the current map. EngineBusy when the queue is full. The
+        future raises OtherMap when `map_id` is given and is not the id of the map."""
         if self._closed.is_set():
             raise EngineClosed(f"{self.path}: the engine has been closed")
         now = time.monotonic()
-        job = Job(work, Future(), now, now + (self.timeout if timeout is None else timeout))
+        job = Job(partial(_checked, work, map_id), Future(), now, now + (self.timeout if timeout is None else timeout))
         if not self._queue.put(job):
             if self._closed.is_set():
                 raise EngineClosed(f"{self.path}: the engine has been closed")
@@ -269,6 +257,12 @@ class QueryEngine:
         else:
             self._counters.answered(time.monotonic() - job.asked)
             job.future.set_result(result)
+
+
+def _checked(work: Callable[[QueryMap], T], wanted: str | None, gmap: QueryMap) -> T:
+    if wanted is not None and wanted != gmap.map_id:
+        raise OtherMap(f"the map is now {gmap.map_id}, not {wanted[:40]}; ask again")
+    return work(gmap)
 
 
 class _Shared:

@@ -14,7 +14,7 @@ from perception.io.map import Map
 from perception.language.ranking import Ranker, answering
 from perception.query.hit import Description, Hit, Neighbor
 from perception.query.nodes import Nodes
-from perception.query.requests import TOP, Request
+from perception.query.requests import TOP, Request, UnknownInstance
 from perception.query.spatial_index import SpatialIndex
 from perception.query.text_ranking import Encoders, TextRanking
 from perception.query.where import Frame, Where, place, tidy
@@ -22,10 +22,6 @@ from perception.types import OrientedBox
 
 _NEIGHBORS = 3
 _LEAST_COLOR = 0.05
-
-
-class UnknownInstance(InputError):
-    """The map has no instance with this id."""
 
 
 class QueryMap(Map):

@@ -1,13 +1,16 @@
-"""`Request`, a prompt with its filters, and `Reply`, its answer."""
+"""What Python and all servers share: engine settings, errors and their words, `Request` and its answer `Reply`."""
 
 from __future__ import annotations
 
 import time
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import Field
 
+from perception.config import Settings
 from perception.errors import InputError
 from perception.query.where import Frame, Where
 
@@ -19,6 +22,73 @@ MAX_TEXT = 1000
 """Largest number of characters in a prompt. No encoder reads more; the bound limits the work of a server."""
 TOP, MAX_TOP = 20, 1000  # hits of a prompt: unless told otherwise, and at most
 MAX_TEXTS = 32
+MAX_BYTES = 64 << 10
+"""Largest request in bytes, JSON included; larger ones are rejected before parsing."""
+
+
+class EngineSettings(Settings):
+    """The settings of a `QueryEngine`, and so of every server."""
+
+    workers: int = Field(2, ge=1, le=64, description="queries answered at the same time")
+    queue_size: int = Field(64, ge=1, le=10_000, description="requests that may wait; more are refused")
+    timeout: float = Field(10.0, ge=1e-3, le=3600, description="seconds until a request is given up")
+    watch: float | None = Field(1.0, ge=0, le=3600, description="seconds between two looks for a new map; 0: never")
+
+    def of_engine(self) -> dict[str, Any]:
+        """The engine's own fields by name, for `QueryEngine(path, **…)`."""
+        return {name: getattr(self, name) for name in EngineSettings.model_fields}
+
+
+class UnknownInstance(InputError):
+    """The map has no instance with this id."""
+
+
+class OtherMap(InputError):
+    """The client's map_id is not that of the current map."""
+
+
+class UnknownFrame(InputError):
+    """No frame of this name is known."""
+
+
+class EngineBusy(RuntimeError):
+    """The request queue is full: retry later, or use another server."""
+
+
+class AnswerTimeout(TimeoutError):
+    """No answer within the time-out; a request that had not started is dropped."""
+
+
+class EngineClosed(RuntimeError):
+    """The engine has been closed."""
+
+
+KINDS: dict[type[BaseException], str] = {
+    UnknownInstance: "unknown_instance",  # these three are InputErrors too, so they come before
+    OtherMap: "other_map",
+    UnknownFrame: "unknown_frame",
+    InputError: "bad_input",
+    EngineBusy: "busy",
+    TimeoutError: "timeout",
+    CancelledError: "timeout",
+    EngineClosed: "closed",
+}
+
+
+def error_kind(error: BaseException) -> str:
+    """The word for an error. unknown_instance, other_map: ask again, with ids of the current map; unknown_frame,
+    bad_input: change the request; busy, timeout: retry later; closed: use another server; failed: a defect here."""
+    return next((word for kind, word in KINDS.items() if isinstance(error, kind)), "failed")
+
+
+def error_line(error: BaseException | str) -> str:
+    """An error's message as one line of valid Unicode."""
+    return " ".join(str(error).encode("utf-8", "backslashreplace").decode().split()) or type(error).__name__
+
+
+def source(gmap: QueryMap, frame: Frame | None = None) -> dict[str, Any]:
+    """What every answer tells of the map: the frame of its coordinates, whether they are metres, the map's id."""
+    return {"frame": frame.name if frame else gmap.frame, "metric": gmap.metric, "map_id": gmap.map_id}
 
 
 @dataclass(frozen=True)
@@ -51,8 +121,7 @@ class Request:
     def answered(self, gmap: QueryMap, since: float) -> Reply:
         """The reply of one map; since: `time.monotonic()` when the request came."""
         hits = gmap.query(self.text, self.top_k, self.min_score, where=self.where, frame=self.frame)
-        frame = self.frame.name if self.frame else gmap.frame
-        return Reply(self, tuple(hits), gmap.map_id, frame, gmap.metric, time.monotonic() - since)
+        return Reply(self, tuple(hits), **source(gmap, self.frame), seconds=time.monotonic() - since)
 
 
 @dataclass(frozen=True)

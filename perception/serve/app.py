@@ -17,8 +17,9 @@ from perception.io.ply import ply_bytes
 from perception.query.bodies import AtBody, FindBody, NearestBody, QueryBody
 from perception.query.engine import QueryEngine
 from perception.query.query_map import QueryMap
+from perception.query.requests import source
 from perception.query.where import Frame
-from perception.serve.guard import HANDLERS, Guard, OtherMap
+from perception.serve.guard import HANDLERS, Guard
 from perception.serve.settings import ServeSettings
 
 FORMATS = {"npz": "application/x-npz", "ply": "application/octet-stream"}
@@ -106,7 +107,7 @@ class _Routes:
 
         def work(gmap: QueryMap) -> dict[str, Any]:
             results = [question.answered(gmap, time.monotonic()).to_json() for question in questions]
-            return {"results": results, **_source(gmap, questions[0].frame)}
+            return {"results": results, **source(gmap, questions[0].frame)}
 
         return JSONResponse(await self._answer(map_id, work))
 
@@ -138,7 +139,7 @@ class _Routes:
 
     async def describe(self, number: Id, map_id: MapId = None) -> Response:
         """One instance."""
-        described = await self._answer(map_id, lambda gmap: {**gmap.describe(number).to_json(), **_source(gmap, None)})
+        described = await self._answer(map_id, lambda gmap: {**gmap.describe(number).to_json(), **source(gmap)})
         return JSONResponse(described)
 
     async def points(self, number: Id, map_id: MapId = None, format: Literal["npz", "ply"] = "npz") -> Response:
@@ -155,21 +156,11 @@ class _Routes:
     # ------------------------------------------------------------------ shared
 
     async def _answer(self, wanted: str | None, work: Callable[[QueryMap], T]) -> T:
-        """The result of `work` in the engine; OtherMap when `wanted` is given and is not the map's id."""
-
-        def checked(gmap: QueryMap) -> T:
-            if wanted is not None and wanted != gmap.map_id:
-                raise OtherMap(f"the map is now {gmap.map_id}, not {wanted[:40]}; ask again")
-            return work(gmap)
-
-        return await self.engine.awaited(self.engine.run(checked))
+        """The result of `work` in the engine."""
+        return await self.engine.awaited(self.engine.run(work, map_id=wanted))
 
     async def _hits(self, wanted: str | None, work: Callable[[QueryMap], list[Any]], frame: Frame | None) -> Response:
         def answer(gmap: QueryMap) -> dict[str, Any]:
-            return {"hits": [hit.to_json() for hit in work(gmap)], **_source(gmap, frame)}
+            return {"hits": [hit.to_json() for hit in work(gmap)], **source(gmap, frame)}
 
         return JSONResponse(await self._answer(wanted, answer))
-
-
-def _source(gmap: QueryMap, frame: Frame | None) -> dict[str, Any]:
-    return {"frame": frame.name if frame else gmap.frame, "metric": gmap.metric, "map_id": gmap.map_id}

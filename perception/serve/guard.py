@@ -16,36 +16,27 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from perception.errors import InputError
 from perception.listening import names_this_machine
 from perception.query.bodies import problem_line
-from perception.query.engine import AnswerTimeout, EngineBusy, EngineClosed
-from perception.query.query_map import UnknownInstance
+from perception.query.requests import KINDS, error_kind, error_line
 from perception.serve.settings import ServeSettings
 
 _log = logging.getLogger("perception.serve")
-
-
-class OtherMap(Exception):
-    """The client's map_id is not that of the current map."""
-
-
-_STATUS: dict[type[Exception], int] = {UnknownInstance: 404, InputError: 400, OtherMap: 409}
-_STATUS |= {EngineBusy: 503, EngineClosed: 503, AnswerTimeout: 504}
-"""HTTP status by exception; UnknownInstance is an InputError too, and comes first."""
+_STATUS = {"unknown_instance": 404, "other_map": 409, "busy": 503, "closed": 503, "timeout": 504}
+_STATUS |= dict.fromkeys(("unknown_frame", "bad_input"), 400)
+"""HTTP status by the word of `error_kind`."""
 
 
 def problem(status: int, line: str, headers: Mapping[str, str] | None = None) -> JSONResponse:
     """An error response as JSON."""
-    text = " ".join(line.encode("utf-8", "backslashreplace").decode().split())
-    return JSONResponse({"error": text, "status": status}, status, headers)
+    return JSONResponse({"error": error_line(line), "status": status}, status, headers)
 
 
 async def answer_error(request: Request, error: Exception) -> JSONResponse:
     """The response to an exception that a handler raised."""
-    for kind, status in _STATUS.items():
-        if isinstance(error, kind):
-            return problem(status, str(error), {"Retry-After": "1"} if status == 503 else None)
+    status = _STATUS.get(error_kind(error))
+    if status is not None:
+        return problem(status, str(error), {"Retry-After": "1"} if status == 503 else None)
     if isinstance(error, RequestValidationError):
         return _bad_request(error)
     if isinstance(error, HTTPException):
@@ -71,7 +62,7 @@ def _bad_request(error: RequestValidationError) -> JSONResponse:
     return problem(400, problem_line(error.errors()))
 
 
-HANDLERS: dict[Any, Any] = dict.fromkeys((RequestValidationError, *_STATUS, HTTPException, Exception), answer_error)
+HANDLERS: dict[Any, Any] = dict.fromkeys((RequestValidationError, *KINDS, HTTPException, Exception), answer_error)
 
 
 OPEN = {"/openapi.json", "/health"}

@@ -11,7 +11,7 @@ from typing import Any
 
 from perception.errors import missing_extra
 from perception.language.base import Encoder
-from perception.listening import listen, url_host
+from perception.listening import check_address, listen, url_host
 from perception.query.engine import QueryEngine
 from perception.serve.settings import ServeSettings
 
@@ -25,26 +25,20 @@ _TOTAL_TIMEOUT = 300.0
 def serve(path: Path, settings: ServeSettings, encoders: Callable[[str], Encoder | None] | None = None) -> None:
     """Serves the map at `path` until SIGINT or SIGTERM; running requests are finished.
 
-    InputError when the map cannot be opened, the port is taken, or the packages of the extra `serve` are missing.
-    The address is written to standard error in one line once requests are accepted.
+    InputError when the map cannot be opened, the port is taken, others could reach it without a token, or the packages
+    of the extra `serve` are missing. The address is written to standard error in one line once requests are accepted.
     """
     for package in ("fastapi", "uvicorn"):
         if importlib.util.find_spec(package) is None:
             raise missing_extra(package, "serve")
     import uvicorn
 
+    check_address(settings.host, settings.port, settings.token)
     from perception.serve.app import build_app
 
     with (
         listen(settings.host, settings.port) as sock,
-        QueryEngine(
-            path,
-            workers=settings.workers,
-            queue_size=settings.queue_size,
-            timeout=settings.timeout,
-            watch=settings.watch or None,
-            encoders=encoders,
-        ) as engine,
+        QueryEngine(path, encoders=encoders, **settings.of_engine()) as engine,
     ):
         _say(f"serving {path} at http://{url_host(settings.host)}:{sock.getsockname()[1]} (Ctrl-C stops)")
         if (trouble := engine.current.problem) is not None:

@@ -13,7 +13,7 @@ from perception.io.map_views import StoredView
 from perception.io.store import read_map, write_map
 from perception.query import load_map
 from perception.query.crops import best_crop
-from perception.query.query_map import UnknownInstance
+from perception.query.requests import UnknownInstance
 from support.query_maps import encoders, write_map_of
 
 

@@ -23,13 +23,14 @@ from openapi_spec_validator import validate as validate_document
 from starlette.testclient import TestClient
 
 from perception.cli import main
-from perception.config import read_toml
+from perception.config import read_toml, settings_from
 from perception.errors import InputError
 from perception.io.cloud import read_cloud
 from perception.io.store import read_map
-from perception.listening import is_local, read_token
+from perception.listening import check_address, is_local, read_token
 from perception.query import QueryEngine, QueryMap
 from perception.serve.app import build_app
+from perception.serve.server import serve
 from perception.serve.settings import ServeSettings
 
 TOKEN = "0123456789abcdef0123"
@@ -302,8 +303,8 @@ def test_a_defect_is_logged_and_not_shown(
 def test_other_machines_need_a_token(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for host in ("0.0.0.0", "::", "192.168.1.5", "robot.local"):
         with pytest.raises(InputError, match="token"):
-            ServeSettings(host=host)
-        ServeSettings(host=host, token=TOKEN)
+            serve(tmp_path, ServeSettings(host=host))
+        check_address(host, 0, TOKEN)
     for host in ("127.0.0.1", "127.8.8.8", "::1", "localhost"):
         assert is_local(host)
     assert main(["serve", str(tmp_path), "--host", "0.0.0.0"]) == 2
@@ -334,8 +335,9 @@ def test_a_token_file_must_hold_one_long_word(tmp_path: Path) -> None:
     [{"port": -1}, {"port": 70000}, {"timeout": 0}, {"workers": 0}, {"queue_size": 0}, {"watch": -1}],
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, Any]) -> None:
-    with pytest.raises(InputError):
-        ServeSettings(**settings)
+    ((name, value),) = settings.items()
+    with pytest.raises(InputError, match=f"{name}: found {value}, expected"):
+        settings_from(ServeSettings, {name: (value, "serve")})
 
 
 def test_without_the_packages_the_install_line_is_told(

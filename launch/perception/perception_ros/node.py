@@ -25,10 +25,10 @@ from perception.errors import InputError
 from perception.export.floor_grid import floor_grid
 from perception.node import answers
 from perception.node.config import NodeConfig, node_config
-from perception.node.core import Core, error_kind
+from perception.node.core import Core
 from perception.node.ros import RosTransport, fill, message_class, spin, stop_on_signals
 from perception.query import AnswerTimeout, EngineBusy, EngineClosed, Frame, QueryEngine, QueryMap, Request
-from perception.query.requests import TOP
+from perception.query.requests import TOP, UnknownFrame, error_kind
 from perception_ros import messages
 from perception_ros.frames import FrameFile, read_frame
 
@@ -154,8 +154,7 @@ class MapNode(LifecycleNode):
         if others:
             raise InputError(f"{others} other node(s) serve {self.get_namespace()} already; use another namespace")
         self._frames = read_frame(Path(texts["frame_file"])) if texts["frame_file"] else None
-        how = config.model_dump(include={"workers", "queue_size", "timeout", "watch"})
-        engine = PlacedEngine(Path(texts["map"]), self._frames, encoders=self._encoders, **how)
+        engine = PlacedEngine(Path(texts["map"]), self._frames, encoders=self._encoders, **config.of_engine())
         self.config = self._transport.config = config
         self._gate.hold(engine)
         held = engine.current
@@ -233,8 +232,8 @@ class MapNode(LifecycleNode):
             future = self._gate.submit(self._request(request))
             reply = future.result(self.config.timeout)
         except (InputError, EngineBusy, EngineClosed, AnswerTimeout, TimeoutError) as error:
-            kind = "timeout" if isinstance(error, TimeoutError) else error_kind(error)
-            return fill(response, {"error": kind, "message": " ".join(str(error).split()) or "no answer in time"})
+            line = " ".join(str(error).split()) or "no answer in time"
+            return fill(response, {"error": error_kind(error), "message": line})
         found = messages.instance_array(reply.hits, reply.map_id, reply.frame, _now())
         return fill(response, {"answer": found})
 
@@ -245,7 +244,7 @@ class MapNode(LifecycleNode):
         if self._frames is not None:
             known[self._frames.parent] = self._frames.parent_frame()
         if asked.frame_id not in known:
-            raise InputError(f"frame_id: found '{asked.frame_id}', expected {' or '.join(filter(None, known))}")
+            raise UnknownFrame(f"frame_id: found '{asked.frame_id}', expected {' or '.join(filter(None, known))}")
         return replace(request, frame=known[asked.frame_id])
 
 
