@@ -148,9 +148,7 @@ class MapConfig(Settings):
     """All settings of `perception map`. The descriptions and ranges are what `perception map --help` prints."""
 
     seed: int = Field(0, ge=0, le=LARGEST_SEED, description="of all random choices")
-    device: Literal["auto", "cpu", "cuda"] = Field(
-        "auto", description="what computes; training does not run on a GPU yet"
-    )
+    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="what trains; auto: a GPU if one works")
     masks: str = Field("auto", description="auto, builtin, sam:PATH or labels:DIR: where object masks come from")
     sam: SamConfig = SamConfig()
     photos: PhotoConfig = PhotoConfig()

@@ -2,11 +2,13 @@
 
 Times forward + backward to the 3D parameters on every SIMD level this processor has, every case once a round
 (interleaved, so that a busy machine is equally unkind to all). A pair is one Gaussian contributing to one pixel. Its
-nanoseconds are CPU time of all threads: of the median round, and of the least disturbed one.
+nanoseconds are CPU time of all threads: of the median round, and of the least disturbed one. `--device cuda` adds
+torch's current GPU, and gsplat on it where that is installed, with the square of each feature for its variance.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import statistics
 import time
 import zipfile
@@ -23,6 +25,7 @@ from perception.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
+GPU, ON_GPU = "cuda", ("cuda", "gsplat")
 SPLAT_KEYS = ("means", "quats", "scales", "opacities", "colors", "features")
 STAGES = ("project", "sort", "bin", "blend", "blend_backward", "reduce")
 COLUMNS: tuple[Column, ...] = (
@@ -33,6 +36,7 @@ COLUMNS: tuple[Column, ...] = (
     ("least", "least_ns_per_pair", ".2f"),
     ("x 1 thread", "times_one_thread", ".2f"),
     ("x baseline", "times_baseline", ".1f"),
+    ("x gsplat", "times_gsplat", ".2f"),
     ("max error", "error_max", ".1e"),
     ("grad", "gradient_error", ".1e"),
     *((stage.replace("blend_backward", "back"), f"share_{stage}", ".0%") for stage in STAGES),
@@ -79,7 +83,7 @@ def load_scene(path: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Case:
-    """One timed configuration. rich: features and their variance are rendered in addition to RGB."""
+    """One timed configuration. simd: a SIMD level, or of ON_GPU. rich: RGB, features and their variance, else RGB."""
 
     simd: str
     dtype: str
@@ -101,31 +105,64 @@ def _run(scene: dict[str, Any], case: Case, dtype: str) -> tuple[Turn, Any, list
     """One pass: its times, the rasterizer's statistics, and images and gradients, flattened to float64."""
     import torch
 
-    from perception.gaussians.rasterize import rasterize
+    from perception.gaussians.rasterize import RasterizationStats, rasterize
 
-    inputs = {k: v.to(getattr(torch, dtype)) if hasattr(v, "dtype") else v for k, v in scene.items()}
+    on_gpu = case.simd in ON_GPU and dtype == case.dtype
+    device = torch.device(GPU if on_gpu else "cpu")
+    inputs = {k: v.to(device, getattr(torch, dtype)) if hasattr(v, "dtype") else v for k, v in scene.items()}
     names = [k for k in SPLAT_KEYS if case.rich or k != "features"]
     inputs |= {k: inputs[k].detach().requires_grad_() for k in names} | ({} if case.rich else {"features": None})
     channels = 3 + (2 * scene["features"].shape[1] if case.rich else 0)
     g = torch.Generator().manual_seed(1)
     pulls = torch.rand((1, scene["height"], scene["width"], channels), generator=g, dtype=torch.float64) * 2 - 1
+    wait = torch.cuda.synchronize if device.type == "cuda" else lambda: None
+    wait()
     cpu, start = time.process_time(), time.perf_counter()
-    out = rasterize(**inputs, depth=False, variance=case.rich, threads=case.threads, simd=case.simd)
-    images: list[Any] = [out.colors, out.features, out.feature_variance] if case.rich else [out.colors]
+    if on_gpu and case.simd == "gsplat":
+        stats, images = RasterizationStats(torch.empty(0)), _gsplat(inputs)
+    else:
+        simd = "auto" if case.simd in ON_GPU else case.simd
+        out = rasterize(**inputs, depth=False, variance=case.rich, threads=case.threads, simd=simd)
+        stats = out.stats
+        images = [image for image in (out.colors, out.features, out.feature_variance) if image is not None]
+    wait()
     middle, spent = time.perf_counter(), time.process_time() - cpu
-    cotangents = [pull.to(out.colors.dtype) for pull in pulls.split([image.shape[-1] for image in images], dim=-1)]
+    cotangents = [pull.to(images[0]) for pull in pulls.split([image.shape[-1] for image in images], dim=-1)]
+    wait()
     cpu, again = time.process_time(), time.perf_counter()
     gradients = torch.autograd.grad(images, [inputs[k] for k in names], cotangents)
+    wait()
     total, spent = middle - start + time.perf_counter() - again, spent + time.process_time() - cpu
-    flat = [torch.cat([t.detach().double().flatten() for t in tensors]) for tensors in (images, gradients)]
-    return Turn(middle - start, total, spent, out.stats.seconds), out.stats, flat
+    flat = [torch.cat([t.detach().cpu().double().flatten() for t in tensors]) for tensors in (images, gradients)]
+    return Turn(middle - start, total, spent, stats.seconds), stats, flat
 
 
-def cases(threads: Sequence[int], dtypes: Sequence[str]) -> list[Case]:
-    """Every SIMD level × precision × {RGB, rich} × number of threads."""
+def _gsplat(inputs: dict[str, Any]) -> list[Tensor]:
+    """gsplat's images of the arguments of `rasterize`."""
+    import torch
+    from gsplat import rasterization
+
+    colors, features = inputs["colors"], inputs["features"]
+    channels = [colors] if features is None else [colors, features, features.square()]
+    names = ("means", "quats", "scales", "opacities")
+    rest = [inputs[name] for name in ("viewmats", "Ks", "width", "height")]
+    rendered, _, _ = rasterization(*(inputs[name] for name in names), torch.cat(channels, dim=1), *rest)
+    image, *more = rendered.split([part.shape[1] for part in channels], dim=-1)
+    return [image, more[0], more[1] - more[0].square()] if more else [image]
+
+
+def cases(threads: Sequence[int], dtypes: Sequence[str], device: str = "cpu") -> list[Case]:
+    """Every SIMD level × precision × {RGB, rich} × number of threads; float32 on the GPU."""
+    from perception.gaussians.device import choose_device
     from perception.gaussians.rasterize import simd_levels
 
-    return [Case(s, d, rich, t) for d in dtypes for rich in (False, True) for s in simd_levels() for t in threads]
+    both = (False, True)
+    chosen = [Case(s, d, rich, t) for d in dtypes for rich in both for s in simd_levels() for t in threads]
+    if device == "cuda":
+        choose_device("cuda")
+        here = ON_GPU if importlib.util.find_spec("gsplat") else ON_GPU[:1]
+        chosen += [Case(name, "float32", rich, 1) for rich in both for name in here]
+    return chosen
 
 
 def measure(name: str, scene: dict[str, Any], chosen: Sequence[Case], rounds: int) -> list[dict[str, Any]]:
@@ -141,6 +178,7 @@ def measure(name: str, scene: dict[str, Any], chosen: Sequence[Case], rounds: in
             **_row(name, scene, case, [turn[case] for turn in turns]),
             "times_one_thread": times_faster(case, replace(case, threads=1)),
             "times_baseline": times_faster(case, replace(case, simd="baseline")),
+            "times_gsplat": times_faster(case, replace(case, simd="gsplat")),
         }
         for case in chosen
     ]
@@ -149,9 +187,10 @@ def measure(name: str, scene: dict[str, Any], chosen: Sequence[Case], rounds: in
 def _row(name: str, scene: dict[str, Any], case: Case, turns: list[Turn]) -> dict[str, Any]:
     """Times, and the largest absolute image error and relative L2 gradient error against the float64 build."""
     _, stats, (image, grad) = _run(scene, case, case.dtype)
-    _, _, (exact, exact_grad) = _run(scene, case, "float64")
+    _, exact_stats, (exact, exact_grad) = _run(scene, case, "float64")
+    stats = exact_stats if case.simd in ON_GPU else stats  # pairs are not counted there
     pairs, cpu = max(1, stats.contributing_pairs), [t.cpu for t in turns]
-    seconds = {stage: statistics.median(t.stages[stage] for t in turns) for stage in STAGES}
+    seconds = {stage: statistics.median(t.stages.get(stage, 0.0) for t in turns) for stage in STAGES}
     whole = max(sum(seconds.values()), 1e-12)
     return {
         "scene": name, "simd": case.simd, "dtype": case.dtype, "threads": case.threads,
@@ -174,10 +213,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--rounds", type=int, default=7, help="counted rounds, at least 1 (default 7)")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--dtypes", nargs="+", default=["float32", "float64"], choices=("float32", "float64"))
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="cuda: the GPU too (default cpu)")
     options = parser.parse_args(arguments)
     if options.rounds < 1 or min(options.threads) < 1:
         raise InputError(f"bench rasterizer: found {options.rounds} rounds and threads {options.threads}, expected ≥ 1")
-    chosen, rows, lines = cases(options.threads, options.dtypes), [], []
+    chosen, rows, lines = cases(options.threads, options.dtypes, options.device), [], []
     for path in options.scenes or [None]:
         scene = load_scene(path) if path else synthetic_scene()
         found = measure(path.stem if path else "synthetic", scene, chosen, options.rounds)

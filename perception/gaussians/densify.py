@@ -8,14 +8,12 @@ preserve the rendered image (Rota Bulò et al. 2024, eq. 11). Opacities decay a 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 
-from perception import _core
+from perception.gaussians.device import training_kernels
 from perception.gaussians.model import Gaussians, sigmoid
 
-_kernels: Any = _core.training  # takes tensors through DLPack where its stub says arrays
 START, STOP = 0.05, 0.6
 """Progress at which the number of Gaussians begins and ends to grow."""
 PERCENT_DENSE = 0.01
@@ -37,14 +35,15 @@ class Statistics:
     radius: torch.Tensor
 
     @staticmethod
-    def zeros(count: int) -> Statistics:
-        return Statistics(*(torch.zeros(count) for _ in range(3)))
+    def zeros(count: int, device: torch.device | None = None) -> Statistics:
+        return Statistics(*(torch.zeros(count, device=device) for _ in range(3)))
 
     def add(self, gradient_px: torch.Tensor, radius_px: torch.Tensor, visible: torch.Tensor, long_side: int) -> None:
         """Adds one view: gradient_px [N, 2] of the 2D mean per pixel, radius_px [N] pixels, visible [N] uint8,
         long_side in pixels. Rows that are not visible are not looked at."""
         sums = (self.gradient, self.seen, self.radius)
-        _kernels.add_statistics(gradient_px, radius_px, visible, *sums, 0.5 * long_side, 1 / long_side)
+        kernels = training_kernels(visible.device)
+        kernels.add_statistics(gradient_px, radius_px, visible, *sums, 0.5 * long_side, 1 / long_side)
 
     def mean_gradient(self) -> torch.Tensor:
         return self.gradient / self.seen.clamp(min=1)
@@ -122,7 +121,7 @@ def _halves(gaussians: Gaussians, index: torch.Tensor, generator: torch.Generato
     children = []
     for _ in range(2):
         child = gaussians.rows(index)
-        offset = torch.randn(len(index), 3, generator=generator) * child.scales
+        offset = torch.randn(len(index), 3, generator=generator).to(child.scales) * child.scales
         child.means += torch.einsum("nij,nj->ni", rotations, offset)
         child.log_scales -= torch.log(torch.tensor(SPLIT_SHRINK))
         children.append(child)
@@ -132,7 +131,7 @@ def _halves(gaussians: Gaussians, index: torch.Tensor, generator: torch.Generato
 def rotation_matrices(quats: torch.Tensor) -> torch.Tensor:
     """[N, 4] wxyz of any norm -> [N, 3, 3]; a zero quaternion gives the identity."""
     norm = quats.norm(dim=1, keepdim=True)
-    identity = torch.tensor([1.0, 0, 0, 0], dtype=quats.dtype)
+    identity = torch.tensor([1.0, 0, 0, 0]).to(quats)
     w, x, y, z = torch.where(norm > 0, quats / norm.clamp(min=1e-30), identity).unbind(1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

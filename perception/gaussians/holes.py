@@ -43,7 +43,7 @@ def fill_holes(gaussians: Gaussians, views: list[TrainingView], room: int, seed:
         empty, blocks = empty + int(holes.sum()), blocks + alphas.size
         if not holes.any() or not covered.any() or len(born) >= room:
             continue
-        found = _placed(view, holes, covered, depths, gaussians, generator)
+        found = _placed(view, holes, covered, depths, gaussians, generator).to(gaussians.means.device)
         born = Gaussians.concatenate([born, found.rows(torch.arange(min(len(found), room - len(born))))])
     return born, empty / max(1, blocks)
 
@@ -53,7 +53,7 @@ def _blocks(gaussians: Gaussians, view: TrainingView) -> tuple[np.ndarray, np.nd
     height, width = view.photo.shape[:2]
     out = render(gaussians, view.camera_from_world, view.K, width, height, eps2d=view.eps2d)
     images = torch.stack([out.alphas[0], out.depths[0]])
-    alpha, depth = _block_mean(images).numpy()
+    alpha, depth = _block_mean(images).cpu().numpy()
     return alpha, np.where(alpha > 0, depth / np.maximum(alpha, 1e-6), 0)
 
 

@@ -3,33 +3,32 @@
     L = L_RGB + λ_inst2D (w_p L_pos + w_n L_neg) + λ_var L_var
 
 Every function returns a loss with its gradient with respect to the images; nothing is recorded for torch's autograd.
-All take CPU tensors of float32 or float64 and sum in float64. The kernels use all processors unless
-`_core.training.set_threads` limits them. The result does not depend on the number of threads, bit for bit.
+All take tensors of float32 or float64 on one device and sum in float64. On the CPU the kernels use all processors
+unless `_core.training.set_threads` limits them, and the result does not depend on the number of threads, bit for bit.
+On another device every figure is a tensor of one element.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from perception import _core
 from perception.errors import InputError
+from perception.gaussians.device import training_kernels
 from perception.io.disk_arrays import Keep
 
-_kernels: Any = _core.training  # takes tensors through DLPack where its stub says arrays
 _LARGEST_ID = 2**31 - 1
 VarianceForm = Literal["paper", "channels", "plain"]
 
 
 def _ready(name: str, tensor: Tensor) -> Tensor:
-    """`tensor` detached and in C order, as the kernels need it; InputError unless float32 or float64 on the CPU."""
-    if tensor.device.type != "cpu" or tensor.dtype not in (torch.float32, torch.float64):
-        found = f"{tensor.dtype} on {tensor.device}"
-        raise InputError(f"{name}: found {found}, expected float32 or float64 on the CPU")
+    """`tensor` detached and in C order, as the kernels need it; InputError unless float32 or float64."""
+    if tensor.dtype not in (torch.float32, torch.float64):
+        raise InputError(f"{name}: found {tensor.dtype}, expected float32 or float64")
     return tensor.detach().contiguous()
 
 
@@ -74,7 +73,8 @@ def photometric(
             raise InputError(f"photometric loss: weight has shape {list(weight.shape)}, expected [H, W]")
         weight = weight.detach().to(render.dtype).contiguous()
     gradient = torch.empty_like(render)
-    value, l1, ssim = _kernels.photometric(render, image.contiguous(), weight, gradient, float(beta))
+    kernels = training_kernels(render.device)
+    value, l1, ssim = kernels.photometric(render, image.contiguous(), weight, gradient, float(beta))
     return PhotometricLoss(value, gradient, l1, ssim)
 
 
@@ -104,7 +104,7 @@ def depth_loss(depths: Tensor, alphas: Tensor, measured: Tensor) -> tuple[float,
     length = (error * error).add_(_DEPTH_NOISE**2).sqrt_()
     pull = error.div_(length).div_(target).mul_(share)
     value = length.sub_(_DEPTH_NOISE + 1).mul_(alphas).add_(1).mul_(share)
-    return _kernels.sum(value.reshape(-1), False), pull, expected.mul_(pull).add_(share).neg_()
+    return training_kernels(depths.device).sum(value.reshape(-1), False), pull, expected.mul_(pull).add_(share).neg_()
 
 
 # ---------- instance
@@ -124,6 +124,11 @@ class LabelAssignment:
     slots: Tensor
     shape: tuple[int, ...]
 
+    def to(self, device: torch.device) -> LabelAssignment:
+        """The same on `device`."""
+        ids, counts, first, slots = (t.to(device) for t in (self.ids, self.counts, self.first, self.slots))
+        return LabelAssignment(ids, counts, first, slots, self.shape)
+
 
 def assign_labels(labels: Tensor | np.ndarray, keep: Keep = np.asarray) -> LabelAssignment:
     """Indexes label image `labels` [H, W] of any integer type (0 = unlabelled, ids need not be dense). keep: for slots.
@@ -140,7 +145,7 @@ def assign_labels(labels: Tensor | np.ndarray, keep: Keep = np.asarray) -> Label
     flat = torch.from_numpy(np.ascontiguousarray(image, dtype=np.int32).reshape(-1))
     slots = torch.empty_like(flat)
     try:
-        ids, counts, first = _kernels.assign(flat, 1.0, 0, slots)
+        ids, counts, first = training_kernels(flat.device).assign(flat, 1.0, 0, slots)
     except ValueError as error:  # an id below 0
         raise InputError(str(error)) from None
     long = torch.int64
@@ -195,16 +200,17 @@ def instance_loss(
         raise InputError(f"instance loss: labels and features have shapes {found}, expected [H, W] and [H, W, D]")
     features = _ready("features", features)
     flat, counts = features.view(-1, features.shape[2]), labels.counts
-    means = torch.empty(len(counts), flat.shape[1], dtype=torch.float64)
-    scatter, apart = torch.empty(len(counts), dtype=torch.float64), torch.empty_like(means)
-    _kernels.prototypes(flat, labels.slots, counts, labels.first, means, scatter)
+    kernels = training_kernels(features.device)
+    means = features.new_empty(len(counts), flat.shape[1], dtype=torch.float64)
+    scatter, apart = means.new_empty(len(counts)), torch.empty_like(means)
+    kernels.prototypes(flat, labels.slots, counts, labels.first, means, scatter)
     shares = 1 / (len(counts) * counts.double())
-    pos = float((shares * scatter).sum())
-    neg = _kernels.separation(means, float(margin), apart)
+    pos = kernels.sum(shares * scatter, False)
+    neg = kernels.separation(means, float(margin), apart)
     # d L_pos / d F(p) = 2 share (F(p) − z): the part through z vanishes, as Σ_p (F(p) − z) = 0.
     gradient = torch.empty_like(features)
     pull, push = 2 * w_pos * shares, w_neg * apart / counts[:, None]
-    _kernels.spread(flat, labels.slots, means, pull, push, gradient.view(flat.shape))
+    kernels.spread(flat, labels.slots, means, pull, push, gradient.view(flat.shape))
     return InstanceLoss(w_pos * pos + w_neg * neg, gradient, pos, neg, means, labels.ids)
 
 
@@ -225,9 +231,10 @@ def variance_loss(feature_variance: Tensor, form: VarianceForm = "paper", weight
     variance = _ready("feature_variance", feature_variance)
     height, width, channels = variance.shape
     share = weight / max(1, height * width * (1 if form == "paper" else channels))
-    value = share * _kernels.sum(variance.view(-1), form != "plain")
+    kernels = training_kernels(variance.device)
+    value = share * kernels.sum(variance.view(-1), form != "plain")
     if form == "plain":
         return value, torch.full_like(variance, share)
     gradient = torch.empty_like(variance)
-    _kernels.scale(variance.view(-1), 2 * share, gradient.view(-1))
+    kernels.scale(variance.view(-1), 2 * share, gradient.view(-1))
     return value, gradient

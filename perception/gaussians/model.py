@@ -38,6 +38,10 @@ class Gaussians:
     def __len__(self) -> int:
         return int(self.means.shape[0])
 
+    def to(self, device: torch.device | str) -> Gaussians:
+        """The same Gaussians on `device`; tensors that are there already are not copied."""
+        return Gaussians(**{name: tensor.to(device) for name, tensor in vars(self).items()})
+
     def rows(self, index: torch.Tensor) -> Gaussians:
         """Copies of the rows `index` [M] int64 selects, in its order."""
         return Gaussians(**{name: tensor[index].clone() for name, tensor in vars(self).items()})

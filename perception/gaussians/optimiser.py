@@ -10,17 +10,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from perception import _core
 from perception.errors import InputError
+from perception.gaussians.device import training_kernels
 
-_kernels: Any = _core.training  # takes tensors through DLPack where its stub says arrays
 Rate = float | Tensor
 BETAS, EPS = (0.9, 0.999), 1e-15
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """Rows of each tensor that were updated, and rows skipped because their gradient held NaN or infinity."""
+    """Rows of each tensor that were updated, and rows skipped because their gradient held NaN or infinity; tensors of
+    one element where the parameters are not on the CPU."""
 
     updated: dict[str, int]
     skipped: dict[str, int]
@@ -29,7 +29,7 @@ class StepReport:
 class SparseAdam:
     """Adam (Kingma & Ba 2015) on the rows a mask selects, for tensors that grow and shrink together.
 
-    params: name -> [N, ...] float32 or float64 leaf tensors on the CPU, the same N for all; updated in place.
+    params: name -> [N, ...] float32 or float64 leaf tensors on one device, the same N for all; updated in place.
     rates: name -> learning rate, or a tensor of one rate per column, shaped like a row ([...]), so that for
     example the DC and the higher spherical harmonics share a tensor and still learn at different speeds.
 
@@ -83,14 +83,15 @@ class SparseAdam:
             return 0, 0
         rows = (len(param), -1)
         tensors = (param, grad.contiguous(), self._first[name], self._second[name])
-        arrays = [t.detach().view(rows).numpy() for t in tensors]
-        width = arrays[0].shape[1]
+        matrices = [t.detach().view(rows) for t in tensors]
+        width = matrices[0].shape[1]
         rate = np.asarray(self.rates[name], dtype=np.float64).reshape(-1)
         if rate.size not in (1, width):
             raise InputError(f"SparseAdam: rates of {name} are {rate.size}, expected 1 or {width}")
         rate = np.ascontiguousarray(np.broadcast_to(rate, width))
-        mask = None if visible is None else visible.numpy()
-        return _kernels.adam(*arrays, mask, rate, self.steps, *BETAS, EPS)
+        adam = training_kernels(param.device).adam
+        updated, skipped = adam(*matrices, visible, rate, self.steps, *BETAS, EPS)
+        return updated, skipped
 
     def keep(self, index: Tensor) -> None:
         """Keeps the rows `index` selects, in its order: [N] bool, or int64 row numbers (repeats allowed)."""
@@ -104,16 +105,18 @@ class SparseAdam:
             raise InputError(f"SparseAdam: append got {sorted(rows)}, expected {sorted(self.params)}")
         for name, new in rows.items():
             old = self.params[name]
-            new = new.detach().to(old.dtype)
+            new = new.detach().to(old)
             self.params[name] = _leaf_like(old, torch.cat([old.detach(), new]))
             for table in (self._first, self._second):
                 table[name] = torch.cat([table[name], torch.zeros_like(new)])
         self._check_rows()
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue: copies of params and moments, rates, step count."""
+        """Everything needed to continue: copies of params and moments on the CPU, rates, step count."""
         tables = {"params": self.params, "first": self._first, "second": self._second}
-        copies: dict[str, Any] = {k: {n: t.detach().clone() for n, t in d.items()} for k, d in tables.items()}
+        copies: dict[str, Any] = {
+            key: {name: t.detach().to("cpu", copy=True) for name, t in table.items()} for key, table in tables.items()
+        }
         return copies | {"rates": dict(self.rates), "steps": self.steps}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -122,7 +125,8 @@ class SparseAdam:
             raise InputError(f"SparseAdam: state has {sorted(state['params'])}, expected {sorted(self.params)}")
         for table, key in ((self.params, "params"), (self._first, "first"), (self._second, "second")):
             for name, tensor in state[key].items():
-                table[name] = _leaf_like(table[name], tensor.detach().clone().contiguous())
+                fresh = tensor.detach().to(table[name].device, copy=True).contiguous()
+                table[name] = _leaf_like(table[name], fresh)
         self.rates = dict(state["rates"])
         self.steps = state["steps"]
         self._check_rows()
@@ -138,8 +142,8 @@ def _leaf_like(old: Tensor, new: Tensor) -> Tensor:
 
 
 def _checked(name: str, tensor: Tensor) -> Tensor:
-    fine = tensor.is_leaf and tensor.device.type == "cpu" and tensor.dtype in (torch.float32, torch.float64)
+    fine = tensor.is_leaf and tensor.dtype in (torch.float32, torch.float64)
     if not fine or tensor.ndim < 1 or not tensor.is_contiguous():
-        found = f"{tensor.dtype} {list(tensor.shape)} on {tensor.device}, leaf={tensor.is_leaf}"
-        raise InputError(f"SparseAdam: {name} is {found}, expected a contiguous float leaf [N, ...] on the CPU")
+        found = f"{tensor.dtype} {list(tensor.shape)}, leaf={tensor.is_leaf}"
+        raise InputError(f"SparseAdam: {name} is {found}, expected a contiguous float leaf [N, ...]")
     return tensor

@@ -58,7 +58,8 @@ class Settings:
     """Rasterization settings. simd: "auto", "avx512", "avx2" or "baseline"; threads: 0 for torch's number.
 
     max_records: most gradient records (one per Gaussian and 64 × 64-pixel tile, 4 (16 + D) bytes in float32) held at
-    once. The backward pass processes larger images in parts. 0: four per visible Gaussian, at least 2**20.
+    once. The backward pass processes larger images in parts. 0: four per visible Gaussian, at least 2**20. On a GPU
+    tiles have 16 × 16 pixels, and 0 means 2**24.
     """
 
     width: int
@@ -73,6 +74,7 @@ class Settings:
     max_records: int = 0
 
 
+_DEVICES = ("cpu", "cuda")
 simd_levels = _core.simd_levels
 """The SIMD levels this processor supports, best first."""
 
@@ -235,11 +237,11 @@ def rasterize_backward(
 
 def passes(device: torch.device) -> tuple[Callable[..., Forward], Callable[..., Any]]:
     """The forward and the backward pass for tensors on `device`."""
-    if device.type == "cuda":
-        from perception.gaussians.cuda import rasterize as on_device
+    if device.type == "cpu":
+        return rasterize_forward, rasterize_backward
+    from perception.gaussians.cuda import rasterize as on_device
 
-        return on_device.rasterize_forward, on_device.rasterize_backward
-    return rasterize_forward, rasterize_backward
+    return on_device.rasterize_forward, on_device.rasterize_backward
 
 
 class _Rasterize(torch.autograd.Function):
@@ -341,7 +343,7 @@ def _check(
             continue
         if not isinstance(t, torch.Tensor):
             raise InputError(f"rasterize: {name} is {type(t).__name__}, expected a torch.Tensor")
-        if t.device.type not in ("cpu", "cuda") or (means is not None and t.device != means.device):
+        if t.device.type not in _DEVICES or (means is not None and t.device != means.device):
             place = "cpu or cuda" if means is None or t is means else f"{means.device}, where means are"
             raise InputError(f"rasterize: {name} is on {t.device}, expected {place}")
         if t.dtype not in (torch.float32, torch.float64) or (means is not None and t.dtype != means.dtype):

@@ -20,19 +20,21 @@ def render(
     harmonics: bool = False,
     **options: Any,
 ) -> Rasterization:
-    """Renders one view (C = 1): camera_from_world [4, 4], K [3, 3] in pixels, float32; `options`: see `rasterize`.
+    """Renders one view (C = 1) where the Gaussians are: camera_from_world [4, 4], K [3, 3] in pixels, float32, on any
+    device; `options`: see `rasterize`.
 
     harmonics: True computes view-dependent colours from all spherical harmonics. False uses the constant term, which is
     enough for visibility, depth and features.
     """
+    device = gaussians.means.device
     return rasterize(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
         gaussians.opacities,
         gaussians.sh if harmonics else gaussians.base_colors,
-        camera_from_world[None],
-        K[None],
+        camera_from_world[None].to(device),
+        K[None].to(device),
         width,
         height,
         sh_degree=gaussians.sh_degree if harmonics else None,

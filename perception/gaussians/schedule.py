@@ -109,7 +109,7 @@ class Schedule:
             turn = round((progress - START) * config.train.iterations / config.densify.every)
             if turn % FILL_EVERY == 0:
                 self._fill(seed)
-            trainer.statistics = Statistics.zeros(len(trainer.gaussians))
+            trainer.statistics = Statistics.zeros(len(trainer.gaussians), trainer.device)
 
     def _grow(self, allowed: int, seed: int) -> None:
         trainer = self.trainer
@@ -133,7 +133,7 @@ class Schedule:
         trainer = self.trainer
         columns = [tensor.reshape(len(tensor), -1) for tensor in vars(trainer.gaussians).values()]
         self._keep(torch.isfinite(torch.cat(columns, dim=1)).all(dim=1), "whose values are not finite")
-        seen = torch.zeros(len(trainer.gaussians), dtype=torch.bool)
+        seen = torch.zeros_like(trainer.gaussians.opacity_logits, dtype=torch.bool)
         with trainer.record.timed("evaluation"):
             for view in trainer.views:
                 seen |= visible_in(trainer.gaussians, view)
@@ -144,7 +144,7 @@ class Schedule:
         if not bool(wanted.all()):
             self._tell(f"pruned: {int((~wanted).sum())} Gaussians {which}")
             self.trainer.keep(torch.nonzero(wanted).flatten())
-            self.trainer.statistics = Statistics.zeros(len(self.trainer.gaussians))
+            self.trainer.statistics = Statistics.zeros(len(self.trainer.gaussians), self.trainer.device)
 
     # ----------------------------------------------------------- early stopping
 

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from perception.config import MapConfig
+from perception.errors import InputError
 from perception.gaussians.densify import Statistics
 from perception.gaussians.losses import (
     LabelAssignment,
@@ -30,7 +31,7 @@ from perception.gaussians.losses import (
 )
 from perception.gaussians.model import Gaussians
 from perception.gaussians.optimiser import SparseAdam
-from perception.gaussians.rasterize import Forward, Settings, rasterize_backward, rasterize_forward, torch_on_one_thread
+from perception.gaussians.rasterize import Forward, Settings, passes, torch_on_one_thread
 from perception.gaussians.rates import learning_rates
 from perception.gaussians.record import TrainRecord
 from perception.gaussians.schedule import Schedule
@@ -41,6 +42,8 @@ __all__ = ["TrainRecord", "Trainer", "TrainingView", "depth_image", "psnr", "ren
 
 SSIM_WEIGHT = 0.2
 """β of the photometric loss (eq. 4), as in Kerbl et al. 2023."""
+_LEAST_RECORDS = 1 << 18
+"""Gradient records that a GPU must have room for at once (see `Settings.max_records`)."""
 INSTANCE_WEIGHT = 0.1
 """λ_inst2d of eq. 14; w_p = w_n = 1 in eq. 9."""
 
@@ -56,12 +59,23 @@ class Observer(Protocol):
 
 
 class Trainer:
-    """All state of one optimisation; `state` exports it for a checkpoint, and `load` restores it."""
+    """All state of one optimisation; `state` exports it for a checkpoint, and `load` restores it.
+
+    gaussians, views, held_out: on the CPU. Gaussians, optimiser and training views are then kept on `device`.
+    """
 
     def __init__(
-        self, gaussians: Gaussians, views: list[TrainingView], config: MapConfig, held_out: list[TrainingView]
+        self,
+        gaussians: Gaussians,
+        views: list[TrainingView],
+        config: MapConfig,
+        held_out: list[TrainingView],
+        device: torch.device | None = None,
     ):
         self.config = config
+        self.device = device or torch.device("cpu")
+        self._forward, self._backward = passes(self.device)
+        self._max_records = 0
         self.held_out = held_out
         self.extent = scene_extent(views)
         self.record = TrainRecord()
@@ -69,9 +83,9 @@ class Trainer:
         self.complete = False  # finished, unless a longer training is requested
         self.skipped = 0.0  # share of training progress skipped by early stopping
         self.initial_count = len(gaussians)
-        self.gaussians = gaussians
-        self.statistics = Statistics.zeros(len(gaussians))
-        self.optimiser = SparseAdam(vars(gaussians), self._rates(0.0))
+        self.gaussians = gaussians.to(self.device)
+        self.statistics = Statistics.zeros(len(gaussians), self.device)
+        self.optimiser = SparseAdam(vars(self.gaussians), self._rates(0.0))
         self._sync()
         self.schedule = Schedule(self)
         self.show(views)
@@ -80,6 +94,7 @@ class Trainer:
     def show(self, views: list[TrainingView]) -> None:
         """Sets the training views: the same photos as before, possibly with labels added."""
         self.views, self.coarse = views, [view.halved().stored() for view in views]
+        self._placed: dict[tuple[str, int], TrainingView] = {}  # those seen so far, on the device
         self._assigned: dict[str, LabelAssignment] = {}  # of the views seen so far
         self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
 
@@ -113,19 +128,44 @@ class Trainer:
     # -------------------------------------------------------------------- step
 
     def step(self, progress: float) -> float:
-        """One iteration: renders a view, computes the loss and its gradient, takes an Adam step. Returns the loss."""
-        view, with_features = self.schedule.next_view(progress)
+        """One iteration: renders a view, computes the loss and its gradient, takes an Adam step. Returns the loss.
+
+        On a GPU without memory enough the step is repeated with fewer gradient records at once; InputError when the
+        fewest do not fit.
+        """
+        while True:
+            try:
+                return self._step(progress)
+            except torch.OutOfMemoryError as error:  # before Adam, so nothing has changed
+                self._max_records = (self._max_records or 1 << 24) // 4
+                if self._max_records < _LEAST_RECORDS:
+                    full = f"{self.device}: its memory is full with {len(self.gaussians)} Gaussians"
+                    raise InputError(f"{full}; use a smaller --budget or --max-side, or --device cpu") from error
+                torch.cuda.empty_cache()
+                self.record.decisions.append(f"memory: at most {self._max_records} gradient records at once")
+            except RuntimeError as error:
+                if self.device.type == "cpu":
+                    raise
+                failed = f"{self.device}: failed at iteration {self.iteration} ({str(error).splitlines()[0]})"
+                raise InputError(f"{failed}; continue from the checkpoint with --resume --device cpu") from error
+
+    def _step(self, progress: float) -> float:
+        chosen, with_features = self.schedule.next_view(progress)
+        view = self._on_device(chosen)
         height, width = view.photo.shape[:2]
         g, measured = self.gaussians, view.depth is not None
-        settings = Settings(width, height, g.sh_degree, eps2d=view.eps2d, variance=with_features, depth=measured)
+        settings = Settings(
+            width, height, g.sh_degree, eps2d=view.eps2d, variance=with_features, depth=measured,
+            max_records=self._max_records,
+        )  # fmt: skip
         # On a random background colour, so that an empty region cannot fit the photo.
         colors = np.random.default_rng([self.config.seed, self.iteration, 1]).random((1, 3), dtype=np.float32)
-        background = torch.from_numpy(colors)
+        background = torch.from_numpy(colors).to(self.device)
         with self.record.timed("rasterizer forward"):
             cameras = (view.camera_from_world[None], view.K[None])
             features = g.features if with_features else None
             inputs = (g.means, g.quats, g.scales, g.opacities, g.sh, features, *cameras)
-            out = rasterize_forward(inputs, background, settings)  # I (eq. 3), F (eq. 5) and Var F (eq. 12)
+            out = self._forward(inputs, background, settings)  # I (eq. 3), F (eq. 5) and Var F (eq. 12)
         with self.record.timed("losses"):
             loss, cotangents = self._losses(view, out)
         with self.record.timed("rasterizer backward"):
@@ -133,10 +173,10 @@ class Trainer:
                 name: buffer for name, buffer in self._gradients.items() if with_features or name != "features"
             }
             stored = [gradients.get(name) for name in (*vars(g), "viewmats", "mean2d")]
-            rasterize_backward(inputs, background, settings, out, cotangents, (), stored)
+            self._backward(inputs, background, settings, out, cotangents, (), stored)
         with self.record.timed("Adam"):
             self.optimiser.rates = self._rates(progress)
-            self.record.skipped_gradients += sum(self.optimiser.step(out.visible[0], gradients).skipped.values())
+            self.record.skipped_gradients += int(sum(self.optimiser.step(out.visible[0], gradients).skipped.values()))
         if self.schedule.grows_at(progress):
             with self.record.timed("densification"):
                 mean2d, long_side = self._gradients["mean2d"][0], max(height, width)
@@ -144,7 +184,16 @@ class Trainer:
         self.record.pairs += out.frames.contributing
         self.record.evaluated_pairs += out.frames.evaluated
         self.iteration += 1
-        return loss
+        return float(loss)
+
+    def _on_device(self, view: TrainingView) -> TrainingView:
+        """The view on the device, where it stays."""
+        if self.device.type == "cpu":
+            return view
+        key = view.name, len(view.photo)
+        if key not in self._placed:
+            self._placed[key] = view.to(self.device)
+        return self._placed[key]
 
     def _losses(self, view: TrainingView, out: Forward) -> tuple[float, tuple[torch.Tensor | None, ...]]:
         """L (eq. 14) and its gradients with respect to colors, alphas, depths, features and their variance."""
@@ -162,7 +211,7 @@ class Trainer:
             value, variance = variance_loss(spread, losses.variance_form, losses.variance_weight)  # λ_var L_var, eq. 13
             total, variance = total + value, (variance if view.weight is None else variance * weight)[None]
             if view.labels is not None:
-                labels = self._assigned.get(view.name) or assign_labels(view.labels, view.keep)
+                labels = self._assigned.get(view.name) or assign_labels(view.labels, view.keep).to(self.device)
                 self._assigned[view.name] = labels
                 w = INSTANCE_WEIGHT
                 found = instance_loss(out.features[0], labels, margin=losses.margin, w_pos=w, w_neg=w)  # eqs. 6 to 9
@@ -214,7 +263,7 @@ class Trainer:
         state, count = self.optimiser.state_dict(), (degree + 1) ** 2
         for table in ("params", "first", "second"):
             sh = state[table]["sh"]
-            more = torch.zeros(len(sh), max(0, count - sh.shape[1]), 3)
+            more = sh.new_zeros(len(sh), max(0, count - sh.shape[1]), 3)
             state[table]["sh"] = torch.cat([sh[:, :count], more], dim=1)
         self._restart_optimiser(state)
 
@@ -229,7 +278,7 @@ class Trainer:
         return (rendered if view.depth is None else torch.where(view.depth > 0, view.depth, rendered)).numpy()
 
     def _restart_optimiser(self, state: dict[str, Any]) -> None:
-        self.gaussians = Gaussians(**state["params"])
+        self.gaussians = Gaussians(**state["params"]).to(self.device)
         self.optimiser = SparseAdam(vars(self.gaussians), self._rates(0.0))
         self.optimiser.load_state_dict(state)
         self._sync()
@@ -241,7 +290,7 @@ class Trainer:
         """
         self.gaussians = Gaussians(**{name: tensor.detach() for name, tensor in self.optimiser.params.items()})
         self._gradients = {name: torch.zeros_like(tensor) for name, tensor in vars(self.gaussians).items()}
-        self._gradients["mean2d"] = torch.zeros(1, len(self.gaussians), 2)
+        self._gradients["mean2d"] = self.gaussians.means.new_zeros(1, len(self.gaussians), 2)
 
     # -------------------------------------------------------------- checkpoint
 
@@ -251,7 +300,7 @@ class Trainer:
             "iteration": self.iteration,
             "initial_count": self.initial_count,
             "optimiser": self.optimiser.state_dict(),
-            "statistics": vars(self.statistics),
+            "statistics": {name: tensor.cpu() for name, tensor in vars(self.statistics).items()},
             "record": dict(vars(self.record), seconds=self.elapsed, iterations=self.iteration),
             "stopping": asdict(self.schedule.stopping),
             "skipped": self.skipped,
@@ -261,7 +310,8 @@ class Trainer:
     def load(self, state: dict[str, Any]) -> None:
         """Restores the result of `state`."""
         self._restart_optimiser(state["optimiser"])
-        self.statistics = Statistics(**state["statistics"])
+        sums = {name: tensor.to(self.device) for name, tensor in state["statistics"].items()}
+        self.statistics = Statistics(**sums)
         self.record = TrainRecord(**state["record"])
         self.iteration, self.initial_count = state["iteration"], state["initial_count"]
         vars(self.schedule.stopping).update(state["stopping"])

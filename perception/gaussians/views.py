@@ -13,6 +13,7 @@ from perception.gaussians.rasterize import Rasterization
 from perception.gaussians.render import render
 from perception.io.disk_arrays import Keep
 
+_ON_DEVICE = ("photo", "K", "camera_from_world", "weight", "depth", "gain")
 BEST_PSNR = 100.0
 """PSNR in dB of two equal images, as in `evaluate.images`: finite, so that means and JSON stay valid."""
 
@@ -43,6 +44,11 @@ class TrainingView:
             if (image := getattr(self, name)) is not None:
                 kept[name] = torch.from_numpy(self.keep(image.numpy()))
         return replace(self, **kept)
+
+    def to(self, device: torch.device) -> TrainingView:
+        """The view on `device`, but for the labels, which `losses.assign_labels` reads once."""
+        tensors: dict[str, Any] = {name: getattr(self, name) for name in _ON_DEVICE}
+        return replace(self, **{name: tensor.to(device) for name, tensor in tensors.items() if tensor is not None})
 
     def halved(self) -> TrainingView:
         """The same view at half the resolution: photo averaged 2 × 2, labels taken at every other pixel. A pixel is
@@ -98,8 +104,8 @@ def scene_extent(views: list[TrainingView]) -> float:
 
 @torch.no_grad()
 def render_view(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
-    """The Gaussians rendered and exposed as the view, [H, W, 3] float32 in [0, 1], on a black background."""
-    return view.exposed(_render(gaussians, view).colors[0]).clamp(0, 1)
+    """The Gaussians rendered and exposed as the view, [H, W, 3] float32 in [0, 1] on the CPU, black background."""
+    return view.exposed(_render(gaussians, view).colors[0].cpu()).clamp(0, 1)
 
 
 @torch.no_grad()
@@ -119,10 +125,10 @@ def _render(gaussians: Gaussians, view: TrainingView) -> Rasterization:
 def depth_image(
     gaussians: Gaussians, camera_from_world: torch.Tensor, K: torch.Tensor, width: int, height: int
 ) -> torch.Tensor:
-    """Expected depth [H, W] along the optical axis where the map is more than half opaque, 0 elsewhere."""
+    """Expected depth [H, W] on the CPU along the optical axis where the map is more than half opaque, 0 elsewhere."""
     out = render(gaussians, camera_from_world, K, width, height)
     alpha = out.alphas[0]
-    return torch.where(alpha > 0.5, out.depths[0] / alpha.clamp(min=1e-6), torch.zeros_like(alpha))
+    return torch.where(alpha > 0.5, out.depths[0] / alpha.clamp(min=1e-6), torch.zeros_like(alpha)).cpu()
 
 
 def psnr(image: torch.Tensor, photo: torch.Tensor, weight: torch.Tensor | None = None) -> float:

@@ -46,8 +46,8 @@ LATER = ("masks", "instances", "language")
 
 
 def fingerprint(source: Path, config: MapConfig) -> str:
-    """Hash of the input path and all settings that change the map, without memory and time_limit."""
-    settings = config.to_json()
+    """Hash of the input path and all settings that change the map, without memory, time_limit and device."""
+    settings = config.to_json() | {"device": "auto"}
     del settings["photos"]["memory"], settings["train"]["time_limit"]
     return _digest(str(source.resolve()), settings)
 

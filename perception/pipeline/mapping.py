@@ -17,6 +17,7 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.frame.place import placed_scene
 from perception.gaussians.depth_start import start_on_surface
+from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
 from perception.gaussians.transients import train_without_transients
@@ -72,15 +73,16 @@ def build_map(
     before training leaves no files. Resuming a finished run returns its map.
     """
     progress, stages, started = progress or Progress(quiet=True), Stages(), time.monotonic()
-    if config.device == "cuda":
-        raise InputError("--device cuda: training does not run on a GPU yet (docs/cuda.md); use --device cpu or auto")
     if resume and output.exists() and read_info(output).get("fingerprint") == fingerprint(source, config):
         progress.log(f"{output}: this run is finished")
         clear_work(output)
         return read_map(output)
 
     with working(source, output, resume) as work:
-        # Files and models are opened first, so that errors appear before hours of work.
+        # Files, models and devices are opened first, so that errors appear before hours of work.
+        device, told = choose_device(config.device)
+        if told is not None:
+            progress.log(told)
         mask_source = make_source(config.masks, config.sam)
         encoder = _encoder(config.language.encoder, progress)
         reader = make_reader(config.language.texts)
@@ -96,7 +98,7 @@ def build_map(
             views = load_all(training, config.photos.max_side, progress, keep)
             held = load_all(held_out, config.photos.max_side, progress, keep)
 
-        trainer = Trainer(initial_gaussians(scene, config, views), views, config, held)
+        trainer = Trainer(initial_gaussians(scene, config, views), views, config, held, device)
         from_geometry = isinstance(mask_source, GeometryMaskSource)
         masks_enter = GEOMETRY_START if from_geometry else config.losses.start
         mark = training_mark(source, config)
@@ -120,7 +122,7 @@ def build_map(
         # Optimise colours and features together: L_RGB + λ_inst2d L_inst2d + λ_var L_var (§3.1 to 3.2.3, eq. 14).
         with stages("train"):
             trainer.run(observer)
-        gaussians, trained = trainer.gaussians, trainer.record
+        gaussians, trained = trainer.gaussians.to("cpu"), trainer.record
         del trainer, observer  # with the optimiser's moments
 
         # Group the Gaussians by their features into instances (§3.2.1), describe these from their best views (§3.2.2).

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import sys
+from types import SimpleNamespace
 
 import pytest
+import torch
 
+import perception
 from perception.bench import rasterizer
 from perception.bench.rasterizer import load_scene, synthetic_scene
 from perception.errors import InputError
@@ -42,3 +46,28 @@ def test_a_file_that_holds_no_splats_is_named(tmp_path):
         load_scene(path)
     with pytest.raises(InputError, match="0 rounds"):
         rasterizer.main(["--rounds", "0"])
+
+
+def test_a_gpu_and_gsplat_are_measured_beside_the_cpu(small, tmp_path, monkeypatch):
+    """With the CPU in the GPU's place, and gsplat played by a renderer of its signature."""
+
+    def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height):
+        background = torch.zeros(3)
+        images = [
+            perception.rasterize(means, quats, scales, opacities, part, viewmats, Ks, width, height).colors
+            for part in torch.nn.functional.pad(colors, (0, -colors.shape[1] % 3)).split(3, dim=1)
+        ]
+        return torch.cat(images, dim=-1)[..., : colors.shape[1]], background, {}
+
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization, __spec__=None))
+    monkeypatch.setattr(rasterizer.importlib.util, "find_spec", lambda _: True)
+    monkeypatch.setattr("perception.gaussians.device.choose_device", lambda wanted: None)
+    monkeypatch.setattr(rasterizer, "GPU", "cpu")
+    arguments = ["--rounds", "1", "--threads", "1", "--dtypes", "float32", "--device", "cuda"]
+    rasterizer.main(["-o", str(tmp_path), *arguments])
+    rows = {
+        (row["simd"], row["channels"]): row for row in json.loads((tmp_path / "rasterizer.json").read_text())["rows"]
+    }
+    assert {simd for simd, _ in rows} >= {"cuda", "gsplat", "baseline"}
+    for row in rows.values():
+        assert row["error_max"] < 1e-3 and row["gradient_error"] < 1e-2 and row["times_gsplat"] > 0

@@ -185,17 +185,22 @@ def rasterize_backward(
     forward: Forward,
     cotangents: tuple[Tensor | None, ...],
     wanted: tuple[bool, ...],
+    stored: list[Tensor | None] | None = None,
 ) -> list[Tensor | None]:
-    """As `perception.gaussians.rasterize.rasterize_backward`, on the tensors' device."""
+    """As `perception.gaussians.rasterize.rasterize_backward`, on the tensors' device; `stored` is written whole."""
     frames: Frames = forward.frames
     call, count = _Call(inputs, background, settings, frames.kernels_for), len(frames.views)
-    grads = [
-        torch.zeros_like(t, memory_format=torch.contiguous_format) if t is not None and w else None
-        for t, w in zip(inputs[:7], wanted, strict=True)
-    ]
+    mean2d = stored[7] if stored else None
+    mean2d = call.means.new_zeros((count, call.n, 2)) if mean2d is None else mean2d.zero_()
+    if stored:
+        grads = [None if buffer is None else buffer.zero_() for buffer in stored[:7]]
+    else:
+        grads = [
+            torch.zeros_like(t, memory_format=torch.contiguous_format) if t is not None and w else None
+            for t, w in zip(inputs[:7], wanted, strict=True)
+        ]
     features, viewmats = grads[5:]
     cameras = None if viewmats is None else call.means.new_zeros((count, call.n, 12))
-    mean2d = call.means.new_zeros((count, call.n, 2))
     images = (forward.colors, forward.alphas, forward.depths, forward.features, forward.feature_variance)
     given = tuple(None if g is None else g.contiguous() for g in cotangents)
     for camera, strips in enumerate(frames.views):
@@ -217,4 +222,8 @@ def rasterize_backward(
         total = cameras.sum(1, dtype=torch.float64).to(cameras.dtype)
         viewmats[:, :3, :3] += total[:, :9].reshape(-1, 3, 3)
         viewmats[:, :3, 3] += total[:, 9:]
+    if stored:  # with respect to logarithms and logits
+        for gradient, value, slope in zip(grads[2:4], inputs[2:4], (lambda s: s, lambda o: o * (1 - o)), strict=True):
+            if gradient is not None and value is not None:
+                gradient.mul_(slope(value))
     return [*grads, None if [index for index, w in enumerate(wanted) if w] == [5] else mean2d]
