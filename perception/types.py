@@ -59,6 +59,11 @@ class View:
     mask: Path | None = None
     gain: tuple[float, float, float] | None = None
 
+    @property
+    def photo_size(self) -> tuple[int, int]:
+        """(width, height) of the photo in pixels, before it is undistorted."""
+        return (self.width, self.height) if self.lens is None else (self.lens.width, self.lens.height)
+
 
 @dataclass
 class Scene:

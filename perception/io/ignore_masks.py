@@ -52,8 +52,7 @@ def load_weight(view: View, width: int, height: int) -> np.ndarray | None:
     """Weight [height, width] float32 of the pixels of the view's pinhole: 1 = used, 0 = ignored; None without mask."""
     if view.mask is None:
         return None
-    size = (view.width, view.height) if view.lens is None else (view.lens.width, view.lens.height)
-    return (warp_labels(view, read_mask(view.mask, *size), width, height) > 0).astype(np.float32)
+    return (warp_labels(view, read_mask(view.mask, *view.photo_size), width, height) > 0).astype(np.float32)
 
 
 def stage_masks(folder: Path, photos: list[Path], names: list[str], masks: list[Path | None]) -> None:

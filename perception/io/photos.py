@@ -164,18 +164,16 @@ def warp_labels(view: View, labels: np.ndarray, width: int, height: int) -> np.n
 
     Pixels outside the photo get 0. The label image must have the photo's size (after EXIF rotation).
     """
-    expected = (view.height, view.width) if view.lens is None else (view.lens.height, view.lens.width)
-    if labels.ndim != 2 or labels.shape != expected:
+    across, down = view.photo_size
+    if labels.shape != (down, across):
         found = "×".join(map(str, labels.shape[::-1]))
-        raise InputError(
-            f"{view.name}: the label image is {found}, expected {expected[1]}×{expected[0]} like the photo"
-        )
+        raise InputError(f"{view.name}: the label image is {found}, expected {across}×{down} like the photo")
     if view.lens is None:
         column = ((np.arange(width) + 0.5) * view.width / width).astype(np.int64)
         row = ((np.arange(height) + 0.5) * view.height / height).astype(np.int64)
         return labels[row[:, None], column[None, :]].astype(np.int32)
     x, y = _grid(view, width, height)
-    inside = (x >= 0) & (y >= 0) & (x < expected[1]) & (y < expected[0])
+    inside = (x >= 0) & (y >= 0) & (x < across) & (y < down)
     warped = np.zeros((height, width), np.int32)
     warped[inside] = labels[y[inside].astype(np.int64), x[inside].astype(np.int64)]
     return warped
@@ -188,16 +186,16 @@ def _grid(view: View, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _oriented(view: View) -> np.ndarray:
-    size = (view.width, view.height) if view.lens is None else (view.lens.width, view.lens.height)
+    width, height = view.photo_size
     photo = read_photo(view.photo)
-    if photo.shape[1::-1] != size:
-        if stored_size(view.photo) == size:
-            with open_photo(view.photo) as image:
-                decode(image, view.photo)
-                return to_rgb(image, view.photo)
-        found = "×".join(map(str, photo.shape[1::-1]))
-        raise InputError(f"{view.photo}: the photo is {found}, its camera expects {size[0]}×{size[1]}")
-    return photo
+    if photo.shape[:2] == (height, width):
+        return photo
+    if stored_size(view.photo) == view.photo_size:
+        with open_photo(view.photo) as image:
+            decode(image, view.photo)
+            return to_rgb(image, view.photo)
+    found = "×".join(map(str, photo.shape[1::-1]))
+    raise InputError(f"{view.photo}: the photo is {found}, its camera expects {width}×{height}")
 
 
 def _shrink(photo: np.ndarray, width: int, height: int) -> np.ndarray:

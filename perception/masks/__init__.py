@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from perception.masks.label_images import compute_masks, load_labels
-from perception.masks.source import GeometryMaskSource, MaskSource, make_source
+from perception.masks.source import MaskSource, make_source
 
-__all__ = ["GeometryMaskSource", "MaskSource", "compute_masks", "load_labels", "make_source"]
+__all__ = ["MaskSource", "compute_masks", "load_labels", "make_source"]

@@ -12,8 +12,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.disk_arrays import Keep
 from perception.masks.merging import Segmentation, segmentation
-from perception.masks.stereo import measure_depths
-from perception.masks.stereo_views import StereoView, make_stereo_view
+from perception.masks.stereo import StereoView, make_stereo_view, measure_depths
 from perception.masks.surface import FOOTPRINTS, Surface, SurfaceBuilder, to_world
 from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.progress import Progress

@@ -41,7 +41,7 @@ class LabelFolder:
                 "stem for each photo (all zero where nothing is labelled)"
             )
         for view in views:
-            _check_header(self._files[view.name], *_photo_size(view))
+            _check_header(self._files[view.name], *view.photo_size)
         used = set(self._files.values())
         # No warning for photos that were kept out of training or not registered.
         folders = {view.photo.parent for view in views if view.photo.parent.is_dir()} - {self.folder}
@@ -59,7 +59,7 @@ class LabelFolder:
         file = self._files.get(view.name) or self._find(view, [view])
         if file is None:
             raise InputError(f"labels:{self.folder}: no label image for photo {view.name}")
-        _check_header(file, *_photo_size(view))
+        _check_header(file, *view.photo_size)
         height, width = photo.shape[:2]
         return warp_labels(view, read_labels(file), width, height)
 
@@ -73,21 +73,15 @@ class LabelFolder:
 
 
 def _check_header(file: Path, width: int, height: int) -> None:
-    header = read_png_header(file)
-    kind = _COLOUR_TYPES.get(header.colour_type, f"colour type {header.colour_type}")
-    if kind not in ("grey", "palette") or header.bits not in (8, 16):
-        raise InputError(f"{file}: a {header.bits}-bit {kind} image; a label image has one channel of 8 or 16 bit")
-    if (header.width, header.height) != (width, height):
+    *size, bits, colour_type = read_png_header(file)
+    kind = _COLOUR_TYPES.get(colour_type, f"colour type {colour_type}")
+    if kind not in ("grey", "palette") or bits not in (8, 16):
+        raise InputError(f"{file}: a {bits}-bit {kind} image; a label image has one channel of 8 or 16 bit")
+    if size != [width, height]:
         raise InputError(
-            f"{file}: {header.width}×{header.height} pixels, but its photo has {width}×{height}; "
+            f"{file}: {size[0]}×{size[1]} pixels, but its photo has {width}×{height}; "
             "label images have the size of the original photo"
         )
-
-
-def _photo_size(view: View) -> tuple[int, int]:
-    if view.lens is None:
-        return view.width, view.height
-    return view.lens.width, view.lens.height
 
 
 def _pngs(folder: Path) -> list[Path]:

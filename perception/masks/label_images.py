@@ -12,7 +12,6 @@ import struct
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -22,8 +21,9 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.disk_arrays import Keep
 from perception.io.documents import brief, safe_name
+from perception.masks.builtin import BuiltinSegmentation
 from perception.masks.merging import Segmentation
-from perception.masks.source import GeometryMaskSource, MaskSource
+from perception.masks.source import MaskSource
 from perception.progress import Progress
 from perception.types import View
 
@@ -45,13 +45,13 @@ def compute_masks(
     """Writes the label image of every view below `folder`, skipping up-to-date files, and SEGMENTATION if the source
     finds segments of a surface. Returns a report.
 
-    load_photo: view -> [h, w, 3] uint8 RGB, undistorted. load_depth: view -> [h, w] z-depth, 0 = none; required by a
-    GeometryMaskSource. depth_key: a string that changes whenever the depth changes. keep: where its images are kept.
+    load_photo: view -> [h, w, 3] uint8 RGB, undistorted. load_depth: view -> [h, w] z-depth, 0 = none; required by
+    BuiltinSegmentation. depth_key: a string that changes whenever the depth changes. keep: where its images are kept.
     Report: source, identity, photos, skipped, seconds, masks (mean per photo), empty (names), warnings.
     """
     warnings = source.check(views)
     start, skipped, counts = perf_counter(), 0, list[int]()
-    if isinstance(source, GeometryMaskSource):
+    if isinstance(source, BuiltinSegmentation):
         if load_depth is None:
             raise ValueError(f"masks from {source.name} need load_depth")
         if any(stored_key(label_file(folder, view)) != _key(view, source, depth_key) for view in views):
@@ -80,10 +80,7 @@ def compute_masks(
                 progress.update(f"masks ({source.name})", done, len(views))
     empty = [view.name for view, count in zip(views, counts, strict=True) if not count]
     if empty:
-        warnings = [
-            *warnings,
-            f"masks from {source.name}: nothing was found in {len(empty)} photos ({empty[0]}, …)",
-        ]
+        warnings = [*warnings, f"masks from {source.name}: nothing was found in {len(empty)} photos ({empty[0]}, …)"]
     return {
         "source": source.name,
         "identity": source.identity,
@@ -115,9 +112,9 @@ def load_labels(folder: Path, view: View) -> np.ndarray:
     file = label_file(folder, view)
     if not file.is_file():
         raise InputError(f"{file}: no label image for photo {view.name}; run the masks stage again")
-    header = read_png_header(file)  # a corrupt size field must not allocate gigabytes
-    if header.width * header.height > 4 * view.width * view.height:
-        raise InputError(f"{file}: {header.width}×{header.height} pixels of a smaller photo; the PNG is damaged")
+    width, height, *_ = read_png_header(file)  # a corrupt size field must not allocate gigabytes
+    if width * height > 4 * view.width * view.height:
+        raise InputError(f"{file}: {width}×{height} pixels of a smaller photo; the PNG is damaged")
     return read_labels(file)
 
 
@@ -172,23 +169,14 @@ def _key(view: View, source: MaskSource, depth_key: str) -> str:
     return digest.hexdigest()[:32]
 
 
-@dataclass(frozen=True)
-class PngHeader:
-    """The IHDR chunk: size in pixels, bits per sample, colour type (PNG's numbers)."""
-
-    width: int
-    height: int
-    bits: int
-    colour_type: int
-
-
-def read_png_header(file: Path) -> PngHeader:
-    """Reads only 26 bytes of the file, so that thousands of label images can be checked quickly."""
+def read_png_header(file: Path) -> tuple[int, int, int, int]:
+    """Width and height in pixels, bits per sample, colour type (PNG's numbers), from the first 26 bytes of the file."""
     with file.open("rb") as stream:
         head = stream.read(26)
     if len(head) < 26 or not head.startswith(_SIGNATURE):
         raise InputError(f"{file}: not a PNG; label images are PNG, 8 or 16 bit, one channel")
-    return PngHeader(*struct.unpack(">IIBB", head[16:26]))
+    width, height, bits, colour_type = struct.unpack(">IIBB", head[16:26])
+    return width, height, bits, colour_type
 
 
 def read_labels(file: Path) -> np.ndarray:

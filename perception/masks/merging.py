@@ -2,18 +2,20 @@
 
 The most likely pair of neighbours is merged first, and the evidence is recomputed after every merge (Nunez-Iglesias et
 al. 2013), until nothing is left to merge. The cut maximises Σ (p − cost) over its regions, where p is the learned
-probability that a region is an object.
+probability that a region is an object. Small neural networks tell the probabilities; `python tests/training/masks.py`
+makes their packaged weights from rendered worlds alone, see docs/masks.md.
 """
 
 from __future__ import annotations
 
+import functools
 import heapq
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from perception.masks.merge_model import MergeModel, packaged_model
 from perception.masks.surface_graph import SurfaceGraph
 
 SMALLEST = 2e-4  # area / (camera distance)² below which a patch joins a neighbour before all others do
@@ -21,6 +23,50 @@ GROUP_COST = 0.4  # of an object, for groups
 _LARGE = 0.1  # area in the same unit, above which a flat segment can be a part of a floor, a wall or a table
 _FLAT = 0.03  # relative to depth: standard deviation of such a segment across its plane, including low objects on it
 _UNKNOWN = 9.0  # largest log odds of a feature, and those of merges inside a patch
+WEIGHTS = Path(__file__).with_name("merge_weights.npz")
+_CLIP = 5.0  # standard deviations: inputs far from all training data do not extrapolate
+_PARTS = 8  # arrays of a network
+
+
+@dataclass(frozen=True)
+class Network:
+    """The mean of E multilayer perceptrons with ReLU. parts: mean and scale of the inputs [F], then for each of three
+    layers weights [E, out, in] and biases [E, 1, out]. All float32."""
+
+    parts: tuple[np.ndarray, ...]
+
+    def __call__(self, inputs: np.ndarray) -> np.ndarray:
+        """[M, F] -> [M, out]. einsum without BLAS: its sums have one order, whatever the number of threads."""
+        mean, scale, *layers = self.parts
+        x = np.clip((inputs - mean) / scale, -_CLIP, _CLIP).astype(np.float32)
+        x = np.broadcast_to(x, (len(layers[0]), *x.shape))
+        for k in range(0, len(layers), 2):
+            x = np.einsum("emi,eoi->emo", np.maximum(x, 0) if k else x, layers[k]) + layers[k + 1]
+        return np.asarray(x.mean(axis=0))
+
+
+@dataclass(frozen=True)
+class MergeModel:
+    """pair: features of two neighbours (SurfaceGraph.features) -> [M, 1] log odds that they are one object.
+
+    whole: features of a region (MergeTree.features) -> [M, 2] log odds that its IoU with an object exceeds 0.5, 0.75.
+    cost: of one more object, in units of an object's probability. calibration: slope and offset of the log odds of the
+    regions that were selected.
+    """
+
+    pair: Network
+    whole: Network
+    cost: float
+    calibration: tuple[float, float] = (1.0, 0.0)
+
+
+@functools.cache
+def packaged_model() -> MergeModel:
+    """The model of the package."""
+    with np.load(WEIGHTS) as stored:
+        settings, *parts = (stored[f"arr_{k}"] for k in range(1 + 2 * _PARTS))
+    cost, slope, offset = settings.tolist()
+    return MergeModel(Network(tuple(parts[:_PARTS])), Network(tuple(parts[_PARTS:])), cost, (slope, offset))
 
 
 @dataclass(frozen=True)
@@ -95,13 +141,6 @@ class MergeTree:
     leaves: int
     children: np.ndarray
     features: np.ndarray
-
-    def leaf_sums(self, values: np.ndarray) -> np.ndarray:
-        """[R + M, C] sum over the leaves of each region. values: [R, C]."""
-        sums = np.concatenate([values, np.zeros((len(self.children), values.shape[1]), values.dtype)])
-        for k, pair in enumerate(self.children, start=self.leaves):
-            sums[k] = sums[pair[0]] + sums[pair[1]]
-        return sums
 
     def cut(self, gain: np.ndarray) -> np.ndarray:
         """[R] the region of each leaf, in the set of disjoint regions with the largest sum of `gain` [R + M]. Where a

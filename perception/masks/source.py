@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 
 from perception.config import SamConfig
 from perception.errors import InputError
-from perception.io.disk_arrays import Keep
 from perception.io.model_store import default_model
-from perception.masks.merging import Segmentation
-from perception.progress import Progress
 from perception.types import View
 
 
@@ -30,28 +26,9 @@ class MaskSource(Protocol):
 
     def check(self, views: list[View]) -> list[str]:
         """Validates everything that can be checked before any work. Returns warnings. Raises InputError."""
-        ...
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
         """photo: [h, w, 3] uint8 RGB, undistorted. Returns [h, w] int32, 0 = unlabelled."""
-        ...
-
-
-@runtime_checkable
-class GeometryMaskSource(MaskSource, Protocol):
-    """A source that needs an approximate depth of each pixel. `survey` is called before `label_image`."""
-
-    def survey(
-        self,
-        views: list[View],
-        load_photo: Callable[[View], np.ndarray],
-        load_depth: Callable[[View], np.ndarray],
-        progress: Progress | None = None,
-        keep: Keep = np.asarray,
-    ) -> Segmentation | None:
-        """Processes all photos jointly, once. load_depth: view -> [h, w] z-depth, 0 = none. keep: where images of all
-        photos are kept. Returns the segments of the surface whose numbers the label images hold, if it has any."""
-        ...
 
 
 def make_source(spec: str, sam: SamConfig | None = None) -> MaskSource:

@@ -32,8 +32,8 @@ from perception.io.store import Map, read_map, write_map
 from perception.language.base import Encoder
 from perception.language.ocr import make_reader
 from perception.masks import MaskSource, compute_masks, make_source
+from perception.masks.builtin import BuiltinSegmentation
 from perception.masks.label_images import load_segmentation
-from perception.masks.source import GeometryMaskSource
 from perception.pipeline.checkpoint import (
     TrainingObserver,
     clear_work,
@@ -99,7 +99,7 @@ def build_map(
             held = load_all(held_out, config.photos.max_side, progress, keep)
 
         trainer = Trainer(initial_gaussians(scene, config, views), views, config, held, device)
-        from_geometry = isinstance(mask_source, GeometryMaskSource)
+        from_geometry = isinstance(mask_source, BuiltinSegmentation)
         masks_enter = GEOMETRY_START if from_geometry else config.losses.start
         mark = training_mark(source, config)
         observer = TrainingObserver(work, mark, mask_source.identity, masks_enter, progress)

@@ -12,17 +12,22 @@ import numpy as np
 import pytest
 
 from perception.errors import InputError
-from perception.masks import GeometryMaskSource, compute_masks, load_labels, make_source
-from perception.masks.builtin import fuse, surface_graph
+from perception.masks import compute_masks, load_labels, make_source
+from perception.masks.builtin import BuiltinSegmentation, fuse, surface_graph
 from perception.masks.cues import depth_cues
-from perception.masks.merge_model import packaged_model
-from perception.masks.merging import MergeTree, divided, segmentation, tree_by
-from perception.masks.stereo import confirmed, homographies, measure_depths, plane_depths
-from perception.masks.stereo_views import StereoView, make_stereo_view
+from perception.masks.merging import MergeTree, divided, packaged_model, segmentation, tree_by
+from perception.masks.stereo import (
+    StereoView,
+    confirmed,
+    homographies,
+    make_stereo_view,
+    measure_depths,
+    plane_depths,
+)
 from perception.masks.surface import pack_voxels, to_world, unpack_voxels, voxel_keys
 from perception.masks.surface_graph import SurfaceGraph, voxel_edges
 from perception.types import DepthImage, View
-from support.mask_scores import best_ious
+from support.mask_scores import best_ious, leaf_sums
 
 K = np.array([[150.0, 0.0, 80.0], [0.0, 150.0, 60.0], [0.0, 0.0, 1.0]])
 LOW, HIGH = np.array([-0.3, 1.0, 0.0]), np.array([0.3, 1.5, 0.45])  # the box
@@ -35,7 +40,7 @@ EYES = [
 @pytest.fixture(autouse=True)
 def matched_as_they_are(monkeypatch):
     """The photos are small; making them larger for stereo would only cost time."""
-    monkeypatch.setattr("perception.masks.stereo_views.SIDE", 160)
+    monkeypatch.setattr("perception.masks.stereo.SIDE", 160)
 
 
 def camera_from_world(eye: np.ndarray) -> np.ndarray:
@@ -265,7 +270,7 @@ def test_box_floor_and_wall_are_one_segment_each_in_all_photos(tmp_path):
     """Through the store, with rough depth, in millimetres: whole parts, and the same ids in every photo."""
     unit = 1000.0
     source = make_source("builtin")
-    assert isinstance(source, GeometryMaskSource)
+    assert isinstance(source, BuiltinSegmentation)
     photos, depths, views = {}, {}, []
     for i, (view, photo, depth, _) in enumerate(world()):
         pose = view.camera_from_world.copy()
@@ -352,7 +357,7 @@ def test_the_cut_of_a_tree_against_all_cuts():
     rng = np.random.default_rng(4)
     for _ in range(30):
         tree = random_tree(rng, 7)
-        members = tree.leaf_sums(np.eye(7, dtype=int)) > 0
+        members = leaf_sums(tree, np.eye(7, dtype=int)) > 0
 
         def cuts(left: frozenset[int], members: np.ndarray = members) -> Iterator[tuple[int, ...]]:
             """All sets of regions that divide the leaves left."""
@@ -396,10 +401,10 @@ def test_regions_of_the_tree_are_sums_of_their_patches():
     surface = fuse(seen)
     graph = surface_graph(seen, surface)
     tree = tree_by(packaged_model(), graph)
-    sums = tree.leaf_sums(graph.sums)
+    sums = leaf_sums(tree, graph.sums)
     area = sums[:, 6] * surface.size**2 / (sums[:, 5] / np.maximum(sums[:, 0], 1)).clip(1e-9) ** 2
     np.testing.assert_allclose(tree.features[:, 4], np.log(area), atol=1e-4)
-    np.testing.assert_allclose(np.exp(tree.features[:, 2]), tree.leaf_sums(np.ones((graph.count, 1)))[:, 0], rtol=1e-5)
+    np.testing.assert_allclose(np.exp(tree.features[:, 2]), leaf_sums(tree, np.ones((graph.count, 1)))[:, 0], rtol=1e-5)
 
 
 def test_networks_give_the_same_bits_for_any_batch():

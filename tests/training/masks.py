@@ -29,10 +29,19 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from perception.bench.output import Column, table
 from perception.demo import scene as scenes
-from perception.masks.merge_model import WEIGHTS, MergeModel, Network
-from perception.masks.merging import SMALLEST, MergeTree, divided, merge_tree, tree_by
+from perception.masks.merging import (
+    SMALLEST,
+    WEIGHTS,
+    MergeModel,
+    MergeTree,
+    Network,
+    divided,
+    merge_tree,
+    tree_by,
+)
 from perception.masks.surface import FOOTPRINTS
 from perception.masks.surface_graph import SurfaceGraph
+from support.mask_scores import leaf_sums
 from training import clutter, patchwork
 
 scenes.SCENES |= {"clutter": clutter, "patchwork": patchwork}
@@ -73,8 +82,7 @@ def read_world(folder: Path, stereo: bool, seed: int = 0, skip: int = -1, side: 
 
     from perception.io.photos import read_photo
     from perception.masks.builtin import fuse, surface_graph
-    from perception.masks.stereo import measure_depths
-    from perception.masks.stereo_views import make_stereo_view
+    from perception.masks.stereo import make_stereo_view, measure_depths
     from perception.types import View
 
     about = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
@@ -180,7 +188,7 @@ def pairs_of(world: World, policy: Callable[[np.ndarray], np.ndarray], seed: int
 def regions_of(world: World, pair: Network) -> Samples:
     """Regions of a tree, and whether their IoU with an object exceeds 0.5 and 0.75."""
     tree = tree_by(MergeModel(pair, pair, 0), world.graph)
-    votes = tree.leaf_sums(world.votes)
+    votes = leaf_sums(tree, world.votes)
     size = votes.sum(axis=1)
     best = (votes / (size[:, None] + world.votes.sum(axis=0) - votes))[:, 1:].max(axis=1)[size >= LEAST]
     return tree.features[size >= LEAST], np.stack([best > 0.5, best > 0.75], axis=1), np.ones(len(best))
@@ -306,7 +314,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for kind in ("sensor", "stereo")
         }
     model = tuned(learn(groups["training"]), groups["validation"])
-    model.save(options.output)
+    settings = np.array([model.cost, *model.calibration])
+    np.savez_compressed(options.output, settings, *model.pair.parts, *model.whole.parts)
     print(report(model, {name: worlds for name, worlds in groups.items() if "," in name}))
 
 
