@@ -14,6 +14,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from perception.colors import instance_palette
 from perception.errors import InputError, missing_extra
 from perception.listening import check_address, is_local, listen, url_host
 from perception.viewer.guard import Guard, guarded_server
@@ -23,6 +24,8 @@ from perception.viewer.session import HIGHLIGHT, Session
 
 WATCH = 1.0
 """Seconds between checks whether another program changed the map."""
+CORNERS = np.array([[i >> a & 1 for a in range(3)] for i in range(8)]) - 0.5  # of a unit box
+EDGES = np.array([(i, i | 1 << a) for i in range(8) for a in range(3) if not i >> a & 1])
 
 
 class Viewer:
@@ -49,8 +52,8 @@ class Viewer:
         self.address = f"http://{shown}:{sock.getsockname()[1]}"
         self.url = f"{self.address}/?token={quote(token, safe='')}"
         self._one = threading.RLock()  # the actions of all browsers run one at a time
-        self._overlays: dict[str, list[Any]] = {"boxes": [], "names": [], "length": []}
-        self._overlays_on = {"boxes": False, "names": False, "length": True}
+        self._overlays: list[Any] = []
+        self._boxed = False
         self._frame_map()
         self.panel = Panel(self)  # before the Gaussians, which take their time on a slow connection
         self._splats = self.server.scene.add_gaussian_splats("/map/splats", *self._gaussians())
@@ -96,60 +99,37 @@ class Viewer:
             if self._drawn is not self.session.editor.original:
                 self._frame_map()
             self._splats.set_gaussians(*self._gaussians())
-            for kind, on in self._overlays_on.items():
-                if on:
-                    self._draw(kind)
+            self._draw_overlays()
 
-    def overlay(self, kind: str, on: bool) -> None:
-        """Shows or hides "boxes" or "names"."""
+    def show_boxes(self, on: bool) -> None:
+        """Shows or hides the instances' boxes and names."""
         with self._one:
-            self._overlays_on[kind] = on
-            self._draw(kind)
+            self._boxed = on
+            self._draw_overlays()
 
-    def _draw(self, kind: str) -> None:
-        for handle in self._overlays[kind]:
+    def _draw_overlays(self) -> None:
+        """Draws anew the boxes and names of the instances that are lit, or of all, and the measured length."""
+        for handle in self._overlays:
             handle.remove()
-        draw = {"boxes": self._boxes, "names": self._names, "length": self._length}[kind]
-        self._overlays[kind] = draw() if self._overlays_on[kind] else []
-
-    def _visible_entries(self) -> list[dict[str, Any]]:
-        session = self.session
-        entries = [entry for entry in session.editor.instances if not entry.get("hidden")]
-        chosen = session.lit()
-        return [entry for entry in entries if not chosen or entry["id"] in chosen]
-
-    def _boxes(self) -> list[Any]:
-        from perception.colors import instance_palette
-
-        handles = []
-        for entry in self._visible_entries():
-            box = entry["obb"]
-            corners = np.array([[i >> a & 1 for a in range(3)] for i in range(8)]) - 0.5
-            points = np.array(box["center"]) + (corners * box["extent"]) @ np.array(box["rotation"])
-            edges = [(i, i | 1 << a) for i in range(8) for a in range(3) if not i >> a & 1]
-            segments = (points[np.array(edges)] * self.scale).astype(np.float32)
-            color = tuple(int(c) for c in instance_palette(np.array([entry["id"]]))[0])
-            name = f"/map/boxes/{entry['id']}"
-            handles.append(
-                self.server.scene.add_line_segments(name, segments, color, thickness=2, thickness_units="screen")
-            )
-        return handles
-
-    def _names(self) -> list[Any]:
-        add, name = self.server.scene.add_label, self.session.name
-        return [
-            add(f"/map/names/{e['id']}", name(e), position=tuple(np.array(e["centroid"]) * self.scale))
-            for e in self._visible_entries()
-        ]
-
-    def _length(self) -> list[Any]:
-        scene, points = self.server.scene, (np.array(self.session.ends) * self.scale).astype(np.float32)
-        if len(points) < 2:
-            return []
-        return [
-            scene.add_line_segments("/map/length/line", points[None], tuple(HIGHLIGHT.tolist()), thickness=0.02),
-            scene.add_label("/map/length/text", self.session.length, position=tuple(points.mean(axis=0))),
-        ]
+        self._overlays, scene, session = [], self.server.scene, self.session
+        lit = session.lit()
+        for entry in session.editor.instances if self._boxed else ():
+            if not entry.get("hidden") and (not lit or entry["id"] in lit):
+                box, number = entry["obb"], entry["id"]
+                points = np.array(box["center"]) + (CORNERS * box["extent"]) @ np.array(box["rotation"])
+                segments = (points[EDGES] * self.scale).astype(np.float32)
+                style = {"thickness": 2, "thickness_units": "screen"}
+                color, place = tuple(instance_palette([number])[0].tolist()), np.array(entry["centroid"]) * self.scale
+                self._overlays += [
+                    scene.add_line_segments(f"/map/boxes/{number}", segments, color, **style),
+                    scene.add_label(f"/map/names/{number}", session.name(entry), position=tuple(place)),
+                ]
+        if len(session.ends) == 2:
+            ends = (np.array(session.ends) * self.scale).astype(np.float32)
+            self._overlays += [
+                scene.add_line_segments("/map/length/line", ends[None], tuple(HIGHLIGHT.tolist()), thickness=0.02),
+                scene.add_label("/map/length/text", session.length, position=tuple(ends.mean(axis=0))),
+            ]
 
     # ------------------------------------------------------------------- events
 

@@ -48,18 +48,15 @@ class Panel:
             self._text = self.gui.add_text("prompt", "", hint='a thing, such as "red mug"; Enter asks')
             button = self.gui.add_button("Search")
         button.on_click(lambda _: form.submit())
-        form.on_submit(lambda event: self.viewer.guarded(self._ask, event.client))
+        form.on_submit(lambda event: self.viewer.guarded(lambda: self.session.ask(self._text.value), event.client))
         self._answer = self.gui.add_markdown("")
         self._hits_folder = self.gui.add_folder("Hits", visible=False)
         self._hit_buttons: list[Any] = []
 
-    def _ask(self) -> None:
-        self.session.ask(self._text.value)
-
     def _build_show(self) -> None:
         with self.gui.add_folder("Show"):
             mode = self.gui.add_dropdown("colours", MODES, initial_value=self.session.mode)
-            boxes = [(kind, self.gui.add_checkbox(kind, False)) for kind in ("boxes", "names")]
+            boxes = self.gui.add_checkbox("boxes and names", False)
             clear = self.gui.add_button("Clear selection")
 
         def choose(_: Any) -> None:
@@ -67,13 +64,8 @@ class Panel:
             self.viewer.redraw()
 
         mode.on_update(choose)
-        for kind, box in boxes:
-            box.on_update(lambda _, kind=kind, box=box: self.viewer.overlay(kind, box.value))
-        clear.on_click(lambda event: self.viewer.guarded(self._clear, event.client))
-
-    def _clear(self) -> None:
-        self.session.hits, self.session.question = [], ""
-        self.session.select(None)
+        boxes.on_update(lambda _: self.viewer.show_boxes(boxes.value))
+        clear.on_click(lambda event: self.viewer.guarded(self.session.clear, event.client))
 
     def _build_selection(self) -> None:
         editor, session = self.session.editor, self.session
@@ -110,13 +102,13 @@ class Panel:
         session, editor = self.session, self.session.editor
         with self.gui.add_folder("Corrections"):
             self._actions("history", {"Undo": editor.undo, "Redo": editor.redo})
-            self._actions("map", {"Show hidden": self._unhide})
+            self._actions("map", {"Show hidden": session.show_all})
             save = self.gui.add_button("Save into the map")
             save.on_click(lambda event: self.viewer.guarded(editor.save, event.client, edited=True))
             self._renew = self.gui.add_button(
                 "Drop them, open the new map", visible=False, hint="another program replaced the map"
             )
-            self._renew.on_click(lambda event: self.viewer.guarded(lambda: session.reopen(), event.client, edited=True))
+            self._renew.on_click(lambda event: self.viewer.guarded(session.reopen, event.client, edited=True))
             self._history = self.gui.add_markdown("")
 
     def _build_measure(self) -> None:
@@ -128,11 +120,6 @@ class Panel:
             scale = self.gui.add_button("Set scale", hint="writes the map in metres, by this length")
         start.on_click(lambda event: guarded(session.measure, event.client))
         scale.on_click(lambda event: guarded(lambda: session.set_scale(metres.value), event.client, edited=True))
-
-    def _unhide(self) -> None:
-        for entry in self.session.editor.instances:
-            if entry.get("hidden"):
-                self.session.editor.hide(entry["id"], False)
 
     # ------------------------------------------------------------------- texts
 
@@ -152,13 +139,12 @@ class Panel:
         unit = "m" if editor.original.metric else "map units"
         self._facts.content = f"**{len(editor.ids):,} Gaussians · instances: {len(editor.instances)}**"
         self._refresh_answer()
+        photo = None
         if not session.selected:
             self._words.content = "Click a thing; shift-click adds another."
-            self._show_photo(None)
         elif len(session.selected) > 1:
             names = [escaped(session.name(editor.entry(i))) for i in session.selected]
             self._words.content = f"{len(names)} selected: {', '.join(names)}"
-            self._show_photo(None)
         else:
             entry = editor.entry(session.selected[0])
             sides = " × ".join(f"{side:.2f}" for side in entry["obb"]["extent"])
@@ -172,7 +158,8 @@ class Panel:
             if named != self._named:  # else keep what a user is typing there
                 self._named = named
                 self._name.value = entry.get("label") or ""
-            self._show_photo(session.crop(entry["id"]))
+            photo = session.crop(entry["id"])
+        self._show_photo(photo)
         wanted = f"click end {len(session.ends) + 1} of 2" if session.measuring else session.length
         lines = [wanted, *frame_lines(editor.original.info), *session.notes]
         self._measured.content = "  \n".join(escaped(line) for line in lines)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -46,7 +45,7 @@ CROP_SIDE = 320
 
 
 class Session:
-    """The state shared by all browsers of one viewer: they see the same map, and edits are applied one at a time."""
+    """The state shared by all browsers of one viewer, which see the same map. Not for concurrent threads."""
 
     def __init__(self, path: Path, inside: Path | None = None):
         """inside: the folder where photos may be read, None = anywhere (see `best_crop`)."""
@@ -58,7 +57,6 @@ class Session:
         self.question = ""
         self.hits: list[Hit] = []
         self.measuring, self.ends, self.notes = False, list[np.ndarray](), list[str]()
-        self._lock = threading.RLock()
         self._opened: tuple[int, QueryMap] | None = None
         self._edits = 0
 
@@ -71,15 +69,14 @@ class Session:
 
     def ask(self, text: str, top_k: int = 5) -> list[Hit]:
         """Ranked hits, which are then highlighted; empty when the text is not present. None is hidden."""
-        with self._lock:
-            hidden = {entry["id"] for entry in self.editor.instances if entry.get("hidden")}
-            found = self._loaded().query(text, top_k + len(hidden))
-            self.question = " ".join(text.split())
-            self.hits = [hit for hit in found if hit.instance_id not in hidden][:top_k]
-            self.select(None)
-            for hit in self.hits[:1]:
-                self.show_hit(hit)
-            return self.hits
+        hidden = {entry["id"] for entry in self.editor.instances if entry.get("hidden")}
+        found = self._loaded().query(text, top_k + len(hidden))
+        self.question = " ".join(text.split())
+        self.hits = [hit for hit in found if hit.instance_id not in hidden][:top_k]
+        self.select(None)
+        for hit in self.hits[:1]:
+            self.show_hit(hit)
+        return self.hits
 
     def show_hit(self, hit: Hit) -> None:
         """Selects the instance of a hit, all those of a group; a part is highlighted."""
@@ -90,16 +87,20 @@ class Session:
 
     def select(self, instance: int | None, add: bool = False) -> None:
         """Selects an instance, or with `add` toggles it in the selection. None clears the selection, unless `add`."""
-        with self._lock:
-            self.part = None
-            if instance is None:
-                self.selected = self.selected if add else []
-            elif not add:
-                self.selected = [instance]
-            elif instance in self.selected:
-                self.selected = [i for i in self.selected if i != instance]
-            else:
-                self.selected = [*self.selected, instance]
+        self.part = None
+        if instance is None:
+            self.selected = self.selected if add else []
+        elif not add:
+            self.selected = [instance]
+        elif instance in self.selected:
+            self.selected = [i for i in self.selected if i != instance]
+        else:
+            self.selected = [*self.selected, instance]
+
+    def clear(self) -> None:
+        """Clears the question, its hits and the selection."""
+        self.hits, self.question = [], ""
+        self.select(None)
 
     def pick(self, origin: np.ndarray, direction: np.ndarray, add: bool = False) -> int | None:
         """Selects the instance that a ray in the map frame shows, and returns its id.
@@ -143,22 +144,26 @@ class Session:
 
     # ----------------------------------------------------------------- editing
 
+    def show_all(self) -> None:
+        """Shows the hidden instances again."""
+        for entry in self.editor.instances:
+            if entry.get("hidden"):
+                self.editor.hide(entry["id"], False)
+
     def edited(self) -> None:
         """To be called after an edit: removes what no longer exists from the selection and the hits."""
-        with self._lock:
-            self._edits += 1
-            known = {entry["id"] for entry in self.editor.instances}
-            parts = {part["id"] for entry in self.editor.instances for part in entry.get("parts", [])}
-            self.selected = [instance for instance in self.selected if instance in known]
-            self.part = self.part if self.part in parts else None
-            self.hits = [hit for hit in self.hits if hit.instance_id in known and hit.part in {None, *parts}]
+        self._edits += 1
+        known = {entry["id"] for entry in self.editor.instances}
+        parts = {part["id"] for entry in self.editor.instances for part in entry.get("parts", [])}
+        self.selected = [instance for instance in self.selected if instance in known]
+        self.part = self.part if self.part in parts else None
+        self.hits = [hit for hit in self.hits if hit.instance_id in known and hit.part in {None, *parts}]
 
     def reopen(self) -> None:
         """Opens the map that another program changed; unsaved edits are dropped."""
-        with self._lock:
-            self.editor.reopen()
-            self.measuring, self.ends, self.notes = False, [], []
-            self.edited()
+        self.editor.reopen()
+        self.measuring, self.ends, self.notes = False, [], []
+        self.edited()
 
     # ----------------------------------------------------------------- showing
 

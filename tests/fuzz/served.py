@@ -270,7 +270,9 @@ class ViewerTarget:
             assert session.colors().shape == (60, 3) and session.opacities().shape == (60,)
 
         server = SimpleNamespace(gui=gui, get_clients=dict)
-        page = SimpleNamespace(session=session, server=server, guarded=guarded, redraw=redraw, overlay=lambda *_: None)
+        page = SimpleNamespace(
+            session=session, server=server, guarded=guarded, redraw=redraw, show_boxes=lambda _: None
+        )
         panel = Panel(page)
         for _ in range(dice.below(8)):
             kind = dice.below(3)

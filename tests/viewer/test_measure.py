@@ -201,7 +201,7 @@ def test_the_page_measures_and_sets_the_scale(viewer: Any, path: Path) -> None:
     assert "end 1 of 2" in viewer.panel._measured.content
     for direction in (FRONT, BACK):
         viewer._clicked(SimpleNamespace(ray_origin=(0, 0, 0), ray_direction=tuple(direction)), add=False)
-    line, label = viewer._overlays["length"]
+    line, label = viewer._overlays
     ends = np.array(viewer.session.ends)
     np.testing.assert_allclose(line.points[0], ends * viewer.scale, rtol=1e-6)
     assert label.text == viewer.session.length and label.text.endswith("map units")
@@ -211,6 +211,6 @@ def test_the_page_measures_and_sets_the_scale(viewer: Any, path: Path) -> None:
     controls["true length (m)"].value = 0.8
     press("Set scale")
     assert json.loads((path / "map.json").read_text())["metric"] is True
-    assert viewer._overlays["length"][1].text == "0.8 m" and "known length" in viewer.panel._measured.content
-    line = viewer._overlays["length"][0]
+    assert viewer._overlays[1].text == "0.8 m" and "known length" in viewer.panel._measured.content
+    line = viewer._overlays[0]
     np.testing.assert_allclose(line.points[0], ends * 0.8 / np.linalg.norm(ends[1] - ends[0]) * viewer.scale, rtol=1e-5)

@@ -302,7 +302,7 @@ def test_names_and_prompts_are_shown_as_they_are_and_run_nothing(
     until(lambda: f"2 selected: instance 0, {label}" in shown.inner_text())
     viewer.guarded(lambda: viewer.session.ask(label))
     until(lambda: f'"{label}": not present' in shown.inner_text())
-    viewer.overlay("names", True)
+    viewer.show_boxes(True)
     viewer.guarded(refuse)
     until(lambda: f"notice {label}" in shown.inner_text())
     assert page.evaluate("document.body.dataset.owned") is None
