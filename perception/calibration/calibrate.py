@@ -166,13 +166,8 @@ def distinct_views(views: Sequence[Detection], width: int) -> list[Detection]:
 
 def _motion(a: Detection, b: Detection) -> float:
     """Median displacement in pixels of the corners that both views show; infinite if they share fewer than 4."""
-    places = {tuple(p): q for p, q in zip(a.board_points.round(6).tolist(), a.pixels, strict=True)}  # type: ignore[misc]
-    shared = [
-        float(np.linalg.norm(places[tuple(p)] - q))
-        for p, q in zip(b.board_points.round(6).tolist(), b.pixels, strict=True)
-        if tuple(p) in places
-    ]
-    return float(np.median(shared)) if len(shared) >= 4 else float("inf")
+    of_a, of_b = np.nonzero((a.board_points[:, None] == b.board_points).all(axis=2))
+    return float(np.median(np.linalg.norm(a.pixels[of_a] - b.pixels[of_b], axis=1))) if len(of_a) >= 4 else np.inf
 
 
 def coverage(solution: Solution) -> float:

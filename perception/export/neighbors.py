@@ -9,29 +9,28 @@ import numpy as np
 
 from perception import _core
 from perception.errors import InputError
-from perception.io.cloud_memory import cores
+from perception.io.memory import cores
 
 CHUNK = 1 << 20  # points at a time: 24 MiB of working memory
 
 
 class Neighbors:
-    """A k-d tree over points [N, 3] (any float dtype, finite).
+    """A k-d tree over the finite ones of points [N, 3] (any float dtype).
 
     For a cloud far from the origin, its centre is subtracted in float64 before conversion to float32, so that
     georeferenced coordinates keep their precision.
     """
 
     def __init__(self, points: np.ndarray, threads: int | None = None) -> None:
-        points = np.asarray(points)
-        if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-            raise InputError(f"expected at least one point as [N, 3]; found an array {list(points.shape)}")
+        finite = np.isfinite(np.asarray(points)).all(axis=-1)
+        if np.ndim(points) != 2 or np.shape(points)[1] != 3 or not finite.any():
+            raise InputError(f"expected at least one finite point as [N, 3]; found an array {list(np.shape(points))}")
+        self.rows = np.flatnonzero(finite).astype(np.int32)
+        points = np.asarray(points)[self.rows] if len(self.rows) < len(points) else np.asarray(points)
         low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
-        if not np.isfinite(low + high).all():
-            raise InputError("points hold NaN or infinite coordinates; leave those out before the search")
         # Coordinates small relative to the extent are not moved: the difference of two close floats is exact.
         small = np.maximum(np.abs(low), np.abs(high)).max() <= 4 * (high - low).max()
         self.center = np.zeros(3) if small else (low + high) / 2
-        self.low, self.high = low, high
         self.threads = threads or cores()
         self._tree = _core.KdTree(self.local(points), self.threads)
 
@@ -51,7 +50,7 @@ class Neighbors:
         squared = np.empty((len(queries), k), np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
             self._tree.knn(self.local(queries), indices, squared, float(max_distance), self.threads)
-        return indices, np.sqrt(squared, out=squared)
+        return np.where(indices >= 0, self.rows[indices], -1), np.sqrt(squared, out=squared)
 
 
 def nearest_gaussian(
@@ -62,14 +61,11 @@ def nearest_gaussian(
     −1 for points that are not finite or farther than max_distance from every mean. Equal distances go to the smaller
     index. Means that are not finite are ignored.
     """
-    finite = np.flatnonzero(np.isfinite(means).all(axis=1))
     result = np.full(len(points), -1, np.int64)
-    if len(finite) == 0:
-        return result
-    tree = Neighbors(means if len(finite) == len(means) else means[finite])
-    for begin in range(0, len(points), chunk):
-        found = tree.query(points[begin : begin + chunk], 1, np.inf if max_distance is None else max_distance)[0][:, 0]
-        result[begin : begin + chunk] = np.where(found >= 0, finite[found], -1)
+    if np.isfinite(means).all(axis=1).any():
+        tree, limit = Neighbors(means), np.inf if max_distance is None else max_distance
+        for begin in range(0, len(points), chunk):
+            result[begin : begin + chunk] = tree.query(points[begin : begin + chunk], 1, limit)[0][:, 0]
     return result
 
 
@@ -87,17 +83,10 @@ def neighbor_lists(points: np.ndarray, k: int) -> np.ndarray:
 
     Points that are not finite have no neighbours and are not neighbours of others.
     """
-    finite = np.flatnonzero(np.isfinite(points).all(axis=1)).astype(np.int32)
-    if len(finite) == 0:
+    finite = int(np.isfinite(points).all(axis=1).sum())
+    if finite == 0:
         return np.full((len(points), 1), -1, np.int32)
-    k = min(k, len(finite), 1024)
-    if len(finite) == len(points):
-        return Neighbors(points).query(points, k)[0]
-    inside = points[finite]
-    found = Neighbors(inside).query(inside, k)[0]
-    lists = np.full((len(points), k), -1, np.int32)
-    lists[finite] = np.where(found >= 0, finite[found], -1)
-    return lists
+    return Neighbors(points).query(points, min(k, finite, 1024))[0]
 
 
 def list_edges(lists: np.ndarray) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,8 @@ from perception.export.neighbors import (
     scannet_weights,
     step_weights,
 )
-from perception.io.cloud_memory import require_memory
+from perception.io.documents import read_json
+from perception.io.memory import require_memory
 from perception.types import PointCloud
 
 K_THRESHOLD, MIN_SIZE = 0.01, 20  # ScanNet's kThresh and segMinVerts
@@ -115,13 +115,10 @@ def vote(labels: np.ndarray, segments: np.ndarray) -> np.ndarray:
 
 def read_segments(path: str | Path, num_points: int) -> np.ndarray:
     """Segments [P] int32 from a ScanNet `*.segs.json` (its list "segIndices"), one for each vertex."""
-    path = Path(path)
     try:
-        values = np.asarray(json.loads(path.read_text(encoding="utf-8"))["segIndices"], np.int64)
-    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
-        raise InputError(
-            f"{path}: is no segmentation file: expected JSON with a list 'segIndices' ({error})"
-        ) from error
+        values = np.asarray(read_json(Path(path))["segIndices"], np.int64)
+    except (KeyError, TypeError, OverflowError) as error:
+        raise InputError(f"{path}: is no segmentation file: expected a list 'segIndices' ({error})") from error
     if values.shape != (num_points,):
         raise InputError(f"{path}: lists {values.size} segments, the cloud has {num_points} points")
     return np.unique(values, return_inverse=True)[1].astype(np.int32)

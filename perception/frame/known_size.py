@@ -18,7 +18,7 @@ from perception.frame.scale import LARGEST_ERROR, KnownLength, Measurement
 from perception.geometry import align_similarity
 from perception.io.lens import camera_from_lens
 from perception.io.photos import read_photo
-from perception.io.views import view_lens
+from perception.io.reading import view_lens
 from perception.types import View
 
 TAG_FAMILIES = ("APRILTAG_36h11", "4X4_50", "5X5_100", "6X6_250")
@@ -121,10 +121,10 @@ def scale_of_sightings(
         seen = np.isfinite(residuals)
         freedom = max(int(seen.sum()) - 3 * len(thing.corners) - 2, 1)  # 2 less: few residuals tell the noise badly
         noise = max(pixel_error / focal, float(np.sqrt((residuals[seen] ** 2).sum() / freedom)))
-        drawn = [_metres(poses, thing.corners, rays + noise * rng.standard_normal(rays.shape)) for _ in range(DRAWS)]
-        metres, error = _metres(poses, thing.corners, rays), float(np.std(drawn))
-        precise = np.isfinite(metres) and error < LARGEST_ERROR * metres
-        if precise and _misshapen(poses, thing.corners, rays) < MISSHAPEN:
+        drawn = [_fitted(poses, thing.corners, rays + noise * rng.standard_normal(rays.shape)) for _ in range(DRAWS)]
+        metres, off = _fitted(poses, thing.corners, rays)
+        error = float(np.std([unit for unit, _ in drawn]))
+        if error < LARGEST_ERROR * metres and off < MISSHAPEN:  # false for NaN
             usable.append((thing.corners, rays, error))
     if not usable:
         raise InputError(f"{source}: its corners cannot be triangulated to its shape; see it from farther apart places")
@@ -132,7 +132,7 @@ def scale_of_sightings(
 
     def mean(kept: np.ndarray) -> float:
         shown = np.where(kept, 1.0, np.nan)[:, None, None]
-        values = np.array([_metres(poses, corners, shown * rays) for corners, rays, _ in usable])
+        values = np.array([_fitted(poses, corners, shown * rays)[0] for corners, rays, _ in usable])
         known = np.isfinite(values)
         return float(weights[known] @ values[known] / weights[known].sum()) if known.any() else np.nan
 
@@ -193,23 +193,19 @@ def _without_outliers(poses: np.ndarray, rays: np.ndarray, noise: float) -> tupl
         rays[each.argmax()] = np.nan
 
 
-def _metres(poses: np.ndarray, corners: np.ndarray, rays: np.ndarray) -> float:
+def _fitted(poses: np.ndarray, corners: np.ndarray, rays: np.ndarray) -> tuple[float, float]:
+    """Metres per unit, and the root mean square deviation of the triangulated corners from the true shape, in its size;
+    NaN where less than two corners are seen, or mirrored."""
     points = triangulated(poses, rays)
     known = np.isfinite(points).all(axis=1)
     if known.sum() < 2:
-        return np.nan
-    units = align_similarity(points[known], corners[known])[0]
-    return 1 / units if units > 0 else np.nan
-
-
-def _misshapen(poses: np.ndarray, corners: np.ndarray, rays: np.ndarray) -> float:
-    """Root mean square deviation of the triangulated corners from the true shape, in its size."""
-    points = triangulated(poses, rays)
-    known = np.isfinite(points).all(axis=1)
+        return np.nan, np.nan
     scale, rotation, shift = align_similarity(points[known], corners[known])
+    if scale <= 0:
+        return np.nan, np.nan
     off = points[known] - (scale * corners[known] @ rotation.T + shift)
     size = scale * np.linalg.norm(np.ptp(corners[known], axis=0))
-    return float(np.sqrt((off**2).sum(axis=1).mean()) / size)
+    return 1 / scale, float(np.sqrt((off**2).sum(axis=1).mean()) / size)
 
 
 def _grey(view: View) -> np.ndarray:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from perception.errors import InputError
 from perception.gaussians.device import training_kernels
-from perception.io.disk_arrays import Keep
+from perception.io.memory import Keep
 
 _LARGEST_ID = 2**31 - 1
 VarianceForm = Literal["paper", "channels", "plain"]

@@ -11,7 +11,7 @@ import torch
 from perception.gaussians.model import Gaussians
 from perception.gaussians.rasterize import Rasterization
 from perception.gaussians.render import render
-from perception.io.disk_arrays import Keep
+from perception.io.memory import Keep
 
 _ON_DEVICE = ("photo", "K", "camera_from_world", "weight", "depth", "gain")
 BEST_PSNR = 100.0

@@ -6,35 +6,17 @@ import io
 import math
 import struct
 import sys
-import tokenize
 import zipfile
-import zlib
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.documents import brief
+from perception.io.documents import DAMAGE, brief
 
 MOST_ARCHIVE = 4 << 30
 """Maximum uncompressed size of an .npz in bytes, against damaged or hostile files that would fill the memory."""
-DAMAGE = (
-    ValueError,
-    KeyError,
-    TypeError,
-    OSError,
-    EOFError,
-    OverflowError,
-    MemoryError,
-    RuntimeError,  # NotImplementedError, RecursionError and "is encrypted" among them
-    SyntaxError,  # numpy reads the header of an array as Python
-    tokenize.TokenError,
-    struct.error,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-"""Exceptions that numpy and zipfile raise on bytes that are not an array or archive."""
 
 
 def read_npz(source: Path | bytes, file: Path, advice: str) -> dict[str, np.ndarray]:

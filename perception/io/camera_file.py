@@ -22,7 +22,9 @@ def read_camera(path: Path) -> Lens:
     to the principal point.
     """
     path = Path(path)
-    data = _load(path)
+    data = read_yaml(path, "ROS camera_info")
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: expected a ROS camera_info mapping with image_width, image_height, camera_matrix")
     width, height = (int(_numbers(data.get(key), 1, path, key)[0]) for key in ("image_width", "image_height"))
     matrix = _numbers(_data(data, "camera_matrix"), 9, path, "camera_matrix.data").reshape(3, 3)
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
@@ -86,13 +88,6 @@ def _write(path: Path, name: str, size: tuple[int, int], kind: str, K: list[floa
     data |= {key: {"rows": r, "cols": c, "data": numbers} for key, (r, c, numbers) in blocks.items()}
     with replacing(path) as file:
         file.write(yaml.safe_dump(data, sort_keys=False, default_flow_style=None).encode())
-
-
-def _load(path: Path) -> dict[str, Any]:
-    data = read_yaml(path, "ROS camera_info")
-    if not isinstance(data, dict):
-        raise InputError(f"{path}: expected a ROS camera_info mapping with image_width, image_height, camera_matrix")
-    return data
 
 
 def _data(data: dict[str, Any], key: str) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.arrays import read_npz
 from perception.io.atomic import replacing
-from perception.io.cloud_memory import require_memory
+from perception.io.memory import require_memory
 from perception.io.ply import read_ply, write_ply
 from perception.types import PointCloud
 

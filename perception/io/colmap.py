@@ -21,10 +21,9 @@ from perception.io.exposure import with_gains
 from perception.io.ignore_masks import mask_of
 from perception.io.lens import lens_from_camera, load_pycolmap
 from perception.io.photos import why_left_out
-from perception.io.reading import Reading
+from perception.io.reading import Reading, fit_lens, make_view
 from perception.io.tracks import tracks_of_model
 from perception.io.triangulate import MIN_POINTS, cloud_of, posed_scene
-from perception.io.views import fit_lens, make_view
 from perception.types import Scene, View
 
 _PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
@@ -57,8 +56,7 @@ def read_workspace(folder: Path, how: Reading) -> Scene:
         raise InputError(f"{path}: the sparse model is empty (no registered photo); run structure from motion again")
     names = {image_id: safe_name(model.images[image_id].name, path) for image_id in model.reg_image_ids()}
     located = {image_id: (name, folder / "images" / name) for image_id, name in names.items()}
-    views, missing, notes = views_of_model(model, located, path, how.strict)
-    views = [replace(view, mask=mask_of(how.masks, view.name)) for view in views]
+    views, missing, notes = views_of_model(model, located, path, how)
     if not views:
         raise InputError(f"{folder / 'images'}: none of the {model.num_reg_images()} photos of {path} is there")
     if len(found) > 1:
@@ -74,24 +72,22 @@ def read_workspace(folder: Path, how: Reading) -> Scene:
 
 
 def views_of_model(
-    model: Any, located: dict[int, tuple[str, Path]], source: Path, strict: bool = False
+    model: Any, located: dict[int, tuple[str, Path]], source: Path, how: Reading
 ) -> tuple[list[View], list[dict[str, str]], list[str]]:
-    """Views sorted by name, photos left out with the reason, notes. located: image id to view name and photo.
-
-    strict: a damaged photo is raised as InputError, not left out.
-    """
+    """Views sorted by name, photos left out with the reason, notes. located: image id to view name and photo."""
     views, missing, notes = [], [], set()
     lenses = {camera_id: lens_from_camera(camera) for camera_id, camera in model.cameras.items()}
     for image_id, (name, photo) in located.items():
         image = model.images[image_id]
-        why = "in the sparse model, but the photo is missing" if not photo.is_file() else why_left_out(photo, strict)
+        there = photo.is_file()
+        why = why_left_out(photo, how.strict) if there else "in the sparse model, but the photo is missing"
         if why is not None:
             missing.append({"name": name, "why": why})
             continue
         lens, note = fit_lens(lenses[image.camera_id], photo, source)
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().matrix()
-        views.append(make_view(name, photo, lens, pose, source))
+        views.append(replace(make_view(name, photo, lens, pose, source), mask=mask_of(how.masks, name)))
         if note:
             notes.add(note)
     views.sort(key=lambda view: view.name)
@@ -117,14 +113,12 @@ def _models(folder: Path) -> list[Path]:
 
 def _read_model(path: Path) -> Any:
     pycolmap = load_pycolmap()
-    for suffix in (".bin", ".txt"):
-        if (path / f"images{suffix}").is_file():
-            needed = [f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
-            absent = [name for name in needed if not (path / name).is_file()]
-            if absent:
-                raise InputError(f"{path}: the sparse model lacks {', '.join(absent)}")
-            break
-    if (path / "images.bin").is_file():
+    suffix = ".bin" if (path / "images.bin").is_file() else ".txt"
+    needed = [f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
+    absent = [name for name in needed if not (path / name).is_file()]
+    if absent:
+        raise InputError(f"{path}: the sparse model lacks {', '.join(absent)}")
+    if suffix == ".bin":
         check_binary_model(path)
     else:
         _refuse_nan_text(path)

@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.arrays import DAMAGE, map_npy
+from perception.io.arrays import map_npy
+from perception.io.documents import DAMAGE
 from perception.io.lens import rescale_lens, warp_grid
 from perception.io.photos import scaled_K
-from perception.io.views import view_lens
+from perception.io.reading import view_lens
 from perception.types import DepthImage, Lens, View
 
 SATURATED = 65535

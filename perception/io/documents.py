@@ -6,13 +6,32 @@ from __future__ import annotations
 
 import json
 import re
+import struct
+import tokenize
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
 from perception.errors import InputError
 
-_YAML_ERRORS = (ValueError, LookupError, AttributeError, TypeError, OverflowError, RecursionError)
-"""Exceptions that PyYAML raises besides its own, for example on invalid dates or numbers without digits."""
+DAMAGE = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    MemoryError,  # Pillow allocates the size given in a chunk header
+    OSError,
+    RuntimeError,  # NotImplementedError, RecursionError and "is encrypted" among them
+    SyntaxError,  # numpy reads the header of an array as Python
+    TypeError,
+    ValueError,
+    struct.error,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""Exceptions that numpy, zipfile, PyYAML and Pillow raise on bytes that are not what they read, or a part of it."""
 
 
 def read_json(file: Path) -> Any:
@@ -42,7 +61,7 @@ def read_yaml(file: Path, expected: str) -> Any:
         return yaml.load(file.read_text(encoding="utf-8"), Loader)
     except FileNotFoundError as error:
         raise InputError(f"{file}: no such file; expected {expected}") from error
-    except (OSError, yaml.YAMLError, *_YAML_ERRORS) as error:
+    except (yaml.YAMLError, *DAMAGE) as error:
         raise InputError(f"{file}: not readable YAML ({brief(error)}); expected {expected}") from error
 
 

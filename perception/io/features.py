@@ -22,9 +22,9 @@ import numpy as np
 from PIL import Image
 
 from perception.io.atomic import atomic_directory, recover
-from perception.io.cloud_memory import cores
 from perception.io.ignore_masks import stage_masks
 from perception.io.lens import load_pycolmap
+from perception.io.memory import cores
 from perception.io.photos import LARGE_PIXELS, exif_of, open_photo, photo_size, read_photo
 from perception.progress import Progress
 from perception.types import Lens

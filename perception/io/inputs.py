@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.arrays import DAMAGE
 from perception.io.atomic import atomic_directory
 from perception.io.camera_file import read_camera
+from perception.io.documents import DAMAGE
 from perception.io.ignore_masks import with_checked_masks
 from perception.io.map_views import view_from_json, view_json
 from perception.io.reading import Reading, check_seen, start_points

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.arrays import DAMAGE, map_npy, read_npz
+from perception.io.arrays import map_npy, read_npz
 from perception.io.atomic import standing
 from perception.io.checksums import EDITABLE, FACTS, check_file, check_sizes, damaged
-from perception.io.documents import brief
+from perception.io.documents import DAMAGE, brief
 from perception.io.map_views import check_names, views_of_facts
 from perception.io.ply import map_ply
 

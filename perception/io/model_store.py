@@ -77,9 +77,9 @@ def find_model(name: str) -> StoredModel | None:
     if not (folder / RECORD).is_file():
         return None
     try:
-        about = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        about = read_json(folder / RECORD)
         return StoredModel(name, folder, about["family"], about["purpose"], list(about["files"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (InputError, KeyError, TypeError) as error:
         raise InputError(f"{folder / RECORD}: cannot be read ({error}); remove {folder} and add it again") from error
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import struct
 import threading
-import zlib
 from pathlib import Path
 from stat import S_ISREG
 
@@ -13,6 +11,7 @@ import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from perception.errors import InputError, missing_extra
+from perception.io.documents import DAMAGE
 from perception.io.lens import warp_grid
 from perception.types import View
 
@@ -22,23 +21,7 @@ LARGE_PIXELS = 200_000_000
 """Photos of more pixels are read at 1/2, 1/4 or 1/8 of their size; `photo_size` returns the reduced size."""
 MOST_DECODED = 400_000_000
 """Maximum number of pixels to decode; JPEG is decoded at the reduced size, other formats at full size."""
-DECODE_ERRORS = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    KeyError,
-    IndexError,
-    TypeError,
-    AttributeError,
-    OverflowError,
-    ArithmeticError,
-    RuntimeError,
-    EOFError,
-    MemoryError,  # Pillow allocates the size given in a chunk header
-    struct.error,
-    zlib.error,
-    Image.DecompressionBombError,
-)
+DECODE_ERRORS = (*DAMAGE, Image.DecompressionBombError)
 """Exceptions that Pillow raises on bytes that are not an image, or on a truncated image."""
 
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from perception.geometry import camera_centres, nearest_rotation
 from perception.io.bundle_adjustment import Poses, adjust, residuals, starting_points
+from perception.io.reading import view_lens
 from perception.io.tracks import Features, tracks_of
-from perception.io.views import view_lens
 from perception.types import View
 
 TOLERANCE, TOLERANCE_SIDE = 1.0, 800

@@ -14,10 +14,9 @@ from perception.geometry import inverse_se3
 from perception.io.depth import read_depth
 from perception.io.documents import safe_name
 from perception.io.ignore_masks import mask_of
-from perception.io.reading import NO_CLOUD, Reading
+from perception.io.reading import NO_CLOUD, Reading, fit_lens, make_view, rigid_pose
 from perception.io.triangulate import posed_scene
 from perception.io.video import Chooser
-from perception.io.views import fit_lens, make_view, rigid_pose
 from perception.progress import Progress
 from perception.types import DepthImage, Lens, Scene, View
 

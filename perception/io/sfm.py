@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +50,7 @@ def reconstruct(folder: Path, lens: Lens | None, how: Reading) -> Scene:
     number = {name: index for index, name in enumerate(store.names)}
     indices = {image_id: number[model.images[image_id].name] for image_id in model.reg_image_ids()}
     located = {image_id: (chosen.names[index], photos[index]) for image_id, index in indices.items()}
-    views, _, _ = views_of_model(model, located, folder, how.strict)
-    views = [replace(view, mask=mask_of(how.masks, view.name)) for view in views]
+    views, _, _ = views_of_model(model, located, folder, how)
     names = {image_id: name for image_id, (name, _) in located.items()}
     views, exposure = with_gains(views, tracks_of_model(model, views, names))
     points, colors = cloud_of(model)

@@ -10,7 +10,7 @@ import numpy as np
 from perception.io.depth import load_depth
 from perception.io.features import FeatureStore, verified_matches
 from perception.io.lens import camera_from_lens, load_pycolmap
-from perception.io.views import view_lens
+from perception.io.reading import view_lens
 from perception.types import View
 
 FLAT = 0.03

@@ -18,9 +18,8 @@ from perception.io.ignore_masks import mask_of
 from perception.io.lens import FISHEYE, PERSPECTIVE, opencv_lens
 from perception.io.map_views import absolute
 from perception.io.photos import SUFFIXES, photo_size, why_left_out
-from perception.io.reading import NO_CLOUD, Reading, start_points
+from perception.io.reading import NO_CLOUD, Reading, fit_lens, make_view, rigid_pose, start_points
 from perception.io.triangulate import posed_scene
-from perception.io.views import fit_lens, make_view, rigid_pose
 from perception.types import DepthImage, Lens, Scene, View
 
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
@@ -48,8 +47,7 @@ def read_transforms(file: Path, how: Reading) -> Scene:
     if not photos:
         first = f"{missing[0]['name']}: {missing[0]['why']}"
         raise InputError(f"{file}: none of the {len(frames)} photos it lists can be read (first: {first})")
-    root = Path(os.path.commonpath([absolute(photo).parent for photo in photos.values()]))
-    views, notes = _views(file, data, frames, photos, root, how.masks)
+    views, notes = _views(file, data, photos, how.masks)
     listed = how.cloud
     if listed is None and data.get("ply_file_path"):
         listed = start_points(_listed(file, "ply_file_path", data["ply_file_path"]))
@@ -83,24 +81,24 @@ def listed_photos(file: Path) -> tuple[list[Path], bool]:
 
 
 def _views(
-    file: Path,
-    data: dict[str, Any],
-    frames: list[dict[str, Any]],
-    photos: dict[int, Path],
-    root: Path,
-    masks: Path | None,
+    file: Path, data: dict[str, Any], photos: dict[int, Path], masks: Path | None
 ) -> tuple[list[View], list[str]]:
+    """Views sorted by name, and notes. photos: by number of the frame."""
     views: dict[str, View] = {}
     notes: set[str] = set()
+    root = os.path.commonpath([absolute(photo).parent for photo in photos.values()])
     for index, photo in photos.items():
-        frame = frames[index]
+        frame = data["frames"][index]
         lens, note = fit_lens(_lens(file, {**data, **frame}, photo), photo, file)
         name = safe_name(absolute(photo).relative_to(root).as_posix(), file)
         if name in views:
             notes.add(f"{name} is listed more than once; the first pose is used")
             continue
         view = make_view(name, photo, lens, _pose(file, frame), file)
-        views[name] = replace(view, depth=_depth(file, data, frame), mask=mask_of(masks, name) or _mask(file, frame))
+        mask = mask_of(masks, name)
+        if mask is None and frame.get("mask_path"):
+            mask = _listed(file, "mask", frame["mask_path"])
+        views[name] = replace(view, depth=_depth(file, data, frame), mask=mask)
         if note:
             notes.add(note)
     return [views[name] for name in sorted(views)], sorted(notes)
@@ -167,10 +165,6 @@ def _depth(file: Path, data: dict[str, Any], frame: dict[str, Any]) -> DepthImag
     if scale <= 0:
         raise InputError(f"{what}: the scale of its depth must be above 0, found {scale:g}")
     return DepthImage(path, scale)
-
-
-def _mask(file: Path, frame: dict[str, Any]) -> Path | None:
-    return _listed(file, "mask", frame["mask_path"]) if frame.get("mask_path") else None
 
 
 def _listed(file: Path, what: str, listed: object) -> Path:

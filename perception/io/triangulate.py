@@ -13,9 +13,8 @@ from perception.io.exposure import with_gains
 from perception.io.features import build_features
 from perception.io.lens import camera_from_lens, lens_text, load_pycolmap
 from perception.io.pose_refinement import checked_poses
-from perception.io.reading import Reading
+from perception.io.reading import Reading, view_lens
 from perception.io.tracks import features_of, tracks_of
-from perception.io.views import view_lens
 from perception.types import Scene, View
 
 MIN_POINTS = 50

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.disk_arrays import Keep
+from perception.io.memory import Keep
 from perception.masks.merging import Segmentation, segmentation
 from perception.masks.stereo import StereoView, make_stereo_view, measure_depths
 from perception.masks.surface import FOOTPRINTS, Surface, SurfaceBuilder, to_world

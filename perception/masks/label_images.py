@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.disk_arrays import Keep
 from perception.io.documents import brief, safe_name
+from perception.io.memory import Keep
 from perception.masks.builtin import BuiltinSegmentation
 from perception.masks.merging import Segmentation
 from perception.masks.source import MaskSource

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from perception import _core
-from perception.io.disk_arrays import Keep
+from perception.io.memory import Keep
 from perception.masks.cues import DepthCues, PhotoCues, depth_cues, filled_depth, photo_cues
 from perception.progress import Progress
 from perception.types import View

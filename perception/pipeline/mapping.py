@@ -21,10 +21,10 @@ from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.train import Trainer, TrainingView, psnr, render_view
 from perception.gaussians.transients import train_without_transients
-from perception.io.disk_arrays import DiskArrays, Keep
 from perception.io.inputs import load_saved_scene, load_scene, save_scene
 from perception.io.map_files import read_info
 from perception.io.map_views import stored_view
+from perception.io.memory import DiskArrays, Keep
 from perception.io.photos import load_photo
 from perception.io.reading import Reading
 from perception.io.recentre import recentred

@@ -12,8 +12,8 @@ import torch
 from perception.errors import InputError
 from perception.gaussians.train import TrainingView
 from perception.io.depth import load_depth, without_edges
-from perception.io.disk_arrays import Keep
 from perception.io.ignore_masks import load_weight
+from perception.io.memory import Keep
 from perception.io.photos import load_photo, scaled_K
 from perception.masks.label_images import load_labels
 from perception.progress import Progress

@@ -24,9 +24,8 @@ from perception.io.colmap import read_workspace
 from perception.io.inputs import load_scene
 from perception.io.photos import photo_size, read_photo
 from perception.io.ply import read_ply
-from perception.io.reading import Reading
+from perception.io.reading import Reading, rigid_pose
 from perception.io.transforms import read_frames, read_transforms
-from perception.io.views import rigid_pose
 from perception.masks.label_images import load_labels, stored_key
 from perception.progress import Progress
 from perception.types import PointCloud, View

@@ -13,9 +13,8 @@ import pytest
 from perception.errors import InputError
 from perception.io.depth import load_depth, read_depth
 from perception.io.map_views import stored_view, view_from_json, view_json
-from perception.io.reading import Reading
+from perception.io.reading import Reading, make_view
 from perception.io.transforms import read_transforms
-from perception.io.views import make_view
 from perception.types import DepthImage, Lens
 
 PINHOLE = Lens("PINHOLE", (50.0, 50.0, 32.0, 24.0), 64, 48)

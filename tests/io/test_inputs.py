@@ -16,9 +16,8 @@ from perception.io.camera_file import read_camera
 from perception.io.inputs import load_scene
 from perception.io.lens import camera_from_lens, load_pycolmap, pinhole_from_lens
 from perception.io.photos import load_photo, read_photo, scaled_K, warp_labels
-from perception.io.reading import Reading
+from perception.io.reading import Reading, make_view
 from perception.io.transforms import read_frames
-from perception.io.views import make_view
 from perception.progress import Progress
 from perception.types import Lens, View
 from support.rotations import rotation_from_quaternion

@@ -23,8 +23,7 @@ from perception.io.inputs import load_scene
 from perception.io.lens import load_pycolmap
 from perception.io.photo_folder import choose_photos, list_photos, view_name
 from perception.io.photos import photo_size, read_photo, why_left_out
-from perception.io.reading import Reading
-from perception.io.views import fit_lens
+from perception.io.reading import Reading, fit_lens
 from perception.types import Lens
 from support.progress import Told
 

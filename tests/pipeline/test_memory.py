@@ -21,8 +21,8 @@ pytest.importorskip("perception._core")
 import perception
 from perception.config import load_config
 from perception.errors import InputError
-from perception.io import disk_arrays
-from perception.io.disk_arrays import DiskArrays, mapped_bytes
+from perception.io import memory
+from perception.io.memory import DiskArrays, mapped_bytes
 from perception.pipeline.mapping import build_map
 
 MIB = 1 << 20
@@ -32,9 +32,9 @@ def test_arrays_beyond_the_limit_lie_on_disk_and_stay_as_they_are(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files: list[int] = []
-    make = disk_arrays._new_file
-    monkeypatch.setattr(disk_arrays, "_new_file", lambda folder, size: files.append(size) or make(folder, size))
-    monkeypatch.setattr(disk_arrays, "CHUNK", 128)
+    make = memory._new_file
+    monkeypatch.setattr(memory, "_new_file", lambda folder, size: files.append(size) or make(folder, size))
+    monkeypatch.setattr(memory, "CHUNK", 128)
     rng = np.random.default_rng(0)
     made = [rng.integers(0, 250, (size, 3)).astype(kind) for size in (7, 100, 1) for kind in ("u1", "i2", "f4", "?")]
     arrays = DiskArrays(tmp_path, limit=800)
@@ -63,7 +63,7 @@ def test_a_full_disk_is_an_error_and_not_a_signal(tmp_path: Path, monkeypatch: p
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(disk_arrays.os, "posix_fallocate", full, raising=False)
+    monkeypatch.setattr(memory.os, "posix_fallocate", full, raising=False)
     with pytest.raises(OSError, match="No space"):
         DiskArrays(tmp_path, limit=0).keep(np.zeros(9))
 

@@ -1,4 +1,4 @@
-"""Arrays of which a bounded part is in memory: the photos and labels of a large place."""
+"""Memory and cores of the machine; arrays of which a bounded part is in memory: photos and labels of a large place."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+
+from perception.errors import InputError
 
 CHUNK = 64 << 20  # bytes of a file; a larger array has a file of its own
 INTERVAL = 0.05  # seconds between two looks at what is resident
@@ -84,3 +86,26 @@ def mapped_bytes() -> int:
         return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[2]) * mmap.PAGESIZE
     except OSError:
         return 1 << 62
+
+
+def available_memory() -> int:
+    """Bytes that can be allocated without swapping (Linux kernel's estimate); on other systems the total memory."""
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def cores() -> int:
+    """Number of CPU cores available to this process."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def require_memory(needed: float, what: str, advice: str) -> None:
+    """InputError naming `what` and `advice` when `needed` bytes exceed 90 % of the available memory."""
+    free = available_memory()
+    if needed > 0.9 * free:
+        raise InputError(f"{what}: needs about {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; {advice}")
