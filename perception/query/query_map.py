@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +20,9 @@ from perception.query.spatial_index import SpatialIndex
 from perception.query.text_ranking import Encoders, TextRanking
 from perception.query.where import Frame, Where, place, tidy
 from perception.types import OrientedBox
+
+if TYPE_CHECKING:
+    from perception.query.standing import FreeSpace
 
 _NEIGHBORS = 3
 _LEAST_COLOR = 0.05
@@ -270,6 +274,13 @@ class QueryMap(Map):
     @cached_property
     def _nodes(self) -> Nodes:
         return Nodes(self)
+
+    @cached_property
+    def free_space(self) -> FreeSpace:
+        """Where a robot can stand (`standing.where_to_stand`); InputError as `floor_grid`."""
+        from perception.query.standing import FreeSpace
+
+        return FreeSpace(self)
 
     @cached_property
     def _spatial(self) -> SpatialIndex:

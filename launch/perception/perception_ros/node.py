@@ -22,7 +22,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.signals import SignalHandlerOptions
 
 from perception.errors import InputError
-from perception.export.floor_grid import floor_grid
+from perception.frame.floor_grid import floor_grid
 from perception.node import answers
 from perception.node.config import NodeConfig, node_config
 from perception.node.core import Core

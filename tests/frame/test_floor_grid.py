@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from perception.errors import InputError
-from perception.export.floor_grid import FREE, OCCUPIED, UNKNOWN, floor_grid
+from perception.frame.floor_grid import FREE, OCCUPIED, UNKNOWN, floor_grid
 from perception.geometry import look_at
 from perception.io.map import Map
 from perception.types import View
