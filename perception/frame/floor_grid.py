@@ -32,7 +32,7 @@ class Surface:
     points: np.ndarray
     rows: np.ndarray
     map_from_level: np.ndarray
-    path: Path
+    path: Path | None
 
     def grid(self, resolution: float, step: float = STEP, height: float = HEIGHT) -> tuple[np.ndarray, np.ndarray]:
         """`floor_grid` of these points."""

@@ -86,9 +86,7 @@ def where_to_stand(
             f"instance {instance_id}: no free floor within {within} m of it that a robot of radius {radius} m reaches"
         )
     places, gaps, middle = places[near], gaps[near], points.mean(axis=0)[:2]
-    order = np.argsort(
-        np.abs(gaps - distance) + SIDEWAYS * np.linalg.norm(places - middle, axis=1), kind="stable"
-    )
+    order = np.argsort(np.abs(gaps - distance) + SIDEWAYS * np.linalg.norm(places - middle, axis=1), kind="stable")
     order = order[:: -(-len(order) // MOST_PLACES)]
     targets = points[np.linspace(0, len(points) - 1, RAYS).astype(int)]
     for some in np.split(order, range(BATCH, len(order), BATCH)):
@@ -146,7 +144,7 @@ class FreeSpace:
     def seen(self, instance_id: int, eyes: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """bool [E, T]: whether the ray from each of eyes [E, 3] to each of targets [T, 3], in the grid's frame, meets
         no voxel with a point of something other than the instance, but for its last 10 cm."""
-        taken = np.unique(self._keys_taken[self._owners != instance_id])
+        taken = self._keys_taken[self._owners != instance_id]
         rays = targets[None] - eyes[:, None]
         lengths = np.linalg.norm(rays, axis=2)
         steps = int(np.ceil(2 * lengths.max() / CELL)) + 1
@@ -179,5 +177,5 @@ class FreeSpace:
         offsets = (np.argwhere(np.ones_like(window))[:, ::-1] + low + 0.5) * CELL - center[:2]
         normals = np.stack([-axes[:, 1], axes[:, 0]])  # [2, 3], zero for an upright axis
         bounds = np.abs(axes[:, :2] @ normals * half[:, None]).sum(axis=0)
-        window.flat = (np.abs(offsets @ normals) <= bounds + CELL / 2).all(axis=1)
+        window[...] = (np.abs(offsets @ normals) <= bounds + CELL / 2).all(axis=1).reshape(window.shape)
         return mask

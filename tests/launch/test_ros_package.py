@@ -15,6 +15,7 @@ from perception import load_map
 from perception.errors import InputError
 from perception.node import answers
 from perception.query import QueryMap
+from perception.query.standing import Stand
 from support.node_maps import encoders, write_small_map
 from support.paths import REPOSITORY
 
@@ -54,8 +55,12 @@ def sent(kind: str, message: dict[str, Any]) -> Any:
         texts = dict(MOVEIT)
         for file in (LAUNCH / "perception_msgs/msg").glob("*.msg"):
             texts[f"perception_msgs/msg/{file.stem}"] = file.read_text()
+        for file in (LAUNCH / "perception_msgs/srv").glob("*.srv"):
+            halves = file.read_text().split("---\n")
+            names = (f"perception_msgs/srv/{file.stem}_{half}" for half in ("Request", "Response"))
+            texts |= zip(names, halves, strict=True)
         for name, text in texts.items():
-            store.register({name: get_types_from_msg(text, name)[name]})
+            store.register({name: next(iter(get_types_from_msg(text, name).values()))})
     return store.deserialize_cdr(serialize(kind, message), kind)
 
 
@@ -95,6 +100,22 @@ def test_occupancy_grid() -> None:
     told = sent("nav_msgs/msg/OccupancyGrid", messages.occupancy_grid(cells, np.eye(4), 0.5, "map", STAMP))
     assert (told.info.width, told.info.height, told.info.resolution, told.info.origin.orientation.w) == (3, 2, 0.5, 1.0)
     assert told.data.tolist() == [0, 100, -1, -1, 0, 100]
+
+
+def test_a_place_to_stand_is_a_goal_that_looks_ahead() -> None:
+    """The quaternion turns x forward to where the robot faces, on the floor of the frame."""
+    robot = Rotation.from_euler("z", 2.0)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = robot.as_matrix(), [1.0, -2.0, 0.25]
+    stand = Stand(4, pose, 0.5, 0.75, "home")
+    fields = {"pose": messages.stand_pose(stand, STAMP), "distance": stand.distance, "seen": stand.seen}
+    told = sent("perception_msgs/srv/WhereToStand_Response", fields)
+    assert (told.error, told.distance, told.seen, told.pose.header.frame_id) == ("", 0.5, 0.75, "home")
+    place, turn = told.pose.pose.position, told.pose.pose.orientation
+    assert [place.x, place.y, place.z] == [1.0, -2.0, 0.25]
+    ahead = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).apply([1, 0, 0])
+    np.testing.assert_allclose(ahead, [np.cos(2.0), np.sin(2.0), 0], atol=1e-12)
+    np.testing.assert_allclose(stand.yaw, 2.0)
 
 
 def test_frame_file_scales_the_map_and_tells_its_place(gmap: QueryMap, tmp_path: Path) -> None:
@@ -168,7 +189,8 @@ def test_manifests_name_every_package_that_the_node_imports() -> None:
     """package.xml against the types of all channels; those of MoveIt are optional."""
     root = ElementTree.parse(LAUNCH / "perception/package.xml").getroot()
     named = {one.text for one in root.findall("exec_depend")}
-    channels = (*answers.OUTPUTS, *messages.OUTPUTS, answers.PROMPT, answers.QUERY, answers.RELOAD, messages.FIND)
+    channels = (*answers.OUTPUTS, *messages.OUTPUTS, answers.PROMPT, answers.QUERY, answers.RELOAD)
+    channels = (*channels, messages.FIND, messages.STAND)
     assert {one.kind.split("/")[0] for one in channels} - named == {"moveit_msgs"}
     assert root.findtext("name") == "perception"
     other = ElementTree.parse(LAUNCH / "perception_msgs/package.xml").getroot()

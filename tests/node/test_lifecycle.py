@@ -9,10 +9,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from perception import load_map
+from perception.io.store import write_map
+from perception.query.standing import where_to_stand
+from support.box_rooms import FURNISHED, map_of
 from support.node_maps import encoders, write_small_map
 from support.paths import REPOSITORY, SUPPORT, TESTS
 
@@ -102,6 +107,37 @@ def test_rviz_finds_every_topic_with_its_type_in_the_graph(walk: tuple[dict[str,
         if "Topic" in one:
             name = one["Topic"]["Value"].replace("/perception/", f"/{'built' if built else 'plain'}/")
             assert found["topics"][name] == [kinds[one["Class"].rpartition("/")[2]]], name
+
+
+def test_where_to_stand_by_the_service(tmp_path: Path) -> None:
+    """The pose is the library's, in the frame that was asked for; what is wrong is told."""
+    if not PREFIX:
+        pytest.skip("PERCEPTION_MSGS_PREFIX names no prefix with perception_msgs; .ci/run builds it")
+    write_map(tmp_path / "a.gsmap", map_of(FURNISHED))
+    turn = Rotation.from_euler("z", 0.5)
+    parent = {"parent": "site", "child": "home", "translation": [1, 2, 0], "rotation": turn.as_quat().tolist()}
+    (tmp_path / "frame.yaml").write_text(yaml.safe_dump(parent))
+    values = {"map": tmp_path / "a.gsmap", "frame_file": tmp_path / "frame.yaml", "autostart": "true"}
+    words = [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
+    node = started("lifecycle_process.py", "--ros-args", *words, "-r", "__ns:=/standing")
+    client = started("rclpy_stand.py", "standing", tmp_path / "out.json", 2, "", "site", "moon")
+    try:
+        assert client.wait(WAIT) == 0, client.communicate()
+    finally:
+        node.terminate()
+        node.communicate(timeout=WAIT)
+    own, site, moon, thin, unknown = json.loads((tmp_path / "out.json").read_text())
+    stand = where_to_stand(load_map(tmp_path / "a.gsmap", encoders=encoders), 2, distance=0.75)
+    assert (own["error"], own["frame"], site["frame"]) == ("", "home", "site")
+    np.testing.assert_allclose(own["position"], stand.position, atol=1e-6)
+    np.testing.assert_allclose(own["distance"], stand.distance, atol=1e-6)
+    np.testing.assert_allclose(site["position"], turn.apply(stand.position) + np.array([1, 2, 0]), atol=1e-6)
+    for told, before in ((own, Rotation.identity()), (site, turn)):
+        ahead = Rotation.from_quat(told["orientation"]).apply([1, 0, 0])
+        np.testing.assert_allclose(ahead, before.apply(stand.map_from_robot[:3, 0]), atol=1e-6)
+    errors = [(one["error"], one["message"]) for one in (moon, thin, unknown)]
+    assert {kind for kind, _ in errors} == {"bad_input"}
+    assert all(word in text for word, (_, text) in zip(("moon", "radius is -1.0", "instance 99"), errors, strict=True))
 
 
 def test_a_node_that_starts_itself_ends_with_2_on_bad_input(tmp_path: Path) -> None:

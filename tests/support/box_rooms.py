@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 
+from perception.boxes import oriented_box
 from perception.export.depth_views import DepthView
 from perception.geometry import look_at
+from perception.query import QueryMap
+from perception.types import View
 
 Boxes = list[tuple[list[float], list[float]]]
 """Lowest and highest corner of each; the first is the room, seen from inside."""
@@ -74,6 +80,45 @@ def points(boxes: Boxes, spacing: float = 0.04) -> np.ndarray:
                     hidden |= ((face <= room_low) | (face >= room_high)).any(axis=1)
                 found.append(face[~hidden])
     return np.concatenate(found)
+
+
+def map_of(
+    boxes: Boxes, map_from_room: np.ndarray | None = None, merged: dict[int, int] | None = None, **info: Any
+) -> QueryMap:
+    """A map of the boxes' surfaces. Instances: the number of the box, or what `merged` says of it; the room's shell has
+    none, unless merged[0] gives it one."""
+    move = np.eye(4) if map_from_room is None else map_from_room
+    surface, owner = points(boxes), np.full(len(points(boxes)), -1, np.int32)
+    for number, (low, high) in enumerate(np.array(boxes)):
+        if number > 0 or (merged and 0 in merged):
+            there = (surface >= low - 1e-9).all(axis=1) & (surface <= high + 1e-9).all(axis=1)
+            owner[there] = (merged or {}).get(number, number)
+    means, count = surface @ move[:3, :3].T + move[:3, 3], len(surface)
+    instances = [
+        {
+            "id": i,
+            "label": None,
+            "score": 1.0,
+            "centroid": own.mean(axis=0).tolist(),
+            "obb": oriented_box(own).to_json(),
+        }
+        for i, own in ((int(i), means[owner == i]) for i in np.unique(owner[owner >= 0]))
+    ]
+    eye = move[:3, :3] @ [0.0, -1.2, 1.4] + move[:3, 3]
+    return QueryMap(
+        means=means.astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        log_scales=np.full((count, 3), np.log(1e-3), np.float32),
+        opacity_logits=np.full(count, 3, np.float32),
+        sh=np.zeros((count, 1, 3), np.float32),
+        features=np.zeros((count, 1), np.float32),
+        instance_ids=owner,
+        membership=np.ones(count, np.float32),
+        instances=instances,
+        info={"metric": True, "frame": "home", "gravity": {"direction": (-move[:3, 2]).tolist()}, **info},
+        views=[View("a.jpg", Path("a.jpg"), np.eye(3), 64, 48, look_at(eye, eye + move[:3, 0], move[:3, 2]))],
+        path=Path("room.gsmap"),
+    )
 
 
 def texture(places: np.ndarray) -> np.ndarray:

@@ -14,8 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from perception.node.answers import Channel, Stamp, box_markers, header, pose
 from perception.query import Frame, Hit, QueryMap
+from perception.query.standing import Stand
 
 FIND = Channel("find", "perception_msgs/srv/Query")
+STAND = Channel("where_to_stand", "perception_msgs/srv/WhereToStand")
 INSTANCES = Channel("map/instances", "perception_msgs/msg/InstanceArray", latched=True)
 INFO = Channel("map/info", "perception_msgs/msg/MapInfo", latched=True)
 MARKERS = Channel("map/markers", "visualization_msgs/msg/MarkerArray", latched=True)
@@ -114,6 +116,13 @@ def occupancy_grid(
         },
         "data": cells.reshape(-1),
     }
+
+
+def stand_pose(stand: Stand, stamp: Stamp) -> Message:
+    """geometry_msgs/PoseStamped of a robot that stands there: on the floor, x forward, z up (REP 103); a goal."""
+    turn = Rotation.from_matrix(stand.map_from_robot[:3, :3]).as_quat(canonical=True)
+    at = {"position": _xyz(stand.position), "orientation": dict(zip("xyzw", map(float, turn), strict=True))}
+    return {"header": header(stand.frame, stamp), "pose": at}
 
 
 def static_transform(parent: Frame, child: str, stamp: Stamp) -> Message:

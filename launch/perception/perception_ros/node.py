@@ -27,8 +27,9 @@ from perception.node import answers
 from perception.node.config import NodeConfig, node_config
 from perception.node.core import Core
 from perception.node.ros import RosTransport, fill, message_class, spin, stop_on_signals
-from perception.query import AnswerTimeout, EngineBusy, EngineClosed, Frame, QueryEngine, QueryMap, Request
+from perception.query import AnswerTimeout, EngineBusy, EngineClosed, Frame, QueryEngine, QueryMap, Reply, Request
 from perception.query.requests import TOP, UnknownFrame, error_kind
+from perception.query.standing import Stand, where_to_stand
 from perception_ros import messages
 from perception_ros.frames import FrameFile, read_frame
 
@@ -125,13 +126,15 @@ class MapNode(LifecycleNode):
         self._core = Core(self._gate, self._transport, self.config)  # type: ignore[arg-type]
         self._transport.listen(self._core)
         self._gate.on_reload(lambda _: self._send_map())
+        services = {messages.FIND: self._find, messages.STAND: self._stand}
         try:
-            kind = message_class(messages.FIND.kind)
-        except ImportError:
+            kinds = {channel: message_class(channel.kind) for channel in services}
+        except (ImportError, AttributeError):
             self.get_logger().info("perception_msgs is not installed: plain messages only")
         else:
-            self.get_logger().info("perception_msgs is installed: its service and topics are served too")
-            self.create_service(kind, messages.FIND.name, self._find, callback_group=ReentrantCallbackGroup())
+            self.get_logger().info("perception_msgs is installed: its services and topics are served too")
+            for channel, answer in services.items():
+                self.create_service(kinds[channel], channel.name, answer, callback_group=ReentrantCallbackGroup())
 
     # --------------------------------------------------------------- lifecycle
 
@@ -228,24 +231,49 @@ class MapNode(LifecycleNode):
 
     def _find(self, request: Any, response: Any) -> Any:
         """The service of perception_msgs/Query."""
+
+        def answered(reply: Reply) -> dict[str, Any]:
+            return {"answer": messages.instance_array(reply.hits, reply.map_id, reply.frame, _now())}
+
+        return self._answer(response, lambda: self._gate.submit(self._request(request)), answered)
+
+    def _stand(self, request: Any, response: Any) -> Any:
+        """The service of perception_msgs/WhereToStand."""
+
+        def asked() -> Future[Any]:
+            names = ("radius", "distance", "within", "sensor_height")
+            lengths = {name: value for name in names if (value := float(getattr(request, name))) != 0}
+            frame = self._frame(request.frame_id)
+            return self._gate.run(lambda gmap: where_to_stand(gmap, request.instance_id, **lengths, frame=frame))
+
+        def answered(stand: Stand) -> dict[str, Any]:
+            pose = messages.stand_pose(stand, _now())
+            return {"pose": pose, "distance": stand.distance, "seen": stand.seen}
+
+        return self._answer(response, asked, answered)
+
+    def _answer(self, response: Any, ask: Callable[[], Future[Any]], answered: Callable[[Any], dict[str, Any]]) -> Any:
+        """The response of a service: the fields of what was asked for, or the kind of the error and why."""
         try:
-            future = self._gate.submit(self._request(request))
-            reply = future.result(self.config.timeout)
+            found = answered(ask().result(self.config.timeout))
         except (InputError, EngineBusy, EngineClosed, AnswerTimeout, TimeoutError) as error:
             line = " ".join(str(error).split()) or "no answer in time"
             return fill(response, {"error": error_kind(error), "message": line})
-        found = messages.instance_array(reply.hits, reply.map_id, reply.frame, _now())
-        return fill(response, {"answer": found})
+        return fill(response, found)
 
     def _request(self, asked: Any) -> Request:
         request = Request(asked.text, asked.top_k or TOP, float(asked.min_score) or None)
+        return replace(request, frame=self._frame(asked.frame_id))
+
+    def _frame(self, name: str) -> Frame | None:
+        """The frame of this name, None for the map's own; InputError when the node does not know it."""
         own = self._gate.current.frame
         known: dict[str, Frame | None] = {"": None, own: None}
         if self._frames is not None:
             known[self._frames.parent] = self._frames.parent_frame()
-        if asked.frame_id not in known:
-            raise UnknownFrame(f"frame_id: found '{asked.frame_id}', expected {' or '.join(filter(None, known))}")
-        return replace(request, frame=known[asked.frame_id])
+        if name not in known:
+            raise UnknownFrame(f"frame_id: found '{name}', expected {' or '.join(filter(None, known))}")
+        return known[name]
 
 
 def _descriptor(field: Any) -> ParameterDescriptor:
