@@ -39,6 +39,7 @@ def register(commands: Any) -> None:
     p.add_argument("--voxels", type=Path, metavar="OUT.npz", help="free, occupied and unknown space; distances")
     p.add_argument("--voxel-size", type=float, metavar="S", help="of --mesh and --voxels, in map units")
     p.add_argument("--scannet", type=Path, metavar="DIR", help="ScanNet submission layout")
+    p.add_argument("--graph", type=Path, metavar="OUT.json", help="rooms, supports, things, parts and their relations")
 
     p = map_command(commands, "render", _render, "pictures of the map from given cameras")
     p.add_argument("--cameras", type=Path, metavar="transforms.json", help="default: the map's held-out views")
@@ -136,9 +137,11 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.io.store import read_map
     from perception.pipeline.exporting import export_map
     from perception.pipeline.meshing import check_outputs, export_mesh, export_voxels
+    from perception.query.query_map import load_map
+    from perception.query.scene_graph import write_graph
 
-    if args.output is None and args.mesh is None and args.voxels is None:
-        raise InputError("export: nothing to write; give -o OUT, --mesh OUT or --voxels OUT.npz")
+    if args.output is None and args.mesh is None and args.voxels is None and args.graph is None:
+        raise InputError("export: nothing to write; give -o OUT, --mesh OUT, --voxels OUT.npz or --graph OUT.json")
     if args.output is None and args.points is not None:
         raise InputError("export: --points labels a cloud; give the file to write it to with -o")
     if args.instance is not None and args.mesh is None:
@@ -146,6 +149,9 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     check_outputs(args.mesh, args.voxels, args.voxel_size)
     facts: dict[str, Any] = {}
     lines = []
+    if args.graph is not None:
+        facts["graph"], text = write_graph(load_map(args.map), args.graph)
+        lines.append(text)
     if args.mesh is not None or args.voxels is not None:
         gmap = read_map(args.map)
         if args.mesh is not None:
@@ -154,8 +160,8 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         if args.voxels is not None:
             facts["voxels"], text = export_voxels(gmap, args.voxels, args.voxel_size)
             lines.append(text)
-        if args.output is None:
-            return facts, "\n".join(lines)
+    if args.output is None:
+        return facts, "\n".join(lines)
     options = ExportOptions(max_distance=args.max_distance, smooth=args.smooth, segments=args.segments)
     how = (options, args.color, args.scannet, args.transform or args.align, args.granularity)
     result, table = export_map(args.map, args.output, args.points, *how)

@@ -56,13 +56,16 @@ class Part:
 
 @dataclass
 class Body:
-    """An instance of the scene: name, further prompts that name it, and its surfaces."""
+    """An instance of the scene: name, further prompts that name it, and its surfaces. on, hangs_on: name of the body
+    that it stands on, that it is attached to."""
 
     name: str
     prompts: list[str]
     parts: list[Part]
     is_stuff: bool = False
     kind: str = ""
+    on: str | None = None
+    hangs_on: str | None = None
 
     @property
     def category(self) -> str:

@@ -95,11 +95,11 @@ def _instances(made: Scene, ids: np.ndarray, pictures: list[Picture]) -> list[Tr
     views = np.zeros(len(made.bodies) + 1, int)
     for picture in pictures:
         views[np.unique(picture.ids)] += 1
-    found = []
+    found, ids_of = [], {body.name: number for number, body in enumerate(made.bodies, start=1)}
     for number, body in enumerate(made.bodies, start=1):
         category, seen = body.category, (int(points[number]), int(views[number]))
-        semantic = 1 + categories.index(category)
-        found.append(Truth(number, body.name, category, semantic, body.prompts, body.is_stuff, *seen))
+        semantic, held = 1 + categories.index(category), (ids_of.get(body.on or ""), ids_of.get(body.hangs_on or ""))
+        found.append(Truth(number, body.name, category, semantic, body.prompts, body.is_stuff, *seen, *held))
     return found
 
 

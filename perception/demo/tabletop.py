@@ -50,7 +50,8 @@ def _demo_things(rng: np.random.Generator) -> list[Body]:
         (orange, 0.035, -0.185, 0, 0), (book, 0.25, -0.135, 0, -24), (things.cactus(rng), 0.44, -0.03, 0, 0),
         (things.clock(rng), 0.27, WALL, 0.46, 0),
     ]  # fmt: skip
-    return [body.placed(turn, np.array(spot)) for body, *spot, turn in placed]
+    standing = [replace(body, on="table").placed(turn, np.array(spot)) for body, *spot, turn in placed]
+    return [*standing[:-1], replace(standing[-1], on=None, hangs_on="wall")]
 
 
 def _chosen_things(rng: np.random.Generator) -> list[Body]:
@@ -79,15 +80,16 @@ def _chosen_things(rng: np.random.Generator) -> list[Body]:
     turns = rng.uniform(0, 360, len(alone))
     found = spots(rng, [radius * scale for (radius, _), scale in zip(alone, scales, strict=True)])
     placed = [
-        body.placed(turn, np.array([*spot, 0.0]), scale)
+        replace(body, on="table").placed(turn, np.array([*spot, 0.0]), scale)
         for (_, body), turn, spot, scale in zip(alone, turns, found, scales, strict=True)
         if spot is not None
     ]
     stacked = things.book(rng, other)
     if found[0] is not None:  # the first disc always fits
+        stacked = replace(stacked, on=alone[0][1].name)
         placed.append(stacked.placed(turns[0] + 25, np.array([*found[0], 0.036 * scales[0]]), 0.85))
     spot = np.array([rng.uniform(0.1, 0.4), WALL, 0.46])
-    return [*placed, things.clock(rng).placed(0, spot)]
+    return [*placed, replace(things.clock(rng), hangs_on="wall").placed(0, spot)]
 
 
 def spots(rng: np.random.Generator, radii: list[float]) -> list[tuple[float, float] | None]:
@@ -139,7 +141,7 @@ def room_around(rng: np.random.Generator, shuffled: bool) -> list[Body]:
     boards = tex.wood(rng, 1100, 1400, 11, "#9c7a56", "#5b4027")
     floor = Part(Sheet(2 * SIDE, 2.4, spin(0), np.array([0, WALL - 1.2, FLOOR])), boards, 0.0, (40, 48), casts=False)
     return [
-        Body("table", ["wooden table"], plank, is_stuff=True),
+        Body("table", ["wooden table"], plank, is_stuff=True, on="floor"),
         Body("wall", ["wallpaper"], walls, is_stuff=True),
         Body("floor", ["wooden floor"], [floor], is_stuff=True),
         *_posters(rng),
@@ -165,6 +167,6 @@ def _posters(rng: np.random.Generator) -> list[Body]:
         ("colourful poster", Sheet(0.80, 0.67, right, np.array([SIDE - 0.01, -0.05, 0.1])), more),
     ]
     return [
-        Body(name, ["poster", "picture"], [Part(sheet, paint, 0.0, (24, 24), False)], is_stuff=True)
+        Body(name, ["poster", "picture"], [Part(sheet, paint, 0.0, (24, 24), False)], is_stuff=True, hangs_on="wall")
         for name, sheet, paint in hung
     ]

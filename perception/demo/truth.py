@@ -18,7 +18,8 @@ from perception.types import PointCloud
 @dataclass(frozen=True)
 class Truth:
     """One instance: id > 0, name, category and its id, prompts that name it, whether it is background (wall, floor...),
-    number of its points in gt_points.ply, and number of photos that show it."""
+    number of its points in gt_points.ply, number of photos that show it, ids of the instances that it stands on and
+    that it is attached to."""
 
     id: int
     name: str
@@ -28,6 +29,8 @@ class Truth:
     is_stuff: bool
     gt_points: int
     views_visible: int
+    on: int | None = None
+    attached_to: int | None = None
 
 
 @dataclass

@@ -3,7 +3,7 @@
 The thing is ranked by its own words, and each instance gains by how well it stands in the relation to what the other
 words mean:  z_i + WEIGHT · max over present j ≠ i of score(other, j) · g(i, j),  g in [0, 1] from the boxes of i and j
 with z up. "Left", "right", "in front" and "behind" are as most photos that show both see them. If the other thing is
-not in the map, no instance gains.
+not in the map, no instance gains. The other words may hold a relation too: "the cup on the desk next to the monitor".
 """
 
 from __future__ import annotations
@@ -68,11 +68,30 @@ def ranked(ranker: Ranker, places: Places | None, text: str) -> Answer:
     relation = parse(text)
     if relation is None or places is None or quoted_text(text) is not None:
         return ranker.rank(text)
-    others, score = ranker.rank(relation.other), np.zeros(len(places.lows))
+    gain = WEIGHT * _standing(ranker, places, relation)
+    return replace(ranker.rank(relation.thing, gain), text=" ".join(text.split()))
+
+
+def _standing(ranker: Ranker, places: Places, relation: Relation) -> np.ndarray:
+    """[I] in [0, 1]: how well each instance stands in the relation to what its other words mean, "the desk next to the
+    monitor" for one."""
+    nested, score = parse(relation.other), np.zeros(len(places.lows))
+    others = ranker.rank(relation.other if nested is None else nested.thing)
     for n, value in others.hits if others.present else ():
         score[n] = value
-    gain = WEIGHT * (places.match(relation.kind) * score[None]).max(axis=1, initial=0.0)
-    return replace(ranker.rank(relation.thing, gain), text=" ".join(text.split()))
+    if nested is not None:
+        score *= _standing(ranker, places, nested)
+    return np.asarray((places.match(relation.kind) * score[None]).max(axis=1, initial=0.0))
+
+
+def level_from_map(gmap: Map) -> np.ndarray | None:
+    """The rotation [3, 3] to a frame with z up: against the map's gravity or, where that is not recorded, up as the
+    cameras were held; None if they were not held level."""
+    from perception.instances.shapes import level_frame, up_from_cameras
+
+    down = (gmap.info.get("gravity") or {}).get("direction")
+    up = up_from_cameras(gmap.poses) if down is None else -np.asarray(down, np.float64)
+    return None if up is None else level_frame(up / np.linalg.norm(up))
 
 
 class Places:
@@ -84,22 +103,17 @@ class Places:
 
     @classmethod
     def of(cls, gmap: Map) -> Places | None:
-        """The places in a map, with z against its gravity or, where that is not recorded, up as the cameras were held;
-        None if they were not held level."""
-        from perception.instances.shapes import level_frame, up_from_cameras
-
-        down = (gmap.info.get("gravity") or {}).get("direction")
-        up = up_from_cameras(gmap.poses) if down is None else -np.asarray(down, np.float64)
-        if up is None:
+        """The places in a map; None if up is not known (`level_from_map`)."""
+        level = level_from_map(gmap)
+        if level is None:
             return None
-        level_from_map = level_frame(up / np.linalg.norm(up))
         boxes = np.zeros((len(gmap.instances), 2, 3))
         for n, entry in enumerate(gmap.instances):
-            points = gmap.index.of(entry["id"]) @ level_from_map.T
+            points = gmap.index.of(entry["id"]) @ level.T
             if len(points):
                 boxes[n] = np.quantile(points, [TRIM, 1 - TRIM], axis=0)
         poses = gmap.poses.copy()
-        poses[:, :3, :3] = poses[:, :3, :3] @ level_from_map.T
+        poses[:, :3, :3] = poses[:, :3, :3] @ level.T
         return cls(boxes[:, 0], boxes[:, 1], poses)
 
     def match(self, kind: str) -> np.ndarray:

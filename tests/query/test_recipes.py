@@ -7,9 +7,11 @@ import re
 import shlex
 import shutil
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
 from perception.cli import build_parser
 from perception.io.cloud import read_cloud
 from perception.io.store import read_map
+from perception.query.query_map import load_map
 from support.processes import served
 from support.synthetic_map import SIGMA
 
@@ -48,11 +51,25 @@ def world(kitchen: Path) -> Iterator[dict[str, Any]]:
     try:
         with served(kitchen) as (_, port):
             for kind, code in SNIPPETS:
+                if "urlopen" in code:
+                    _wait_for_labels(port)
                 if kind == "python":
                     exec(compile(code.replace(":8765", f":{port}"), "recipes.md", "exec"), names)
             yield names
     finally:
         patch.undo()
+
+
+def _wait_for_labels(port: int) -> None:
+    """Until the server has taken over the labels that an earlier snippet gave; else an answer's map may be replaced."""
+    written, deadline = load_map("kitchen.gsmap").map_id, time.monotonic() + 20
+    while time.monotonic() < deadline:
+        with urlopen(f"http://127.0.0.1:{port}/health", timeout=30) as answer:
+            health = json.load(answer)
+            if health["map_id"] == written:
+                return
+        time.sleep(0.05)
+    raise AssertionError(f"the server never took over map {written}: {health}")
 
 
 def members(world: dict[str, Any], number: int) -> np.ndarray:

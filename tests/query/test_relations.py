@@ -106,11 +106,12 @@ def _direction(text: str) -> np.ndarray:
     return x / np.linalg.norm(x)
 
 
-def test_the_place_decides_between_equals_and_an_absent_other_changes_nothing() -> None:
-    def thing(axis: int) -> InstanceDescription:
-        row = np.eye(24, dtype=np.float32)[axis]
-        return InstanceDescription(row, row[None], np.zeros((24, 4), np.float32), ["a"], [(0, 0, 1, 1)])
+def thing(axis: int) -> InstanceDescription:
+    row = np.eye(24, dtype=np.float32)[axis]
+    return InstanceDescription(row, row[None], np.zeros((24, 4), np.float32), ["a"], [(0, 0, 1, 1)])
 
+
+def test_the_place_decides_between_equals_and_an_absent_other_changes_nothing() -> None:
     ranker = Ranker([thing(0), thing(0), thing(1)], Axes())
     lows = np.array([[0.0, 0, 0], [3, 0, 0], [3.5, 0, 0]])
     places = Places(lows, lows + np.array([0.3, 0.3, 0.2]), np.zeros((0, 4, 4)))
@@ -119,3 +120,14 @@ def test_the_place_decides_between_equals_and_an_absent_other_changes_nothing() 
     plain = ranker.rank("book")
     assert ranked(ranker, places, "book next to the shelf").hits == plain.hits
     assert ranked(ranker, None, "book").hits == plain.hits
+
+
+def test_relations_may_be_chained() -> None:
+    """Both books stand next to a lamp; one lamp stands next to the shelf."""
+    ranker = Ranker([thing(axis) for axis in (0, 0, 1, 1, 3)], Axes())
+    lows = np.array([[0.0, 0, 0], [6.0, 0, 0], [0.5, 0, 0], [6.5, 0, 0], [7.0, 0, 0]])
+    places = Places(lows, lows + np.array([0.3, 0.3, 0.2]), np.zeros((0, 4, 4)))
+    hits = dict(ranked(ranker, places, "book next to the lamp next to the shelf").hits)
+    assert hits[1] > hits[0] and hits[1] == max(hits.values())
+    once = dict(ranked(ranker, places, "book next to the lamp").hits)
+    assert once[0] == pytest.approx(once[1])

@@ -1,0 +1,266 @@
+"""The scene graph of a map: rooms, the things in them, what each rests on, and their parts, with z up.
+
+    part --part of--> object --on | in | attached to--> support --in--> room,    object --next to--> object
+
+The layers are those of Armeni et al. (ICCV 2019) and Hughes et al. (RSS 2022). What lies under a thing is never seen,
+so what it stands on is looked for in a ring around its foot.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from perception.errors import InputError
+from perception.io.atomic import atomic_file
+from perception.query.relations import Places, level_from_map
+
+if TYPE_CHECKING:
+    import networkx
+
+    from perception.io.map import Map
+
+MOST_POINTS = 3000  # of an instance that are looked at
+SECTORS = 8  # of the ring around a thing's foot
+LEAST_RING, LEAST_WALLS = 2 / SECTORS, 7 / SECTORS  # shares of the sectors that a support, a container fills
+CLEAR = 0.5  # of several supports the highest counts whose score is at least this share of the best one's
+SHELL = 0.6  # share of the map's extent along two axes from which an instance is a wall, a floor or a ceiling
+RING = 0.4  # width of the ring, as a share of the foot's shorter side
+FLAT, TOUCHING = (
+    0.15,
+    0.05,
+)  # thickness of what hangs on a wall, as a share of its size; share of its points at the wall
+HIDDEN = 0.5  # share of a thing's height, at its foot, that no photo may have seen
+MATCH = 0.5  # least match of `Places` for "in" and "next to"
+DOOR = 1.2  # metres: narrower passages part two rooms
+
+
+@dataclass(frozen=True)
+class Holder:
+    """The instance that holds another, by its position: relation is "on", "in" or "attached to", score in [0, 1]."""
+
+    position: int
+    relation: str
+    score: float
+
+
+def scene_graph(gmap: Map) -> networkx.DiGraph:
+    """The scene graph of a map, ready for `networkx.node_link_data`.
+
+    Nodes: instances by their id, "part 7", "room 0"; each with `kind` (room, shell, support, object or part), and where
+    it has one its label, score, centroid [3], box (`obb`) and lengths in the map's frame. Edges as above, with
+    `relation` and `score`. Graph attributes: frame, metric, map_id. Rooms need a metric map with gravity and a floor;
+    otherwise there is one. InputError when it is not known which way is up.
+    """
+    import networkx
+
+    places, level = Places.of(gmap), level_from_map(gmap)
+    if places is None or level is None:
+        raise InputError(f"{gmap.path}: which way is up is not known, and a scene graph needs it; see frame.up")
+    points = [_thinned(gmap.index.of(entry["id"])) @ level.T for entry in gmap.instances]
+    held = holders(points, places)
+    beside, rooms = places.match("beside"), _rooms(gmap)
+    shell = _shells(places)
+    ids = [int(entry["id"]) for entry in gmap.instances]
+    graph = networkx.DiGraph(frame=gmap.frame, metric=gmap.metric, map_id=gmap.map_id)
+    supports = {holder.position for holder in held if holder is not None and holder.relation == "on"}
+    for n, entry in enumerate(gmap.instances):
+        kind = "shell" if shell[n] else "support" if n in supports else "object"
+        facts = {key: entry[key] for key in ("label", "score", "centroid", "obb", "texts") if key in entry}
+        graph.add_node(ids[n], kind=kind, **facts)
+        for part in entry.get("parts", []):
+            of = {key: part[key] for key in ("score", "centroid", "obb") if key in part}
+            graph.add_edge(f"part {part['id']}", ids[n], relation="part of", score=1.0)
+            graph.add_node(f"part {part['id']}", kind="part", **of)
+    for n, holder in enumerate(held):
+        if holder is not None:
+            graph.add_edge(ids[n], ids[holder.position], relation=holder.relation, score=round(holder.score, 3))
+        if holder is None or shell[holder.position]:
+            room = f"room {rooms[n]}"
+            graph.add_node(room, kind="room")
+            if holder is None:
+                graph.add_edge(ids[n], room, relation="in", score=1.0)
+            else:
+                graph.nodes[ids[n]]["room"] = room
+    for a, b in zip(*np.nonzero(np.triu(beside >= MATCH)), strict=True):
+        one, other = held[a], held[b]
+        together = one is not None and other is not None and one.position == other.position
+        if together and not graph.has_edge(ids[a], ids[b]) and not graph.has_edge(ids[b], ids[a]):
+            for i, j in ((a, b), (b, a)):
+                graph.add_edge(ids[i], ids[j], relation="next to", score=round(float(beside[a, b]), 3))
+    return graph
+
+
+def holders(points: list[np.ndarray], places: Places) -> list[Holder | None]:
+    """What holds each instance; None where nothing does. points: of the instances, [P, 3] each, z up."""
+    shell, sizes, inside = _shells(places), places.highs - places.lows, places.match("in")
+    typical = float(np.median(sizes[~shell].max(axis=1))) if (~shell).any() else 0.0
+    trees = [cKDTree(cloud) if len(cloud) else None for cloud in points]
+    found: list[Holder | None] = []
+    for n, mine in enumerate(points):
+        slack = 0.02 * typical + min(0.25 * sizes[n, 2], 0.1 * typical)
+        found.append(None if shell[n] or len(mine) == 0 else _holder(n, points, trees, places, shell, inside[n], slack))
+    for n, holder in enumerate(found):  # of two things that hold each other, the lower one stands by itself
+        other = None if holder is None else found[holder.position]
+        if holder is not None and other is not None and other.position == n:
+            found[n if places.lows[n, 2] <= places.lows[holder.position, 2] else holder.position] = None
+    return found
+
+
+def _holder(
+    n: int,
+    points: list[np.ndarray],
+    trees: list[cKDTree | None],
+    places: Places,
+    shell: np.ndarray,
+    inside: np.ndarray,
+    slack: float,
+) -> Holder | None:
+    mine, low, size = points[n], places.lows[n], places.highs[n] - places.lows[n]
+    others = [j for j in range(len(points)) if j != n and len(points[j])]
+    middle = (places.lows[n] + places.highs[n])[:2] / 2
+
+    def around(xy: np.ndarray) -> float:
+        """Share of the directions from the thing in which there are such points."""
+        turn = np.arctan2(*(xy - middle).T[::-1])
+        return len(np.unique(np.floor((turn / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS)) / SECTORS
+
+    for j in np.argsort(-inside, kind="stable"):
+        if inside[j] < MATCH:
+            break
+        beside = points[j][(np.abs(points[j][:, :2] - middle) >= 0.8 * size[:2] / 2).any(axis=1)]
+        walls = beside[beside[:, 2] >= low[2] + 0.5 * size[2]]
+        flat = len(walls) < 0.1 * len(beside)  # what stands above is the noise of a level surface
+        if not shell[j] and not flat and around(walls[:, :2]) >= LEAST_WALLS:
+            return Holder(int(j), "in", float(inside[j]))
+    reach = 2 * slack + float(size.min())
+    away = np.maximum(places.lows - places.highs[n], places.lows[n] - places.highs).max(axis=1)
+    touches = {j: 0.0 if away[j] > 2 * reach else _touching(mine, trees[j], reach) for j in others}
+    flat = size[:2].min() < FLAT * size.max()
+    upright = [j for j in others if shell[j] and places.highs[j, 2] - places.lows[j, 2] > size[2]]
+    wall = max(upright, key=lambda j: touches[j], default=None)
+    if flat and wall is not None and touches[wall] >= TOUCHING:
+        return Holder(wall, "attached to", touches[wall])
+    foot = mine[mine[:, 2] <= low[2] + slack + 0.1 * size[2]][:, :2]
+    tree, width = cKDTree(foot if len(foot) else mine[:, :2]), max(RING * float(size[:2].min()), 3 * slack)
+    over = (places.lows[:, :2] <= middle).all(axis=1) & (middle <= places.highs[:, :2]).all(axis=1)
+    spans = places.highs - places.lows
+    floors = shell & (spans[:, 2] < 0.5 * spans[:, :2].min(axis=1))
+    under = [j for j in others if floors[j] or (over[j] and not shell[j])]
+    for wide in (width, 3 * width):  # of a corner behind furniture little floor is seen
+        tops: list[tuple[float, float, int]] = []  # height, score, position
+        for j in under:
+            near = points[j][points[j][:, 2] >= low[2] - max(3 * slack, HIDDEN * size[2])]
+            near = near[np.isfinite(tree.query(near[:, :2], distance_upper_bound=wide)[0])] if len(near) else near
+            below = near[near[:, 2] <= low[2] + slack]
+            if (
+                len(below) and (share := around(below[:, :2])) >= LEAST_RING
+            ):  # a neighbour stands higher beside the thing
+                tops.append((float(np.quantile(below[:, 2], 0.9)), share * len(below) / len(near), j))
+        if tops:
+            best_score = max(score for _, score, _ in tops)
+            _, score, j = max(top for top in tops if top[1] >= CLEAR * best_score)
+            return Holder(j, "on", score)
+    best = max(others, key=lambda j: touches[j], default=None)
+    if best is not None and touches[best] >= TOUCHING:
+        return Holder(best, "attached to", touches[best])
+    flats = [j for j in under if floors[j] and low[2] - HIDDEN * size[2] <= places.highs[j, 2] <= low[2] + slack]
+    return Holder(max(flats, key=lambda j: places.highs[j, 2]), "on", 1 / SECTORS) if flats else None
+
+
+def _touching(points: np.ndarray, tree: cKDTree | None, reach: float) -> float:
+    """Share of the points that are no farther than `reach` from one of the tree."""
+    return 0.0 if tree is None else float(np.isfinite(tree.query(points, distance_upper_bound=reach)[0]).mean())
+
+
+def _thinned(points: np.ndarray) -> np.ndarray:
+    """At most MOST_POINTS, evenly chosen, float64."""
+    return np.asarray(points[:: -(-len(points) // MOST_POINTS) or 1], np.float64)
+
+
+def _shells(places: Places) -> np.ndarray:
+    """[I] bool: the instances as large as the map along two axes: walls, floors, ceilings."""
+    if len(places.lows) == 0:
+        return np.zeros(0, bool)
+    extent = np.maximum(places.highs.max(axis=0) - places.lows.min(axis=0), 1e-9)
+    return np.asarray(((places.highs - places.lows) >= SHELL * extent).sum(axis=1) >= 2)
+
+
+def _rooms(gmap: Map) -> list[int]:
+    """The room of each instance: rooms are what remains connected of the free space, 1.2 to 1.8 m above the floor,
+    without what is nearer than DOOR / 2 to something. One room where that is not known."""
+    from scipy import ndimage
+
+    from perception.frame.floor_grid import FREE, OCCUPIED, floor_grid
+
+    cell = 0.1
+    try:
+        cells, map_from_grid = floor_grid(gmap, cell, step=1.2)
+    except InputError:
+        return [0] * len(gmap.instances)
+    open_ = ndimage.distance_transform_edt(cells != OCCUPIED) * cell > DOOR / 2
+    rooms, count = ndimage.label(open_ & (cells == FREE))
+    if count < 2:
+        return [0] * len(gmap.instances)
+    nearest = ndimage.distance_transform_edt(rooms == 0, return_distances=False, return_indices=True)
+    middles = np.array([entry["centroid"] for entry in gmap.instances]).reshape(-1, 3)
+    local = np.linalg.inv(map_from_grid) @ np.c_[middles, np.ones(len(middles))].T
+    x, y = np.clip((local[:2] / cell).astype(int), 0, np.array(cells.shape)[::-1, None] - 1)
+    return [int(room) - 1 for room in rooms[nearest[0][y, x], nearest[1][y, x]]]
+
+
+def write_graph(gmap: Map, path: Path) -> tuple[dict[str, Any], str]:
+    """Writes the scene graph as node-link JSON, or for spark_dsg where the path ends in .dsg.json; facts and a line."""
+    import networkx
+
+    graph = scene_graph(gmap)
+    with atomic_file(path) as aside:
+        if path.name.endswith(".dsg.json"):
+            of = aside.with_suffix(".json")
+            to_spark_dsg(graph).save(str(of), include_mesh=False)
+            of.replace(aside)
+        else:
+            aside.write_text(json.dumps(networkx.node_link_data(graph, edges="edges"), indent=1), encoding="utf-8")
+    kinds = Counter(kind for _, kind in graph.nodes(data="kind"))
+    relations = Counter(relation for _, _, relation in graph.edges(data="relation"))
+    told = ", ".join(f"{count} {name}" for name, count in (*sorted(kinds.items()), *sorted(relations.items())))
+    return {"path": str(path), "nodes": dict(kinds), "edges": dict(relations)}, f"{path}: {told}"
+
+
+def to_spark_dsg(graph: networkx.DiGraph) -> Any:
+    """The graph as a `spark_dsg.DynamicSceneGraph`: rooms in its layer of rooms, everything else in that of objects.
+
+    Relations stand in each object's metadata, beside the ids of the map. InputError without the package spark-dsg.
+    """
+    try:
+        import spark_dsg
+    except ImportError:
+        raise InputError("spark_dsg is not installed; run: pip install 'splat-perception[dsg]'") from None
+    dsg, symbols = spark_dsg.DynamicSceneGraph(), {}
+    for number, (node, facts) in enumerate(graph.nodes(data=True)):
+        room = facts["kind"] == "room"
+        attributes = spark_dsg.RoomNodeAttributes() if room else spark_dsg.ObjectNodeAttributes()
+        relations = [
+            {"relation": edge["relation"], "to": other, "score": edge["score"]}
+            for _, other, edge in graph.out_edges(node, data=True)
+        ]
+        attributes.name = str(facts.get("label") or node)
+        attributes.metadata.set({"id": node, "kind": facts["kind"], "relations": relations})
+        if "obb" in facts:
+            box = facts["obb"]
+            middle, extent = (np.array(box[key], np.float32) for key in ("center", "extent"))
+            attributes.position = middle.astype(np.float64)
+            turn = np.array(box["rotation"], np.float32).T
+            attributes.bounding_box = spark_dsg.BoundingBox(spark_dsg.BoundingBoxType.OBB, extent, middle, turn)
+        symbols[node] = spark_dsg.NodeSymbol("R" if room else "O", number)
+        layer = spark_dsg.DsgLayers.ROOMS if room else spark_dsg.DsgLayers.OBJECTS
+        dsg.add_node(layer, symbols[node], attributes)
+    for node, other in graph.edges:
+        dsg.insert_edge(symbols[other], symbols[node])
+    return dsg
