@@ -110,9 +110,8 @@ def gravity(bag: Bag, poses: Poses, fixed: str) -> tuple[np.ndarray, float] | No
     """
     samples = []
     for _, recorded, message in bag.messages(bag.of_type(IMU)):
-        push, turn = (
-            np.array([v.x, v.y, v.z], np.float64) for v in (message.linear_acceleration, message.angular_velocity)
-        )
+        vectors = (message.linear_acceleration, message.angular_velocity)
+        push, turn = (np.array([v.x, v.y, v.z], np.float64) for v in vectors)
         size = float(np.linalg.norm(push))
         if abs(size - G) < STILL_PUSH and not np.linalg.norm(turn) > STILL_TURN:  # a gyroscope may be absent: NaN
             samples.append((str(message.header.frame_id), stamp_of(message) or recorded, push / size))

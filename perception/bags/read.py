@@ -113,10 +113,8 @@ def decode_image(message: Any, where: str) -> np.ndarray:
 def _raw(message: Any, where: str) -> np.ndarray:
     encoding = str(message.encoding)
     if encoding not in _EIGHT_BIT:
-        raise InputError(
-            f"{where}: images are encoded as '{encoding}'; expected one of {', '.join(_EIGHT_BIT)} "
-            "(a depth image? give another --topic)"
-        )
+        known = f"{', '.join(_EIGHT_BIT)} (a depth image? give another --topic)"
+        raise InputError(f"{where}: images are encoded as '{encoding}'; expected one of {known}")
     channels, conversion = _EIGHT_BIT[encoding]
     rows = raw_rows(message, channels, where)
     picture = rows if channels == 1 else rows.reshape(len(rows), -1, channels)
@@ -128,9 +126,8 @@ def raw_rows(message: Any, size: int, where: str) -> np.ndarray:
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.frombuffer(bytes(message.data), np.uint8)
     if min(height, width) < 1 or step < width * size or data.size < step * height:
-        raise InputError(
-            f"{where}: an image of {width}x{height} ({message.encoding}, rows of {step} bytes) holds {data.size} bytes"
-        )
+        what = f"{message.encoding}, rows of {step} bytes"
+        raise InputError(f"{where}: an image of {width}x{height} ({what}) holds {data.size} bytes")
     return np.ascontiguousarray(data[: step * height].reshape(height, step)[:, : width * size])
 
 

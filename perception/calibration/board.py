@@ -128,13 +128,9 @@ class Board:
         if min(self.squares) < 3 or not self.square > 0:
             raise InputError(f"board of {self.squares[0]}x{self.squares[1]} squares of {self.square}: too small")
         if self.kind == "charuco" and not 0 < self.marker < self.square:
-            raise InputError(
-                f"--marker is {self.marker}; expected a length above 0 and under the square's {self.square}"
-            )
+            raise InputError(f"--marker is {self.marker}; expected a length above 0, under the square's {self.square}")
         if self.kind == "charuco" and not hasattr(cv2.aruco, f"DICT_{self.dictionary}"):
-            raise InputError(
-                f"--dictionary '{self.dictionary}' is not known; expected one of OpenCV's, such as 5X5_100"
-            )
+            raise InputError(f"--dictionary '{self.dictionary}' is not known; expected OpenCV's, such as 5X5_100")
 
     @classmethod
     def from_text(cls, text: str) -> Board:

@@ -146,10 +146,8 @@ def _table(result: dict[str, Any]) -> str:
         f"(worst {worst}: {result['views'][worst]:.3f} px); {result['pictures_with_board']} of "
         f"{result['pictures_looked_at']} pictures show the board"
     )
-    lines.append(
-        f"corners cover {result['coverage']:.0%} of the picture, tilts differ by "
-        f"{result['tilt_spread_degrees']:.0f} deg"
-    )
+    cover, tilts = f"{result['coverage']:.0%}", f"{result['tilt_spread_degrees']:.0f}"
+    lines.append(f"corners cover {cover} of the picture, tilts differ by {tilts} deg")
     lines += [f"warning: {note}" for note in result["warnings"]]
     lines.append(f"written to {result['camera']}")
     return "\n".join(lines)

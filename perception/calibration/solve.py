@@ -78,9 +78,8 @@ def solve(model: str, views: Sequence[Detection], size: tuple[int, int]) -> Solu
             fuller = _solved(model, solution.views, size, np.ones_like(free))
             solution = fuller if abs(fuller.values[8]) > 3 * fuller.sigmas[8] else solution
     except (cv2.error, np.linalg.LinAlgError) as error:
-        raise InputError(
-            f"no {model} camera explains the boards found; is the board flat, and are its sizes right?"
-        ) from error
+        why = "is the board flat, and are its sizes right?"
+        raise InputError(f"no {model} camera explains the boards found; {why}") from error
     return solution
 
 
@@ -101,9 +100,7 @@ def _solved(model: str, views: Sequence[Detection], size: tuple[int, int], free:
     if model == "fisheye":
         K, distortion, turns, shifts = _fisheye(views, size)
     else:
-        points, pixels = (
-            [np.asarray(getattr(v, name), np.float32) for v in views] for name in ("board_points", "pixels")
-        )
+        points, pixels = [v.board_points for v in views], [v.pixels for v in views]
         flags = 0 if free[8] else cv2.CALIB_FIX_K3
         found = cv2.calibrateCamera(points, pixels, size, None, None, None, None, flags, _STOP)  # type: ignore[call-overload]
         K, distortion, turns, shifts = found[1:]

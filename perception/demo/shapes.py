@@ -9,35 +9,31 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+LENGTHS = ("width", "height", "extent", "radii", "profile", "bend")  # fields of shapes that scale with them
 NEAR = 1e-4  # hits closer than this (metres along the ray) are self-intersections at the ray's start
 
 
 class Shape(Protocol):
-    """Interface of a surface for the renderer and the light baker. LENGTHS: names of the fields that scale with it."""
+    """Interface of a surface for the renderer and the light baker."""
 
-    LENGTHS: ClassVar[tuple[str, ...]]
     rotation: np.ndarray
     origin: np.ndarray
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rays [N, 3] in the local frame -> t [N] (inf = miss, in units of the direction), u [N], v [N]."""
-        ...
 
     def point_normal(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Chart coordinates [N] -> local points [N, 3] and outward unit normals [N, 3]."""
-        ...
 
     def bounds(self) -> np.ndarray:
         """[2, 3] smallest and largest local coordinates."""
-        ...
 
     def size(self) -> tuple[float, float]:
         """Typical lengths of the chart along u and v in metres, used to scale textures."""
-        ...
 
 
 def to_local(shape: Shape, points: np.ndarray) -> np.ndarray:
@@ -52,7 +48,7 @@ def to_world(shape: Shape, points: np.ndarray) -> np.ndarray:
 
 def placed(shape: Any, turn: np.ndarray, shift: np.ndarray, scale: float = 1.0) -> Any:
     """The shape scaled about the origin, turned by the rotation `turn` [3, 3] and moved by `shift` [3]."""
-    lengths = {name: scale * np.asarray(getattr(shape, name)) for name in shape.LENGTHS}
+    lengths = {name: scale * np.asarray(getattr(shape, name)) for name in LENGTHS if hasattr(shape, name)}
     return replace(shape, rotation=turn @ shape.rotation, origin=scale * turn @ shape.origin + shift, **lengths)
 
 
@@ -71,7 +67,6 @@ def _quadratic(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray,
 class Sheet:
     """A rectangle in the local xy plane, or the ellipse inscribed in it. Normal +z; u along x, v along -y."""
 
-    LENGTHS: ClassVar[tuple[str, ...]] = ("width", "height")
     width: float
     height: float
     rotation: np.ndarray = field(default_factory=_identity)
@@ -113,7 +108,6 @@ _RIM = 0.01  # margin of each face's chart that is not sampled: the texture of t
 class Box:
     """A cuboid with edge lengths `extent` [3], centred on its origin. v covers six charts: +z, -z, -y, +x, +y, -x."""
 
-    LENGTHS: ClassVar[tuple[str, ...]] = ("extent",)
     extent: np.ndarray
     rotation: np.ndarray = field(default_factory=_identity)
     origin: np.ndarray = field(default_factory=_zero)
@@ -164,7 +158,6 @@ class Box:
 class Ellipsoid:
     """An ellipsoid with semi-axes `radii`; u is the longitude, v runs from the +z pole to the -z pole."""
 
-    LENGTHS: ClassVar[tuple[str, ...]] = ("radii",)
     radii: np.ndarray
     rotation: np.ndarray = field(default_factory=_identity)
     origin: np.ndarray = field(default_factory=_zero)
@@ -199,7 +192,6 @@ class Lathe:
     u is the angle, v the arc length along the profile. Normals point outwards if the outer profile runs upwards.
     """
 
-    LENGTHS: ClassVar[tuple[str, ...]] = ("profile",)
     profile: np.ndarray
     rotation: np.ndarray = field(default_factory=_identity)
     origin: np.ndarray = field(default_factory=_zero)
@@ -272,7 +264,6 @@ class Tube:
     found by sphere tracing. The distance bound is exact for constant radii and damped for varying ones.
     """
 
-    LENGTHS: ClassVar[tuple[str, ...]] = ("bend", "radii")
     bend: float
     start: float
     stop: float

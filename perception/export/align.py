@@ -116,9 +116,8 @@ class Registration:
         shift[:3, 3] = self.middle
         self.views = [replace(view, camera_from_world=view.camera_from_world @ shift) for view in views]
         self.tree = Neighbors(self.points)
-        self.scan, self.brightness = _thinned(
-            raw, None if scan.colors is None else scan.colors[rows], self.extent / unit / 150
-        )
+        colors = None if scan.colors is None else scan.colors[rows]
+        self.scan, self.brightness = _thinned(raw, colors, self.extent / unit / 150)
         self.scan_normals = list_normals(self.scan, neighbor_lists(self.scan, 24)).astype(np.float64)
         self.scan_tree = Neighbors(self.scan)
         self.rows = np.arange(0, len(self.scan), max(len(self.scan) // ROWS, 1))
@@ -204,9 +203,8 @@ class Registration:
         chosen = slice(None, None, max(len(self.points) // ROWS, 1))
         back = (self.points[chosen] - place.shift) @ np.linalg.inv(place.linear).T
         index, distance = self.scan_tree.query(back, 1, self.tolerance / place.scale)
-        facing = np.einsum(
-            "ij,ij->i", self.normals[chosen] @ place.linear / place.scale, self.scan_normals[index[:, 0]]
-        )
+        turned = self.normals[chosen] @ place.linear / place.scale
+        facing = np.einsum("ij,ij->i", turned, self.scan_normals[index[:, 0]])
         near = (index[:, 0] >= 0) & (np.abs(facing) > 0.7)
         depth = np.where(near, distance[:, 0] * place.scale / self.tolerance, 1.0)
         score = max(2 * agreement - 1, 0.0) * float((1 - depth**2).mean())
@@ -241,16 +239,8 @@ class Registration:
             if len(near) < 30:
                 break
             own, at = rows[near], index[near, 0]
-            place, rms, information = plane_step(
-                place,
-                self.scan[own],
-                self.scan_normals[own],
-                self.points[at],
-                self.normals[at],
-                width,
-                self.extent,
-                self.similar,
-            )
+            pairs = (self.scan[own], self.scan_normals[own], self.points[at], self.normals[at])
+            place, rms, information = plane_step(place, *pairs, width, self.extent, self.similar)
         return place, rms, information
 
     def _photometric(self, place: Place, rows: np.ndarray) -> Place:

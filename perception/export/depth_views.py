@@ -104,9 +104,8 @@ def grid_cells(points: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray
     """(the cell [P], 0 to C − 1, of each of points [P, 3] in a grid of cells of `width`; points per cell [C])."""
     keys = np.floor((points - points.min(axis=0)) / width).astype(np.int64)
     sizes = keys.max(axis=0) + 1
-    _, cell, count = np.unique(
-        (keys[:, 0] * sizes[1] + keys[:, 1]) * sizes[2] + keys[:, 2], return_inverse=True, return_counts=True
-    )
+    flat = (keys[:, 0] * sizes[1] + keys[:, 1]) * sizes[2] + keys[:, 2]
+    _, cell, count = np.unique(flat, return_inverse=True, return_counts=True)
     return cell.reshape(-1), count
 
 

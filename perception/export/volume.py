@@ -22,9 +22,7 @@ def grid_shape(low: np.ndarray, high: np.ndarray, voxel: float) -> tuple[int, in
         raise InputError(f"--voxel-size is {voxel:g}; expected a length above 0 in map units")
     shape = np.maximum(np.ceil((high - low) / voxel), 1)
     if shape.prod() > MOST_VOXELS:
-        raise InputError(
-            f"--voxel-size {voxel:g} gives {shape.prod():.2g} voxels; choose one for at most {MOST_VOXELS:.0e}"
-        )
+        raise InputError(f"--voxel-size {voxel:g} gives {shape.prod():.2g} voxels; at most {MOST_VOXELS:.0e} are held")
     return int(shape[0]), int(shape[1]), int(shape[2])
 
 

@@ -65,9 +65,8 @@ def scale_of_tags(views: Sequence[View], size: float) -> Measurement:
         shown = [s for s in seen.values() if np.isfinite(s.rays[:, 0, 0]).sum() >= 2]
         if shown:
             return scale_of_sightings(views, shown, CORNER_ERROR, f"{len(shown)} {family} tags of {size:g} m")
-    raise InputError(
-        f"tag size: no tag of {', '.join(TAG_FAMILIES)} is seen in two of the {len(views)} photos; take photos with it"
-    )
+    families = ", ".join(TAG_FAMILIES)
+    raise InputError(f"tag size: no tag of {families} is seen in two of the {len(views)} photos; take photos with it")
 
 
 def scale_of_board(views: Sequence[View], board: Board) -> Measurement:
@@ -92,9 +91,7 @@ def scale_of_pixels(views: Sequence[View], length: KnownLength) -> Measurement:
     assert length.pixels is not None
     for name, pixels in length.pixels.items():
         if name not in number:
-            raise InputError(
-                f"known length: '{name}' is none of the {len(views)} posed photos, such as {views[0].name}"
-            )
+            raise InputError(f"known length: '{name}' is no posed photo; expected one such as {views[0].name}")
         rays[number[name]] = rays_of_pixels(views[number[name]], pixels)
     if len(length.pixels) < 2:
         raise InputError("known length: both ends are needed in two photos or more, found one; add '; PHOTO X,Y X,Y'")

@@ -51,9 +51,8 @@ def combined(found: Sequence[Measurement]) -> tuple[Measurement | None, list[str
     best = int(errors.argmin())
     for other in range(len(found)):
         if abs(logs[other] - logs[best]) > 3 * np.hypot(errors[other], errors[best]):
-            return found[best], [
-                f"the unit is {found[best]} and {found[other]}, which contradict each other; the first is used"
-            ]
+            both = f"{found[best]} and {found[other]}"
+            return found[best], [f"the unit is {both}, which contradict each other; the first is used"]
     if errors[best] == 0:
         return found[best], []
     weights = errors**-2

@@ -92,9 +92,8 @@ def _measured(gmap: Map, options: FrameConfig) -> tuple[Measurement, list[str]]:
     other, notes = measured_scale(views, np.empty((0, 3)), options)
     scale, warnings = combined([*found, *([] if other is None else [other])])
     if scale is None:
-        raise InputError(
-            f"{gmap.path}: nothing tells its unit; give --known-length, --tag-size or --board" + "".join(notes)
-        )
+        give = "give --known-length, --tag-size or --board"
+        raise InputError(f"{gmap.path}: nothing tells its unit; {give}" + "".join(notes))
     return scale, [*notes, *warnings]
 
 

@@ -209,9 +209,7 @@ def _disk_errors(path: Path) -> Iterator[None]:
         if error.errno in _FULL or short:
             raise InputError(f"{path}: the disk is full, nothing was written; free some space") from error
         if error.errno in _REFUSED:
-            raise InputError(
-                f"{path}: cannot be written ({error.strerror}); choose a place you may write to"
-            ) from error
+            raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
         raise
 
 
@@ -288,6 +286,5 @@ def _take(path: Path) -> int:
             os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         return descriptor
     except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written ({error.strerror}: {file.parent}); choose a place you may write to"
-        ) from error
+        why = f"{error.strerror}: {file.parent}"
+        raise InputError(f"{path}: cannot be written ({why}); choose another place") from error

@@ -178,9 +178,8 @@ def _linearised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np
     slope = np.zeros((len(z), 3, 3))
     slope[:, 0, 0] = slope[:, 1, 1] = tracks.focal / (sigma * z)
     slope[:, :2, 2] = -tracks.focal[:, None] / sigma * x[:, :2] / z[:, None] ** 2
-    slope[:, 2, 2] = np.where(
-        tracks.depth > 0, 1 / (problem.depth_sigma * np.where(tracks.depth > 0, tracks.depth, 1)), 0
-    )
+    known = tracks.depth > 0
+    slope[:, 2, 2] = np.where(known, 1 / (problem.depth_sigma * np.where(known, tracks.depth, 1)), 0)
     weight = np.repeat(1 / (1 + (error**2).sum(1) / CAUCHY**2), 2).reshape(-1, 2)
     weight = np.concatenate([weight, 1 / (1 + depth[:, None] ** 2 / CAUCHY**2)], axis=1)
     root = np.sqrt(np.where(front[:, None], weight, 0.0))

@@ -29,10 +29,8 @@ def read_camera(path: Path) -> Lens:
     matrix = _numbers(_data(data, "camera_matrix"), 9, path, "camera_matrix.data").reshape(3, 3)
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
     if min(width, height) < 1 or max(width, height) > MOST_SIDE or min(fx, fy) <= 0:
-        raise InputError(
-            f"{path}: image sides must be 1 to {MOST_SIDE} pixels and focal lengths positive, found "
-            f"{width:.6g}×{height:.6g}, {fx:g}, {fy:g}"
-        )
+        sides = f"{width:.6g}×{height:.6g}, {fx:g}, {fy:g}"
+        raise InputError(f"{path}: image sides must be 1 to {MOST_SIDE} pixels, focal lengths positive; found {sides}")
     name = data.get("distortion_model", "plumb_bob")
     if not isinstance(name, str) or name not in _COUNTS:
         raise InputError(f"{path}: distortion_model {brief(name)} is not known; expected one of {', '.join(_COUNTS)}")

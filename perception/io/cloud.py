@@ -69,9 +69,8 @@ def to_int32(values: np.ndarray, where: str) -> np.ndarray:
         if values.dtype.kind == "f":
             fits &= values == np.floor(values)
     if not fits.all():
-        raise InputError(
-            f"{where}: value {values[~fits][0]} at index {int(np.argmin(fits))} is not a 32-bit whole number"
-        )
+        first = int(np.argmin(fits))
+        raise InputError(f"{where}: value {values[first]} at index {first} is not a 32-bit whole number")
     return values.astype(np.int32)
 
 
@@ -190,9 +189,7 @@ def _read_pcd(path: Path) -> dict[str, np.ndarray]:
             raise InputError(f"{path}: is cut short: {(len(data) - at) // dtype.itemsize} of {points} points are there")
         rows = np.frombuffer(data, dtype, points, at)
     else:
-        raise InputError(
-            f"{path}: PCD DATA is '{kind}'; expected ascii or binary, as pcl_convert_pcd_ascii_binary makes"
-        )
+        raise InputError(f"{path}: PCD DATA is '{kind}'; expected ascii or binary (pcl_convert_pcd_ascii_binary)")
     columns = {name: rows[name] for name in dtype.names or () if rows[name].ndim == 1 and not name.startswith("_")}
     for name in ("rgb", "rgba"):
         if name in columns and columns[name].dtype.itemsize == 4:

@@ -83,9 +83,8 @@ def with_checked_masks(scene: Scene, folder: Path | None) -> Scene:
     views = [view for view in scene.views if shares.get(view.name) != 1.0]
     if not views:
         raise InputError(f"{masked[0].mask}: this and all other masks are black (0 = ignored); are they inverted?")
-    out = [
-        {"name": view.name, "why": f"{view.mask}: ignores every pixel"} for view in masked if shares[view.name] == 1.0
-    ]
+    black = [view for view in masked if shares[view.name] == 1.0]
+    out = [{"name": view.name, "why": f"{view.mask}: ignores every pixel"} for view in black]
     share = float(np.mean(list(shares.values())))
     note = f"masks: {share:.1%} of the pixels of {len(masked)} of {len(scene.views)} photos are ignored"
     report = {**scene.report, "notes": [*scene.report.get("notes", []), note]}

@@ -48,9 +48,7 @@ def model_warnings(models: list[Any], database: Path, photos: int) -> list[str]:
         warnings.append(f"only {registered} of {photos} photos are registered")
     if len(models) > 1 and models[1].num_reg_images() > MAX_SECOND_MODEL * registered:
         sizes = ", ".join(str(model.num_reg_images()) for model in models)
-        warnings.append(
-            f"the photos split into {len(models)} unconnected models (photos: {sizes}); the largest is used"
-        )
+        warnings.append(f"the photos split into {len(models)} unconnected models ({sizes}); the largest is used")
     pairs = verified_pairs(best, database)
     wrong = len(stronger_contradictions(pairs))
     if len(pairs) >= 5 and wrong > MAX_CONTRADICTED * len(pairs):
@@ -104,9 +102,8 @@ def verified_pairs(model: Any, database: Path) -> list[Pair]:
     registered = set(model.reg_image_ids())
     poses = {i: model.images[i].cam_from_world().matrix() for i in registered}
     rays: dict[int, np.ndarray] = {i: _normalised(model.images[i]) for i in registered}
-    tolerance = {
-        i: max(EPIPOLAR_TOLERANCE, TOLERANCE_PIXELS / model.images[i].camera.mean_focal_length()) for i in registered
-    }
+    focal = {i: model.images[i].camera.mean_focal_length() for i in registered}
+    tolerance = {i: max(EPIPOLAR_TOLERANCE, TOLERANCE_PIXELS / focal[i]) for i in registered}
     pairs = []
     for (i, j), found in verified_matches(database).items():
         if i in registered and j in registered and len(found):

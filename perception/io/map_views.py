@@ -80,9 +80,6 @@ def _relative(photo: Path, folder: Path) -> str:
     return os.path.relpath(photo, absolute(folder))
 
 
-# ------------------------------------------------------------------------ JSON
-
-
 def view_json(view: View) -> dict[str, Any]:
     """A view as JSON, with the photo record if `view` is a `StoredView`, and its depth, mask and gain if it has any."""
     entry = {
@@ -149,9 +146,8 @@ def views_of_facts(info: dict[str, Any], file: Path, cameras: dict[str, np.ndarr
     """
     try:
         entries = info.get("views") or _entries_of_arrays(cameras)
-        held = {
-            str(name) for name, out in zip(cameras.get("names", ()), cameras.get("held_out", ()), strict=False) if out
-        }
+        names, out = cameras.get("names", ()), cameras.get("held_out", ())
+        held = {str(name) for name, is_out in zip(names, out, strict=False) if is_out}
         return [view_from_json({"held_out": entry["name"] in held, **entry}) for entry in entries]
     except (ValueError, TypeError, KeyError, IndexError, OverflowError, AttributeError) as error:
         raise InputError(f"{file}: its views cannot be understood ({error}); the map is damaged") from error

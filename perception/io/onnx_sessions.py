@@ -88,11 +88,9 @@ def open_session(path: Path, threads: int = 0) -> Any:
         raise missing_extra("onnxruntime", "demo") from error
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected an ONNX model")
-    missing = [side.name for side in side_files(path) if not side.is_file()]
+    missing = ", ".join(side.name for side in side_files(path) if not side.is_file())
     if missing:
-        raise InputError(
-            f"{path}: its weights are in {', '.join(missing)}, not beside it; fetch that file too, by this name"
-        )
+        raise InputError(f"{path}: its weights are in {missing}, not beside it; fetch that file too, by this name")
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     options.intra_op_num_threads = threads
@@ -104,9 +102,7 @@ def open_session(path: Path, threads: int = 0) -> Any:
     except Exception as error:  # onnxruntime's exceptions share no public base class
         first = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
         if "NOT_IMPLEMENTED" in first:
-            raise InputError(
-                f"{path}: onnxruntime lacks a kernel for it here ({first}); take full precision"
-            ) from error
+            raise InputError(f"{path}: onnxruntime lacks a kernel for it ({first}); take full precision") from error
         if path.open("rb").read(40).startswith(b"version https://git-lfs"):
             raise InputError(f"{path}: a Git LFS pointer, not the model; fetch it with git lfs pull") from error
         raise InputError(f"{path}: not an ONNX model that onnxruntime can open ({first})") from error

@@ -225,9 +225,7 @@ def register_heif() -> None:
 def decode(image: Image.Image, path: Path) -> None:
     """Decodes an open photo. Raises InputError if the file is damaged or has more than MOST_DECODED pixels."""
     if image.width * image.height > MOST_DECODED:
-        raise InputError(
-            f"{path}: {image.width}×{image.height} pixels, at most {MOST_DECODED} can be decoded; make it smaller"
-        )
+        raise InputError(f"{path}: {image.width}×{image.height} pixels, at most {MOST_DECODED} are read; shrink it")
     try:
         image.load()
     except DECODE_ERRORS as error:

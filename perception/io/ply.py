@@ -82,9 +82,7 @@ def map_ply(path: str | Path, element: str) -> np.ndarray:
         dtype = np.dtype([(p.name, order + p.kind) for p in tables[0].properties])
         found = (size - start) // max(dtype.itemsize, 1)
         if found < tables[0].rows:
-            raise InputError(
-                f"{path}: is cut short: element '{element}' has {found} whole rows, header says {tables[0].rows}"
-            )
+            raise InputError(_cut_short(path, tables[0], found))
         if tables[0].rows == 0 or dtype.itemsize == 0:
             return np.empty(tables[0].rows, dtype)
         return np.memmap(file, dtype, "r", start, (tables[0].rows,))
@@ -195,10 +193,12 @@ def _read_element(source: _Body, table: _Table, path: Path) -> Element:
     except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: is cut short within element '{table.name}' ({table.rows} rows expected)") from error
     if not listed:
-        raise InputError(
-            f"{path}: is cut short: element '{table.name}' has {found} whole rows, header says {table.rows}"
-        )
+        raise InputError(_cut_short(path, table, found))
     return {p.name: _column([row[p.name] for row in each], p) for p in table.properties}
+
+
+def _cut_short(path: Path, table: _Table, found: int) -> str:
+    return f"{path}: is cut short: element '{table.name}' has {found} whole rows, header says {table.rows}"
 
 
 def _take_row(source: _Body, table: _Table) -> Element:

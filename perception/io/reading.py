@@ -66,9 +66,7 @@ def check_seen(scene: Scene, path: Path) -> None:
         x, y, z = view.K @ (view.camera_from_world[:3, :3] @ scene.points.T + view.camera_from_world[:3, 3:])
         seen |= (z > 0) & (x >= 0) & (x < view.width * z) & (y >= 0) & (y < view.height * z)
     if not seen.any():
-        raise InputError(
-            f"{path}: no photo sees any of its {len(seen)} points; expected the frame and unit of the input's poses"
-        )
+        raise InputError(f"{path}: no photo sees any of its {len(seen)} points; expected frame and unit of the poses")
     if seen.mean() < FEW_SEEN:
         scene.report["warnings"].append(f"{path}: only {seen.mean():.2%} of its points lie in the view of some photo")
 

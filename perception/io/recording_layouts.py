@@ -158,9 +158,7 @@ def _redwood(source: Path, folder: Path) -> Recording:
     """color/ (or image/, rgb/) and depth/ in mm in equal order, and a .log of world_from_camera matrices."""
     photos, depths = _images(folder), _images(source / "depth")
     if len(photos) != len(depths):
-        raise InputError(
-            f"{source}: {len(photos)} photos in {folder.name}/, {len(depths)} images in depth/; expected pairs"
-        )
+        raise InputError(f"{source}: {len(photos)} photos in {folder.name}/, {len(depths)} in depth/; expected pairs")
     logs = sorted(source.glob("*.log"))
     named = [log for log in logs if log.name == "trajectory.log"] or logs
     if len(named) > 1:

@@ -117,9 +117,7 @@ def median_depth(recording: Recording) -> float:
     """Median in metres over some depth images of the recording. InputError when nothing or nonsense was measured."""
     paths = [frame.depth for frame in recording.frames if frame.depth is not None]
     if not paths:
-        raise InputError(
-            f"{recording.source}: a recording as of {recording.kind}, but no photo has a depth image of the same frame"
-        )
+        raise InputError(f"{recording.source}: a recording as of {recording.kind}, but no photo has a depth image")
     some = [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, LOOKED_AT).round().astype(int))]
     measured = [depth[depth > 0] for depth in map(read_depth, some)]
     found = [float(np.median(values)) / recording.metre for values in measured if values.size]

@@ -118,9 +118,8 @@ def _report(
 def _best_partners(store: FeatureStore) -> dict[str, tuple[int, int]]:
     """name -> (features, geometrically verified matches with the best partner)."""
     db = load_pycolmap().Database.open(store.database)
-    features = {
-        image.image_id: (image.name, db.num_keypoints_for_image(image.image_id)) for image in db.read_all_images()
-    }
+    images = {image.image_id: image.name for image in db.read_all_images()}
+    features = {number: (name, db.num_keypoints_for_image(number)) for number, name in images.items()}
     db.close()
     best = dict.fromkeys(features, 0)
     for pair, found in verified_matches(store.database).items():

@@ -68,9 +68,7 @@ def read_transforms(file: Path, how: Reading) -> Scene:
 def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:
     """(file_path, camera_from_world [4, 4], lens) of every frame, in file order; with w, h photos need not exist."""
     data = _load(file)
-    return [
-        (str(frame["file_path"]), _pose(file, frame), _lens(file, {**data, **frame}, None)) for frame in data["frames"]
-    ]
+    return [(str(f["file_path"]), _pose(file, f), _lens(file, {**data, **f}, None)) for f in data["frames"]]
 
 
 def listed_photos(file: Path) -> tuple[list[Path], bool]:

@@ -78,10 +78,8 @@ def _check_header(file: Path, width: int, height: int) -> None:
     if kind not in ("grey", "palette") or bits not in (8, 16):
         raise InputError(f"{file}: a {bits}-bit {kind} image; a label image has one channel of 8 or 16 bit")
     if size != [width, height]:
-        raise InputError(
-            f"{file}: {size[0]}×{size[1]} pixels, but its photo has {width}×{height}; "
-            "label images have the size of the original photo"
-        )
+        both = f"{size[0]}×{size[1]} pixels, but its photo has {width}×{height}"
+        raise InputError(f"{file}: {both}; label images have the size of the original photo")
 
 
 def _pngs(folder: Path) -> list[Path]:

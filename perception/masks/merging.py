@@ -213,9 +213,8 @@ def join_planes(graph: SurfaceGraph, ends: np.ndarray) -> np.ndarray:
 
     ends: [R] the segment of each patch. Returns [R] with one number for each set of joined segments.
     """
-    large = [
-        i for i in np.unique(ends).tolist() if graph.area(i) > _LARGE and graph.extents[i, 0] < _FLAT * graph.depth(i)
-    ]
+    large = [i for i in np.unique(ends).tolist() if graph.area(i) > _LARGE]
+    large = [i for i in large if graph.extents[i, 0] < _FLAT * graph.depth(i)]
     joined = np.arange(graph.count)
     for place, a in enumerate(large):
         for b in large[place + 1 :]:

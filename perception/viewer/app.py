@@ -69,8 +69,6 @@ class Viewer:
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints there
             self.server.stop()
 
-    # ------------------------------------------------------------------ drawing
-
     def _frame_map(self) -> None:
         """Sets up direction, first camera and scale. The page uses half precision, so the map is scaled to size 10."""
         self._drawn = gmap = self.session.editor.original
@@ -130,8 +128,6 @@ class Viewer:
                 scene.add_line_segments("/map/length/line", ends[None], tuple(HIGHLIGHT.tolist()), thickness=0.02),
                 scene.add_label("/map/length/text", session.length, position=tuple(ends.mean(axis=0))),
             ]
-
-    # ------------------------------------------------------------------- events
 
     def _clicked(self, event: Any, add: bool) -> None:
         origin, direction = np.array(event.ray_origin) / self.scale, np.array(event.ray_direction)

@@ -41,8 +41,6 @@ class Panel:
         self._build_measure()
         self.refresh()
 
-    # ----------------------------------------------------------------- building
-
     def _build_ask(self) -> None:
         with self.gui.add_form("Ask") as form:
             self._text = self.gui.add_text("prompt", "", hint='a thing, such as "red mug"; Enter asks')
@@ -87,11 +85,11 @@ class Panel:
                     "Remove": lambda: editor.remove(session.chosen()),
                 },
             )
-        form.on_submit(
-            lambda event: self.viewer.guarded(
-                lambda: editor.rename(session.chosen(), self._name.value), event.client, edited=True
-            )
-        )
+
+        def rename_it() -> None:
+            editor.rename(session.chosen(), self._name.value)
+
+        form.on_submit(lambda event: self.viewer.guarded(rename_it, event.client, edited=True))
 
     def _actions(self, label: str, actions: dict[str, Callable[[], object]]) -> None:
         """A row of buttons, each an edit."""
@@ -105,9 +103,8 @@ class Panel:
             self._actions("map", {"Show hidden": session.show_all})
             save = self.gui.add_button("Save into the map")
             save.on_click(lambda event: self.viewer.guarded(editor.save, event.client, edited=True))
-            self._renew = self.gui.add_button(
-                "Drop them, open the new map", visible=False, hint="another program replaced the map"
-            )
+            why = "another program replaced the map"
+            self._renew = self.gui.add_button("Drop them, open the new map", visible=False, hint=why)
             self._renew.on_click(lambda event: self.viewer.guarded(session.reopen, event.client, edited=True))
             self._history = self.gui.add_markdown("")
 
@@ -120,8 +117,6 @@ class Panel:
             scale = self.gui.add_button("Set scale", hint="writes the map in metres, by this length")
         start.on_click(lambda event: guarded(session.measure, event.client))
         scale.on_click(lambda event: guarded(lambda: session.set_scale(metres.value), event.client, edited=True))
-
-    # ------------------------------------------------------------------- texts
 
     def notify(self, client: Any, text: str) -> None:
         """Shows a notification in one browser, or in all when `client` is None."""

@@ -60,8 +60,6 @@ class Session:
         self._opened: tuple[int, QueryMap] | None = None
         self._edits = 0
 
-    # ------------------------------------------------------------------ asking
-
     def _loaded(self) -> QueryMap:
         if self._opened is None or self._opened[0] != self._edits:
             self._opened = (self._edits, QueryMap.of(self.editor.current()))
@@ -82,8 +80,6 @@ class Session:
         """Selects the instance of a hit, all those of a group; a part is highlighted."""
         self.select(hit.instance_id)
         self.selected, self.part = list(hit.instances or self.selected), hit.part
-
-    # -------------------------------------------------- selecting and measuring
 
     def select(self, instance: int | None, add: bool = False) -> None:
         """Selects an instance, or with `add` toggles it in the selection. None clears the selection, unless `add`."""
@@ -142,8 +138,6 @@ class Session:
         facts = self.editor.set_scale(f"{float(metres)!r}: {ends}")
         self.ends, self.notes = [facts["factor"] * end for end in self.ends], facts["notes"]
 
-    # ----------------------------------------------------------------- editing
-
     def show_all(self) -> None:
         """Shows the hidden instances again."""
         for entry in self.editor.instances:
@@ -164,8 +158,6 @@ class Session:
         self.editor.reopen()
         self.measuring, self.ends, self.notes = False, [], []
         self.edited()
-
-    # ----------------------------------------------------------------- showing
 
     def shown(self) -> np.ndarray:
         """[N] bool: Gaussians of no hidden instance."""
