@@ -41,9 +41,7 @@ def depth_topics(bag: Bag) -> list[str]:
 
 def choose_depth(bag: Bag, topics: list[str], wanted: str | None, frame: str) -> str | None:
     """The depth topic to use for photos in tf frame `frame`; None when there is none, or `wanted` is "none".
-
-    Preferred: in the photos' frame, then named aligned or registered, then not compressed.
-    """
+    Preferred: in the photos' frame, then named aligned or registered, then not compressed."""
     if wanted == "none" or not (topics or wanted):
         return None
 
@@ -94,9 +92,7 @@ def _compressed(data: bytes, kind: str) -> np.ndarray | None:
 
 def registered(depth: np.ndarray, own: Lens, color: Lens, color_from_depth: np.ndarray) -> np.ndarray:
     """Depth [h, w] of lens `own` as lens `color` sees it, at a resolution at which pixels of `own` leave no gaps.
-
-    Each measured point is moved by color_from_depth [4, 4]; where several fall on a pixel, the nearest counts.
-    """
+    Each measured point is moved by color_from_depth [4, 4]; where several fall on a pixel, the nearest counts."""
     height, width = depth.shape
     own = rescale_lens(own, width, height)
     scale = min(1.0, own.params[0] / color.params[0])
@@ -130,10 +126,8 @@ def write_depth(
         if apart[name] <= APART:
             wanted.setdefault(index, []).append(name)
     if not wanted:
-        raise InputError(
-            f"{bag.path}: no image of {topic} lies within {APART} s of a photo (the nearest: "
-            f"{min(apart.values()):.3g} s); give another --depth, or --depth none"
-        )
+        found = f"no image of {topic} lies within {APART} s of a photo (the nearest: {min(apart.values()):.3g} s)"
+        raise InputError(f"{bag.path}: {found}; give another --depth, or --depth none")
     folder.mkdir()
     for index, (_, recorded, message) in enumerate(bag.messages([topic])):
         if index not in wanted:

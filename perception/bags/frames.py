@@ -45,9 +45,7 @@ class FrameOptions:
 
 def run_frames(source: Path, output: Path, options: FrameOptions | None = None) -> tuple[dict[str, Any], str]:
     """Writes `output`/images, camera.yaml, depth of the images, and, with poses, transforms.json: (JSON result, text).
-
-    Map `output` if there are poses. Otherwise map `output`/images with --camera `output`/camera.yaml.
-    """
+    Map `output` if there are poses. Otherwise map `output`/images with --camera `output`/camera.yaml."""
     options = options or FrameOptions()
     if output.exists() and any(output.iterdir()):
         raise InputError(f"{output}: is not empty; choose another -o or remove it first")
@@ -107,10 +105,8 @@ def _camera_info(bag: Bag, topic: str, wanted: str | None) -> Any:
     beside = f"{base}/camera_info"
     name = wanted or (beside if beside in topics else topics[0] if len(topics) == 1 else beside)
     if name not in topics:
-        raise InputError(
-            f"{bag.path}: has no camera_info '{name}' (found {', '.join(topics) or 'none'}); give its topic with "
-            "--camera-info, or a camera file with --camera (perception calibrate makes one)"
-        )
+        advice = "give its topic with --camera-info, or a camera file with --camera (perception calibrate makes one)"
+        raise InputError(f"{bag.path}: has no camera_info '{name}' (found {', '.join(topics) or 'none'}); {advice}")
     for _, _, message in bag.messages([name]):
         return message
     raise InputError(f"{bag.path}: {name} holds no message; give a camera file with --camera")
@@ -124,10 +120,8 @@ def _write_camera(path: Path, camera: Path | None, info: Any, topic: str, size: 
         write_camera_info(path, info, rectified="rect" in topic.rpartition("/")[2].partition("_")[2])
         lens = read_camera(path)
     if (lens.width, lens.height) != size:
-        raise InputError(
-            f"{source}: images of {topic} are {size[0]}x{size[1]} pixels, the camera {lens.width}x{lens.height}; give "
-            "the camera_info of these images"
-        )
+        found = f"images of {topic} are {size[0]}x{size[1]} pixels, the camera {lens.width}x{lens.height}"
+        raise InputError(f"{source}: {found}; give the camera_info of these images")
     return lens
 
 
@@ -193,9 +187,7 @@ def _write_transforms(
     down: tuple[np.ndarray, float] | None,
 ) -> None:
     """nerfstudio's format: only frames with a pose, OpenGL camera axes, pixel centres at +0.5, depth in millimetres.
-
-    "gravity" points down in the world; "gravity_std_deg" is its standard error in degrees.
-    """
+    "gravity" points down in the world; "gravity_std_deg" is its standard error in degrees."""
     frames = [
         {
             "file_path": f"images/{name}",

@@ -100,10 +100,8 @@ def _detect(source: Path, board: Board) -> tuple[list[Detection], tuple[int, int
         if size is None:
             size = here
         elif here != size:
-            raise InputError(
-                f"{source}: {name} is {here[0]}x{here[1]} pixels, the pictures before it {size[0]}x{size[1]}; a "
-                "calibration is for one camera at one size"
-            )
+            what = f"{name} is {here[0]}x{here[1]} pixels, the pictures before it {size[0]}x{size[1]}"
+            raise InputError(f"{source}: {what}; a calibration is for one camera at one size")
         seen = board.detect(name, picture)
         if seen is not None:
             found.append(seen)
@@ -210,10 +208,8 @@ def check_solution(solution: Solution, source: str) -> list[str]:
         )
     share = coverage(solution)
     if share < MIN_COVERAGE:
-        raise InputError(
-            f"{source}: the board covers {share:.0%} of the picture over all views, at least {MIN_COVERAGE:.0%} is "
-            "needed; move it into the corners of the picture, or nearer"
-        )
+        found = f"the board covers {share:.0%} of the picture over all views, at least {MIN_COVERAGE:.0%} is needed"
+        raise InputError(f"{source}: {found}; move it into the corners of the picture, or nearer")
     notes = []
     if share < GOOD_COVERAGE:
         notes.append(f"the board covers {share:.0%} of the picture; beyond that the distortion is a guess")

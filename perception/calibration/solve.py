@@ -100,7 +100,7 @@ def _solved(model: str, views: Sequence[Detection], size: tuple[int, int], free:
     if model == "fisheye":
         K, distortion, turns, shifts = _fisheye(views, size)
     else:
-        points, pixels = [v.board_points for v in views], [v.pixels for v in views]
+        points, pixels = ([getattr(v, name).astype(np.float32) for v in views] for name in ("board_points", "pixels"))
         flags = 0 if free[8] else cv2.CALIB_FIX_K3
         found = cv2.calibrateCamera(points, pixels, size, None, None, None, None, flags, _STOP)  # type: ignore[call-overload]
         K, distortion, turns, shifts = found[1:]

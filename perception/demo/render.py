@@ -25,9 +25,7 @@ class Picture:
 
 def cast(bodies: list[Body], lamp: Lamp, camera: Camera, samples: int = 2) -> Picture:
     """A noise-free image with samples × samples rays per pixel. ids, parts and depth are reduced from the finer grid.
-
-    lamp: the lamp that produces highlights.
-    """
+    lamp: the lamp that produces highlights."""
     height, width = camera.height * samples, camera.width * samples
     rotation = camera.camera_from_world[:3, :3]
     x = ((np.arange(width) + 0.5) / samples - camera.K[0, 2]) / camera.K[0, 0]

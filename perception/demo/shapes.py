@@ -188,9 +188,7 @@ class Ellipsoid:
 @dataclass
 class Lathe:
     """A surface of revolution about z. The profile [S + 1, 2] holds (radius, height); its segments are cones or rings.
-
-    u is the angle, v the arc length along the profile. Normals point outwards if the outer profile runs upwards.
-    """
+    u is the angle, v the arc length along the profile. Normals point outwards if the outer profile runs upwards."""
 
     profile: np.ndarray
     rotation: np.ndarray = field(default_factory=_identity)
@@ -241,9 +239,7 @@ def _segment_roots(
     r0: float, z0: float, r1: float, z1: float, ray: tuple[np.ndarray, ...]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Intersections of rays with one cone or ring of a lathe: (t, position along the segment) for each root.
-
-    ray: (o_z, d_z, d_xy·d_xy, o_xy·d_xy, o_xy·o_xy).
-    """
+    ray: (o_z, d_z, d_xy·d_xy, o_xy·d_xy, o_xy·o_xy)."""
     oz, dz, dd, od, oo = ray
     with np.errstate(invalid="ignore", divide="ignore"):
         if abs(z1 - z0) < 1e-9:

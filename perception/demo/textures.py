@@ -25,9 +25,7 @@ def noise(
     rng: np.random.Generator, height: int, width: int, cells: tuple[float, float], octaves: int = 4
 ) -> np.ndarray:
     """Fractal value noise [h, w] float32 with zero mean and about unit standard deviation, periodic along the width.
-
-    cells: lattice cells of the first octave (vertical, horizontal). Each octave doubles them and halves the weight.
-    """
+    cells: lattice cells of the first octave (vertical, horizontal). Each octave doubles them and halves the weight."""
     total = np.zeros((height, width), np.float32)
     weight = 1.0
     for octave in range(octaves):

@@ -85,9 +85,7 @@ class Alignment:
 
 def align(views: Sequence[DepthView], scan: PointCloud, similar: bool) -> Alignment:
     """The place of `scan` in the map whose rendered depth is `views`; similar: with a scale, else rigid.
-
-    The caller decides by `Alignment.refusal`. InputError if the map's views or the scan hold too little.
-    """
+    The caller decides by `Alignment.refusal`. InputError if the map's views or the scan hold too little."""
     registration = Registration(views, scan, similar)
     places = registration.refined(registration.candidates())
     if not places:

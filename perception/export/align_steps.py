@@ -147,9 +147,7 @@ def _robust_gain(I: np.ndarray, g: np.ndarray) -> tuple[float, np.ndarray, np.nd
 
 def likely_rotations(normals: np.ndarray, onto: np.ndarray) -> list[np.ndarray]:
     """Up to KEPT rotations [3, 3], best first, that turn unit normals [P, 3] onto unit normals [Q, 3], signs ignored.
-
-    Zero normals are left out. Score: the mean root density of `onto` at the turned normals.
-    """
+    Zero normals are left out. Score: the mean root density of `onto` at the turned normals."""
     table = _density(onto[:: max(len(onto) // 1000, 1)])
     known = normals[np.linalg.norm(normals, axis=1) > 0]
     chosen = known[:: max(len(known) // 250, 1)]

@@ -71,18 +71,14 @@ def nearest_gaussian(
 
 def mesh_edges(faces: np.ndarray) -> np.ndarray:
     """Edges [E, 2] int32 of triangles [F, 3], three per face as ScanNet's segmentator lists them: 12, 13, 32.
-
-    Of faces that contain a vertex twice, edges from a vertex to itself are left out.
-    """
+    Of faces that contain a vertex twice, edges from a vertex to itself are left out."""
     edges = np.stack([faces[:, [0, 1]], faces[:, [0, 2]], faces[:, [2, 1]]], axis=1).reshape(-1, 2)
     return np.ascontiguousarray(edges[edges[:, 0] != edges[:, 1]], dtype=np.int32)
 
 
 def neighbor_lists(points: np.ndarray, k: int) -> np.ndarray:
     """The k nearest points [P, k] int32 of each point, itself among them, nearest first; −1 where there are fewer.
-
-    Points that are not finite have no neighbours and are not neighbours of others.
-    """
+    Points that are not finite have no neighbours and are not neighbours of others."""
     finite = int(np.isfinite(points).all(axis=1).sum())
     if finite == 0:
         return np.full((len(points), 1), -1, np.int32)
@@ -134,9 +130,7 @@ def scannet_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def scannet_weights(points: np.ndarray, normals: np.ndarray, edges: np.ndarray, *, oriented: bool = True) -> np.ndarray:
     """Weights [E] float32 of edges (a, b): 1 − n_a·n_b, squared when the pair is convex, n_b·(p_b − p_a) > 0.
-
-    Not oriented: normals of unknown sign; 1 − |n_a·n_b| and no convexity. A missing (zero) normal weighs 1.
-    """
+    Not oriented: normals of unknown sign; 1 − |n_a·n_b| and no convexity. A missing (zero) normal weighs 1."""
     a, b = edges[:, 0], edges[:, 1]
     cosine = _dot(normals[a], normals[b])
     if not oriented:

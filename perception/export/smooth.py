@@ -36,9 +36,7 @@ def felzenszwalb(
     edges: np.ndarray, weights: np.ndarray, num_nodes: int, k_threshold: float = K_THRESHOLD, min_size: int = MIN_SIZE
 ) -> np.ndarray:
     """Segment [num_nodes] int32 of each node of a graph, numbered in order of appearance (IJCV 2004).
-
-    edges [E, 2] int32, weights [E]; equal weights are ordered by node numbers, not by position in `edges`.
-    """
+    edges [E, 2] int32, weights [E]; equal weights are ordered by node numbers, not by position in `edges`."""
     labels = np.empty(num_nodes, np.int32)
     edges = np.ascontiguousarray(edges, np.int32)
     _core.felzenszwalb(edges, np.ascontiguousarray(weights, np.float32), k_threshold, min_size, labels)
@@ -95,9 +93,7 @@ def _median_colors(colors: np.ndarray, lists: np.ndarray) -> np.ndarray:
 
 def vote(labels: np.ndarray, segments: np.ndarray) -> np.ndarray:
     """Each segment's most frequent label, for all its points [P] int32; ties go to the smallest label.
-
-    labels [P] int32 (−1 = none), segments [P] int32 >= 0. −1 counts like any other label.
-    """
+    labels [P] int32 (−1 = none), segments [P] int32 >= 0. −1 counts like any other label."""
     if len(labels) != len(segments):
         raise InputError(f"{len(segments)} segment ids for {len(labels)} points; they must be the same points in order")
     if len(labels) == 0:

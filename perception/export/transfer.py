@@ -42,9 +42,7 @@ def export_labels(
     means: np.ndarray, instance_ids: np.ndarray, cloud: PointCloud, options: ExportOptions | None = None
 ) -> np.ndarray:
     """Instance of each point [P] int32, −1 = none: that of the nearest mean (OpenSplat3D, point cloud transfer).
-
-    means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise).
-    """
+    means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise)."""
     options = options or ExportOptions()
     limit = options.max_distance
     if limit is not None and not limit >= 0:
@@ -67,9 +65,7 @@ def export_labels(
 
 def check_overlap(means: np.ndarray, points: np.ndarray) -> float:
     """Share of the finite points inside the map's bounds (1st to 99th percentile of its means).
-
-    InputError when the two bounding boxes do not overlap: the cloud has another frame or unit.
-    """
+    InputError when the two bounding boxes do not overlap: the cloud has another frame or unit."""
     finite = points[np.isfinite(points).all(axis=1)]
     if len(finite) == 0:
         raise InputError("cloud: all coordinates are NaN or infinite; nothing can be labelled")

@@ -55,9 +55,7 @@ class Gravity:
 
 def up_from_cameras(camera_from_world: np.ndarray) -> np.ndarray | None:
     """The up direction [3] in the world frame, from poses [C, 4, 4]; None when the cameras were not held level.
-
-    The x axes of level cameras are horizontal, so up is the direction of their smallest mean squared component.
-    """
+    The x axes of level cameras are horizontal, so up is the direction of their smallest mean squared component."""
     if len(camera_from_world) < 3:
         return None
     right, down = camera_from_world[:, 0, :3], camera_from_world[:, 1, :3]
@@ -181,9 +179,7 @@ def _planes(points: np.ndarray, down: np.ndarray, near: float, seed: int) -> tup
 
 def floor_height(up: np.ndarray, points: np.ndarray, eye: np.ndarray) -> float:
     """Height along `up` of the floor below a camera at `eye` [3]: the lowest level slab that holds many points.
-
-    Without such a slab it is the height that 1 % of the points lie below; without points that of the camera.
-    """
+    Without such a slab it is the height that 1 % of the points lie below; without points that of the camera."""
     heights = np.sort(np.asarray(points, np.float64) @ up)
     below = heights[heights < eye @ up]
     if len(below) < 30:

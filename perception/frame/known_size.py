@@ -41,9 +41,7 @@ class Sighting:
 
 def scale_of_tags(views: Sequence[View], size: float) -> Measurement:
     """Metres per unit from AprilTags or ArUco markers of one size; size: side of the black square in metres.
-
-    InputError when no tag is seen in two photos, or when the tags seen are no squares.
-    """
+    InputError when no tag is seen in two photos, or when the tags seen are no squares."""
     square = size * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -91,7 +89,7 @@ def scale_of_pixels(views: Sequence[View], length: KnownLength) -> Measurement:
     assert length.pixels is not None
     for name, pixels in length.pixels.items():
         if name not in number:
-            raise InputError(f"known length: '{name}' is no posed photo; expected one such as {views[0].name}")
+            raise InputError(f"known length: '{name}' is none of the {len(views)} photos, such as {views[0].name}")
         rays[number[name]] = rays_of_pixels(views[number[name]], pixels)
     if len(length.pixels) < 2:
         raise InputError("known length: both ends are needed in two photos or more, found one; add '; PHOTO X,Y X,Y'")

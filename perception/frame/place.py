@@ -72,10 +72,8 @@ def measured_scale(
     if options.known_length is not None:
         length = known_length(options.known_length)
         if length.pixels is None:
-            raise InputError(
-                "known length: before the map exists it is given by pixels of photos, 'METRES: PHOTO X,Y X,Y; PHOTO "
-                "X,Y X,Y'; by instances or points of a finished map with `perception scale`"
-            )
+            what = "before the map exists it is given by pixels of photos, 'METRES: PHOTO X,Y X,Y; PHOTO X,Y X,Y'"
+            raise InputError(f"known length: {what}; by instances or points of a finished map with `perception scale`")
         found.append(scale_of_pixels(views, length))
     if options.tag_size is not None:
         found.append(scale_of_tags(views, options.tag_size))
@@ -154,9 +152,7 @@ def _depth_in_units(scene: Scene, scale: Measurement | None, posed: bool) -> Sce
 
 def upright(pose: np.ndarray, points: np.ndarray, gravity: Gravity, unit: float) -> np.ndarray:
     """map_from_world [4, 4]: z up, x along the view of the first camera, the origin on the floor below it.
-
-    pose [4, 4]: camera_from_world of that camera. points [P, 3]: of the scene. unit: metres per unit of the world.
-    """
+    pose [4, 4]: camera_from_world of that camera. points [P, 3]: of the scene. unit: metres per unit of the world."""
     up = -gravity.direction
     eye, ahead = camera_centres(pose[None])[0], pose[2, :3] - (pose[2, :3] @ up) * up
     if np.linalg.norm(ahead) < 0.3:  # it looks down or up: what is up in its photo lies ahead

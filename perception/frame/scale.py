@@ -42,9 +42,7 @@ class Measurement:
 
 def combined(found: Sequence[Measurement]) -> tuple[Measurement | None, list[str]]:
     """The mean weighted by inverse variance, and warnings; the most precise one where they contradict each other.
-
-    Two measurements contradict each other when they differ by more than three standard errors of the difference.
-    """
+    Two measurements contradict each other when they differ by more than three standard errors of the difference."""
     if not found:
         return None, []
     logs, errors = np.log([m.metres for m in found]), np.array([m.standard_error / m.metres for m in found])

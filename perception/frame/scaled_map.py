@@ -41,10 +41,8 @@ def scale_map(path: Path, output: Path | None, options: FrameConfig, improve: bo
         stated = (gmap.info.get("scale") or {}).get("standard_error")
         if improve and gmap.metric and (stated is None or stated <= error):
             known = "as its input states" if stated is None else f"within ± {stated:.1%}"
-            raise InputError(
-                f"{path}: is in metres already, {known}, and this length only within ± {error:.1%}; `perception scale` "
-                "replaces the unit all the same"
-            )
+            found = f"is in metres already, {known}, and this length only within ± {error:.1%}"
+            raise InputError(f"{path}: {found}; `perception scale` replaces the unit all the same")
         entry = Measurement(1.0, error, scale.source).to_json()
         info = {**gmap.info, "metric": True, "scale": entry}
         write_map(target, scaled(Map.of(gmap, info=info), scale.metres))
@@ -54,9 +52,7 @@ def scale_map(path: Path, output: Path | None, options: FrameConfig, improve: bo
 
 def scaled(gmap: Map, factor: float) -> Map:
     """The map with all lengths times `factor`: Gaussians, instances, parts and views.
-
-    map.json's map_from_input is continued if the input had poses.
-    """
+    map.json's map_from_input is continued if the input had poses."""
     b_from_a = np.diag([factor, factor, factor, 1.0])
     info = dict(gmap.info)
     if "map_from_input" in info or info.get("scene", {}).get("input") != "photos":

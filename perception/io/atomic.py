@@ -34,9 +34,7 @@ _held: set[tuple[Path, int]] = set()
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
     """Yield a temporary sibling to write; on success it is synced and renamed to `path`, else removed.
-
-    Temporary siblings left by killed writers of `path` are deleted. InputError for a full disk or missing rights.
-    """
+    Temporary siblings left by killed writers of `path` are deleted. InputError for a full disk or missing rights."""
     with _aside(Path(path), lambda new: new.touch(exist_ok=False), Path.replace) as temporary:
         yield temporary
 
@@ -78,9 +76,7 @@ def _aside(path: Path, make: Callable[[Path], Any], put: Callable[[Path, Path], 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[BinaryIO]:
     """Yields a binary file to write; it replaces `path` only when the block ends without an error.
-
-    The folder of `path` must exist. Every OSError is raised as InputError.
-    """
+    The folder of `path` must exist. Every OSError is raised as InputError."""
     path = Path(path)
     try:
         if not path.parent.is_dir():
@@ -215,9 +211,7 @@ def _disk_errors(path: Path) -> Iterator[None]:
 
 def lock(descriptor: int) -> bool:
     """Takes the exclusive lock on an open file or folder; False when another descriptor holds it.
-
-    OSError where the file system does not support flock.
-    """
+    OSError where the file system does not support flock."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:

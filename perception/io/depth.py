@@ -25,9 +25,7 @@ _ASPECT = 0.02
 
 def read_depth(path: Path) -> np.ndarray:
     """The image [h, w] as stored, float32; 0 where nothing was measured (0, negative, NaN, infinite, saturated).
-
-    InputError when the file is missing, damaged, empty or not of one channel.
-    """
+    InputError when the file is missing, damaged, empty or not of one channel."""
     if not path.is_file():
         raise InputError(f"{path}: no such depth image")
     try:
@@ -67,9 +65,7 @@ def load_depth(view: View, width: int, height: int) -> np.ndarray:
 
 def without_edges(depth: np.ndarray) -> np.ndarray:
     """depth [h, w], 0 = none, with 0 at every pixel that has a depth edge in its 3 × 3 neighbourhood.
-
-    At edges sensors measure mixtures of both surfaces, and the shift between colour and depth camera is not exact.
-    """
+    At edges sensors measure mixtures of both surfaces, and the shift between colour and depth camera is not exact."""
     kernel = np.ones((3, 3), np.uint8)
     near = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), kernel)
     return np.where(cv2.dilate(depth, kernel) - near <= _EDGE * depth, depth, np.float32(0))
@@ -78,8 +74,6 @@ def without_edges(depth: np.ndarray) -> np.ndarray:
 def _depth_lens(view: View, depth: DepthImage, width: int, height: int) -> Lens:
     lens = depth.lens or view_lens(view)
     if abs(width * lens.height / (height * lens.width) - 1) > _ASPECT:
-        raise InputError(
-            f"{depth.path}: the depth image is {width}×{height}, its camera {lens.width}×{lens.height}; "
-            "expected the same field of view at any resolution"
-        )
+        found = f"the depth image is {width}×{height}, its camera {lens.width}×{lens.height}"
+        raise InputError(f"{depth.path}: {found}; expected the same field of view at any resolution")
     return rescale_lens(lens, width, height)

@@ -46,9 +46,7 @@ def read_json(file: Path) -> Any:
 
 def read_yaml(file: Path, expected: str) -> Any:
     """The value in a YAML file; InputError naming `expected` when it is not valid YAML.
-
-    Aliases (*name) are refused: nested aliases can expand to more values than fit into memory.
-    """
+    Aliases (*name) are refused: nested aliases can expand to more values than fit into memory."""
     import yaml
 
     class Loader(yaml.SafeLoader):

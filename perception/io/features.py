@@ -106,9 +106,7 @@ AT_ONCE = 64
 
 class FeatureStore:
     """A folder with the COLMAP `database.db` and `photos/`, which holds the photos under numbered names (see staging).
-
-    names[i] is the name of the i-th photo in both.
-    """
+    names[i] is the name of the i-th photo in both."""
 
     def __init__(self, folder: Path, names: list[str], facts: dict[str, Any]) -> None:
         self.folder, self.image_root, self.names, self.facts = folder, folder / "photos", names, facts
@@ -220,9 +218,7 @@ def _extract(
 
 def _drop_poor(database: Path, names: list[str]) -> list[str]:
     """Deletes the features of photos that have fewer than MIN_FEATURES and returns those photos.
-
-    pycolmap then extracts these again. It has no function that deletes the features of one image.
-    """
+    pycolmap then extracts these again. It has no function that deletes the features of one image."""
     db = load_pycolmap().Database.open(database)
     ids = {name: db.read_image_with_name(name).image_id for name in names}
     poor = [name for name in names if db.num_keypoints_for_image(ids[name]) < MIN_FEATURES]
@@ -364,9 +360,7 @@ def _coarse_votes(descriptors: list[np.ndarray], compared: np.ndarray, progress:
 
 def _mutual_matches(similarity: np.ndarray) -> int:
     """Number of mutual nearest neighbours that pass Lowe's ratio test; [F, G] dot products of unit descriptors.
-
-    The largest value of each row is overwritten.
-    """
+    The largest value of each row is overwritten."""
     if min(similarity.shape) < 2:
         return 0
     rows = np.arange(len(similarity))

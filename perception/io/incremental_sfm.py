@@ -154,9 +154,7 @@ LEVELS = (MIN_INLIERS, 2 * MIN_INLIERS, 4 * MIN_INLIERS, 8 * MIN_INLIERS)
 
 def map_photos(store: FeatureStore, fixed: bool, seed: int, count: int, progress: Progress) -> Found:
     """All models, largest first (pycolmap does not sort them), and names of photos left out as contradicted.
-
-    fixed: the intrinsics in the database are not refined.
-    """
+    fixed: the intrinsics in the database are not refined."""
     folder = store.folder / "mapping"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()

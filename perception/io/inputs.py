@@ -104,9 +104,7 @@ class PhotoSizes:
 
 def photo_sizes(source: Path) -> PhotoSizes:
     """The sizes of the photos of `source` from their headers; photos that cannot be read are skipped.
-
-    A video counts as the maximum number of frames. InputError where `source` cannot be read.
-    """
+    A video counts as the maximum number of frames. InputError where `source` cannot be read."""
     from perception.io.photo_folder import list_photos
     from perception.io.recordings import MOST_FRAMES as MOST_RECORDED
     from perception.io.recordings import Recording

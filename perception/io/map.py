@@ -194,9 +194,7 @@ class Map:
 
     def with_photo(self, view: View) -> View:
         """`view` with the current path of its photo; InputError when the photo is missing or has changed.
-
-        The first such error of a map also issues a PhotosMoved warning.
-        """
+        The first such error of a map also issues a PhotosMoved warning."""
         try:
             return replace(view, photo=locate_photo(view, self.path))
         except InputError as error:

@@ -90,9 +90,7 @@ class MapFiles:
 
     def read(self, name: str) -> Any:
         """The field `name` of a `Map`, in memory. Checksums are verified before whole files are read.
-
-        Arrays are copies, float32 or int32 and writable. InputError naming the file when it is damaged.
-        """
+        Arrays are copies, float32 or int32 and writable. InputError naming the file when it is damaged."""
         if name in ("info", "instances"):
             return getattr(self, name)
         if name == "views":
@@ -109,9 +107,7 @@ class MapFiles:
 
     def _check_contents(self) -> None:
         """Compares the SHA-256 of every file with the one recorded, once; InputError names the first that differs.
-
-        Skipped when the folder has been replaced by another map.
-        """
+        Skipped when the folder has been replaced by another map."""
         with self._lock:
             if self._checked or _folder_identity(self.path) != self._identity:
                 return

@@ -50,9 +50,7 @@ def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
 
 def locate_photo(view: View, folder: Path | None) -> Path:
     """The path of the photo of `view`: relative to the map, else its absolute path when the map was made.
-
-    folder: of the map, None when it is not on disk. InputError when there is no file, or only one of another size.
-    """
+    folder: of the map, None when it is not on disk. InputError when there is no file, or only one of another size."""
     places = [Path(view.photo)]
     size = None
     if isinstance(view, StoredView):

@@ -34,9 +34,7 @@ class StoredModel:
 @dataclass(frozen=True)
 class Entry:
     """A model on the Hugging Face hub. files: path in the repository -> [bytes, sha256], None where not known.
-
-    revision: a commit, so that the files cannot change. Digests are those that several public projects pin for it.
-    """
+    revision: a commit, so that the files cannot change. Digests are those that several public projects pin for it."""
 
     purpose: str
     repository: str

@@ -78,9 +78,7 @@ def read_config(model: Path, name: str) -> dict[str, Any]:
 
 def open_session(path: Path, threads: int = 0) -> Any:
     """An InferenceSession on the first of `wanted_providers` that loads. threads: of one run; 0: all cores.
-
-    InputError for what is no ONNX model, for missing weights, and for a graph that this onnxruntime cannot run.
-    """
+    InputError for what is no ONNX model, for missing weights, and for a graph that this onnxruntime cannot run."""
     try:
         with uninterrupted():  # Ctrl-C inside the import becomes an ImportError
             import onnxruntime
@@ -102,7 +100,8 @@ def open_session(path: Path, threads: int = 0) -> Any:
     except Exception as error:  # onnxruntime's exceptions share no public base class
         first = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
         if "NOT_IMPLEMENTED" in first:
-            raise InputError(f"{path}: onnxruntime lacks a kernel for it ({first}); take full precision") from error
+            what = f"onnxruntime lacks a kernel for it here ({first})"
+            raise InputError(f"{path}: {what}; take full precision") from error
         if path.open("rb").read(40).startswith(b"version https://git-lfs"):
             raise InputError(f"{path}: a Git LFS pointer, not the model; fetch it with git lfs pull") from error
         raise InputError(f"{path}: not an ONNX model that onnxruntime can open ({first})") from error
@@ -141,9 +140,7 @@ def signature(session: Any) -> str:
 
 def fingerprint(path: Path) -> str:
     """12 hex digits of the size, the first and the last MiB of a model and of its side files.
-
-    This distinguishes weights without reading the whole files, which can be gigabytes.
-    """
+    This distinguishes weights without reading the whole files, which can be gigabytes."""
     digest = hashlib.sha256()
     for part in (path, *side_files(path)):
         size = part.stat().st_size

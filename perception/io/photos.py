@@ -144,9 +144,7 @@ def load_photo(view: View, max_side: int | None = None) -> np.ndarray:
 
 def warp_labels(view: View, labels: np.ndarray, width: int, height: int) -> np.ndarray:
     """Labels [H, W] in the photo's geometry to int32 [height, width] in the view's pinhole, nearest sampling.
-
-    Pixels outside the photo get 0. The label image must have the photo's size (after EXIF rotation).
-    """
+    Pixels outside the photo get 0. The label image must have the photo's size (after EXIF rotation)."""
     across, down = view.photo_size
     if labels.shape != (down, across):
         found = "×".join(map(str, labels.shape[::-1]))

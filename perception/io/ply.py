@@ -70,9 +70,7 @@ def read_ply(path: str | Path) -> dict[str, Element]:
 
 def map_ply(path: str | Path, element: str) -> np.ndarray:
     """The first element of a binary little-endian PLY as a structured array [rows], mapped into memory, read-only.
-
-    For large tables. InputError when the first element has another name or lists, or when the file is truncated.
-    """
+    For large tables. InputError when the first element has another name or lists, or when the file is truncated."""
     path = Path(path)
     with path.open("rb") as file:
         order, tables = _read_header(file, path)
@@ -90,9 +88,7 @@ def map_ply(path: str | Path, element: str) -> np.ndarray:
 
 def write_ply(path: str | Path, elements: Mapping[str, Mapping[str, np.ndarray]]) -> None:
     """Write elements of scalar properties [rows] and list properties [rows, k], in the order given.
-
-    Binary little endian. The file appears complete or not at all.
-    """
+    Binary little endian. The file appears complete or not at all."""
     with replacing(path) as file:
         file.write(_header(elements))
         for properties in elements.values():

@@ -95,19 +95,15 @@ def rigid_pose(matrix: np.ndarray, what: str) -> np.ndarray:
 
 def fit_lens(lens: Lens, photo: Path, source: Path) -> tuple[Lens, str | None]:
     """The lens scaled to the photo's size, and a note if it was scaled; InputError if the aspect ratio differs.
-
-    For a large photo that is read at 1/2, 1/4 or 1/8, the lens of the full size is scaled in the same way.
-    """
+    For a large photo that is read at 1/2, 1/4 or 1/8, the lens of the full size is scaled in the same way."""
     size, whole = photo_size(photo), (lens.width, lens.height)
     if whole in (size, stored_size(photo)) and max(whole) <= max(size):
         return lens, None
     if size[0] * lens.height == size[1] * lens.width or size in (reduced_size(*whole, k) for k in (2, 4, 8)):
         note = f"{photo.name}: photo {size[0]}×{size[1]}, camera {lens.width}×{lens.height}: intrinsics scaled"
         return rescale_lens(lens, *size), note
-    raise InputError(
-        f"{source}: {photo.name} is {size[0]}×{size[1]} but its camera says {lens.width}×{lens.height}; "
-        "give the camera of these photos or the photos of this camera"
-    )
+    found = f"{photo.name} is {size[0]}×{size[1]} but its camera says {lens.width}×{lens.height}"
+    raise InputError(f"{source}: {found}; give the camera of these photos or the photos of this camera")
 
 
 def view_lens(view: View) -> Lens:

@@ -32,9 +32,7 @@ def recentred(scene: Scene) -> Scene:
 
 def moved_scene(scene: Scene, b_from_a: np.ndarray) -> Scene:
     """The scene in frame b, by a similarity [4, 4]; report["map_from_input"] leads there from the input's frame.
-
-    The down direction in report["gravity"] is rotated as well.
-    """
+    The down direction in report["gravity"] is rotated as well."""
     report = {**scene.report, "map_from_input": (b_from_a @ scene.report.get("map_from_input", np.eye(4))).tolist()}
     if "gravity" in report:
         down = b_from_a[:3, :3] @ report["gravity"]["direction"] / scale_of(b_from_a)
@@ -45,9 +43,7 @@ def moved_scene(scene: Scene, b_from_a: np.ndarray) -> Scene:
 
 def moved(view: View, b_from_a: np.ndarray) -> View:
     """The view in frame b, its depth in units of b; b_from_a [4, 4]: a similarity x_b = s R x_a + t.
-
-    A camera x_c = R_c x_a + t_c becomes x_c = R_c Rᵀ x_b + s t_c − R_c Rᵀ t.
-    """
+    A camera x_c = R_c x_a + t_c becomes x_c = R_c Rᵀ x_b + s t_c − R_c Rᵀ t."""
     scale = scale_of(b_from_a)
     pose = np.array(view.camera_from_world, np.float64)
     pose[:3, :3] = pose[:3, :3] @ (b_from_a[:3, :3] / scale).T
@@ -58,9 +54,7 @@ def moved(view: View, b_from_a: np.ndarray) -> View:
 
 def map_from_input(path: Path, info: dict[str, Any]) -> np.ndarray:
     """The similarity [4, 4] from the coordinates of a map's input to those of the map; info: map.json.
-
-    The identity for a map in its input's frame. Maps of earlier releases record the offset `scene.origin`.
-    """
+    The identity for a map in its input's frame. Maps of earlier releases record the offset `scene.origin`."""
     matrix = info.get("map_from_input")
     if matrix is not None:
         return check_similarity(matrix, f"{path / 'map.json'}: map_from_input")

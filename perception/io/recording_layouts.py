@@ -76,10 +76,8 @@ def _tum(source: Path) -> Recording:
     nearest = np.abs(depth_at[None] - at[:, None]).argmin(axis=1)
     apart = np.abs(depth_at[nearest] - at)
     if apart.min() > TUM_APART:
-        raise InputError(
-            f"{source}: photos and depth are at least {apart.min():.3g} s apart, at most {TUM_APART} are allowed; do "
-            "rgb.txt and depth.txt use one clock?"
-        )
+        found = f"photos and depth are at least {apart.min():.3g} s apart, at most {TUM_APART} are allowed"
+        raise InputError(f"{source}: {found}; do rgb.txt and depth.txt use one clock?")
     frames = []
     for time, photo, depth, near in zip(at, photos, nearest, apart <= TUM_APART, strict=True):
         pose = interpolated_pose(times, poses, time, TUM_GAP)
@@ -139,9 +137,7 @@ def _seven_scenes(source: Path) -> Recording:
 
 def _posed(source: Path, photos: list[Path], beside: Callable[[Path, str], Path]) -> list[Frame]:
     """The photos with a pose, a file of world_from_camera that is neither infinite nor all zero (tracking was lost).
-
-    beside: the photo's file of kind "depth" (.png) or "pose" (.txt), without suffix.
-    """
+    beside: the photo's file of kind "depth" (.png) or "pose" (.txt), without suffix."""
     frames = []
     for photo in photos:
         depth, pose = (Path(f"{beside(photo, kind)}{suffix}") for kind, suffix in (("depth", ".png"), ("pose", ".txt")))
@@ -158,7 +154,7 @@ def _redwood(source: Path, folder: Path) -> Recording:
     """color/ (or image/, rgb/) and depth/ in mm in equal order, and a .log of world_from_camera matrices."""
     photos, depths = _images(folder), _images(source / "depth")
     if len(photos) != len(depths):
-        raise InputError(f"{source}: {len(photos)} photos in {folder.name}/, {len(depths)} in depth/; expected pairs")
+        raise InputError(f"{source}: {len(photos)} photos in {folder.name}/, {len(depths)} images in depth/; pair them")
     logs = sorted(source.glob("*.log"))
     named = [log for log in logs if log.name == "trajectory.log"] or logs
     if len(named) > 1:
@@ -230,10 +226,8 @@ def _matrix_lens(file: Path, size: tuple[int, int]) -> Lens | None:
         raise InputError(f"{file}: {len(K)} rows, expected a matrix of intrinsics, 3×3 or 4×4")
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     if not (min(fx, fy) > 0 and abs(cx / size[0] - 0.5) < 0.25 and abs(cy / size[1] - 0.5) < 0.25):
-        raise InputError(
-            f"{file}: focal length {fx:g} and centre ({cx:g}, {cy:g}) are not those of images of {size[0]}×{size[1]}; "
-            "were they resized? give --camera FILE, or the original images"
-        )
+        found = f"focal length {fx:g} and centre ({cx:g}, {cy:g}) are not those of images of {size[0]}×{size[1]}"
+        raise InputError(f"{file}: {found}; were they resized? give --camera FILE, or the original images")
     return _lens((fx, fy, cx, cy), size)
 
 

@@ -57,9 +57,7 @@ class Recording:
 
 def recorded_scene(recording: Recording, how: Reading) -> Scene:
     """The chosen frames of a recording as a Scene in its own world, whose unit is the metre.
-
-    InputError for poses that are not rigid, a missing lens, and depth whose unit cannot be right.
-    """
+    InputError for poses that are not rigid, a missing lens, and depth whose unit cannot be right."""
     source, kind, lens = recording.source, recording.kind, recording.lens
     if not recording.frames:
         raise InputError(f"{source}: a recording as of {kind}, but no frame has both photo and pose")

@@ -76,10 +76,8 @@ def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, fixed: bool, how: 
         started = time.perf_counter()
         models, contradicted = map_photos(store, fixed, how.seed, len(chosen.photos), how.progress)
         if not models:
-            raise InputError(
-                f"{folder}: none of the {len(chosen.photos)} photos could be registered; take sharp, overlapping "
-                "photos of a textured scene from different places"
-            )
+            advice = "take sharp, overlapping photos of a textured scene from different places"
+            raise InputError(f"{folder}: none of the {len(chosen.photos)} photos could be registered; {advice}")
         seconds = {**store.facts["seconds"], "mapping": time.perf_counter() - started}
         report = _report(models, contradicted, store, chosen.names, seconds)
         with atomic_directory(done) as new:

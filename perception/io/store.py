@@ -77,9 +77,7 @@ def _recorded(view: View, path: Path, before: Path | None) -> StoredView:
 
 def read_map(path: Path) -> Map:
     """Reads a whole map into memory and verifies its checksums.
-
-    InputError naming the file when it is not a map, of an unknown version, or damaged.
-    """
+    InputError naming the file when it is not a map, of an unknown version, or damaged."""
     return Map.open(path).load()
 
 

@@ -25,9 +25,7 @@ def posed_scene(
     views: list[View], cloud: tuple[np.ndarray, np.ndarray], facts: dict[str, Any], how: Reading, least: int
 ) -> Scene:
     """The Scene of views with known poses. cloud: points [P, 3] and colors [P, 3] from the input.
-
-    With fewer than `least` points, triangulated points are used instead. facts: report entries, with "warnings".
-    """
+    With fewer than `least` points, triangulated points are used instead. facts: report entries, with "warnings"."""
     cameras = sorted({lens_text(view_lens(view)) for view in views})
     report = {**facts, "registered": len(views), "cameras": cameras, "seconds": {}}
     points, colors = cloud

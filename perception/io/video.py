@@ -121,9 +121,7 @@ def frames(
     video: Path, wanted: set[int] | None = None, most: int | None = None
 ) -> Iterator[tuple[int, float, np.ndarray]]:
     """(number, share of the video, BGR [h, w, 3] uint8) of the `wanted` frames, upright.
-
-    Without `wanted`, every n-th frame: LOOKS_PER_SECOND, or about `most` in all. None where the video is unreadable.
-    """
+    Without `wanted`, every n-th frame: LOOKS_PER_SECOND, or about `most` in all. None where the video is unreadable."""
     capture = cv2.VideoCapture(str(video))
     try:
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)

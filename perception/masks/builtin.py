@@ -52,9 +52,7 @@ class BuiltinSegmentation:
         keep: Keep = np.asarray,
     ) -> Segmentation | None:
         """Segments the surface seen by all photos jointly. load_depth: view -> [h, w] z-depth, 0 = none.
-
-        There are no segments, None, if fewer than two photos have depth, or if no depths agree.
-        """
+        There are no segments, None, if fewer than two photos have depth, or if no depths agree."""
         made = [make_stereo_view(view, load_photo(view), load_depth(view), keep) for view in views]
         found = [view for view in made if view is not None]
         if len(found) < 2:

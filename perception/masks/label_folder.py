@@ -17,9 +17,7 @@ _COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RG
 
 class LabelFolder:
     """Label images read from a folder. The photo `a/0001.jpg` uses `a/0001.png`, or `0001.png` if stems are unique.
-
-    Format: 8 or 16 bit grey, or an 8-bit palette whose index is the label. 0 = unlabelled.
-    """
+    Format: 8 or 16 bit grey, or an 8-bit palette whose index is the label. 0 = unlabelled."""
 
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():
@@ -36,10 +34,8 @@ class LabelFolder:
         self._files = {view.name: file for view in views if (file := self._find(view, views)) is not None}
         missing = [view.name for view in views if view.name not in self._files]
         if missing:
-            raise InputError(
-                f"labels:{self.folder}: {_some(missing)} without a label image; expected a PNG of the same "
-                "stem for each photo (all zero where nothing is labelled)"
-            )
+            advice = "expected a PNG of the same stem for each photo (all zero where nothing is labelled)"
+            raise InputError(f"labels:{self.folder}: {_some(missing)} without a label image; {advice}")
         for view in views:
             _check_header(self._files[view.name], *view.photo_size)
         used = set(self._files.values())

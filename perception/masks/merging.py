@@ -159,9 +159,7 @@ class MergeTree:
 
 def merge_tree(graph: SurfaceGraph, score: Callable[[SurfaceGraph, np.ndarray], np.ndarray]) -> MergeTree:
     """Merges the most likely pair of neighbours until no neighbours are left; patches under SMALLEST come first.
-
-    score: (graph as merged so far, pairs [M, 2]) -> [M] log odds that the two are one; −inf: never merge.
-    """
+    score: (graph as merged so far, pairs [M, 2]) -> [M] log odds that the two are one; −inf: never merge."""
     graph = graph.copy()
     count = graph.count
     node = list(range(count))  # of each patch that others were merged into
@@ -210,9 +208,7 @@ def merge_tree(graph: SurfaceGraph, score: Callable[[SurfaceGraph, np.ndarray], 
 
 def join_planes(graph: SurfaceGraph, ends: np.ndarray) -> np.ndarray:
     """Joins large flat segments that are coplanar and similar in colour, such as floors and tables split by objects.
-
-    ends: [R] the segment of each patch. Returns [R] with one number for each set of joined segments.
-    """
+    ends: [R] the segment of each patch. Returns [R] with one number for each set of joined segments."""
     large = [i for i in np.unique(ends).tolist() if graph.area(i) > _LARGE]
     large = [i for i in large if graph.extents[i, 0] < _FLAT * graph.depth(i)]
     joined = np.arange(graph.count)

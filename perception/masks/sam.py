@@ -175,9 +175,7 @@ def mask_box(mask: np.ndarray) -> np.ndarray:
 
 def box_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.ndarray:
     """Greedy non-maximum suppression. Returns the kept indices, best score first; ties keep the input order.
-
-    boxes: [M, 4], scores: [M]. IoU in float32 with areas (x1 − x0)(y1 − y0), as in torchvision.
-    """
+    boxes: [M, 4], scores: [M]. IoU in float32 with areas (x1 − x0)(y1 − y0), as in torchvision."""
     x0, y0, x1, y1 = boxes.astype(np.float32).T
     areas = (x1 - x0) * (y1 - y0)
     order = np.argsort(-scores, kind="stable")

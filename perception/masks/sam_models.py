@@ -162,9 +162,7 @@ class SamModel:
 
     def _probe(self) -> bool:
         """Whether two prompts of an empty embedding are answered in one call. Declared axes are not to be trusted.
-
-        Warns of a decoder that gives one mask a prompt. InputError if the decoder does not run at all.
-        """
+        Warns of a decoder that gives one mask a prompt. InputError if the decoder does not run at all."""
         shapes = {role: shape_of(x) for role, x in self.decoder.inputs.items() if role in self.encoder.outputs}
         axis = 1 if self.kind.nested else 0
         fixed = shape_of(self.decoder.inputs["points"])[axis]
@@ -258,9 +256,7 @@ class SamModel:
 
 def open_sam(spec: str, threads: int = 0) -> SamModel:
     """spec: a folder with both graphs, an encoder file next to its decoder, `ENCODER,DECODER`, or a stored name.
-
-    threads: of one run; 0: all cores.
-    """
+    threads: of one run; 0: all cores."""
     spec = resolve(spec)
     paths = [Path(part.strip()) for part in spec.split(",")] if "," in spec else _candidates(Path(spec).expanduser())
     graphs = [open_graph(path, threads) for path in paths]
@@ -273,10 +269,8 @@ def open_sam(spec: str, threads: int = 0) -> SamModel:
     for kind, here, other in (("encoder", encoders, decoders), ("decoder", decoders, encoders)):
         if not here:
             role = "decoder" if kind == "encoder" else "encoder"
-            raise InputError(
-                f"sam:{spec}: {other[0].path.name} is a {role} and its {kind} is missing; "
-                f"put both into one folder or write sam:ENCODER,DECODER"
-            )
+            what = f"{other[0].path.name} is a {role} and its {kind} is missing"
+            raise InputError(f"sam:{spec}: {what}; put both into one folder or write sam:ENCODER,DECODER")
     names = ", ".join(g.path.name for g in encoders + decoders)
     raise InputError(f"sam:{spec}: several models found ({names}); write sam:ENCODER,DECODER")
 
@@ -307,10 +301,8 @@ def _candidates(path: Path) -> list[Path]:
             raise InputError(f"sam:{path}: no .onnx file in this folder; expected an encoder and a decoder")
         return files
     if not path.is_file():
-        raise InputError(
-            f"sam:{path}: no such file or folder, nor a stored model; expected a SAM encoder and decoder as ONNX; "
-            f"{known_names()}"
-        )
+        found = "no such file or folder, nor a stored model; expected a SAM encoder and decoder as ONNX"
+        raise InputError(f"sam:{path}: {found}; {known_names()}")
     partners = [path.with_name(path.name.replace(a, b)) for a, b in (("encoder", "decoder"), ("decoder", "encoder"))]
     beside = [partner for partner in partners if partner != path and partner.is_file()]
     other = [file for file in sorted(path.parent.glob("*.onnx")) if file != path and "decoder" in file.name]

@@ -90,9 +90,7 @@ def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray, keep: Kee
 
 def measure_depths(views: list[StereoView], progress: Progress | None = None) -> None:
     """Replaces the depths of all views by stereo depths, and marks the pixels confirmed by other views.
-
-    Depths that a sensor measured are kept, averaged with those of the views that agree.
-    """
+    Depths that a sensor measured are kept, averaged with those of the views that agree."""
     chosen = choose_neighbours(views)
     depths = []
     for i, (view, near) in enumerate(zip(views, chosen, strict=True), start=1):

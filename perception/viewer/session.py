@@ -100,9 +100,7 @@ class Session:
 
     def pick(self, origin: np.ndarray, direction: np.ndarray, add: bool = False) -> int | None:
         """Selects the instance that a ray in the map frame shows, and returns its id.
-
-        After `measure`, the point that it shows becomes an end of the length; InputError when it shows none.
-        """
+        After `measure`, the point that it shows becomes an end of the length; InputError when it shows none."""
         if self.measuring:
             end = pick_point(self.editor.original, self.shown(), origin, direction)
             if end is None:
