@@ -56,25 +56,22 @@ def read_workspace(folder: Path, how: Reading) -> Scene:
         raise InputError(f"{path}: the sparse model is empty (no registered photo); run structure from motion again")
     names = {image_id: safe_name(model.images[image_id].name, path) for image_id in model.reg_image_ids()}
     located = {image_id: (name, folder / "images" / name) for image_id, name in names.items()}
-    views, missing, notes = views_of_model(model, located, path, how)
-    if not views:
-        raise InputError(f"{folder / 'images'}: none of the {model.num_reg_images()} photos of {path} is there")
+    views, facts = views_of_model(model, located, path, how)
     if len(found) > 1:
         sizes = ", ".join(f"{p.name}: {m.num_reg_images()}" for p, m in found.items())
-        notes.append(f"{folder}: {len(found)} sparse models (photos in {sizes}); the largest is used")
+        facts["warnings"].append(f"{folder}: {len(found)} sparse models (photos in {sizes}); the largest is used")
     cloud = how.cloud or cloud_of(model)
     if len(cloud[0]) < MIN_POINTS:
-        notes.append(f"{path}: the sparse model holds {len(cloud[0])} points; new ones are triangulated")
-    facts: dict[str, Any] = {"input": "colmap", "left_out": missing, "warnings": notes}
+        facts["warnings"].append(f"{path}: the sparse model holds {len(cloud[0])} points; new ones are triangulated")
     facts |= {"model": path.relative_to(folder).as_posix(), "mean_reprojection_error_px": _reprojection_error(model)}
-    views, exposure = with_gains(views, tracks_of_model(model, views, names))
-    return posed_scene(views, cloud, {**facts, **exposure}, how, MIN_POINTS)
+    return posed_scene(views, cloud, {"input": "colmap", **facts}, how, MIN_POINTS)
 
 
 def views_of_model(
     model: Any, located: dict[int, tuple[str, Path]], source: Path, how: Reading
-) -> tuple[list[View], list[dict[str, str]], list[str]]:
-    """Views sorted by name, photos left out with the reason, notes. located: image id to view name and photo."""
+) -> tuple[list[View], dict[str, Any]]:
+    """Views sorted by name, and facts: "left_out" with reasons, "warnings", "exposure". located: view name and photo by
+    image id. InputError when no photo is left."""
     views, missing, notes = [], [], set()
     lenses = {camera_id: lens_from_camera(camera) for camera_id, camera in model.cameras.items()}
     for image_id, (name, photo) in located.items():
@@ -90,8 +87,12 @@ def views_of_model(
         views.append(replace(make_view(name, photo, lens, pose, source), mask=mask_of(how.masks, name)))
         if note:
             notes.add(note)
+    if not views:
+        raise InputError(f"{source}: none of the {len(located)} photos of the sparse model is there")
+    names = {image_id: name for image_id, (name, _) in located.items()}
     views.sort(key=lambda view: view.name)
-    return views, sorted(missing, key=lambda item: item["name"]), sorted(notes)
+    views, exposure = with_gains(views, tracks_of_model(model, views, names))
+    return views, {"left_out": sorted(missing, key=lambda item: item["name"]), "warnings": sorted(notes), **exposure}
 
 
 def _reprojection_error(model: Any) -> float | None:

@@ -14,7 +14,6 @@ from typing import Any
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory, recover
 from perception.io.colmap import views_of_model
-from perception.io.exposure import with_gains
 from perception.io.features import FeatureStore, build_features, verified_matches
 from perception.io.ignore_masks import mask_of
 from perception.io.incremental_sfm import map_photos, model_warnings
@@ -22,7 +21,6 @@ from perception.io.lens import lens_from_camera, lens_text, load_pycolmap
 from perception.io.photo_folder import PhotoSet, choose_photos
 from perception.io.photos import photo_size
 from perception.io.reading import Reading
-from perception.io.tracks import tracks_of_model
 from perception.io.triangulate import cloud_of
 from perception.types import Lens, Scene
 
@@ -47,15 +45,12 @@ def reconstruct(folder: Path, lens: Lens | None, how: Reading) -> Scene:
     ignored = [mask_of(how.masks, name) for name in chosen.names]
     store = build_features(photos, [lens] * len(photos), how.workdir, how.seed, how.progress, ignored)
     model, report = _map(store, chosen, folder, lens is not None, how)
-    number = {name: index for index, name in enumerate(store.names)}
-    indices = {image_id: number[model.images[image_id].name] for image_id in model.reg_image_ids()}
-    located = {image_id: (chosen.names[index], photos[index]) for image_id, index in indices.items()}
-    views, _, _ = views_of_model(model, located, folder, how)
-    names = {image_id: name for image_id, (name, _) in located.items()}
-    views, exposure = with_gains(views, tracks_of_model(model, views, names))
+    staged = dict(zip(store.names, zip(chosen.names, photos, strict=True), strict=True))
+    located = {image_id: staged[model.images[image_id].name] for image_id in model.reg_image_ids()}
+    views, facts = views_of_model(model, located, folder, how)
     points, colors = cloud_of(model)
     report["left_out"] = sorted([*chosen.left_out, *report["left_out"]], key=lambda entry: entry["name"])
-    return Scene(views, points, colors, report={**report, **exposure, "notes": chosen.notes})
+    return Scene(views, points, colors, report={**report, "exposure": facts["exposure"], "notes": chosen.notes})
 
 
 def _too_few(folder: Path, chosen: PhotoSet) -> InputError:

@@ -10,18 +10,18 @@ import pytest
 from scipy.spatial import Delaunay
 
 from perception.errors import InputError
-from perception.export.neighbors import (
-    Neighbors,
+from perception.export.neighbors import Neighbors, list_normals, nearest_gaussian, neighbor_lists
+from perception.export.smooth import (
+    felzenszwalb,
     list_edges,
-    list_normals,
     mesh_edges,
-    nearest_gaussian,
-    neighbor_lists,
+    read_segments,
     scannet_normals,
     scannet_weights,
+    segment_cloud,
     step_weights,
+    vote,
 )
-from perception.export.smooth import felzenszwalb, read_segments, segment_cloud, vote
 from perception.types import PointCloud
 
 CLOUDS = {
