@@ -117,27 +117,25 @@ _PIXELS = re.compile(rf"(.+?)\s+({_NUMBER},{_NUMBER})\s+({_NUMBER},{_NUMBER})")
 def known_length(text: str) -> KnownLength:
     """Reads "METRES: A, B" (labels or ids), "METRES: X,Y,Z X,Y,Z" or "METRES: PHOTO X,Y X,Y; PHOTO X,Y X,Y"."""
     expected = 'expected "METRES: LABEL, LABEL", "METRES: X,Y,Z X,Y,Z" or "METRES: PHOTO X,Y X,Y; PHOTO X,Y X,Y"'
-    length, colon, rest = text.partition(":")
-    try:
-        metres = float(length)
-    except ValueError:
-        metres = np.nan
-    if not (colon and rest.strip()) or np.isnan(metres):
-        raise InputError(f"known length: found '{text}', {expected}")
-    if not 0 < metres < np.inf:
-        raise InputError(f"known length: found {metres:g} m, expected a length above 0")
+    length, _, rest = (part.strip() for part in text.partition(":"))
     entries = [_PIXELS.fullmatch(entry.strip()) for entry in rest.split(";") if entry.strip()]
+    names = [name.strip() for name in rest.split(",")]
     try:
-        if places := _POINTS.fullmatch(rest.strip()):
-            return KnownLength(metres, points=_finite([places[1], places[2]]))
-        if entries and all(entries):
-            return KnownLength(metres, pixels={e[1]: _finite([e[2], e[3]]) for e in entries if e})
+        if np.isnan(metres := float(length)):
+            raise ValueError("its length is no number")
+        if places := _POINTS.fullmatch(rest):
+            found = KnownLength(metres, points=_finite([places[1], places[2]]))
+        elif entries and all(entries):
+            found = KnownLength(metres, pixels={e[1]: _finite([e[2], e[3]]) for e in entries if e})
+        elif len(names) == 2 and all(names) and ";" not in rest:
+            found = KnownLength(metres, names=(names[0], names[1]))
+        else:
+            raise ValueError("its ends are no two names, points or pixels")
     except ValueError as error:
         raise InputError(f"known length: found '{text}', {expected} ({error})") from error
-    names = [name.strip() for name in rest.split(",")]
-    if len(names) != 2 or not all(names) or ";" in rest:
-        raise InputError(f"known length: found '{text}', {expected}")
-    return KnownLength(metres, names=(names[0], names[1]))
+    if not 0 < metres < np.inf:
+        raise InputError(f"known length: found {metres:g} m, expected a length above 0")
+    return found
 
 
 def _finite(places: list[str]) -> np.ndarray:

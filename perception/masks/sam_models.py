@@ -263,16 +263,10 @@ def open_sam(spec: str, threads: int = 0) -> SamModel:
     encoders, decoders = [g for g in graphs if g.is_encoder], [g for g in graphs if g.is_decoder]
     if len(encoders) == 1 and len(decoders) == 1:
         return SamModel(encoders[0], decoders[0])
-    if not encoders and not decoders:
-        found = ", ".join(f"{g.path.name}: {signature(g.session)}" for g in graphs)
-        raise InputError(f"sam:{spec}: no SAM encoder or decoder recognised ({found})")
-    for kind, here, other in (("encoder", encoders, decoders), ("decoder", decoders, encoders)):
-        if not here:
-            role = "decoder" if kind == "encoder" else "encoder"
-            what = f"{other[0].path.name} is a {role} and its {kind} is missing"
-            raise InputError(f"sam:{spec}: {what}; put both into one folder or write sam:ENCODER,DECODER")
-    names = ", ".join(g.path.name for g in encoders + decoders)
-    raise InputError(f"sam:{spec}: several models found ({names}); write sam:ENCODER,DECODER")
+    kinds = ("encoder" if g.is_encoder else "decoder" if g.is_decoder else signature(g.session) for g in graphs)
+    found = "; ".join(f"{g.path.name}: {kind}" for g, kind in zip(graphs, kinds, strict=True))
+    what = f"expected one SAM encoder and its decoder, found {found}"
+    raise InputError(f"sam:{spec}: {what}; put both into one folder or write sam:ENCODER,DECODER")
 
 
 def open_graph(path: Path, threads: int = 0) -> Graph:
