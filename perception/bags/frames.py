@@ -53,7 +53,10 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         raise InputError(f"--max-frames {options.max_frames}, --spacing {options.spacing}: expected 2 or more, above 0")
     with open_bag(source) as bag:
         depths = depth_topics(bag)
-        topic = _image_topic(bag, options.topic, depths)
+        images = bag.of_type(*IMAGES)
+        if not images:
+            raise InputError(f"{bag.path}: holds no images; its topics are {', '.join(sorted(bag.topics)) or 'none'}")
+        topic = bag.chosen([t for t in images if t not in depths] or images, options.topic, "image", "--topic")
         info = None if options.camera is not None else _camera_info(bag, topic, options.camera_info)
         chooser = Chooser(options.spacing)
         size = None
@@ -89,13 +92,6 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         "gravity_std_deg": None if down is None else down[1],
     }
     return facts, _text(facts)
-
-
-def _image_topic(bag: Bag, wanted: str | None, depths: list[str]) -> str:
-    topics = bag.of_type(*IMAGES)
-    if not topics:
-        raise InputError(f"{bag.path}: holds no images; its topics are {', '.join(sorted(bag.topics)) or 'none'}")
-    return bag.chosen([topic for topic in topics if topic not in depths] or topics, wanted, "image", "--topic")
 
 
 def _camera_info(bag: Bag, topic: str, wanted: str | None) -> Any:

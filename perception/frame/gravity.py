@@ -42,11 +42,7 @@ class Gravity:
         return self.standard_error <= CONFIDENT
 
     def to_json(self) -> dict[str, Any]:
-        return {
-            "direction": [float(x) for x in self.direction],
-            "source": self.source,
-            "standard_error_deg": float(self.standard_error),
-        }
+        return {"direction": self.direction.tolist(), "source": self.source, "standard_error_deg": self.standard_error}
 
     @classmethod
     def from_json(cls, entry: dict[str, Any]) -> Gravity:

@@ -78,8 +78,9 @@ def checked_poses(views: list[View], features: Features, how: str) -> tuple[list
     refined = refine(features, given)
     after = _medians(features, refined)
     if after["epipolar"] <= min(IMPROVED * before["epipolar"], HOPELESS * good):
-        facts |= {"refined": True, "error_px": after, **_changes(refined.since(given))}
-        report["notes"].append(f"refined poses: {_text(after)}; {_changes_text(facts)}")
+        changes, text = _changes(refined.since(given))
+        facts |= {"refined": True, "error_px": after, **changes}
+        report["notes"].append(f"refined poses: {_text(after)}; {text}")
         return [replace(v, camera_from_world=m) for v, m in zip(usable, refined.matrices(), strict=True)], report
     if before["epipolar"] <= HOPELESS * good:
         report["notes"].append(f"refining them gains little ({_text(after)}); they are used as they are")
@@ -147,21 +148,13 @@ def _text(errors: dict[str, float]) -> str:
     return f"{errors['epipolar']:.2f} px off their epipolar lines{by_depth} (medians)"
 
 
-def _changes(delta: np.ndarray) -> dict[str, Any]:
-    """How far the cameras moved, in scene units, and turned, for changes [N, 6] of the poses."""
-    spreads = {}
-    for name, vectors in (("moved", delta[:, 3:]), ("turned_deg", np.degrees(delta[:, :3]))):
-        lengths = np.linalg.norm(vectors, axis=1)
-        spreads[name] = {"median": float(np.median(lengths)), "max": float(lengths.max())}
-    return spreads
-
-
-def _changes_text(facts: dict[str, Any]) -> str:
-    moved, turned = facts["moved"], facts["turned_deg"]
-    return (
-        f"cameras moved {moved['median']:.3g} units in the median, at most {moved['max']:.3g}, "
-        f"and turned {turned['median']:.2g}°, at most {turned['max']:.2g}°"
-    )
+def _changes(delta: np.ndarray) -> tuple[dict[str, Any], str]:
+    """How far the cameras moved, in scene units, and turned, for changes [N, 6] of the poses; the same as text."""
+    lengths = (np.linalg.norm(vectors, axis=1) for vectors in (delta[:, 3:], np.degrees(delta[:, :3])))
+    moved, turned = ({"median": float(np.median(each)), "max": float(each.max())} for each in lengths)
+    text = f"cameras moved {moved['median']:.3g} units in the median, at most {moved['max']:.3g}, "
+    text += f"and turned {turned['median']:.2g}°, at most {turned['max']:.2g}°"
+    return {"moved": moved, "turned_deg": turned}, text
 
 
 def _rays(features: Features, of: np.ndarray) -> np.ndarray:

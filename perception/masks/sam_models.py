@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from perception.errors import InputError
 from perception.io.model_store import known_names, resolve
@@ -199,7 +200,8 @@ class SamModel:
         if self.kind.fit == "pad":
             ratio = min(height / photo.shape[0], width / photo.shape[1])
             used = (int(photo.shape[0] * ratio + 0.5), int(photo.shape[1] * ratio + 0.5))
-        resized = _resize(photo, *used).astype(np.float32)
+        # Pillow's bilinear filter, with anti-aliasing, is the published predictor's.
+        resized = np.asarray(Image.fromarray(photo).resize(used[::-1], Image.Resampling.BILINEAR), np.float32)
         if raw and shape[0] is None:
             return resized, used, used  # the graph pads internally
         padded = np.zeros((height, width, 3), np.float32)
@@ -335,10 +337,3 @@ def _check_pair(encoder: Graph, decoder: Graph) -> None:
 def _square(embedding: Encoded) -> int:
     """Side of the padded square in pixels. SAM's encoders have a stride of 16."""
     return 16 * embedding.tensors["embedding"].shape[-1]
-
-
-def _resize(photo: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Bilinear resize with anti-aliasing by Pillow, as in the published predictor."""
-    from PIL import Image
-
-    return np.asarray(Image.fromarray(photo).resize((width, height), Image.Resampling.BILINEAR))

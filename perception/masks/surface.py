@@ -48,28 +48,20 @@ class SurfaceBuilder:
         """Adds one photo. known: [h, w] bool, pixels with reliable depth. world_from_camera: [4, 4]."""
         points = to_world(depth.points[known], world_from_camera)
         normals = depth.normals[known] @ world_from_camera[:3, :3].T
-        keys, index = np.unique(voxel_keys(points, self.size), return_inverse=True)
         values = np.concatenate([np.ones((len(points), 1)), points, normals, photo.lab[known]], axis=1)
-        sums = np.stack([np.bincount(index, weights=column, minlength=len(keys)) for column in values.T], axis=1)
-        self._merge(keys, sums)
+        self._merge(voxel_keys(points, self.size), values)
 
-    def _merge(self, keys: np.ndarray, sums: np.ndarray) -> None:
+    def _merge(self, keys: np.ndarray, values: np.ndarray) -> None:
+        """Adds values [P, C] to the sums of voxels keys [P]; too many voxels are made eight times as large."""
         every, index = np.unique(np.concatenate([self._keys, keys]), return_inverse=True)
-        total = np.zeros((len(every), sums.shape[1]))
-        total[index[: len(self._keys)]] = self._sums
-        total[index[len(self._keys) :]] += sums
+        old, new = np.split(index, [len(self._keys)])
+        total = np.stack([np.bincount(new, column, len(every)) for column in values.T], axis=1)
+        total[old] += self._sums
         self._keys, self._sums = every, total
         if len(every) > 2 * _MOST:
-            self._coarsen()
-
-    def _coarsen(self) -> None:
-        """Doubles the side of the voxels: eight voxels become one."""
-        self.size *= 2
-        old, self._keys = unpack_voxels(self._keys) // 2, np.zeros(0, np.int64)
-        keys, index = np.unique(pack_voxels(old), return_inverse=True)
-        sums = np.stack([np.bincount(index, weights=column, minlength=len(keys)) for column in self._sums.T], axis=1)
-        self._sums = np.zeros((0, sums.shape[1]))
-        self._merge(keys, sums)
+            self.size *= 2
+            self._keys, self._sums = np.zeros(0, np.int64), np.zeros((0, values.shape[1]))
+            self._merge(pack_voxels(unpack_voxels(every) // 2), total)
 
     def build(self) -> Surface:
         """The voxels with at least _LEAST_PIXELS pixels."""
@@ -77,14 +69,8 @@ class SurfaceBuilder:
         sums = self._sums[rows]
         count = np.maximum(sums[:, :1], 1)
         normals = sums[:, 4:7] / np.maximum(np.linalg.norm(sums[:, 4:7], axis=1, keepdims=True), 1e-9)
-        return Surface(
-            self.size,
-            self._keys[rows],
-            sums[:, 0],
-            (sums[:, 1:4] / count).astype(np.float32),
-            normals.astype(np.float32),
-            (sums[:, 7:10] / count).astype(np.float32),
-        )
+        points, lab = ((sums[:, k : k + 3] / count).astype(np.float32) for k in (1, 7))
+        return Surface(self.size, self._keys[rows], sums[:, 0], points, normals.astype(np.float32), lab)
 
 
 def to_world(points: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
