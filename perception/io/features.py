@@ -145,40 +145,21 @@ def build_features(
     most = POSED_PARTNERS if posed else len(photos)
     folder = workdir / f"features-{_key(photos, lenses, (seed, most), masks)}"
     recover(folder)
-    facts_file = folder / "facts.json"
-    if not facts_file.exists():
+    if not (folder / "facts.json").exists():
         with atomic_directory(folder) as new:
-            facts = _build(new, photos, lenses, masks, seed, most, progress)
-            (new / "facts.json").write_text(json.dumps(facts))
-    facts = json.loads(facts_file.read_text())
+            load_pycolmap().set_random_seed(seed)
+            started = time.perf_counter()
+            names = stage_photos(new / "photos", photos, progress)
+            if masks is not None:
+                stage_masks(new / "masks", photos, names, masks)
+            _extract(new / "database.db", new / "photos", photos, names, lenses, progress)
+            extracted = time.perf_counter()
+            count, total = _match(new / "database.db", new / "pairs.txt", names, seed, most, progress)
+            seconds = {"features": extracted - started, "matching": time.perf_counter() - extracted}
+            made = {"names": names, "pairs_matched": count, "pairs_possible": total, "seconds": seconds}
+            (new / "facts.json").write_text(json.dumps(made))
+    facts = json.loads((folder / "facts.json").read_text())
     return FeatureStore(folder, facts.pop("names"), facts)
-
-
-def _build(
-    folder: Path,
-    photos: list[Path],
-    lenses: list[Lens | None],
-    masks: list[Path | None] | None,
-    seed: int,
-    most: int,
-    progress: Progress,
-) -> dict[str, Any]:
-    pycolmap = load_pycolmap()
-    pycolmap.set_random_seed(seed)
-    started = time.perf_counter()
-    names = stage_photos(folder / "photos", photos, progress)
-    if masks is not None:
-        stage_masks(folder / "masks", photos, names, masks)
-    database = folder / "database.db"
-    _extract(database, folder / "photos", photos, names, lenses, progress)
-    extracted = time.perf_counter()
-    count, total = _match(database, folder / "pairs.txt", names, seed, most, progress)
-    return {
-        "names": names,
-        "pairs_matched": count,
-        "pairs_possible": total,
-        "seconds": {"features": extracted - started, "matching": time.perf_counter() - extracted},
-    }
 
 
 def _extract(
