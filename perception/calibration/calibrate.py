@@ -17,7 +17,7 @@ from perception.calibration.solve import NAMES, Solution, solve
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
 from perception.io.camera_file import write_camera
-from perception.io.photos import SUFFIXES
+from perception.io.photos import SUFFIXES, read_grey
 from perception.io.video import frames
 
 MAX_FRAMES = 240
@@ -77,10 +77,7 @@ def _pictures(source: Path) -> Iterator[tuple[str, np.ndarray]]:
         if not files:
             raise InputError(f"{source}: holds no photos; expected pictures of a calibration board")
         for file in files:
-            picture = cv2.imdecode(np.frombuffer(file.read_bytes() or b"\0", np.uint8), cv2.IMREAD_GRAYSCALE)
-            if picture is None:
-                raise InputError(f"{file}: is not a readable picture")
-            yield file.name, np.asarray(picture)
+            yield file.name, read_grey(file)
     elif source.is_file():
         number = None
         for number, _, frame in frames(source, most=MAX_FRAMES):
@@ -93,20 +90,15 @@ def _pictures(source: Path) -> Iterator[tuple[str, np.ndarray]]:
 
 def _detect(source: Path, board: Board) -> tuple[list[Detection], tuple[int, int], int]:
     found: list[Detection] = []
-    size, looked_at = None, 0
-    for name, picture in _pictures(source):
-        looked_at += 1
+    size, looked_at = (0, 0), 0
+    for looked_at, (name, picture) in enumerate(_pictures(source), start=1):
         here = (picture.shape[1], picture.shape[0])
-        if size is None:
-            size = here
-        elif here != size:
+        if looked_at > 1 and here != size:
             what = f"{name} is {here[0]}x{here[1]} pixels, the pictures before it {size[0]}x{size[1]}"
             raise InputError(f"{source}: {what}; a calibration is for one camera at one size")
-        seen = board.detect(name, picture)
+        size, seen = here, board.detect(name, picture)
         if seen is not None:
             found.append(seen)
-    if size is None:
-        raise InputError(f"{source}: holds no pictures")
     return found, size, looked_at
 
 

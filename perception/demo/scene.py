@@ -19,8 +19,6 @@ from perception.demo.shapes import Box, Ellipsoid, Shape, to_world
 from perception.demo.truth import DemoTruth, Truth
 from perception.errors import InputError
 
-__all__ = ["SCENES", "DemoTruth", "make_photos"]
-
 SCENES = {"tabletop": tabletop, "room": room}
 LEAST_POINTS = 1200  # minimum per object, before points that fewer than two photos see are dropped
 NOISE = 1.6  # standard deviation of the sensor noise in 8-bit steps

@@ -17,7 +17,7 @@ from perception.errors import InputError
 from perception.frame.scale import LARGEST_ERROR, KnownLength, Measurement
 from perception.geometry import align_similarity
 from perception.io.lens import camera_from_lens
-from perception.io.photos import read_photo
+from perception.io.photos import read_grey
 from perception.io.reading import view_lens
 from perception.types import View
 
@@ -50,7 +50,7 @@ def scale_of_tags(views: Sequence[View], size: float) -> Measurement:
         detector = cv2.aruco.ArucoDetector(words, parameters)
         seen: dict[int, Sighting] = {}
         for number, view in enumerate(views):
-            picture = _grey(view)
+            picture = read_grey(view.photo)
             corners, ids, _ = detector.detectMarkers(picture)
             numbers = [] if ids is None else [int(tag) for tag in np.ravel(ids)]
             for tag, pixels in zip(numbers, corners, strict=True):
@@ -69,7 +69,7 @@ def scale_of_tags(views: Sequence[View], size: float) -> Measurement:
 
 def scale_of_board(views: Sequence[View], board: Board) -> Measurement:
     """Metres per unit from a calibration board; InputError when it is not seen in two photos."""
-    found = [board.detect(view.name, _grey(view)) for view in views]
+    found = [board.detect(view.name, read_grey(view.photo)) for view in views]
     points = np.unique(np.concatenate([d.board_points for d in found if d] or [np.empty((0, 3))]), axis=0)
     rays = np.full((len(views), len(points), 2), np.nan)
     for number, (view, detection) in enumerate(zip(views, found, strict=True)):
@@ -201,7 +201,3 @@ def _fitted(poses: np.ndarray, corners: np.ndarray, rays: np.ndarray) -> tuple[f
     off = points[known] - (scale * corners[known] @ rotation.T + shift)
     size = scale * np.linalg.norm(np.ptp(corners[known], axis=0))
     return 1 / scale, float(np.sqrt((off**2).sum(axis=1).mean()) / size)
-
-
-def _grey(view: View) -> np.ndarray:
-    return np.asarray(cv2.cvtColor(read_photo(view.photo), cv2.COLOR_RGB2GRAY))

@@ -51,16 +51,12 @@ class _Look:
     why: str | None = None
 
 
-def list_photos(folder: Path) -> list[Path]:
-    """All photos under `folder`, sorted by their path relative to it.
+def list_photos(folder: Path, suffixes: frozenset[str] = SUFFIXES) -> list[Path]:
+    """All photos, or files of other suffixes, under `folder`, sorted by their path relative to it.
 
     Skipped: hidden files and folders, maps and work folders (*.gsmap*), frames taken from a video. Linked folders are
     followed; each real folder is listed once.
     """
-    return _files(folder, SUFFIXES)
-
-
-def _files(folder: Path, suffixes: frozenset[str]) -> list[Path]:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of photos")
@@ -197,7 +193,7 @@ def _notes(folder: Path, looks: list[_Look], kept: list[_Look]) -> list[str]:
     blurred = [look.name for look in kept if look.sharpness < BLURRED * usual]
     if blurred:
         notes.append(f"{len(blurred)} {of} are far more blurred than the others, and used: {_some(blurred)}")
-    videos = _files(folder, VIDEO_SUFFIXES)
+    videos = list_photos(folder, VIDEO_SUFFIXES)
     if videos:
         stems = {look.path.with_suffix("") for look in looks}
         live = sum(video.with_suffix("") in stems for video in videos)

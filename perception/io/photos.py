@@ -99,6 +99,11 @@ def read_photo(path: Path) -> np.ndarray:
     return photo if factor == 1 else np.array(Image.fromarray(photo).reduce(factor))
 
 
+def read_grey(path: Path) -> np.ndarray:
+    """`read_photo` as uint8 [h, w] grey."""
+    return np.asarray(cv2.cvtColor(read_photo(path), cv2.COLOR_RGB2GRAY))
+
+
 def _draft(image: Image.Image) -> int:
     """Prepares an open photo to be decoded at its reduced size if its format can; returns the factor that remains."""
     factor = _reduction(image)
