@@ -135,11 +135,6 @@ _RECORD = np.round(255 * np.clip(to_srgb(np.arange(2 * _STEPS) / _STEPS), 0, 1))
 _LINEAR = to_linear(np.arange(1024) / 1023).astype(np.float32)
 
 
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    """`to_linear` by table lookup, for whole textures."""
-    return _LINEAR[(np.clip(srgb, 0, 1) * 1023 + 0.5).astype(np.int32)]
-
-
 def first_hits(around: list[Caster], origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance [N] to the first caster along each unit ray (inf = none) and its index in the list (-1 = none)."""
     origins, rays = origins.astype(np.float32), rays.astype(np.float32)
@@ -201,7 +196,8 @@ def _recorded(paint: np.ndarray, light: np.ndarray) -> np.ndarray:
     light = wide[:, 4:-4] if wide.shape[1] > columns else wide
     height, width = paint.shape[:2]
     light = cv2.resize(light, (width, height), interpolation=cv2.INTER_LINEAR)
-    return _RECORD[(_linear(paint) * light * _STEPS).astype(np.int32).clip(0, len(_RECORD) - 1)]
+    linear = _LINEAR[(np.clip(paint, 0, 1) * 1023 + 0.5).astype(np.int32)]  # `to_linear` by table
+    return _RECORD[(linear * light * _STEPS).astype(np.int32).clip(0, len(_RECORD) - 1)]
 
 
 def _near(around: list[Caster], start: np.ndarray, reach: float, axis: np.ndarray | None = None) -> list[Caster]:

@@ -127,10 +127,8 @@ def _photos(file: Path, frames: list[dict[str, Any]], strict: bool) -> tuple[dic
 
 def _find(folder: Path, listed: str) -> Path | None:
     plain = folder / listed
-    if _is_file(plain):
-        return plain
-    candidates = [plain.with_name(plain.name + suffix) for suffix in sorted(SUFFIXES)] if plain.name else []
-    return next((path for path in candidates if _is_file(path)), None)
+    others = (plain.with_name(plain.name + suffix) for suffix in sorted(SUFFIXES) if plain.name)
+    return next((path for path in (plain, *others) if _is_file(path)), None)
 
 
 def _is_file(path: Path) -> bool:

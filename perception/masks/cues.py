@@ -51,7 +51,8 @@ def depth_cues(depth: np.ndarray, K: np.ndarray) -> DepthCues:
 
     z = cv2.medianBlur(filled_depth(depth), 5)
     z = np.exp(cv2.bilateralFilter(np.log(z), 9, 0.03, 4))  # smooths noise, keeps steps of more than 3 %
-    points = _unproject(z, K)
+    y, x = np.mgrid[: z.shape[0], : z.shape[1]].astype(np.float32) + np.float32(0.5)
+    points = np.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], axis=-1).astype(np.float32)
     normals = np.cross(_tangent(points, 1), _tangent(points, 0))
     normals = cv2.ximgproc.jointBilateralFilter(np.log(z), _unit(normals).astype(np.float32), 9, 0.02, 4)
     normals = _unit(normals).astype(np.float32)
@@ -86,11 +87,6 @@ def filled_depth(depth: np.ndarray) -> np.ndarray:
         return depth.astype(np.float32)
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     return depth[tuple(nearest)].astype(np.float32)
-
-
-def _unproject(z: np.ndarray, K: np.ndarray) -> np.ndarray:
-    y, x = np.mgrid[: z.shape[0], : z.shape[1]].astype(np.float32) + np.float32(0.5)
-    return np.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], axis=-1).astype(np.float32)
 
 
 def _tangent(points: np.ndarray, axis: int, reach: int = 3) -> np.ndarray:

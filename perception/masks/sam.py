@@ -104,7 +104,9 @@ def _prompted(model: SamModel, photo: np.ndarray, settings: SamConfig) -> list[S
     """The masks of one grid of prompts, sorted by falling predicted IoU."""
     height, width = photo.shape[:2]
     embedding = model.encode(photo)
-    points = point_grid(settings.points_per_side) * np.array([width, height])
+    side = settings.points_per_side
+    centres = np.linspace(1 / (2 * side), 1 - 1 / (2 * side), side)  # of an even grid, row by row
+    points = np.stack(np.meshgrid(centres, centres), axis=-1).reshape(-1, 2) * np.array([width, height])
     covered = np.zeros((height, width), bool)
     at_once = POINTS_PER_BATCH
     if settings.skip_covered:
@@ -150,13 +152,6 @@ def paint(masks: list[SamMask], shape: tuple[int, int]) -> np.ndarray:
     for label, row in enumerate(np.argsort(scores, kind="stable"), start=1):
         labels[masks[row].pixels()] = label
     return labels
-
-
-def point_grid(side: int) -> np.ndarray:
-    """[side², 2] float64 (x, y) in (0, 1), row by row, at the centres of an even grid."""
-    centres = np.linspace(1 / (2 * side), 1 - 1 / (2 * side), side)
-    x, y = np.meshgrid(centres, centres)
-    return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
 def stability(logits: np.ndarray) -> np.float32:
