@@ -19,6 +19,7 @@ RAYS, MOST_PLACES, BATCH = 32, 640, 64  # points of an instance that are looked 
 LEAST_SEEN = 0.5  # share of the rays that make a line of sight
 NEAR = 0.1  # end of a ray in which nothing blocks it, metres: what touches the instance does not hide it
 SIDEWAYS = 0.25  # metres off the wanted distance that weigh as much as one metre off the instance's centre
+TALL = 200  # voxels above the floor in which something can block a ray: 10 m
 _CORNER = np.sqrt(0.5) * CELL  # from the centre of a cell to its corner
 
 
@@ -129,11 +130,10 @@ class FreeSpace:
             if mask.any() and free[mask].mean() <= 0.5:
                 self._free &= ~mask
         corner = (np.linalg.inv(surface.map_from_level) @ self.map_from_grid)[:2, 3]
-        voxels = np.floor((surface.points - [*corner, 0]) / CELL).astype(np.int64)
-        self._low, self._size = voxels.min(axis=0) - 1, np.ptp(voxels, axis=0) + 3
-        self._ids, owner = np.unique(gmap.instance_ids, return_inverse=True)
-        keys = np.unique(self._keys(voxels) * len(self._ids) + owner[surface.rows])
-        self._keys_taken, self._owners = keys // len(self._ids), self._ids[keys % len(self._ids)]
+        keys, within = self._keys(surface.points - [*corner, 0])
+        ids, owner = np.unique(gmap.instance_ids, return_inverse=True)
+        taken = np.unique(keys[within] * len(ids) + owner[surface.rows[within]])
+        self._taken, self._owners = taken // len(ids), ids[taken % len(ids)]
 
     def reachable(self, radius: float) -> np.ndarray:
         """bool [H, W]: cells at whose centre a disc of `radius` metres is free, the largest connected part."""
@@ -144,19 +144,21 @@ class FreeSpace:
     def seen(self, instance_id: int, eyes: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """bool [E, T]: whether the ray from each of eyes [E, 3] to each of targets [T, 3], in the grid's frame, meets
         no voxel with a point of something other than the instance, but for its last 10 cm."""
-        taken = self._keys_taken[self._owners != instance_id]
+        taken = self._taken[self._owners != instance_id]
         rays = targets[None] - eyes[:, None]
         lengths = np.linalg.norm(rays, axis=2)
         steps = int(np.ceil(2 * lengths.max() / CELL)) + 1
         shares = np.linspace(0, 1, steps)[:, None, None] * np.maximum(1 - NEAR / np.maximum(lengths, NEAR), 0)
-        voxels = np.floor((eyes[:, None] + shares[..., None] * rays) / CELL).astype(np.int64)
-        within = ((voxels >= self._low) & (voxels < self._low + self._size)).all(axis=-1)
-        keys = self._keys(voxels)
+        keys, within = self._keys(eyes[:, None] + shares[..., None] * rays)
         return ~(within & (taken[np.searchsorted(taken, keys).clip(max=len(taken) - 1)] == keys)).any(axis=0)
 
-    def _keys(self, voxels: np.ndarray) -> np.ndarray:
-        x, y, z = np.moveaxis(voxels - self._low, -1, 0)
-        return (x * self._size[1] + y) * self._size[2] + z
+    def _keys(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers of the voxels of points [..., 3] in the grid's frame, int64, and whether each lies above the grid."""
+        size = np.array([*self._free.shape[::-1], TALL])
+        voxels = np.floor(points / CELL)
+        within = np.asarray(((voxels >= 0) & (voxels < size)).all(axis=-1))
+        x, y, z = np.moveaxis(np.where(within[..., None], voxels, 0).astype(np.int64), -1, 0)
+        return (x * size[1] + y) * TALL + z, within
 
     def _footprint(self, box: dict[str, list[float]]) -> np.ndarray:
         """bool [H, W]: cells below the box, of instances.json, where a robot would be in it.

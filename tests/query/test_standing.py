@@ -134,6 +134,13 @@ def test_in_another_frame() -> None:
     np.testing.assert_allclose(np.linalg.det(other.map_from_robot[:3, :3]), 1)
 
 
+def test_a_gaussian_far_away_changes_nothing() -> None:
+    """Keys of voxels do not overflow."""
+    near, far = room([ROOM, CRATE, SCREEN]), room([ROOM, CRATE, SCREEN])
+    far.means[0] = [3e9, -4e9, 5e9]
+    np.testing.assert_array_equal(where_to_stand(far, 1).map_from_robot, where_to_stand(near, 1).map_from_robot)
+
+
 @pytest.mark.parametrize(
     ("info", "how", "words"),
     [
