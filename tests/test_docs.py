@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "launch/README.md", ROOT / "calib/README.md"]
 
 # Run elsewhere: servers by their own tests, calibration on rendered boards, bags on written ones, models on built ones.
-ELSEWHERE = {"demo", "serve", "node", "view", "bench", "calibrate", "frames", "models"}
+ELSEWHERE = {"demo", "serve", "mcp", "node", "view", "bench", "calibrate", "frames", "models"}
 
 
 def documented() -> list[tuple[str, str]]:

@@ -39,6 +39,7 @@ LAYERS = [
     },
     {
         "serve",
+        "mcp",
         "node",
         "pipeline",
         "viewer",

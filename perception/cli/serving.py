@@ -1,4 +1,4 @@
-"""`perception serve`, `node` and `view`: one map over HTTP, on a robot's middleware, and in a browser."""
+"""`perception serve`, `mcp`, `node` and `view`: one map over HTTP, for a language model, on ROS 2, in a browser."""
 
 from __future__ import annotations
 
@@ -21,6 +21,11 @@ def register(commands: Any) -> None:
     p.add_argument("--queue", type=int, default=64, metavar="N", help="questions that may wait; more are refused")
     p.add_argument("--watch", type=float, default=1.0, metavar="S", help="look for a new map this often, 0: never")
 
+    p = map_command(commands, "mcp", _mcp, "a map as tools of a language model (MCP), over stdio or HTTP; read-only")
+    p.set_defaults(interrupted="stopped")
+    p.add_argument("--http", metavar="HOST:PORT", help="streamable HTTP at http://HOST:PORT/mcp instead of stdio")
+    p.add_argument("--token-file", type=Path, metavar="FILE", help="HTTP clients send its content as a bearer token")
+
     p = map_command(commands, "node", _node, "serve a map on ROS 2 (rclpy): prompts in; points, boxes and markers out")
     p.add_argument("--namespace", metavar="NAME", help="before all topics; default: perception")
     p.add_argument("--domain", metavar="N", help="ROS domain; default: ROS_DOMAIN_ID or 0")
@@ -32,18 +37,31 @@ def register(commands: Any) -> None:
     p.add_argument("--token-file", type=Path, metavar="FILE", help="its content opens the page; default: a new token")
 
 
-def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+def _settings(args: argparse.Namespace, **given: Any) -> Any:
     from perception.config import settings_from
     from perception.listening import read_token
-    from perception.serve.settings import ServeSettings
+    from perception.serve.server import ServeSettings
 
-    given = {name: (getattr(args, name), "serve") for name in ("host", "port", "timeout", "workers", "watch")}
-    given["queue_size"] = (args.queue, "serve")
-    given["token"] = (None if args.token_file is None else read_token(args.token_file), "serve")
-    settings = settings_from(ServeSettings, given)
+    given["token"] = None if args.token_file is None else read_token(args.token_file)
+    return settings_from(ServeSettings, {name: (value, args.command) for name, value in given.items()})
+
+
+def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.serve.server import serve
 
-    serve(args.map, settings)
+    names = ("host", "port", "timeout", "workers", "watch")
+    serve(args.map, _settings(args, queue_size=args.queue, **{name: getattr(args, name) for name in names}))
+    return {}, ""
+
+
+def _mcp(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.mcp import serve_http, serve_stdio
+
+    if args.http is None:
+        serve_stdio(args.map)
+    else:
+        host, _, port = args.http.rpartition(":")
+        serve_http(args.map, _settings(args, host=host.strip("[]"), port=port))
     return {}, ""
 
 

@@ -19,6 +19,8 @@ from perception.instances.silhouettes import render_silhouettes
 from perception.io.documents import safe_name
 from perception.io.recentre import map_from_input, moved
 from perception.io.store import Map, read_map
+from perception.query.crops import best_box, cut_out
+from perception.query.query_map import QueryMap
 from perception.types import View
 
 KINDS = ("rgb", "depth", "instances", "features")
@@ -58,6 +60,12 @@ def as_gaussians(gmap: Map) -> Gaussians:
     """A map's Gaussians as tensors."""
     names = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
     return Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(getattr(gmap, name))) for name in names})
+
+
+def rendered_crop(gmap: QueryMap, instance_id: int, side: int) -> np.ndarray | None:
+    """`query.crops.best_crop` of the map's own picture in place of the photo."""
+    found = best_box(gmap, instance_id)
+    return None if found is None else cut_out(_picture("rgb", as_gaussians(gmap), gmap, found[0]), found[1], side)
 
 
 def map_views(gmap: Map, held_out: bool = True) -> list[View]:

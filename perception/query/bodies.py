@@ -122,17 +122,22 @@ class FrameBody(Body):
         return frame
 
 
-class FilteredBody(Body):
-    """What all questions share: a filter, and the frame that the question and its answer are in."""
+class FramedBody(Body):
+    """What all questions share: the frame that the question and its answer are in."""
 
-    where: WhereBody | None = None
     frame: FrameBody | None = None
-
-    def asked_where(self) -> Where | None:
-        return None if self.where is None else self.where.where()
 
     def asked_frame(self) -> Frame | None:
         return None if self.frame is None else self.frame.frame()
+
+
+class FilteredBody(FramedBody):
+    """A question with a filter."""
+
+    where: WhereBody | None = None
+
+    def asked_where(self) -> Where | None:
+        return None if self.where is None else self.where.where()
 
 
 class QueryBody(FilteredBody):
@@ -160,15 +165,11 @@ class NearestBody(FilteredBody):
     top_k: Annotated[int, Field(ge=1, le=MAX_TOP)] | None = None
 
 
-class AtBody(Body):
+class AtBody(FramedBody):
     """The instance that a point lies on."""
 
     point: Point
     max_distance: Length | None = None
-    frame: FrameBody | None = None
-
-    def asked_frame(self) -> Frame | None:
-        return None if self.frame is None else self.frame.frame()
 
 
 Model = TypeVar("Model", bound=Body)

@@ -26,23 +26,31 @@ def best_crop(gmap: QueryMap, instance_id: int, side: int = 320, inside: Path | 
     """
     from perception.io.photos import load_photo
 
-    position = gmap.position(instance_id)
-    box = gmap.best_view(position)
-    if box is None:
-        return None
-    name, (x0, y0, x1, y1) = box
-    view = next((view for view in gmap.views if view.name == name), None)
-    if view is None:
+    found = best_box(gmap, instance_id)
+    if found is None:
         return None
     try:
-        photo = load_photo(readable_view(gmap, view, inside), int(gmap.info["config"]["photos"]["max_side"]))
+        photo = load_photo(readable_view(gmap, found[0], inside), int(gmap.info["config"]["photos"]["max_side"]))
     except UnknownInstance:
         raise
     except (InputError, OSError, ValueError, KeyError):
         return None
+    return cut_out(photo, found[1], side)
+
+
+def best_box(gmap: QueryMap, instance_id: int) -> tuple[View, tuple[int, int, int, int]] | None:
+    """The view that shows an instance best, and its box there (`QueryMap.best_view`); None when there is none."""
+    name, box = gmap.best_view(gmap.position(instance_id)) or (None, (0, 0, 0, 0))
+    view = next((view for view in gmap.views if view.name == name), None)
+    return None if view is None else (view, box)
+
+
+def cut_out(picture: np.ndarray, box: tuple[int, int, int, int], side: int) -> np.ndarray | None:
+    """The box (x0, y0, x1, y1) of a picture [H, W, 3] with a margin, longer side at most `side`; None outside of it."""
+    x0, y0, x1, y1 = box
     margin = 2 + round(MARGIN * max(x1 - x0, y1 - y0))
     top, left = max(0, y0 - margin), max(0, x0 - margin)
-    cut = photo[top : y1 + margin, left : x1 + margin]
+    cut = picture[top : y1 + margin, left : x1 + margin]
     return _shrunk(cut, side) if cut.size else None
 
 

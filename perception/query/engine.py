@@ -14,7 +14,7 @@ from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeout
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -55,13 +55,13 @@ class QueryEngine:
         """settings: the fields of `EngineSettings`; InputError when one is unknown or out of range."""
         chosen = settings_from(EngineSettings, {name: (value, "engine") for name, value in settings.items()})
         self.path, self.timeout = Path(path), chosen.timeout
-        self._encoders = _Shared(encoders or make_encoder)
+        self._encoders = lru_cache(encoders or make_encoder)  # shared by the current map and a reloaded one
         self._signature = map_signature(self.path)
         self._map = self.open_map()
         self._counters = Counters()
         self._queue = RequestQueue(chosen.queue_size, self._drop)
         self._reloading = threading.Lock()
-        self._listeners: list[Callable[[QueryMap], None]] = []
+        self._listeners: list[Callable[[QueryMap], object]] = []
         self._problem: str | None = None
         self._busy_since: dict[int, float] = {}
         self._closed = threading.Event()
@@ -152,7 +152,7 @@ class QueryEngine:
                 listener(fresh)
             return True
 
-    def on_reload(self, listener: Callable[[QueryMap], None]) -> None:
+    def on_reload(self, listener: Callable[[QueryMap], object]) -> None:
         """Registers `listener(new map)`, called after each swap by the thread that reloaded; it must not raise."""
         self._listeners.append(listener)
 
@@ -263,19 +263,6 @@ def _checked(work: Callable[[QueryMap], T], wanted: str | None, gmap: QueryMap) 
     if wanted is not None and wanted != gmap.map_id:
         raise OtherMap(f"the map is now {gmap.map_id}, not {wanted[:40]}; ask again")
     return work(gmap)
-
-
-class _Shared:
-    """Encoders by name; each is made once and shared by the current map and a reloaded one."""
-
-    def __init__(self, make: Callable[[str], Encoder | None]) -> None:
-        self._make, self._made, self._lock = make, {}, threading.Lock()  # type: ignore[var-annotated]
-
-    def __call__(self, spec: str) -> Encoder | None:
-        with self._lock:
-            if spec not in self._made:
-                self._made[spec] = self._make(spec)
-            return self._made[spec]
 
 
 @dataclass(eq=False)

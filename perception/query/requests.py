@@ -51,6 +51,10 @@ class UnknownFrame(InputError):
     """No frame of this name is known."""
 
 
+class NoScale(InputError):
+    """Metres were asked of a map whose scale is not known."""
+
+
 class EngineBusy(RuntimeError):
     """The request queue is full: retry later, or use another server."""
 
@@ -64,9 +68,10 @@ class EngineClosed(RuntimeError):
 
 
 KINDS: dict[type[BaseException], str] = {
-    UnknownInstance: "unknown_instance",  # these three are InputErrors too, so they come before
+    UnknownInstance: "unknown_instance",  # these four are InputErrors too, so they come before
     OtherMap: "other_map",
     UnknownFrame: "unknown_frame",
+    NoScale: "no_scale",
     InputError: "bad_input",
     EngineBusy: "busy",
     TimeoutError: "timeout",
@@ -76,8 +81,8 @@ KINDS: dict[type[BaseException], str] = {
 
 
 def error_kind(error: BaseException) -> str:
-    """The word for an error. unknown_instance, other_map: ask again, with ids of the current map; unknown_frame,
-    bad_input: change the request; busy, timeout: retry later; closed: use another server; failed: a defect here."""
+    """The word for an error. unknown_instance, other_map: ask again for ids; unknown_frame, no_scale, bad_input: change
+    the request; busy, timeout: retry later; closed: use another server; failed: a defect here."""
     return next((word for kind, word in KINDS.items() if isinstance(error, kind)), "failed")
 
 

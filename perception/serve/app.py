@@ -20,7 +20,7 @@ from perception.query.query_map import QueryMap
 from perception.query.requests import source
 from perception.query.where import Frame
 from perception.serve.guard import HANDLERS, Guard
-from perception.serve.settings import ServeSettings
+from perception.serve.server import ServeSettings
 
 FORMATS = {"npz": "application/x-npz", "ply": "application/octet-stream"}
 """Name → media type."""

@@ -19,11 +19,11 @@ from starlette.exceptions import HTTPException
 from perception.listening import names_this_machine
 from perception.query.bodies import problem_line
 from perception.query.requests import KINDS, error_kind, error_line
-from perception.serve.settings import ServeSettings
+from perception.serve.server import ServeSettings
 
 _log = logging.getLogger("perception.serve")
 _STATUS = {"unknown_instance": 404, "other_map": 409, "busy": 503, "closed": 503, "timeout": 504}
-_STATUS |= dict.fromkeys(("unknown_frame", "bad_input"), 400)
+_STATUS |= dict.fromkeys(("unknown_frame", "no_scale", "bad_input"), 400)
 """HTTP status by the word of `error_kind`."""
 
 

@@ -9,11 +9,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from pydantic import Field
+
 from perception.errors import missing_extra
 from perception.language.base import Encoder
 from perception.listening import check_address, listen, url_host
 from perception.query.engine import QueryEngine
-from perception.serve.settings import ServeSettings
+from perception.query.requests import MAX_BYTES, EngineSettings
 
 MAX_CONNECTIONS = 256
 MAX_WAITING = MAX_CONNECTIONS // 2
@@ -22,9 +24,25 @@ _TOTAL_TIMEOUT = 300.0
 """Seconds from a request's header to the end of its answer: 100 MB of points at 3 Mbit/s."""
 
 
-def serve(path: Path, settings: ServeSettings, encoders: Callable[[str], Encoder | None] | None = None) -> None:
+class ServeSettings(EngineSettings):
+    """How one process serves one map over HTTP. `serve` checks host and token."""
+
+    host: str = Field("127.0.0.1", description="where to listen")
+    port: int = Field(8765, ge=0, le=65535, description="0: any free one")
+    token: str | None = Field(None, description="clients send it as a bearer token; none only on this machine")
+    max_body: int = Field(MAX_BYTES, ge=1, description="bytes of a request")
+
+
+def serve(
+    path: Path,
+    settings: ServeSettings,
+    encoders: Callable[[str], Encoder | None] | None = None,
+    build: Callable[[QueryEngine, ServeSettings], Any] | None = None,
+    page: str = "",
+) -> None:
     """Serves the map at `path` until SIGINT or SIGTERM; running requests are finished.
 
+    build: makes the ASGI application, `app.build_app` when None; page: its path in the address that is printed.
     InputError when the map cannot be opened, the port is taken, others could reach it without a token, or the packages
     of the extra `serve` are missing. The address is written to standard error in one line once requests are accepted.
     """
@@ -34,21 +52,22 @@ def serve(path: Path, settings: ServeSettings, encoders: Callable[[str], Encoder
     import uvicorn
 
     check_address(settings.host, settings.port, settings.token)
-    from perception.serve.app import build_app
+    if build is None:
+        from perception.serve.app import build_app
 
+        build = build_app
     with (
         listen(settings.host, settings.port) as sock,
         QueryEngine(path, encoders=encoders, **settings.of_engine()) as engine,
     ):
-        _say(f"serving {path} at http://{url_host(settings.host)}:{sock.getsockname()[1]} (Ctrl-C stops)")
+        _say(f"serving {path} at http://{url_host(settings.host)}:{sock.getsockname()[1]}{page} (Ctrl-C stops)")
         if (trouble := engine.current.problem) is not None:
             _say(f"warning: prompts cannot be answered: {trouble}")
         config = uvicorn.Config(
-            build_app(engine, settings),
+            build(engine, settings),
             http=timed_protocol(settings.timeout, _TOTAL_TIMEOUT),
             proxy_headers=False,  # a client could forge them
             log_level="warning",
-            lifespan="off",
             server_header=False,
             limit_concurrency=MAX_CONNECTIONS,
             timeout_graceful_shutdown=max(1, round(settings.timeout)),

@@ -57,7 +57,7 @@ class HttpTarget:
     def __init__(self) -> None:
         from perception.query import QueryEngine
         from perception.serve.app import build_app
-        from perception.serve.settings import ServeSettings
+        from perception.serve.server import ServeSettings
         from support.query_maps import encoders, write_map_of
 
         self._folder = TemporaryDirectory(prefix="fuzz-")

@@ -30,8 +30,7 @@ from perception.io.store import read_map
 from perception.listening import check_address, is_local, read_token
 from perception.query import QueryEngine, QueryMap
 from perception.serve.app import build_app
-from perception.serve.server import serve
-from perception.serve.settings import ServeSettings
+from perception.serve.server import ServeSettings, serve
 
 TOKEN = "0123456789abcdef0123"
 

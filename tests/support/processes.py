@@ -19,7 +19,7 @@ def hears_ctrl_c() -> None:
 
 SERVER = (
     "import sys; from pathlib import Path; from support.query_maps import encoders\n"
-    "from perception.serve.server import serve; from perception.serve.settings import ServeSettings\n"
+    "from perception.serve.server import ServeSettings, serve\n"
     "serve(Path(sys.argv[1]), ServeSettings(port=int(sys.argv[2]), timeout=5), encoders=encoders)\n"
 )
 
@@ -41,7 +41,7 @@ def server(command: list[str], folder: Path) -> Iterator[tuple[subprocess.Popen[
         assert process.stderr is not None
         line = process.stderr.readline()
         assert line.startswith("serving "), line + process.stderr.read()
-        yield process, int(line.split("://127.0.0.1:")[1].split()[0])
+        yield process, int(line.split("://127.0.0.1:")[1].split()[0].partition("/")[0])
     finally:
         process.kill()
         process.communicate()
