@@ -170,7 +170,7 @@ def _holder(
     best = max(others, key=lambda j: touches[j], default=None)
     if best is not None and touches[best] >= TOUCHING:
         return Holder(best, "attached to", touches[best])
-    flats = [j for j in under if floors[j] and low[2] - HIDDEN * size[2] <= places.highs[j, 2] <= low[2] + slack]
+    flats = [j for j in under if floors[j] and low[2] - size[2] <= places.highs[j, 2] <= low[2] + slack]
     return Holder(max(flats, key=lambda j: places.highs[j, 2]), "on", 1 / SECTORS) if flats else None
 
 
