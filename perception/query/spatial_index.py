@@ -11,7 +11,7 @@ from perception.io.map import InstanceIndex
 from perception.query.where import inside
 from perception.types import OrientedBox
 
-_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _NEIGHBORS = 8
 
 
@@ -77,7 +77,7 @@ class SpatialIndex:
 
     def _apart(self, instance_id: int, region: OrientedBox) -> bool:
         """True when the bounding boxes alone show that no point is inside."""
-        corners = region.center + (_CORNERS * region.extent) @ region.rotation
+        corners = region.center + (CORNERS * region.extent) @ region.rotation
         low, high = self.aabb(instance_id)
         return bool((corners.max(axis=0) < low - 1e-9).any() or (corners.min(axis=0) > high + 1e-9).any())
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
@@ -12,6 +13,7 @@ from perception.errors import InputError
 from perception.frame.floor_grid import FREE, HEIGHT, STEP, UNKNOWN, level_surface
 from perception.geometry import move_points, scale_of
 from perception.query.query_map import QueryMap
+from perception.query.spatial_index import CORNERS
 from perception.query.where import Frame
 
 CELL = 0.05  # side of a cell of the floor and of a voxel, metres
@@ -76,11 +78,9 @@ def where_to_stand(
             raise InputError(f"where_to_stand: {name} is {value}, expected a positive number of metres")
     gmap.position(instance_id)
     space, points = gmap.free_space, gmap.index.of(instance_id)
-    if not len(points):
-        raise InputError(f"instance {instance_id}: has no points")
     points = move_points(np.linalg.inv(space.map_from_grid), points.astype(np.float64))
     places = (np.argwhere(space.reachable(radius))[:, ::-1] + 0.5) * CELL
-    gaps = cKDTree(points[:, :2]).query(places, distance_upper_bound=within)[0] if len(places) else np.zeros(0)
+    gaps = cKDTree(points[:, :2]).query(places, distance_upper_bound=within)[0]
     near = np.isfinite(gaps)
     if not near.any():
         raise InputError(
@@ -161,23 +161,10 @@ class FreeSpace:
         return (x * size[1] + y) * TALL + z, within
 
     def _footprint(self, box: dict[str, list[float]]) -> np.ndarray:
-        """bool [H, W]: cells below the box, of instances.json, where a robot would be in it.
-
-        The shadow of a box is a polygon with edges along those of the box: p is in it if, for each of the box's axes,
-        the distance of p from the line through the centre along that axis is at most that of the farthest corner.
-        """
-        grid_from_map = np.linalg.inv(self.map_from_grid)
-        axes = np.array(box["rotation"]) @ grid_from_map[:3, :3].T  # rows
-        center, half = move_points(grid_from_map, np.array(box["center"])), np.array(box["extent"]) / 2
-        reach = np.abs(axes * half[:, None]).sum(axis=0)
-        mask = np.zeros(self._free.shape, bool)
-        if center[2] - reach[2] >= HEIGHT or center[2] + reach[2] <= STEP:
-            return mask
-        low, high = (np.round((center[:2] + side * (reach[:2] + CELL)) / CELL).astype(int) for side in (-1, 1))
-        low, high = np.maximum(low, 0), np.maximum(high, 0)
-        window = mask[low[1] : high[1], low[0] : high[0]]
-        offsets = (np.argwhere(np.ones_like(window))[:, ::-1] + low + 0.5) * CELL - center[:2]
-        normals = np.stack([-axes[:, 1], axes[:, 0]])  # [2, 3], zero for an upright axis
-        bounds = np.abs(axes[:, :2] @ normals * half[:, None]).sum(axis=0)
-        window[...] = (np.abs(offsets @ normals) <= bounds + CELL / 2).all(axis=1).reshape(window.shape)
-        return mask
+        """bool [H, W]: cells below the box, of instances.json, if a robot under it would be in it."""
+        corners = np.array(box["center"]) + CORNERS * np.array(box["extent"]) @ np.array(box["rotation"])
+        corners, mask = move_points(np.linalg.inv(self.map_from_grid), corners), np.zeros(self._free.shape, np.uint8)
+        if corners[:, 2].min() < HEIGHT and corners[:, 2].max() > STEP:
+            cells = np.floor(corners[:, :2] / CELL).astype(np.int32)
+            cv2.fillConvexPoly(mask, cv2.convexHull(cells), 1)
+        return mask.astype(bool)
