@@ -28,6 +28,10 @@ class Matches:
     has_truth: bool = False
     has_prediction: bool = False
 
+    def add(self, score: float, positive: bool) -> None:
+        self.scores.append(score)
+        self.positive.append(positive)
+
 
 def match(scenes: Sequence[Overlap], label: int, threshold: float, min_region: int) -> Matches:
     """Greedy matching of predictions and true instances of one class at one IoU threshold, over all scenes."""
@@ -40,7 +44,11 @@ def match(scenes: Sequence[Overlap], label: int, threshold: float, min_region: i
         result.has_prediction |= len(preds) > 0
         hit = scene.iou > threshold
         _match_truth(scene, preds, big, hit, result)
-        _unmatched(scene, preds, truths, hit, threshold, min_region, result)
+        small = truths[scene.gt_sizes[truths] < min_region]
+        for p in preds[~hit[np.ix_(preds, truths)].any(axis=1)].tolist():
+            ignored = scene.pred_void[p] + scene.intersections[p, small].sum()
+            if ignored / scene.pred_sizes[p] <= threshold:
+                result.add(float(scene.pred_scores[p]), positive=False)
     return result
 
 
@@ -52,32 +60,11 @@ def _match_truth(scene: Overlap, preds: np.ndarray, truths: np.ndarray, hit: np.
             result.misses += 1
             continue
         used.add(candidates[0])  # only the first is used: a duplicate may still match another true instance
-        best = float(scene.pred_scores[candidates[0]])
-        for p in candidates[1:]:
-            score = float(scene.pred_scores[p])
-            result.scores.append(min(best, score))
-            result.positive.append(False)
+        best, *others = scene.pred_scores[candidates].tolist()
+        for score in others:
+            result.add(min(best, score), positive=False)
             best = max(best, score)
-        result.scores.append(best)
-        result.positive.append(True)
-
-
-def _unmatched(
-    scene: Overlap,
-    preds: np.ndarray,
-    truths: np.ndarray,
-    hit: np.ndarray,
-    threshold: float,
-    min_region: int,
-    result: Matches,
-) -> None:
-    """Adds a false positive for each prediction that matches no true instance of its class, unless it is ignored."""
-    small = truths[scene.gt_sizes[truths] < min_region]
-    for p in preds[~hit[np.ix_(preds, truths)].any(axis=1)].tolist():
-        ignored = scene.pred_void[p] + scene.intersections[p, small].sum()
-        if ignored / scene.pred_sizes[p] <= threshold:
-            result.scores.append(float(scene.pred_scores[p]))
-            result.positive.append(False)
+        result.add(best, positive=True)
 
 
 def average_precision(matches: Matches) -> float:
@@ -191,13 +178,12 @@ def mask_overlap(
     gt_ids: np.ndarray,
     classes: Sequence[int] | None,
     gt_semantics: np.ndarray | None,
-    ignore: np.ndarray | None,
 ) -> Overlap:
     """Overlap of one scene's masks (each bool [N]; they may overlap) with its true ids [N] under a protocol.
 
     The order of the masks is the input order of the matching rules.
     """
-    keep, truth = _truth(rules, np.asarray(gt_ids), gt_semantics, ignore)
+    keep, truth = _truth(rules, np.asarray(gt_ids), gt_semantics, None)
     kept = [np.asarray(mask, bool)[keep] for mask in masks]
     if rules.by_class and classes is None:
         raise InputError("evaluation by class needs a class for each predicted mask; there are none")

@@ -174,7 +174,7 @@ def run_scannet(
             missing.append(path.stem)
             found = ([], [], [])
         masks, classes, scores = found
-        overlaps.append(mask_overlap(rules, masks, scores, ids, classes, ids // 1000, None))
+        overlaps.append(mask_overlap(rules, masks, scores, ids, classes, ids // 1000))
     result = evaluate_overlaps(overlaps, rules)
     result |= {"scenes": [p.stem for p in files], "missing": missing}
     return result, instances_table(result)

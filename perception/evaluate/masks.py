@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import cv2
@@ -45,18 +45,9 @@ def evaluate_lerf_mask(predictions: Masks, truths: Masks, **switches: Any) -> di
     rendered; printed with the result.
     """
     scores: dict[str, list[tuple[float, float]]] = {}
-    absent = []
-    for (view, prompt), truth in sorted(truths.items()):
-        per_prompt = scores.setdefault(prompt, [])
-        if (view, prompt) not in predictions:
-            absent.append([view, prompt])
-            per_prompt.append((0.0, 0.0))
-            continue
-        true = truth if truth.dtype == bool else truth > 128
-        predicted = _fitted(predictions[view, prompt], true.shape, 128)
-        per_prompt.append((mask_iou(predicted, true), boundary_iou(predicted, true)))
-    if not truths:
-        raise InputError("LERF-mask: there are no truth masks")
+    for _, prompt, found, true in _paired("LERF-mask", predictions, truths, 128, 128):
+        score = (0.0, 0.0) if found is None else (mask_iou(found, true), boundary_iou(found, true))
+        scores.setdefault(prompt, []).append(score)
     prompts = {
         prompt: {"miou": float(np.mean([s[0] for s in rows])), "mbiou": float(np.mean([s[1] for s in rows]))}
         for prompt, rows in scores.items()
@@ -65,7 +56,7 @@ def evaluate_lerf_mask(predictions: Masks, truths: Masks, **switches: Any) -> di
         "miou": float(np.mean([row["miou"] for row in prompts.values()])),
         "mbiou": float(np.mean([row["mbiou"] for row in prompts.values()])),
         "prompts": prompts,
-        "missing": absent,
+        "missing": [list(key) for key in sorted(truths.keys() - predictions.keys())],
         "protocol": {
             "name": "lerf-mask",
             "truth": "> 128",
@@ -86,13 +77,9 @@ def evaluate_lerf_ovs(predictions: Masks, truths: Masks, **switches: Any) -> dic
     (object > .7), or bool. A missing prediction scores 0. switches: selection rule, occlusion, held-out views; printed
     with the result.
     """
-    if not truths:
-        raise InputError("LERF-OVS: there are no truth masks")
     rows = []
-    for (view, prompt), truth in sorted(truths.items()):
-        true = truth if truth.dtype == bool else truth > 10
-        found = predictions.get((view, prompt))
-        iou = 0.0 if found is None else mask_iou(_fitted(found, true.shape, 0.7), true)
+    for view, prompt, found, true in _paired("LERF-OVS", predictions, truths, 10, 0.7):
+        iou = 0.0 if found is None else mask_iou(found, true)
         rows.append({"view": view, "prompt": prompt, "iou": iou, "missing": found is None})
     ious = np.array([row["iou"] for row in rows])
     return {
@@ -111,10 +98,19 @@ def evaluate_lerf_ovs(predictions: Masks, truths: Masks, **switches: Any) -> dic
     }
 
 
-def _fitted(mask: np.ndarray, shape: tuple[int, ...], threshold: float) -> np.ndarray:
-    """A prediction as a bool mask of the true mask's size (nearest neighbour)."""
-    found = mask if mask.dtype == bool else mask > threshold
-    if found.shape == shape:
-        return found
-    size = (shape[1], shape[0])
-    return cv2.resize(found.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
+def _paired(
+    name: str, predictions: Masks, truths: Masks, truth_above: float, predicted_above: float
+) -> Iterator[tuple[str, str, np.ndarray | None, np.ndarray]]:
+    """(view, prompt, predicted mask, true mask) by view and prompt, both bool [H, W] of the truth's size (nearest
+    neighbour); masks that are not bool are cut above the thresholds; None for a missing prediction."""
+    if not truths:
+        raise InputError(f"{name}: there are no truth masks")
+    for (view, prompt), truth in sorted(truths.items()):
+        true = truth if truth.dtype == bool else truth > truth_above
+        found = predictions.get((view, prompt))
+        if found is not None and found.dtype != bool:
+            found = found > predicted_above
+        if found is not None and found.shape != true.shape:
+            size = (true.shape[1], true.shape[0])
+            found = cv2.resize(found.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
+        yield view, prompt, found, true

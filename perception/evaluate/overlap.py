@@ -121,7 +121,7 @@ def overlap_of_ids(
 def overlap_of_masks(
     masks: Sequence[np.ndarray], scores: Sequence[float], truth: Truth, classes: Sequence[int] | None = None
 ) -> Overlap:
-    """Overlap of P masks, each bool [N] or an array of point indices. Masks may overlap; their order is kept."""
+    """Overlap of P masks, each bool [N]. Masks may overlap; their order is kept."""
     if len(scores) != len(masks) or (classes is not None and len(classes) != len(masks)):
         raise InputError(
             f"prediction: {len(masks)} masks, {len(scores)} scores; one score (and class) per mask is needed"
@@ -130,9 +130,7 @@ def overlap_of_masks(
     target = np.where(truth.index >= 0, truth.index, g)
     table = np.zeros((len(masks), g + 1), np.int64)
     for row, mask in zip(table, masks, strict=True):
-        mask = np.asarray(mask)
-        if mask.dtype == bool:
-            _same_length(len(mask), len(truth.index))
+        _same_length(len(mask), len(truth.index))
         row += np.bincount(target[mask], minlength=g + 1)
     ids = np.arange(len(masks))
     return _overlap(ids, scores, [OBJECT] * len(masks) if classes is None else classes, table, truth)

@@ -12,4 +12,4 @@ def evaluate_masks(
 ) -> dict[str, Any]:
     """AP of masks (each bool [N]) of one scene against the truth ids [N]; changes: switches of Protocol."""
     rules = get_protocol("scannet", **changes)
-    return evaluate_overlaps([mask_overlap(rules, masks, scores, gt_ids, classes, gt_semantics, None)], rules)
+    return evaluate_overlaps([mask_overlap(rules, masks, scores, gt_ids, classes, gt_semantics)], rules)
