@@ -20,7 +20,7 @@ from perception.io.atomic import atomic_directory, atomic_file
 from perception.io.map_files import read_info
 from perception.io.store import Map, read_map
 from perception.pipeline.mapping import build_map
-from perception.pipeline.rendering import as_gaussians, map_views
+from perception.pipeline.rendering import as_gaussians, map_views, write_picture
 from perception.progress import Progress
 from perception.query import QueryMap
 from perception.types import View
@@ -187,15 +187,10 @@ class InstanceViews:
     def write(self, target: Path, truths: Masks, photos: Mapping[str, str], chosen: Mapping[str, list[int]]) -> None:
         """<target>/<view>/<prompt>.png for each (view, prompt) of `truths` whose photo is registered: 255 × the
         silhouette, or mask, of the instances `chosen` for the prompt. photos: photo name by view."""
-        import cv2
-
         for label, prompt in truths:
             if (view := self.find(photos[label])) is not None:
                 image = np.clip(np.round(self.silhouette(chosen[prompt], view) * 255.0), 0, 255).astype(np.uint8)
-                path = target / label / f"{prompt}.png"
-                path.parent.mkdir(parents=True, exist_ok=True)
-                if not cv2.imwrite(str(path), image):
-                    raise InputError(f"{path}: cannot be written; choose a writable -o")
+                write_picture(target / label / f"{prompt}.png", image)
 
 
 def by_words(gmap: Map, prompt: str, rule: str, scoring: str = "calibrated") -> list[int]:

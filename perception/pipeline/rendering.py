@@ -49,9 +49,7 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     for kind in what:
         folder = output if len(what) == 1 else output / kind
         for name, view in zip(names, views, strict=True):
-            path = (folder / name).with_suffix(".png")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            _write(path, _through_lens(kind, gaussians, gmap, view))
+            write_picture((folder / name).with_suffix(".png"), _through_lens(kind, gaussians, gmap, view))
     facts = {"output": str(output), "views": len(views), "what": what}
     return facts, f"{output}: {len(views)} views of {', '.join(what)}"
 
@@ -142,9 +140,11 @@ def _picture(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarr
     raise ValueError(f"unknown kind of picture: {kind}")
 
 
-def _write(path: Path, image: np.ndarray) -> None:
+def write_picture(path: Path, image: np.ndarray) -> None:
+    """Writes an image [H, W] or [H, W, 3] RGB; folders are made. InputError when that fails."""
     import cv2
 
+    path.parent.mkdir(parents=True, exist_ok=True)
     if image.ndim == 3:
         image = np.ascontiguousarray(image[..., ::-1])
     if not cv2.imwrite(str(path), image):
