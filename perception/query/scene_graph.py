@@ -32,10 +32,8 @@ LEAST_RING, LEAST_WALLS = 2 / SECTORS, 7 / SECTORS  # shares of the sectors that
 CLEAR = 0.5  # of several supports the highest counts whose score is at least this share of the best one's
 SHELL = 0.6  # share of the map's extent along two axes from which an instance is a wall, a floor or a ceiling
 RING = 0.4  # width of the ring, as a share of the foot's shorter side
-FLAT, TOUCHING = (
-    0.15,
-    0.05,
-)  # thickness of what hangs on a wall, as a share of its size; share of its points at the wall
+FLAT = 0.15  # most thickness of what hangs on a wall, as a share of its size
+TOUCHING = 0.05  # least share of the points of what is attached that touch what holds it
 HIDDEN = 0.5  # share of a thing's height, at its foot, that no photo may have seen
 MATCH = 0.5  # least match of `Places` for "in" and "next to"
 DOOR = 1.2  # metres: narrower passages part two rooms
