@@ -108,7 +108,11 @@ class Trainer:
                     with uninterrupted():
                         whole = False
                         self.complete = False
-                        loss = self.step(progress)
+                        try:
+                            loss = self.step(progress)
+                        except RuntimeError as error:
+                            self._recover(error)
+                            continue
                         self.schedule.after_step(progress, may_stop=until >= 1.0)
                         whole = True
                     if observer is not None:
@@ -125,31 +129,25 @@ class Trainer:
                 observer.after_leg(self)
         return self.record
 
+    def _recover(self, error: RuntimeError) -> None:
+        """After a step that failed, before Adam, so that nothing has changed: fewer gradient records at once where a
+        GPU's memory was full. InputError when the fewest do not fit, or for another failure of a GPU."""
+        if self.device.type == "cpu":
+            raise error
+        if not isinstance(error, torch.OutOfMemoryError):
+            failed = f"{self.device}: failed at iteration {self.iteration} ({str(error).splitlines()[0]})"
+            raise InputError(f"{failed}; continue from the checkpoint with --resume --device cpu") from error
+        self._max_records = (self._max_records or 1 << 24) // 4
+        if self._max_records < _LEAST_RECORDS:
+            full = f"{self.device}: its memory is full with {len(self.gaussians)} Gaussians"
+            raise InputError(f"{full}; use a smaller --budget or --max-side, or --device cpu") from error
+        torch.cuda.empty_cache()
+        self.record.decisions.append(f"memory: at most {self._max_records} gradient records at once")
+
     # -------------------------------------------------------------------- step
 
     def step(self, progress: float) -> float:
-        """One iteration: renders a view, computes the loss and its gradient, takes an Adam step. Returns the loss.
-
-        On a GPU without memory enough the step is repeated with fewer gradient records at once; InputError when the
-        fewest do not fit.
-        """
-        while True:
-            try:
-                return self._step(progress)
-            except torch.OutOfMemoryError as error:  # before Adam, so nothing has changed
-                self._max_records = (self._max_records or 1 << 24) // 4
-                if self._max_records < _LEAST_RECORDS:
-                    full = f"{self.device}: its memory is full with {len(self.gaussians)} Gaussians"
-                    raise InputError(f"{full}; use a smaller --budget or --max-side, or --device cpu") from error
-                torch.cuda.empty_cache()
-                self.record.decisions.append(f"memory: at most {self._max_records} gradient records at once")
-            except RuntimeError as error:
-                if self.device.type == "cpu":
-                    raise
-                failed = f"{self.device}: failed at iteration {self.iteration} ({str(error).splitlines()[0]})"
-                raise InputError(f"{failed}; continue from the checkpoint with --resume --device cpu") from error
-
-    def _step(self, progress: float) -> float:
+        """One iteration: renders a view, computes the loss and its gradient, takes an Adam step. Returns the loss."""
         chosen, with_features = self.schedule.next_view(progress)
         view = self._on_device(chosen)
         height, width = view.photo.shape[:2]

@@ -194,7 +194,7 @@ def test_a_full_memory_is_met_with_fewer_records_then_refused(pretended, monkeyp
 
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
     of._backward = full
-    of.step(0.0)
+    of.run(until=(of.iteration + 1) / 1000)
     assert limits == [0, 1 << 22, 1 << 20] and of.iteration == 1 and len(of.record.decisions) == 2
 
     def always_full(*_: object) -> None:
@@ -203,7 +203,7 @@ def test_a_full_memory_is_met_with_fewer_records_then_refused(pretended, monkeyp
     of._backward = always_full
     before = of.gaussians.means.cpu()
     with pytest.raises(InputError, match="memory is full with 60 Gaussians; use a smaller --budget"):
-        of.step(0.0)
+        of.run(until=(of.iteration + 1) / 1000)
     assert of.iteration == 1 and torch.equal(before, of.gaussians.means.cpu())
 
     def gone(*_: object) -> None:
@@ -211,7 +211,7 @@ def test_a_full_memory_is_met_with_fewer_records_then_refused(pretended, monkeyp
 
     of._backward = gone
     with pytest.raises(InputError, match=r"failed at iteration 1 \(CUDA error: device-side assert\); continue from"):
-        of.step(0.0)
+        of.run(until=(of.iteration + 1) / 1000)
 
 
 def test_which_device_is_chosen(monkeypatch):

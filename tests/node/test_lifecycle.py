@@ -95,7 +95,11 @@ def test_latched_topics_parameters_and_unknown_frames(walk: tuple[dict[str, Any]
         assert found["heard"]["map/info"] == [gmap.map_id, True, "kitchen"]
         assert found["heard"]["map/instances"] == [[0, "red mug"], [10, "laptop"]]
         assert found["unknown frame"] == ["unknown_frame", "frame_id: found 'moon', expected kitchen"]
-    assert found["parameters"] == [["map", True, []], ["workers", True, [[1, 64]]], ["timeout", True, [[0.001, 3600.0]]]]
+    assert found["parameters"] == [
+        ["map", True, []],
+        ["workers", True, [[1, 64]]],
+        ["timeout", True, [[0.001, 3600.0]]],
+    ]
 
 
 def test_rviz_finds_every_topic_with_its_type_in_the_graph(walk: tuple[dict[str, Any], bool]) -> None:
