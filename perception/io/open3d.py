@@ -25,7 +25,8 @@ def load_open3d() -> Any:
     except (ImportError, OSError) as error:  # such as "libusb-1.0.so.0: cannot open shared object file"
         raise InputError(
             f"the package 'open3d' does not load ({error}); install its system libraries, "
-            "on Debian and Ubuntu: apt-get install libusb-1.0-0 libgl1 libx11-6 libgomp1"
+            "on Debian and Ubuntu: apt-get install libusb-1.0-0 libgl1 libx11-6 libgomp1; "
+            "'pip install \"open3d<0.20\"' (Python below 3.13) needs no libusb"
         ) from error
     return open3d
 
