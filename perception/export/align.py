@@ -252,8 +252,8 @@ class Registration:
                 found = photometric_step(
                     found, self.scan[rows], self.brightness[rows], images, self.tolerance, self.extent, self.similar
                 )
-        some = self.rows
-        before, after = (self._alike(p(self.scan[some]), self.brightness[some], self.views) for p in (place, found))
+        # With the fewer points of `judged`, noise turned down refinements from 1.2 to 0.3 cm.
+        before, after = (self._alike(p(self.scan[rows]), self.brightness[rows], self.views) for p in (place, found))
         return found if after > before and self.apart(found, place) < 2 * self.tolerance else place
 
 
