@@ -75,7 +75,7 @@ def test_steps_on_planes_and_brightness_end_at_the_true_place() -> None:
     pictures = registration._photometric(module.Place(1.01 * np.eye(3), true.shift + 0.02), registration.rows)
     assert registration.apart(pictures, true) < 0.01
     assert registration.judged(pictures)[0] > registration.judged(place)[0]
-    every, registration.rows = registration.rows, registration.rows[:20]  # too few to tell which of two places is better
+    every, registration.rows = registration.rows, registration.rows[:20]  # too few to compare two places
     pictures = registration._photometric(module.Place(1.01 * np.eye(3), true.shift + 0.02), every)
     assert registration.apart(pictures, true) < 0.01
 
