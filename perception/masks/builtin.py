@@ -6,11 +6,13 @@ Label ids are consistent across photos, because every photo shows the same segme
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
 from perception.errors import InputError
 from perception.io.memory import Keep
+from perception.masks.boundaries import WEIGHTS, boundaries, read_layers
 from perception.masks.merging import Segmentation, segmentation
 from perception.masks.stereo import StereoView, make_stereo_view, measure_depths
 from perception.masks.surface import FOOTPRINTS, Surface, SurfaceBuilder, to_world
@@ -18,7 +20,7 @@ from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.progress import Progress
 from perception.types import View
 
-VERSION = 13  # increased whenever the label images change, so that cached ones are recomputed
+VERSION = 14  # increased whenever the label images change, so that cached ones are recomputed
 _SMOOTH = 0.03  # relative to the depth: a pixel with a larger depth step is not part of the surface
 _LEAST_VOXELS = 100
 
@@ -77,24 +79,30 @@ class BuiltinSegmentation:
         return cv2.resize(labels, photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
 
 
-def fuse(views: list[StereoView], side: float = FOOTPRINTS) -> Surface:
-    """Fuses the confirmed pixels of all photos into one surface. side: of a voxel, in pixel footprints."""
+def fuse(views: list[StereoView], side: float = FOOTPRINTS, weights: Path = WEIGHTS) -> Surface:
+    """Fuses the confirmed pixels of all photos into one surface. side: of a voxel, in pixel footprints; weights: of
+    learned borders."""
+    layers = read_layers(weights)
     footprints = np.concatenate([(view.depth[::4, ::4] / view.K[0, 0]).ravel() for view in views])
     builder = SurfaceBuilder(side * float(np.median(footprints)))
     for view in views:
         photo, depth = view.cues()
-        builder.add(photo, depth, view.confirmed & (depth.step.max(axis=0) < _SMOOTH), view.world_from_camera)
+        view.learned = view.keep(boundaries(photo, depth, layers).astype(np.float16))
+        border = 1 / (1 + np.exp(-view.learned[:2].max(axis=0).astype(np.float32)))
+        known = view.confirmed & (depth.step.max(axis=0) < _SMOOTH)
+        builder.add(photo, depth, border, known, view.world_from_camera)
     return builder.build()
 
 
 def surface_graph(views: list[StereoView], surface: Surface) -> SurfaceGraph:
-    """Patches of the surface, with the evidence of all photos about the borders between them."""
+    """Patches of the surface, with the evidence of all photos, which were fused, about the borders between them."""
     edges = voxel_edges(surface)
     graph = SurfaceGraph(surface, patches(surface, edges), edges)
     for view in views:
         photo, depth = view.cues()
         view.voxel = view.keep(surface.voxel_of(to_world(depth.points, view.world_from_camera)))
-        graph.add(np.where(view.voxel >= 0, graph.patch[view.voxel], -1), photo, depth)
+        regions = np.where(view.voxel >= 0, graph.patch[view.voxel], -1)
+        graph.add(regions, photo, depth, np.asarray(view.learned, np.float32))
     graph.link()
     return graph
 

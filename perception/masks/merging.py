@@ -61,9 +61,9 @@ class MergeModel:
 
 
 @functools.cache
-def packaged_model() -> MergeModel:
-    """The model of the package."""
-    with np.load(WEIGHTS) as stored:
+def read_model(file: Path = WEIGHTS) -> MergeModel:
+    """The model of the package, or of another file of `tests/training/masks.py`."""
+    with np.load(file) as stored:
         settings, *parts = (stored[f"arr_{k}"] for k in range(1 + 2 * _PARTS))
     cost, slope, offset = settings.tolist()
     return MergeModel(Network(tuple(parts[:_PARTS])), Network(tuple(parts[_PARTS:])), cost, (slope, offset))
@@ -90,7 +90,7 @@ class Segmentation:
 def segmentation(graph: SurfaceGraph) -> Segmentation:
     """The cuts with the packaged model, at a third of its cost of an object, at its cost, and at GROUP_COST; such cuts
     are nested."""
-    model = packaged_model()
+    model = read_model()
     tree = tree_by(model, graph)
     segment, probability = divided(graph, tree, model)
     odds = model.whole(tree.features).astype(np.float64)
@@ -136,7 +136,8 @@ def _logistic(odds: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MergeTree:
-    """Leaves 0 … R − 1 are the patches, then one region per merge, in order. children: [M, 2]; features: [R + M, F]."""
+    """Leaves 0 … R − 1 are the patches, then one region per merge, in order. children: [M, 2], the larger one first.
+    features: [R + M, 6 F + 3] of each region and of its relatives in the tree."""
 
     leaves: int
     children: np.ndarray
@@ -202,8 +203,26 @@ def merge_tree(graph: SurfaceGraph, score: Callable[[SurfaceGraph, np.ndarray], 
     for a in range(count):
         if node[a] >= 0:
             describe(a, None, -_UNKNOWN)
-    rows = np.array([features[k] for k in range(len(leaves))], np.float32)
-    return MergeTree(count, np.array(children, np.int64).reshape(-1, 2), rows)
+    own = np.array([features[k] for k in range(len(leaves))], np.float32)
+    pairs = np.array(children, np.int64).reshape(-1, 2)
+    return MergeTree(count, pairs, _with_relatives(own, pairs))
+
+
+def _with_relatives(own: np.ndarray, children: np.ndarray) -> np.ndarray:
+    """[N, 6 F + 3] features of each region, own [N, F]; then those of its parent, the parent's other child, the
+    grandparent and both children, less its own, 0 where there is none; then whether it has no parent, no grandparent,
+    no children. What a region would become, and what it is made of, tell whether it is a whole (Liu et al. 2016)."""
+    regions, none = np.arange(len(own)), np.full(len(own), -1)
+    parent, sibling, larger, smaller = (none.copy() for _ in range(4))
+    merged = regions[len(own) - len(children) :]
+    parent[children] = merged[:, None]
+    sibling[children] = children[:, ::-1]
+    larger[merged], smaller[merged] = children.T
+    grandparent = np.where(parent >= 0, parent[parent], -1)
+    relatives = (parent, sibling, grandparent, larger, smaller)
+    rows = [np.where(other[:, None] >= 0, own[other] - own, 0) for other in relatives]
+    missing = np.stack([other < 0 for other in (parent, grandparent, larger)], axis=1)
+    return np.concatenate([own, *rows, missing], axis=1, dtype=np.float32)
 
 
 def join_planes(graph: SurfaceGraph, ends: np.ndarray) -> np.ndarray:

@@ -32,7 +32,8 @@ class StereoView:
 
     prior: [h, w] depth known before stereo, 0 = none. depth: [h, w] current best depth. confirmed: [h, w] bool, pixels
     whose depth other photos agree with. measured: the prior comes from a sensor. voxel: [h, w] int32, the voxel of the
-    surface that each pixel shows, −1 = none, set by `surface_graph`. keep: where images that are made later are kept.
+    surface that each pixel shows, −1 = none, set by `surface_graph`. learned: [3, h, w] float16, see `boundaries`, set
+    by `fuse`. keep: where images that are made later are kept.
     """
 
     name: str
@@ -45,11 +46,12 @@ class StereoView:
     confirmed: np.ndarray
     measured: bool = False
     voxel: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.int32))
+    learned: np.ndarray = field(default_factory=lambda: np.zeros((3, 0, 0), np.float16))
     keep: Keep = np.asarray
 
     def store(self, keep: Keep) -> None:
         """Puts the images but `voxel` where `keep` puts them."""
-        for name in ("photo", "grey", "prior", "depth", "confirmed"):
+        for name in ("photo", "grey", "prior", "depth", "confirmed", "learned"):
             setattr(self, name, keep(getattr(self, name)))
 
     @property

@@ -17,7 +17,8 @@ _OFFSET = 1 << 20  # makes voxel indices positive; 2^21 values per axis
 @dataclass(frozen=True)
 class Surface:
     """V voxels of side `size`. keys [V] int64 ascending; pixels [V]: number of pixels in each, over all photos;
-    points, normals, lab [V, 3] float32 means in the world frame (Lab in 8-bit scale)."""
+    points, normals, lab [V, 3] float32 means in the world frame (Lab in 8-bit scale); border [V]: mean probability that
+    pixels to both sides are of different things."""
 
     size: float
     keys: np.ndarray
@@ -25,6 +26,7 @@ class Surface:
     points: np.ndarray
     normals: np.ndarray
     lab: np.ndarray
+    border: np.ndarray
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -42,13 +44,18 @@ class SurfaceBuilder:
 
     size: float
     _keys: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
-    _sums: np.ndarray = field(default_factory=lambda: np.zeros((0, 10)))
+    _sums: np.ndarray = field(default_factory=lambda: np.zeros((0, 11)))
 
-    def add(self, photo: PhotoCues, depth: DepthCues, known: np.ndarray, world_from_camera: np.ndarray) -> None:
-        """Adds one photo. known: [h, w] bool, pixels with reliable depth. world_from_camera: [4, 4]."""
+    def add(
+        self, photo: PhotoCues, depth: DepthCues, border: np.ndarray, known: np.ndarray, world_from_camera: np.ndarray
+    ) -> None:
+        """Adds one photo. border: [h, w] probability; known: [h, w] bool, pixels with reliable depth;
+        world_from_camera: [4, 4]."""
         points = to_world(depth.points[known], world_from_camera)
         normals = depth.normals[known] @ world_from_camera[:3, :3].T
-        values = np.concatenate([np.ones((len(points), 1)), points, normals, photo.lab[known]], axis=1)
+        values = np.concatenate(
+            [np.ones((len(points), 1)), points, normals, photo.lab[known], border[known][:, None]], axis=1
+        )
         self._merge(voxel_keys(points, self.size), values)
 
     def _merge(self, keys: np.ndarray, values: np.ndarray) -> None:
@@ -69,8 +76,10 @@ class SurfaceBuilder:
         sums = self._sums[rows]
         count = np.maximum(sums[:, :1], 1)
         normals = sums[:, 4:7] / np.maximum(np.linalg.norm(sums[:, 4:7], axis=1, keepdims=True), 1e-9)
-        points, lab = ((sums[:, k : k + 3] / count).astype(np.float32) for k in (1, 7))
-        return Surface(self.size, self._keys[rows], sums[:, 0], points, normals.astype(np.float32), lab)
+        points, lab, border = (
+            (sums[:, k] / count).astype(np.float32) for k in (slice(1, 4), slice(7, 10), slice(10, 11))
+        )
+        return Surface(self.size, self._keys[rows], sums[:, 0], points, normals.astype(np.float32), lab, border[:, 0])
 
 
 def to_world(points: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:

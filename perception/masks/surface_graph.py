@@ -15,19 +15,21 @@ from perception import _core
 from perception.masks.cues import COLOUR_BINS, DepthCues, PhotoCues
 from perception.masks.surface import Surface
 
-FEATURES = 34
+FEATURES = 36
 NEIGHBOURS = 8
 _STEP = 0.012  # relative to depth: minimum size of a step between surfaces
 _STEP_CAP = 0.06
 _TURN, _OFFSET = 0.02, 0.025  # coplanar: 1 − cosine of the normals; offset relative to depth
 _ALIKE = 0.5  # histogram intersection of colours above which coplanar parts that do not touch are joined
+_BORDER = 2.0  # weight of a learned border between voxels, in the unit of their difference
 _SHARP = 12.0  # border gradient above which it counts as an edge
 
 # Columns of the sums over a patch's pixels and voxels, then of the sums over border pixels of two patches.
 _AREA, _LAB, _TEXTURE, _DEPTH = 0, slice(1, 4), 4, 5
 _VOXELS, _NORMAL, _POINT, _SQUARES = 6, slice(7, 10), slice(10, 13), slice(13, 19)
 _COLOURS = slice(19, 19 + COLOUR_BINS)
-_LENGTH, _EDGE, _SHARPS, _STEPS, _BROKEN, _CONCAVE, _CONVEX, _CONTACT = range(8)
+_THING = _COLOURS.stop
+_LENGTH, _EDGE, _SHARPS, _STEPS, _BROKEN, _CONCAVE, _CONVEX, _LEARNED, _CONTACT = range(9)
 _UPPER = np.triu_indices(3)
 
 
@@ -45,11 +47,13 @@ def voxel_edges(surface: Surface) -> np.ndarray:
 
 
 def patches(surface: Surface, edges: np.ndarray, scale: float = 4.0, smallest: int = 12) -> np.ndarray:
-    """[V] int32 patch of each voxel, uniform in colour and normal (Felzenszwalb & Huttenlocher 2004)."""
+    """[V] int32 patch of each voxel, uniform in colour and normal, without learned borders within (Felzenszwalb &
+    Huttenlocher 2004)."""
     a, b = edges[:, 0], edges[:, 1]
     colour = (surface.lab[a] - surface.lab[b]) / np.array([14.0, 7.0, 7.0], np.float32)
     turn = (surface.normals[a] - surface.normals[b]) / 0.25
-    weights = np.sqrt((colour**2).sum(axis=1) + (turn**2).sum(axis=1)).astype(np.float32)
+    weights = np.sqrt((colour**2).sum(axis=1) + (turn**2).sum(axis=1))
+    weights = (weights + _BORDER * np.maximum(surface.border[a], surface.border[b])).astype(np.float32)
     labels = np.empty(len(surface), np.int32)
     _core.felzenszwalb(edges, np.ascontiguousarray(weights), scale, smallest, labels)
     return labels
@@ -67,7 +71,7 @@ class SurfaceGraph:
         local = (surface.points - surface.points.mean(axis=0)).astype(np.float64)
         squares = np.stack([local[:, i] * local[:, j] for i, j in zip(*_UPPER, strict=True)], axis=1)
         maps = [np.ones((len(patch), 1)), surface.normals, local, squares]
-        self.sums = np.zeros((count, _COLOURS.stop))
+        self.sums = np.zeros((count, _THING + 1))
         self.sums[:, _VOXELS : _COLOURS.start] = _sum_by(patch, np.concatenate(maps, axis=1), count)
         ends = patch[edges]
         ends = np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1).astype(np.int64)
@@ -76,8 +80,9 @@ class SurfaceGraph:
         self._border[:, _CONTACT] = contact
         self.borders: list[dict[int, np.ndarray]] = []
 
-    def add(self, regions: np.ndarray, photo: PhotoCues, depth: DepthCues) -> None:
-        """Adds the evidence of one photo. regions: [h, w] patch of each pixel, −1 = none."""
+    def add(self, regions: np.ndarray, photo: PhotoCues, depth: DepthCues, learned: np.ndarray) -> None:
+        """Adds the evidence of one photo. regions: [h, w] patch of each pixel, −1 = none; learned: [3, h, w], see
+        `perception.masks.boundaries.boundaries`."""
         inside = regions >= 0
         flat = regions[inside]
         z = depth.points[..., 2]
@@ -86,6 +91,7 @@ class SurfaceGraph:
         words = flat.astype(np.int64) * COLOUR_BINS + photo.colour_bin[inside]
         words = np.bincount(words, minlength=self.count * COLOUR_BINS)
         self.sums[:, _COLOURS] += words.reshape(self.count, COLOUR_BINS)
+        self.sums[:, _THING] += np.bincount(flat, learned[2][inside], self.count)
         for axis in (0, 1):
             first, second = neighbours(regions, axis)
             cut = (first != second) & (first >= 0) & (second >= 0)
@@ -93,9 +99,9 @@ class SurfaceGraph:
             keys = low * self.count + high
             place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
             edge = np.maximum(*neighbours(photo.edge, axis))[cut]
-            step, bend = (neighbours(maps[axis], axis)[0][cut] for maps in (depth.step, depth.bend))
+            step, bend, odds = (neighbours(maps[axis], axis)[0][cut] for maps in (depth.step, depth.bend, learned))
             columns = [np.ones(len(edge)), edge, edge > _SHARP, np.minimum(step, _STEP_CAP) / _STEP_CAP, step > _STEP]
-            columns += [np.clip(-bend, 0, 1), np.clip(bend, 0, 1)]
+            columns += [np.clip(-bend, 0, 1), np.clip(bend, 0, 1), odds]
             touching = self._keys[place] == keys
             values = np.stack(columns, axis=1)[touching]
             self._border[:, :_CONTACT] += _sum_by(place[touching], values, len(self._keys))
@@ -160,12 +166,14 @@ class SurfaceGraph:
                 same_plane * sharp,
                 flat_of_larger * (1 - same_plane),
                 *_growth_features(one, two, extents, a_is_larger, depth, self._scale / 4),
+                border[:, _LEARNED] / length,
+                np.abs(look_a[:, _THING] - look_b[:, _THING]),
             ],
             axis=1,
         )
 
     def region_features(self, a: int, sibling: int | None) -> np.ndarray:
-        """[17] features for the decision whether `a` is a whole object: area and extents, all its borders together,
+        """[19] features for the decision whether `a` is a whole object: area and extents, all its borders together,
         texture and variety of colour, and size and contact of the neighbour that it would be merged with next."""
         sums, links = self.sums[a], self.borders[a]
         voxels, pixels, depth = sums[_VOXELS], max(sums[_AREA], 1), max(self.depth(a), 1e-9)
@@ -185,6 +193,7 @@ class SurfaceGraph:
                 np.log1p(border[_CONTACT]) - np.log(voxels) / 2,
                 len(links),
                 sums[_TEXTURE] / pixels,
+                sums[_THING] / pixels,
                 -(colours * np.log(colours + 1e-9)).sum(),
                 *beside,
                 np.log(pixels / voxels),

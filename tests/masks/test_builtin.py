@@ -15,7 +15,14 @@ from perception.errors import InputError
 from perception.masks import compute_masks, load_labels, make_source
 from perception.masks.builtin import BuiltinSegmentation, fuse, surface_graph
 from perception.masks.cues import depth_cues
-from perception.masks.merging import MergeTree, divided, packaged_model, segmentation, tree_by
+from perception.masks.merging import (
+    MergeTree,
+    _with_relatives,
+    divided,
+    read_model,
+    segmentation,
+    tree_by,
+)
 from perception.masks.stereo import (
     StereoView,
     confirmed,
@@ -192,7 +199,8 @@ def test_fused_surface_lies_on_the_parts():
 
 
 def test_merging_patches_keeps_the_evidence_exact():
-    """After merging, all sums equal those of a graph built from the merged patches."""
+    """After merging, all sums equal those of a graph built from the merged patches; contacts, which no photo shows at
+    some borders, those of the borders that are shown."""
     seen = true_views()[:3]
     surface = fuse(seen)
     edges = voxel_edges(surface)
@@ -203,16 +211,17 @@ def test_merging_patches_keeps_the_evidence_exact():
         for shown in seen:
             photo, depth = shown.cues()
             voxel = surface.voxel_of(to_world(depth.points, shown.world_from_camera))
-            graph.add(np.where(voxel >= 0, patch[voxel], -1), photo, depth)
+            graph.add(np.where(voxel >= 0, patch[voxel], -1), photo, depth, shown.learned.astype(np.float32))
         graph.link()
         return graph
 
-    rng, patch = np.random.default_rng(1), first.patch.copy()
+    contacts = np.array([[links[b][-1] if b in links else 0 for b in range(first.count)] for links in first.borders])
+    rng, patch, into = np.random.default_rng(1), first.patch.copy(), np.arange(first.count)
     for _ in range(first.count // 2):
         a = int(rng.choice([i for i in range(first.count) if first.borders[i]]))
         b = int(rng.choice(list(first.borders[a])))
         first.merge(a, b)
-        patch[patch == b] = a
+        patch[patch == b] = into[into == b] = a
     kept, dense = np.unique(patch, return_inverse=True)
     fresh = graph_of(dense.astype(np.int32))
     np.testing.assert_allclose(first.sums[kept], fresh.sums, atol=1e-6)
@@ -220,15 +229,15 @@ def test_merging_patches_keeps_the_evidence_exact():
     for i, a in enumerate(kept):
         for j in fresh.borders[i]:
             old, new = (g.features(np.array([pair]))[0] for g, pair in ((first, (a, kept[j])), (fresh, (i, j))))
-            contact = [8, 9]  # contacts that no photo shows are forgotten
-            np.testing.assert_allclose(np.delete(old, contact), np.delete(new, contact), atol=1e-6)
-            np.testing.assert_allclose(old[contact], new[contact], atol=0.1)
+            of_contacts = [8, 9]
+            np.testing.assert_allclose(np.delete(old, of_contacts), np.delete(new, of_contacts), atol=1e-6)
+            assert first.borders[a][kept[j]][-1] == contacts[into == a][:, into == kept[j]].sum()
             compared += 1
     assert compared > 3
 
 
 def test_growth_of_a_union_against_its_voxels():
-    """The last features of a pair, from the voxels themselves: extents by singular values, not from sums of squares."""
+    """Features of a pair, from the voxels themselves: extents by singular values, not from sums of squares."""
     seen = true_views()[:3]
     surface = fuse(seen)
     graph = surface_graph(seen, surface)
@@ -259,7 +268,7 @@ def test_growth_of_a_union_against_its_voxels():
                 np.log(union.prod() / (big.prod() + small.prod())),
             ]
             np.testing.assert_allclose(
-                graph.features(np.array([[a, b]]))[0, -11:], expected, atol=1e-4
+                graph.features(np.array([[a, b]]))[0, 23:34], expected, atol=1e-4
             )  # points are float32
             compared += 1
     assert compared > 20
@@ -400,16 +409,31 @@ def test_regions_of_the_tree_are_sums_of_their_patches():
     seen = true_views()[:3]
     surface = fuse(seen)
     graph = surface_graph(seen, surface)
-    tree = tree_by(packaged_model(), graph)
+    tree = tree_by(read_model(), graph)
     sums = leaf_sums(tree, graph.sums)
     area = sums[:, 6] * surface.size**2 / (sums[:, 5] / np.maximum(sums[:, 0], 1)).clip(1e-9) ** 2
     np.testing.assert_allclose(tree.features[:, 4], np.log(area), atol=1e-4)
     np.testing.assert_allclose(np.exp(tree.features[:, 2]), leaf_sums(tree, np.ones((graph.count, 1)))[:, 0], rtol=1e-5)
 
 
+def test_relatives_of_regions_are_compared_with_them():
+    """One tree of three leaves and one that is alone, by hand: 3 = 0 + 1 and 4 = 3 + 2."""
+    own = np.array([[1.0, 10], [2, 20], [4, 40], [8, 80], [16, 160], [32, 320]])
+    own = own[[0, 1, 2, 5, 3, 4]]  # leaves 0, 1, 2 and 3, which is alone; regions 4 and 5
+    rows = _with_relatives(own, np.array([[0, 1], [4, 2]]))
+    none = -1
+    parent, sibling, grandparent = [4, 4, 5, none, 5, none], [1, 0, 4, none, 2, none], [5, 5, none, none, none, none]
+    larger, smaller = [none] * 4 + [0, 4], [none] * 4 + [1, 2]
+    expected = [own]
+    for relatives in (parent, sibling, grandparent, larger, smaller):
+        expected.append(np.array([own[k] - row if k >= 0 else 0 * row for k, row in zip(relatives, own, strict=True)]))
+    np.testing.assert_array_equal(rows[:, :12], np.concatenate(expected, axis=1))
+    np.testing.assert_array_equal(rows[:, 12:], np.array([parent, grandparent, larger]).T < 0)
+
+
 def test_networks_give_the_same_bits_for_any_batch():
-    network = packaged_model().pair
-    x = np.random.default_rng(0).normal(0, 2, (50, 34)) * network.parts[1] + network.parts[0]
+    network = read_model().pair
+    x = np.random.default_rng(0).normal(0, 2, (50, len(network.parts[0]))) * network.parts[1] + network.parts[0]
     whole = network(x)
     np.testing.assert_array_equal(whole, np.concatenate([network(row[None]) for row in x]))
     mean, scale, *layers = (part.astype(np.float64) for part in network.parts)
@@ -431,11 +455,9 @@ def test_segments_do_not_depend_on_the_order_of_patches():
     for shown in seen:
         photo, depth = shown.cues()
         voxel = surface.voxel_of(to_world(depth.points, shown.world_from_camera))
-        second.add(np.where(voxel >= 0, second.patch[voxel], -1), photo, depth)
+        second.add(np.where(voxel >= 0, second.patch[voxel], -1), photo, depth, shown.learned.astype(np.float32))
     second.link()
-    (labels, probability), (others, _) = (
-        divided(g, tree_by(packaged_model(), g), packaged_model()) for g in (first, second)
-    )
+    (labels, probability), (others, _) = (divided(g, tree_by(read_model(), g), read_model()) for g in (first, second))
     np.testing.assert_array_equal(labels, others)
     inside = np.all((surface.points > LOW - 0.02) & (surface.points < HIGH + 0.02), axis=1) & (
         surface.points[:, 2] > 0.03
@@ -455,6 +477,6 @@ def test_noise_on_a_bare_wall_is_no_thing():
         views.append(make_stereo_view(View("", Path("x.jpg"), K, 160, 120, pose), photo, depth))
     surface = fuse(views)
     graph = surface_graph(views, surface)
-    labels, probability = divided(graph, tree_by(packaged_model(), graph), packaged_model())
+    labels, probability = divided(graph, tree_by(read_model(), graph), read_model())
     small = np.bincount(labels, minlength=len(probability)) < 0.5 * len(labels)
     assert (probability[small] < 0.5).all()

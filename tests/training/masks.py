@@ -1,12 +1,11 @@
 """Trains the merge model of the built-in masks on rendered worlds: `python tests/training/masks.py WORK`.
 
-Worlds are clutter, rooms and tabletops by seed, in sets of four: twelve sets train, two choose the cost and the
-calibration, two are for testing. Each world is read twice, as maps with and without depth images see its surface. Pairs
-of patches are gathered along merges that the truth permits, in the order of a plain rule, then of the model so far
-(Nunez-Iglesias et al. 2013). WORK keeps the worlds, so that a run that was stopped goes on. A world takes 20 s of a
-core, learning 3 min. Equal seeds give equal weights. The packaged ones are those of this command. Four
-worlds of patchwork, things of several colours and look-alikes that touch, are for testing too; `--patchwork` also
-trains and tunes on such worlds, two more in each set.
+Worlds are clutter, rooms, tabletops and patchwork by seed, in sets of six: 24 sets train, two choose the cost and the
+calibration, two are for testing. Each world is read twice, as maps with and without depth images see its surface. A
+network of object borders is trained first, then what tells pairs of patches and regions. Pairs are gathered along
+merges that the truth permits, in the order of a plain rule, then of the model so far (Nunez-Iglesias et al. 2013). WORK
+keeps the worlds and the first network, so that a run that was stopped goes on. On two cores, the worlds take 25 min and
+learning 40 min. Equal seeds give equal weights. The packaged ones are those of this command.
 """
 
 from __future__ import annotations
@@ -15,11 +14,12 @@ import argparse
 import json
 import os
 import pickle
+import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass, field, replace
+from itertools import pairwise, product, repeat
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from perception.bench.output import Column, table
 from perception.demo import scene as scenes
+from perception.masks.boundaries import WEIGHTS as BORDERS
+from perception.masks.boundaries import inputs_of
 from perception.masks.merging import (
     SMALLEST,
     WEIGHTS,
@@ -37,20 +39,23 @@ from perception.masks.merging import (
     Network,
     divided,
     merge_tree,
+    read_model,
     tree_by,
 )
+from perception.masks.stereo import StereoView
 from perception.masks.surface import FOOTPRINTS
 from perception.masks.surface_graph import SurfaceGraph
 from support.mask_scores import leaf_sums
-from training import clutter, patchwork
+from training import boundaries, clutter, patchwork
 
 scenes.SCENES |= {"clutter": clutter, "patchwork": patchwork}
-SCENES = (("clutter", 3100, 2), ("clutter", 3101, 2), ("room", 2000, 1), ("tabletop", 1000, 1))  # first seed, step
-PATCHWORK = (("patchwork", 4000, 2), ("patchwork", 4001, 2))
+PATCHWORK = (("patchwork", 4000, 2), ("patchwork", 4001, 2))  # first seed, step
+SCENES = (("clutter", 3100, 2), ("clutter", 3101, 2), ("room", 2000, 1), ("tabletop", 1000, 1), *PATCHWORK)
 KEPT = {"validation": (8, 18), "test": (9, 19)}  # numbers of sets that are not trained on
 PAIRS, LEAST = 8000, 20  # pairs of one world and round; voxels of a region that is learned from
+VIEWS = 9  # of a reading that borders are learned from
 MEMBERS = 3  # networks of an ensemble for pairs; twice as many for regions, of which there are fewer
-COSTS = (0.02, 0.05, 0.1, 0.15, 0.2)  # higher ones join things in scenes unlike the worlds
+COSTS = (0.01, 0.02, 0.05, 0.1, 0.15)  # higher ones join things in scenes unlike the worlds
 NOISE, NEARER = 0.1, 0.3  # standard deviations: of inputs, relative to theirs; of the logarithm of the size of things
 PAIR_SIZE = {6: 2, 7: 2, 9: 1, **dict.fromkeys(range(27, 33), 1)}  # power of that size in SurfaceGraph.features
 WHOLE_SIZE = {4: 2, 5: 1, 6: 1, 7: 1}  # and in MergeTree.features
@@ -74,14 +79,25 @@ class World:
         np.add.at(self.votes, (self.graph.patch, self.truth), 1)
 
 
-def read_world(folder: Path, stereo: bool, seed: int = 0, skip: int = -1, side: float = 0) -> World:
+@dataclass
+class Reading:
+    """A scene as a map sees it. views: with depth; ids: [h, w] int64 of each view, true; side: of a voxel, in pixel
+    footprints; stuff: ids of floors, walls and tables; walls: an id of three walls in one."""
+
+    views: list[StereoView]
+    ids: list[np.ndarray]
+    side: float
+    stuff: list[int]
+    walls: list[int] = field(default_factory=list)
+
+
+def read_scene(folder: Path, stereo: bool, seed: int = 0, skip: int = -1, side: float = 0) -> Reading:
     """A scene in the format of docs/benchmarks.md, as a map with depth images or, `stereo`, without sees its surface.
     seed: of the noise. skip: a photo to leave out. side: of a voxel, in pixel footprints; 0: drawn from SIDES."""
     import cv2
     from scipy.spatial.transform import Rotation
 
     from perception.io.photos import read_photo
-    from perception.masks.builtin import fuse, surface_graph
     from perception.masks.stereo import make_stereo_view, measure_depths
     from perception.types import View
 
@@ -108,13 +124,27 @@ def read_world(folder: Path, stereo: bool, seed: int = 0, skip: int = -1, side: 
             shown = cv2.resize(truth, made.grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
             ids.append(shown.astype(np.int64))
     measure_depths(views)
-    surface = fuse(views, side or drawn)
-    graph = surface_graph(views, surface)
-    votes = np.zeros((len(surface), int(max(image.max() for image in ids)) + 1), np.int32)
-    for shown_by, image in zip(views, ids, strict=True):
+    named = json.loads((folder / "scene.json").read_text(encoding="utf-8"))["instances"]
+    walls = [entry["id"] for entry in named if entry["name"] == "wall"]
+    walls = walls if len(walls) == 1 else []  # a demo tabletop's three are one body
+    return Reading(views, ids, side or drawn, [entry["id"] for entry in named if entry["is_stuff"]], walls)
+
+
+def world_of(reading: Reading, borders: Path = BORDERS) -> World:
+    """The surface graph of a reading, with the truth. The tabletop's three walls count as three. borders: weights."""
+    from perception.masks.builtin import fuse, surface_graph
+
+    surface = fuse(reading.views, reading.side, borders)
+    graph = surface_graph(reading.views, surface)
+    votes = np.zeros((len(surface), int(max(image.max() for image in reading.ids)) + 1), np.int32)
+    for shown_by, image in zip(reading.views, reading.ids, strict=True):
         on_surface = shown_by.voxel >= 0
         np.add.at(votes, (shown_by.voxel[on_surface], image[on_surface]), 1)
-    return World(graph, votes.argmax(axis=1))
+    truth = votes.argmax(axis=1)
+    for wall in reading.walls:
+        across = surface.points[:, 0] * (truth == wall)
+        truth += votes.shape[1] * ((np.abs(across) > 1.5) + (across > 1.5).astype(int))
+    return World(graph, truth)
 
 
 def _noisy(depth: np.ndarray, stereo: bool, share: float, rng: np.random.Generator) -> np.ndarray:
@@ -140,21 +170,30 @@ def _noisy(depth: np.ndarray, stereo: bool, share: float, rng: np.random.Generat
     return without_edges(np.where(unknown, 0, noisy * waves(SENSED * share)).astype(np.float32))
 
 
-def make_world(folder: Path, stereo: bool) -> World:
-    """The scene SCENE_SEED, rendered unless it is there. The tabletop's three walls count as three."""
+def make_reading(folder: Path, stereo: bool) -> Reading:
+    """The scene SCENE_SEED, rendered and read unless it is there."""
     file = folder.with_suffix(".stereo" if stereo else ".sensor")
     if not file.is_file():
         scene, seed = folder.name.split("_")
         if not (folder / "scene.json").is_file():
             size = {"width": 320, "height": 240, "views": 26 if scene == "room" else 20, "light_samples": 6}
             scenes.make_photos(folder / "images", scene=scene, seed=int(seed), truth_folder=folder, **size)
-        world, names = read_world(folder, stereo), json.loads((folder / "scene.json").read_text("utf-8"))["instances"]
-        for wall in [entry["id"] for entry in names if entry["name"] == "wall"] if scene == "tabletop" else []:
-            across = world.graph.surface.points[:, 0] * (world.truth == wall)
-            world = World(world.graph, world.truth + len(names) * (np.abs(across) > 1.5) + (across > 1.5))
-        file.with_suffix(".part").write_bytes(pickle.dumps((world.graph, world.truth)))
+        file.with_suffix(".part").write_bytes(pickle.dumps(tuple(vars(read_scene(folder, stereo)).values())))
         file.with_suffix(".part").replace(file)
-    return World(*pickle.loads(file.read_bytes()))
+    return Reading(*pickle.loads(file.read_bytes()))
+
+
+def border_samples(folder: Path, stereo: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs and targets of the network of borders, from some views."""
+    reading = make_reading(folder, stereo)
+    some = np.random.default_rng(0).permutation(len(reading.views))[:VIEWS]
+    inputs = [inputs_of(*reading.views[k].cues()) for k in some]
+    return np.stack(inputs), np.stack([boundaries.targets_of(reading.ids[k], reading.stuff) for k in some])
+
+
+def make_world(folder: Path, stereo: bool, borders: Path = BORDERS) -> World:
+    """The surface graph of the scene SCENE_SEED, with the truth."""
+    return world_of(make_reading(folder, stereo), borders)
 
 
 def plain_rule(features: np.ndarray) -> np.ndarray:
@@ -194,8 +233,11 @@ def regions_of(world: World, pair: Network) -> Samples:
     return tree.features[size >= LEAST], np.stack([best > 0.5, best > 0.75], axis=1), np.ones(len(best))
 
 
-def fit(samples: list[Samples], size: dict[int, int], epochs: int, seed: int, members: int = MEMBERS) -> Network:
-    """Networks with 24 and 12 hidden units, by AdamW on the weighted cross entropy. size: features that grow with
+def fit(
+    samples: list[Samples], size: dict[int, int], epochs: int, seed: int, members: int = MEMBERS,
+    hidden: tuple[int, int] = (24, 12),
+) -> Network:  # fmt: skip
+    """Networks with two layers of `hidden` units, by AdamW on the weighted cross entropy. size: features that grow with
     the size of things, and their power of it. Inputs are varied by other sizes and by noise, for stability."""
     import torch
 
@@ -207,7 +249,7 @@ def fit(samples: list[Samples], size: dict[int, int], epochs: int, seed: int, me
     inputs = torch.from_numpy(np.clip((x - mean) / scale, -5, 5).astype(np.float32))
     target, weights = (torch.from_numpy(a.astype(np.float32)) for a in (y, weight[:, None] / weight.mean()))
     nearer = torch.tensor([NEARER * size.get(k, 0) / float(scale[k]) for k in range(len(scale))])
-    sizes = [x.shape[1], 24, 12, y.shape[1]]
+    sizes = [x.shape[1], *hidden, y.shape[1]]
     layers = [(torch.randn(members, b, a) * (2 / a) ** 0.5).requires_grad_() for a, b in pairwise(sizes)]
     offsets = [torch.zeros(members, 1, b, requires_grad=True) for b in sizes[1:]]
     steps = epochs * len(x) // 1024
@@ -227,12 +269,12 @@ def fit(samples: list[Samples], size: dict[int, int], epochs: int, seed: int, me
     return Network((mean.astype(np.float32), scale.astype(np.float32), *learned))
 
 
-def learn(worlds: list[World], seed: int = 0) -> MergeModel:
-    """Both networks, with a cost and a calibration yet to be tuned."""
-    samples = [pairs_of(world, plain_rule, seed) for world in worlds]
+def learn(worlds: list[World], seed: int = 0, each: Callable[..., Iterable[Samples]] = map) -> MergeModel:
+    """Both networks, with a cost and a calibration yet to be tuned. each: `map`, or that of a pool."""
+    samples = list(each(pairs_of, worlds, repeat(plain_rule), repeat(seed)))
     first = fit(samples, PAIR_SIZE, 6, seed)
-    pair = fit(samples + [pairs_of(world, first, seed + 1) for world in worlds], PAIR_SIZE, 6, seed)
-    whole = fit([regions_of(world, pair) for world in worlds], WHOLE_SIZE, 20, seed, 2 * MEMBERS)
+    pair = fit(samples + list(each(pairs_of, worlds, repeat(first), repeat(seed + 1))), PAIR_SIZE, 6, seed)
+    whole = fit(list(each(regions_of, worlds, repeat(pair))), WHOLE_SIZE, 20, seed, 2 * MEMBERS, (32, 16))
     return MergeModel(pair, whole, COSTS[0])
 
 
@@ -284,39 +326,78 @@ def report(model: MergeModel, groups: dict[str, list[World]]) -> str:
     return table(rows, COLUMNS, ("worlds",))
 
 
+def spread(model: MergeModel, worlds: list[World]) -> str:
+    """Mean and standard deviation of the figures of readings of one scene."""
+    found = [scores(world, tree_by(model, world.graph), model) for world in worlds]
+    rows = {goal: [row[goal.lower()] for row in found] for goal in GOALS}
+    return ", ".join(f"{goal} {np.mean(row):.3f} ± {np.std(row, ddof=1):.3f}" for goal, row in rows.items())
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("work", type=Path, metavar="WORK", help="folder of the worlds")
-    parser.add_argument("--worlds", type=int, default=12, metavar="N", help="sets of four to train on (default 12)")
-    parser.add_argument("--patchwork", action="store_true", help="train and tune on patchwork too")
+    parser.add_argument("--worlds", type=int, default=24, metavar="N", help="sets of six to train on (default 24)")
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="SCENE", help="more scenes to test on")
-    parser.add_argument("-o", "--output", type=Path, default=WEIGHTS, metavar="NPZ", help="default: the package's file")
+    parser.add_argument(
+        "--spread", type=int, default=1, metavar="N", help="read them N times, one photo less each time"
+    )
+    parser.add_argument("--weights", type=Path, metavar="DIR", help="test the weights of DIR and learn nothing")
+    parser.add_argument("-o", "--output", type=Path, default=WEIGHTS.parent, metavar="DIR", help="default: the package")
     options = parser.parse_args(arguments)
     options.work.mkdir(parents=True, exist_ok=True)
-    numbers = {"training": [k for k in range(2 * options.worlds) if k % 10 < 8][: options.worlds], **KEPT}
-    plan = [(name, sets, SCENES + PATCHWORK * (options.patchwork and name != "test")) for name, sets in numbers.items()]
-    jobs = [
-        (name, options.work / f"{scene}_{first + step * k}", stereo)
-        for name, sets, kinds in [*plan, ("patchwork", KEPT["test"], PATCHWORK)]
-        for k in sets
-        for scene, first, step in kinds
-        for stereo in (False, True)
-    ]
-    with ProcessPoolExecutor(os.cpu_count()) as pool:
-        worlds = list(pool.map(make_world, *zip(*(job[1:] for job in jobs), strict=True), chunksize=2))
-    groups: dict[str, list[World]] = {}
-    for (name, _, stereo), world in zip(jobs, worlds, strict=True):
-        groups.setdefault(name, []).append(world)
-        groups.setdefault(f"{name}, {'stereo' if stereo else 'sensor'}", []).append(world)
-    for scene in options.scenes:
-        groups |= {
-            f"{scene.name}, {kind}": [read_world(scene, kind == "stereo", side=FOOTPRINTS)]
-            for kind in ("sensor", "stereo")
-        }
-    model = tuned(learn(groups["training"]), groups["validation"])
+    with ProcessPoolExecutor(os.cpu_count(), initializer=_one_thread) as pool:
+        if options.weights is None:
+            train(options.work, options.worlds, options.output, pool)
+        weights = options.weights or options.output
+        model, borders = read_model(weights / WEIGHTS.name), weights / BORDERS.name
+        groups: dict[str, list[World]] = {}
+        jobs = jobs_of(options.work, KEPT["test"])
+        for (folder, stereo), world in zip(jobs, made_worlds(jobs, borders, pool), strict=True):
+            kind = "patchwork" if folder.name.startswith("patchwork") else "test"
+            groups.setdefault(f"{kind}, {'stereo' if stereo else 'sensor'}", []).append(world)
+        for scene, stereo in product(options.scenes, (False, True)):
+            name = f"{scene.name}, {'stereo' if stereo else 'sensor'}"
+            groups[name] = [world_of(read_scene(scene, stereo, side=FOOTPRINTS), borders)]
+            if options.spread > 1:
+                turns = range(options.spread)
+                worlds = [world_of(read_scene(scene, stereo, k, k, FOOTPRINTS), borders) for k in turns]
+                print(f"{name}, {options.spread} readings: {spread(model, worlds)}")
+    print(report(model, groups))
+
+
+def train(work: Path, sets: int, output: Path, pool: ProcessPoolExecutor) -> None:
+    """Makes the weights from that many sets, and tunes them on those of validation."""
+    numbers = [k for k in range(2 * sets) if k % 10 < 8][:sets]
+    jobs, borders = jobs_of(work, numbers), work / BORDERS.name
+    if not borders.is_file():
+        inputs, targets = zip(*pool.map(border_samples, *zip(*jobs, strict=True)), strict=True)
+        layers = boundaries.train(np.concatenate(inputs), np.concatenate(targets), seed=0)
+        aside = work / f"part_{BORDERS.name}"
+        np.savez_compressed(aside, *(part.numpy().astype(np.float16) for layer in layers for part in layer))
+        aside.replace(borders)
+    worlds, kept = (made_worlds(some, borders, pool) for some in (jobs, jobs_of(work, KEPT["validation"])))
+    model = tuned(learn(worlds, each=pool.map), kept)
     settings = np.array([model.cost, *model.calibration])
-    np.savez_compressed(options.output, settings, *model.pair.parts, *model.whole.parts)
-    print(report(model, {name: worlds for name, worlds in groups.items() if "," in name}))
+    np.savez_compressed(output / WEIGHTS.name, settings, *model.pair.parts, *model.whole.parts)
+    shutil.copyfile(borders, output / BORDERS.name)
+
+
+def jobs_of(work: Path, sets: Iterable[int]) -> list[tuple[Path, bool]]:
+    """Folder of each world of the sets, read as by a sensor and by stereo."""
+    kinds = [
+        (f"{scene}_{first + step * k}", stereo) for k in sets for scene, first, step in SCENES for stereo in (0, 1)
+    ]
+    return [(work / name, bool(stereo)) for name, stereo in kinds]
+
+
+def made_worlds(jobs: list[tuple[Path, bool]], borders: Path, pool: ProcessPoolExecutor) -> list[World]:
+    return list(pool.map(make_world, *zip(*jobs, strict=True), repeat(borders), chunksize=2))
+
+
+def _one_thread() -> None:
+    import torch
+
+    torch.set_num_threads(1)
 
 
 if __name__ == "__main__":

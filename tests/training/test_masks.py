@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial import cKDTree
 
 from perception.demo.scene import make_photos
-from training import patchwork
-from training.masks import fit, learn, make_world, pairs_of, plain_rule
+from perception.masks.boundaries import REACH, forward, scaled
+from training import boundaries, patchwork
+from training.masks import border_samples, fit, learn, make_world, pairs_of, plain_rule
 
 
 @pytest.fixture(scope="module")
@@ -69,3 +71,30 @@ def test_a_patchwork_animal_is_one_body_of_at_least_three_paints():
         assert len(np.unique(means.round(6), axis=0)) >= 3
         low = min(float(part.shape.origin[2] - part.shape.radii[2]) for part in body.parts)
         assert abs(low) < 0.03  # it stands on the ground
+
+
+def test_targets_of_borders_against_loops():
+    rng = np.random.default_rng(3)
+    ids = np.kron(rng.integers(0, 4, (5, 6)), np.ones((5, 5), int))
+    targets, (height, width) = boundaries.targets_of(ids, [2]), ids.shape
+    for y in range(height):
+        for x in range(width):
+            for axis, step in ((0, (0, REACH)), (1, (REACH, 0))):
+                ends = [(y - step[0], x - step[1]), (y + step[0], x + step[1])]
+                inside = all(0 <= v < height and 0 <= u < width for v, u in ends)
+                a, b = (ids[end] for end in ends) if inside else (0, 0)
+                assert targets[axis, y, x] == (a != b if a and b else 2)
+            assert targets[2, y, x] == (ids[y, x] != 2 if ids[y, x] else 2)
+
+
+@pytest.mark.slow
+def test_borders_are_learned_and_equal_seeds_give_equal_layers(photographed):
+    inputs, targets = border_samples(photographed[0], False)
+    layers, again = (boundaries.train(inputs, targets, seed=0, steps=60) for _ in range(2))
+    for one, two in zip(layers, again, strict=True):
+        assert all(torch.equal(*pair) for pair in zip(one, two, strict=True))
+    with torch.no_grad():
+        odds = forward(layers, scaled(torch.from_numpy(inputs))).numpy()
+    for k in range(3):
+        yes, no = odds[:, k][targets[:, k] == 1], odds[:, k][targets[:, k] == 0]
+        assert np.median(yes) > np.quantile(no, 0.7)
