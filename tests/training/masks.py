@@ -19,7 +19,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
-from itertools import pairwise, product, repeat
+from itertools import chain, pairwise, product, repeat
 from pathlib import Path
 from typing import Any
 
@@ -355,6 +355,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for (folder, stereo), world in zip(jobs, made_worlds(jobs, borders, pool), strict=True):
             kind = "patchwork" if folder.name.startswith("patchwork") else "test"
             groups.setdefault(f"{kind}, {'stereo' if stereo else 'sensor'}", []).append(world)
+        groups["all of them"] = list(chain(*groups.values()))
         for scene, stereo in product(options.scenes, (False, True)):
             name = f"{scene.name}, {'stereo' if stereo else 'sensor'}"
             groups[name] = [world_of(read_scene(scene, stereo, side=FOOTPRINTS), borders)]
