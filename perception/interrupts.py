@@ -1,29 +1,37 @@
-"""Signals that end a program, held back while its state is between two valid ones."""
+"""Handlers of the signals that end a program, for the length of a block."""
 
 from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
-_ENDING = (signal.SIGINT, signal.SIGTERM)
+ENDING = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def handled(handler: Callable[[int, Any], object], *numbers: int) -> Iterator[None]:
+    """`handler` gets these signals inside the block. Threads other than the main get none, so nothing is done there."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old if old is not None else signal.SIG_DFL)
 
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Holds SIGINT and SIGTERM back until the block has ended. Threads other than the main get none."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+    """Holds SIGINT and SIGTERM back until the block has ended, where a state is between two valid ones."""
     held: list[int] = []
-    before = {number: signal.getsignal(number) for number in _ENDING}
     try:
-        for number in _ENDING:
-            signal.signal(number, lambda number, _: held.append(number))
-        yield
+        with handled(lambda number, _: held.append(number), *ENDING):
+            yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
         for caught in held[:1]:
             signal.raise_signal(caught)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 import signal
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from perception.cli.parser import command, map_command
 from perception.errors import InputError
+from perception.interrupts import handled
 
 if TYPE_CHECKING:
     from perception.progress import Progress
@@ -121,7 +120,7 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.pipeline.summary import map_facts
     from perception.progress import Progress
 
-    with sigterm_as_interrupt(), Progress() as progress:
+    with _sigterm_as_interrupt(), Progress() as progress:
         gmap = build_map(args.input, args.output, config, resume=args.resume, progress=progress)
         _write_own_report(args.output, progress)
 
@@ -140,17 +139,9 @@ def _write_own_report(path: Path, progress: Progress) -> None:
         progress.log(f"warning: no report: {error}")
 
 
-@contextmanager
-def sigterm_as_interrupt() -> Iterator[None]:
+def _sigterm_as_interrupt() -> AbstractContextManager[None]:
     """Treats SIGTERM like Ctrl-C inside the block: finished work is kept, and the exit code is 130."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+    return handled(signal.default_int_handler, signal.SIGTERM)
 
 
 def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -187,7 +178,7 @@ def _demo(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
         raise InputError(f"--seed: found {args.seed}, expected 0 or more")
     if args.photos_only is not None:
         return write_scene(args.photos_only, args.scene, args.seed)
-    with sigterm_as_interrupt(), Progress() as progress:
+    with _sigterm_as_interrupt(), Progress() as progress:
         return run_demo(args.output, progress, args.scene, args.seed)
 
 

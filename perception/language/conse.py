@@ -14,15 +14,17 @@ mean over all classes. The paper weights by p; √p measured better on objects w
 from __future__ import annotations
 
 import hashlib
-import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from perception.errors import InputError
+from perception.io.atomic import atomic_file
 from perception.io.model_store import cache_folder
 from perception.language import minilm
 from perception.language.base import Part, Reading, check_images, check_texts, packaged_file, unit_rows
@@ -156,11 +158,7 @@ def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
     starts = np.cumsum([0] + [len(group) for group in names[:-1]])
     sizes = np.array([len(group) for group in names])
     classes = unit_rows(np.add.reduceat(embedded, starts, axis=0) / sizes[:, None])
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".npy", delete=False) as file:
+    with suppress(OSError, InputError):  # without a writable cache the embeddings are recomputed each time
+        with atomic_file(path) as aside, aside.open("wb") as file:
             np.save(file, classes)
-        Path(file.name).replace(path)
-    except OSError:
-        pass  # without a writable cache the embeddings are recomputed each time
     return classes

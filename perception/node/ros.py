@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.interrupts import ENDING, handled
 from perception.language.base import Encoder
 from perception.node import answers
 from perception.node.answers import DEPTH, Channel
@@ -224,11 +225,7 @@ def stop_on_signals() -> Iterator[threading.Event]:
             interrupted.set()
         stop.set()
 
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with handled(end, *ENDING):
         yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     if interrupted.is_set():
         raise KeyboardInterrupt

@@ -7,11 +7,11 @@ import ctypes
 import functools
 import hashlib
 import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 from perception.errors import InputError
+from perception.io.atomic import atomic_file
 from perception.io.model_store import cache_folder
 
 MAX_FEATURES = 8  # channels that the kernels take at once; more go through in slices
@@ -114,9 +114,6 @@ def cached_kernels(options: KernelOptions, architecture: int) -> bytes:
     if file.is_file():
         return file.read_bytes()
     cubin, _ = compile_kernels(nvrtc, options, architecture)
-    with contextlib.suppress(OSError):  # a home that cannot be written to: compiled again next time
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=file.parent, delete=False) as part:
-            part.write(cubin)
-        Path(part.name).replace(file)
+    with contextlib.suppress(OSError, InputError), atomic_file(file) as part:
+        part.write_bytes(cubin)  # or, in a home that cannot be written to, compiled again next time
     return cubin
