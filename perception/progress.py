@@ -1,13 +1,25 @@
-"""Progress display of long computations: a bar on a terminal, plain log lines elsewhere, always on stderr."""
+"""Progress of long computations: a bar on a terminal, plain log lines elsewhere, always on stderr; seconds by part."""
 
 from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 LINE = "{desc}{percentage:3.0f}%{postfix}  {bar}"
 """Format of tqdm's line. tqdm's own rate and remaining time are omitted, as they are wrong for a resumed run."""
+
+
+@contextmanager
+def timed(seconds: dict[str, float], part: str) -> Iterator[None]:
+    """Adds the wall-clock seconds of its block to `part` of `seconds`."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds[part] = seconds.get(part, 0.0) + time.perf_counter() - start
 
 
 class Progress:

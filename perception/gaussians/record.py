@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+
+from perception.progress import timed
 
 
 @dataclass
@@ -24,11 +24,6 @@ class TrainRecord:
     iterations: int = 0
     skipped_gradients: int = 0
 
-    @contextmanager
-    def timed(self, part: str) -> Iterator[None]:
+    def timed(self, part: str) -> AbstractContextManager[None]:
         """Adds the wall-clock seconds of its block to `part` of the profile. A nested block counts in both parts."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.profile[part] = self.profile.get(part, 0.0) + time.perf_counter() - start
+        return timed(self.profile, part)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +47,9 @@ from perception.pipeline.checkpoint import (
 from perception.pipeline.estimate import image_memory, log_estimate, memory_limit
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
 from perception.pipeline.photos import exposed_as_neighbours, load_all, split_views, with_labels
-from perception.pipeline.record import Stages, depth_errors, depth_used, finite, peak_memory_mib, versions
+from perception.pipeline.record import depth_errors, depth_used, finite, peak_memory_mib, versions
 from perception.pipeline.summary import depth_text, frame_lines
-from perception.progress import Progress
+from perception.progress import Progress, timed
 from perception.types import Scene, View
 
 GEOMETRY_START = 0.3
@@ -72,7 +73,9 @@ def build_map(
     `resume` a run continues from them and repeats only what has changed (see `pipeline.checkpoint`). A run that fails
     before training leaves no files. Resuming a finished run returns its map.
     """
-    progress, stages, started = progress or Progress(quiet=True), Stages(), time.monotonic()
+    progress, started = progress or Progress(quiet=True), time.monotonic()
+    seconds: dict[str, float] = {}
+    stages = partial(timed, seconds)
     if resume and output.exists() and read_info(output).get("fingerprint") == fingerprint(source, config):
         progress.log(f"{output}: this run is finished")
         clear_work(output)
@@ -148,7 +151,7 @@ def build_map(
             "training": vars(trained),
             "instances": found.report,
             "quality": quality,
-            "seconds": {**stages.seconds, "total": round(time.monotonic() - started, 2)},
+            "seconds": {name: round(s, 2) for name, s in (*seconds.items(), ("total", time.monotonic() - started))},
             "peak_memory_mib": peak_memory_mib(),
         }
         gmap = _assemble(gaussians, found, scene, held_out, record, output)

@@ -1,4 +1,4 @@
-"""Run record: seconds by stage, peak memory, versions, and what a run made of depth images: how much was measured, and
+"""Run record: peak memory, versions, and what a run made of depth images: how much was measured, and
 how far rendered depth is from it.
 """
 
@@ -8,9 +8,6 @@ import math
 import platform
 import resource
 import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib import metadata
 from typing import Any
 
@@ -18,21 +15,6 @@ import numpy as np
 
 from perception.gaussians.model import Gaussians
 from perception.gaussians.train import TrainingView, depth_image
-
-
-class Stages:
-    """Wall-clock seconds by stage, summed if a stage is entered again."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        start = time.monotonic()
-        try:
-            yield
-        finally:
-            self.seconds[name] = round(self.seconds.get(name, 0.0) + time.monotonic() - start, 2)
 
 
 def peak_memory_mib() -> float:

@@ -32,26 +32,18 @@ Text = Annotated[str, Field(max_length=MAX_TEXT)]  # with a bound, pydantic also
 Prompt = Annotated[str, Field(min_length=1, max_length=MAX_TEXT)]
 
 
-def _of_lists(value: Any) -> str:
-    """Tag of the union member that a value belongs to, so that a validation error names that member only."""
-    if isinstance(value, list):
-        return "nested" if value and isinstance(value[0], list) else "list"
-    return "single"
-
-
-Place = Annotated[
-    Annotated[Point, Tag("list")] | Annotated[Matrix, Tag("nested")],
-    Discriminator(lambda value: "nested" if _of_lists(value) == "nested" else "list"),
-]
+# The union member that a value belongs to, so that a validation error names that member only.
+_LIST_OR_NESTED = Discriminator(
+    lambda value: "nested" if isinstance(value, list) and value and isinstance(value[0], list) else "list"
+)
+_SINGLE_OR_LIST = Discriminator(lambda value: "list" if isinstance(value, list) else "single")
+Place = Annotated[Annotated[Point, Tag("list")] | Annotated[Matrix, Tag("nested")], _LIST_OR_NESTED]
 """A point [3], or a pose [4, 4] of which only the origin is used."""
 Prompts = Annotated[
     Annotated[Prompt, Tag("single")] | Annotated[list[Prompt], Field(min_length=1, max_length=MAX_TEXTS), Tag("list")],
-    Discriminator(lambda value: "list" if isinstance(value, list) else "single"),
+    _SINGLE_OR_LIST,
 ]
-Labels = Annotated[
-    Annotated[Text, Tag("single")] | Annotated[list[Text], Tag("list")],
-    Discriminator(lambda value: "list" if isinstance(value, list) else "single"),
-]
+Labels = Annotated[Annotated[Text, Tag("single")] | Annotated[list[Text], Tag("list")], _SINGLE_OR_LIST]
 
 
 class Body(BaseModel):
