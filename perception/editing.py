@@ -22,7 +22,7 @@ from perception.config import FrameConfig, InstanceConfig
 from perception.errors import InputError
 from perception.frame.scaled_map import scale_map
 from perception.io.atomic import writing
-from perception.io.map import PART, Map
+from perception.io.map import Map, language_in, prefixed
 from perception.io.map_files import map_signature, read_info
 from perception.io.store import read_map, write_map
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
@@ -330,9 +330,9 @@ def _joined(descriptions: list[InstanceDescription]) -> InstanceDescription:
 
 def _described(parts: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, np.ndarray]:
     """The arrays of parts.npz with language rows only for parts that are alive [P] bool, in ascending id."""
-    language = {name.removeprefix(PART): array for name, array in parts.items() if name.startswith(PART)}
+    language = language_in(parts)
     if not language or alive.all():
         return parts
     descriptions, encoder = from_arrays(language)
     left = [description for description, lives in zip(descriptions, alive, strict=True) if lives]
-    return {"ids": parts["ids"], **{PART + name: a for name, a in to_arrays(left, encoder).items()}}
+    return {"ids": parts["ids"], **prefixed(to_arrays(left, encoder))}

@@ -51,8 +51,17 @@ GAUSSIANS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features",
 """Fields with one row per Gaussian."""
 
 
-PART = "language_"
-"""Prefix of the arrays in `parts` that correspond to those in `language`."""
+_PREFIX = "language_"  # of the arrays in `parts` and `groups` that correspond to those in `language`
+
+
+def language_in(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """As `Map.language`, of the parts or groups: one row per part in ascending id; {} without embeddings."""
+    return {name.removeprefix(_PREFIX): array for name, array in arrays.items() if name.startswith(_PREFIX)}
+
+
+def prefixed(language: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Inverse of `language_in`."""
+    return {_PREFIX + name: array for name, array in language.items()}
 
 
 class PhotosMoved(UserWarning):
@@ -143,16 +152,6 @@ class Map:
     def poses(self) -> np.ndarray:
         """[V, 4, 4] float64 camera_from_world of the views."""
         return np.array([view.camera_from_world for view in self.views], np.float64).reshape(-1, 4, 4)
-
-    @property
-    def part_language(self) -> dict[str, np.ndarray]:
-        """As `language`, for the parts: one row per part in ascending id; {} without parts or embeddings."""
-        return {n.removeprefix(PART): array for n, array in self.parts.items() if n.startswith(PART)}
-
-    @property
-    def group_language(self) -> dict[str, np.ndarray]:
-        """As `language`, for the groups; {} without groups or embeddings."""
-        return {n.removeprefix(PART): array for n, array in self.groups.items() if n.startswith(PART)}
 
     @property
     def group_ids(self) -> np.ndarray:

@@ -21,7 +21,7 @@ from perception.instances.levels import with_levels
 from perception.instances.silhouettes import Silhouettes, render_silhouettes
 from perception.instances.texts import Reader, read_texts, store_texts
 from perception.instances.votes import mask_votes
-from perception.io.map import PART
+from perception.io.map import prefixed
 from perception.language.base import Encoder, reading_of
 from perception.language.description import to_arrays
 from perception.masks.merging import Segmentation
@@ -103,8 +103,7 @@ def describe(
     def language_of(ids: np.ndarray, seen: list[Silhouettes]) -> dict[str, np.ndarray]:
         if encoder is None:
             return {}
-        arrays = _embed(encoder, ids, seen, views, min(2, words.views), 1, progress)
-        return {PART + name: array for name, array in arrays.items()}
+        return prefixed(_embed(encoder, ids, seen, views, min(2, words.views), 1, progress))
 
     if grouped.parents:
         found.parts = {"ids": grouped.part_ids, **language_of(local, parts_seen)}

@@ -14,7 +14,7 @@ from perception.instances.describe import Load, describe_instances
 from perception.instances.silhouettes import render_silhouettes
 from perception.instances.texts import Reader, read_texts, store_texts
 from perception.io.atomic import writing
-from perception.io.map import PART, Map
+from perception.io.map import Map, language_in, prefixed
 from perception.io.map_files import read_info
 from perception.io.map_views import StoredView, locate_photo, stored_view
 from perception.io.store import FORMAT_VERSION, read_map, write_map
@@ -69,19 +69,17 @@ def _encoder(gmap: Map, encoders: Callable[[str], Encoder | None]) -> Encoder | 
 
 
 def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:
-    """Replaces `language` and, if present, the `language_` arrays of the parts and groups."""
+    """Replaces `language` and, if present, that of the parts and groups."""
     zooms = int(gmap.info.get("config", {}).get("language", {}).get("zooms") or reading_of(encoder).zooms)
     ids = [entry["id"] for entry in gmap.instances]
     gmap.language = _described(gmap, encoder, gmap.language, gmap.instance_ids, ids, zooms, progress)
-    if gmap.part_language:
+    if stored := language_in(gmap.parts):
         owners = gmap.parts["ids"]
-        known = sorted({int(i) for i in np.unique(owners) if i >= 0})
-        anew = _described(gmap, encoder, gmap.part_language, owners, known, 1, progress)
-        gmap.parts = {"ids": owners, **{PART + name: array for name, array in anew.items()}}
-    if gmap.group_language:
+        known = np.unique(owners[owners >= 0]).tolist()
+        gmap.parts = gmap.parts | prefixed(_described(gmap, encoder, stored, owners, known, 1, progress))
+    if stored := language_in(gmap.groups):
         known = list(range(len(gmap.groups["scores"])))
-        anew = _described(gmap, encoder, gmap.group_language, gmap.group_ids, known, 1, progress)
-        gmap.groups = {**gmap.groups, **{PART + name: array for name, array in anew.items()}}
+        gmap.groups = gmap.groups | prefixed(_described(gmap, encoder, stored, gmap.group_ids, known, 1, progress))
 
 
 def _read_again(gmap: Map, reader: Reader | None, progress: Progress) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from perception.boxes import oriented_box
+from perception.io.map import language_in
 from perception.language.description import from_arrays
 from perception.language.printed import quoted_text
 from perception.language.ranking import PRESENT, Ranker
@@ -32,16 +33,16 @@ class Nodes:
         self._nodes: list[tuple[QueryMap, int, list[int]]] = []
         place = {entry["id"]: n for n, entry in enumerate(opened.instances)}
         parts = [part for entry in opened.instances for part in entry.get("parts", [])]
-        if parts and opened.part_language and "ids" in opened.parts:
+        if parts and (language := language_in(opened.parts)) and "ids" in opened.parts:
             parts.sort(key=lambda part: int(part["id"]))
-            self._add(parts, opened.parts["ids"], opened.part_language, [[place[part["parent"]]] for part in parts])
-        if opened.group_language and (opened.group_ids >= 0).any():
+            self._add(parts, opened.parts["ids"], language, [[place[part["parent"]]] for part in parts])
+        if (language := language_in(opened.groups)) and (opened.group_ids >= 0).any():
             ids, groups = opened.group_ids, range(len(opened.groups["scores"]))
             members = [np.flatnonzero(opened.groups["of"] == g).tolist() for g in groups]
             points = [opened.means[ids == g].astype(np.float64) for g in groups]
             boxes = [{"centroid": x.mean(axis=0), "obb": oriented_box(x, 0.01).to_json()} for x in points]
             entries = [{"id": g, "score": 1.0, **boxes[g]} for g in groups]
-            self._add(entries, ids, opened.group_language, members)
+            self._add(entries, ids, language, members)
 
     def _add(
         self, entries: list[dict[str, Any]], ids: np.ndarray, language: dict[str, np.ndarray], related: list[list[int]]
