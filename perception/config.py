@@ -109,9 +109,6 @@ class LossConfig(Settings):
     feature_dim: int = Field(8, ge=1, le=64, description="dimensions D of the instance features")
     variance_weight: float = Field(0.5, ge=0, le=1000, description="weight λ_var of the variance loss (eq. 13)")
     margin: float = Field(1.0, gt=0, le=1000, description="margin γ of L_neg (eq. 8), in units of ‖z‖²")
-    variance_form: Literal["paper", "channels", "plain"] = Field(
-        "paper", description="L_var as in the paper, averaged over channels (the authors' code), or the mean variance"
-    )
     depth_weight: float = Field(
         0.5, ge=0, le=1000, description="weight of the depth loss of photos with depth images; 0: depth is not used"
     )
@@ -177,7 +174,6 @@ PAPER: dict[str, Any] = {
     "losses.feature_dim": 8,
     "losses.variance_weight": 0.5,
     "losses.margin": 1.0,
-    "losses.variance_form": "paper",
     "losses.depth_weight": 0.0,
     "losses.start": 0.0,
     "losses.every": 1,
@@ -194,20 +190,7 @@ PAPER: dict[str, Any] = {
 """OpenSplat3D as published: 30k iterations, each training all parameters at full resolution (3DGS reduces photos wider
 than 1600 pixels), with the densification threshold of the authors' LERF configuration; then HDBSCAN of the features
 alone. β, λ_inst2d, the growth of the crops (.3) and the threshold of silhouettes (.2) are constants, the paper's.
-`export` without options is the paper's, nearest mean and Felzenszwalb. It still differs from the paper:
-
-- Masks and words need models: --masks sam:PATH for SAM, language.encoder for a CLIP in place of MasQCLIP.
-- Densification runs from 5 to 60 % of the training (3DGS: iterations 500 to 15 000). Opacities decay by 1 % each time
-  instead of a reset every 3000, clone and original share their opacity, size prunes nothing, empty regions are filled.
-  The number of Gaussians rises evenly to the budget at most; 3DGS has none.
-- Learning rates of scales and colours are twice, of harmonics eight times those of 3DGS; the means' ends at 5e-5
-  instead of 1.6e-6; that of features is 1e-2 (authors' code: 2.5e-3). All fall over the last 10 %.
-- Harmonics gain a degree every 5 % after growth (3DGS: every 1000 iterations), and degrees worth under .05 dB are cut.
-- Exposure that differs between the photos is compensated.
-- Above 60 000 Gaussians HDBSCAN runs on a sample, and the others join by its density criterion.
-- Silhouettes of large photos are rendered at half their size; a pixel of two belongs to the heavier one alone.
-- An instance's score is the calibrated agreement with the masks; `--protocol segment3d` gives AP with constant ones.
-- `query` calibrates similarities; the plain cosine is `bench lerf-ovs --scoring cosine` and `bench scannetpp`.
+What still differs from the paper stands in docs/benchmarks.md.
 """
 
 PRESETS: dict[str, dict[str, Any]] = {

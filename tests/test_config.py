@@ -41,7 +41,7 @@ def test_the_papers_preset_is_the_published_method() -> None:
         "densify": {"every": 100, "grad_threshold": 3.5e-4},
         "losses": {
             "feature_dim": 8, "variance_weight": 0.5, "margin": 1,
-            "variance_form": "paper", "depth_weight": 0, "start": 0, "every": 1, "half_resolution": False,
+            "depth_weight": 0, "start": 0, "every": 1, "half_resolution": False,
         },
         "instances": {
             "method": "hdbscan", "split": False, "settle": False, "min_cluster_size": 32, "min_samples": 16,
@@ -74,7 +74,7 @@ def test_values_take_their_field_type() -> None:
         ("train.time_limit=nan", "found 'nan'"),
         ("densify.every=0", "densify.every: found '0'"),
         ("losses.every=0", "losses.every: found '0'"),
-        ("losses.variance_form=mean", "paper, channels or plain"),
+        ("instances.method=mean", "consensus or hdbscan"),
         ("losses.half_resolution=perhaps", "true or false"),
         ("instances.min_samples=0", "instances.min_samples: found '0'"),
         ("device=tpu", "auto, cpu or cuda"),

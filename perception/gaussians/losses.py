@@ -11,7 +11,6 @@ On another device every figure is a tensor of one element.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -22,7 +21,6 @@ from perception.gaussians.device import training_kernels
 from perception.io.memory import Keep
 
 _LARGEST_ID = 2**31 - 1
-VarianceForm = Literal["paper", "channels", "plain"]
 
 
 def _ready(name: str, tensor: Tensor) -> Tensor:
@@ -217,24 +215,18 @@ def instance_loss(
 # ---------- variance
 
 
-def variance_loss(feature_variance: Tensor, form: VarianceForm = "paper", weight: float = 1) -> tuple[float, Tensor]:
+def variance_loss(feature_variance: Tensor, weight: float = 1) -> tuple[float, Tensor]:
     """weight · L_var, L_var = 1/|I| Σ_p ‖Var(F(p))‖² of the rendered per-pixel variance, feature_variance [H, W, D].
 
-    form "paper": as above, summed over channels. "channels": the authors' released code, also averaged over
-    the D channels. "plain": the mean of Var itself, over pixels and channels.
-    Returns the loss and its gradient [H, W, D].
+    Returns the loss and its gradient [H, W, D]. The authors' released code also averages over the D channels.
     """
     if feature_variance.ndim != 3:
         raise InputError(f"variance loss: found {list(feature_variance.shape)}, expected [H, W, D]")
-    if form not in ("paper", "channels", "plain"):
-        raise InputError(f"variance loss: form is '{form}', expected paper, channels or plain")
     variance = _ready("feature_variance", feature_variance)
-    height, width, channels = variance.shape
-    share = weight / max(1, height * width * (1 if form == "paper" else channels))
+    height, width, _ = variance.shape
+    share = weight / max(1, height * width)
     kernels = training_kernels(variance.device)
-    value = share * kernels.sum(variance.view(-1), form != "plain")
-    if form == "plain":
-        return value, torch.full_like(variance, share)
+    value = share * kernels.sum(variance.view(-1), True)
     gradient = torch.empty_like(variance)
     kernels.scale(variance.view(-1), 2 * share, gradient.view(-1))
     return value, gradient

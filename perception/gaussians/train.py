@@ -206,7 +206,7 @@ class Trainer:
         if out.features is not None and out.feature_variance is not None:
             weight = 1.0 if view.weight is None else view.weight[..., None]
             spread = out.feature_variance[0] if view.weight is None else out.feature_variance[0] * weight
-            value, variance = variance_loss(spread, losses.variance_form, losses.variance_weight)  # λ_var L_var, eq. 13
+            value, variance = variance_loss(spread, losses.variance_weight)  # λ_var L_var, eq. 13
             total, variance = total + value, (variance if view.weight is None else variance * weight)[None]
             if view.labels is not None:
                 labels = self._assigned.get(view.name) or assign_labels(view.labels, view.keep).to(self.device)

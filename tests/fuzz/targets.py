@@ -358,7 +358,7 @@ def _config() -> Target:
     from perception.config import load_config
 
     seed = b'seed = 1\ndevice = "cpu"\n[train]\niterations = 10\ntime_limit = 3.5\n[losses]\nhalf_resolution = true\n'
-    pairs = b"train.iterations=10\ntrain.time_limit=none\nlosses.margin=1e-3\nlosses.variance_form=plain\n"
+    pairs = b"train.iterations=10\ntrain.time_limit=none\nlosses.margin=1e-3\ninstances.method=hdbscan\n"
 
     def read(folder: Path, name: str) -> None:
         json.dumps(load_config(folder / "c.toml").to_json())
