@@ -10,6 +10,8 @@ import torch
 
 from perception.colors import rgb_from_sh, sh_from_rgb
 
+Inputs = tuple[torch.Tensor | None, ...]
+
 
 def sigmoid(logits: torch.Tensor) -> torch.Tensor:
     """Sigmoid 1 / (1 + exp(−x)) of each element; the result does not depend on the number of threads, bit for bit.
@@ -67,6 +69,12 @@ class Gaussians:
     def base_colors(self) -> torch.Tensor:
         """[N, 3] RGB in about [0, 1] as seen without view dependence."""
         return rgb_from_sh(self.sh[:, 0])
+
+    def inputs(self, camera_from_world: torch.Tensor, K: torch.Tensor, features: torch.Tensor | None = None) -> Inputs:
+        """The inputs of `rasterize_forward` for one camera, on the same device, with colours that do not depend on the
+        view. camera_from_world [4, 4], K [3, 3] pixels; features [N, D]."""
+        camera = (camera_from_world[None].contiguous(), K[None].contiguous())
+        return (self.means, self.quats, self.scales, self.opacities, self.base_colors, features, *camera)
 
 
 def from_points(

@@ -12,7 +12,8 @@ run resumed from a checkpoint takes the same steps as one without interruption.
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -33,10 +34,10 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.rasterize import Forward, Settings, passes, torch_on_one_thread
 from perception.gaussians.rates import learning_rates
-from perception.gaussians.record import TrainRecord
 from perception.gaussians.schedule import Schedule
 from perception.gaussians.views import TrainingView, depth_image, psnr, render_view, scene_extent, target_photo
 from perception.interrupts import uninterrupted
+from perception.progress import timed
 
 __all__ = ["TrainRecord", "Trainer", "TrainingView", "depth_image", "psnr", "render_view", "scene_extent"]
 
@@ -46,6 +47,27 @@ _LEAST_RECORDS = 1 << 18
 """Gradient records that a GPU must have room for at once (see `Settings.max_records`)."""
 INSTANCE_WEIGHT = 0.1
 """λ_inst2d of eq. 14; w_p = w_n = 1 in eq. 9."""
+
+
+@dataclass
+class TrainRecord:
+    """JSON-able. profile: wall-clock seconds by part.
+
+    pairs, evaluated_pairs: (Gaussian, pixel) pairs of all training steps that contributed, that were computed.
+    """
+
+    curve: list[dict[str, float]] = field(default_factory=list)
+    decisions: list[str] = field(default_factory=list)
+    profile: dict[str, float] = field(default_factory=dict)
+    pairs: int = 0
+    evaluated_pairs: int = 0
+    seconds: float = 0.0
+    iterations: int = 0
+    skipped_gradients: int = 0
+
+    def timed(self, part: str) -> AbstractContextManager[None]:
+        """Adds the wall-clock seconds of its block to `part` of the profile. A nested block counts in both parts."""
+        return timed(self.profile, part)
 
 
 class Observer(Protocol):

@@ -45,16 +45,7 @@ def render_silhouettes(
     levels: ids [N] int32, −1 = none, 0 … M − 1. An instance's weight in a pixel is the sum of the weights of its
     Gaussians; all other Gaussians occlude it. camera_from_world [4, 4], K [3, 3] float32. eps2d: see `rasterize`.
     """
-    inputs = (
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.base_colors,
-        None,
-        camera_from_world[None].contiguous(),
-        K[None].contiguous(),
-    )
+    inputs = gaussians.inputs(camera_from_world, K)
     owners = np.stack([np.asarray(ids, np.int32) for ids in levels])
     images, visible = label_images(inputs, owners, threshold, Settings(width, height, depth=False, eps2d=eps2d))
     found = []

@@ -127,16 +127,7 @@ def _of_view(gaussians: Gaussians, view: TrainingView) -> tuple[sparse.csr_matri
     names, dense = np.unique(np.append(view.labels.numpy(), 0), return_inverse=True)
     labels = torch.from_numpy(dense.reshape(-1)[:-1].reshape(height, width))
     masks = range(len(names))
-    inputs = (
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.base_colors,
-        torch.zeros(len(gaussians), BLOCK),
-        view.camera_from_world[None].contiguous(),
-        view.K[None].contiguous(),
-    )
+    inputs = gaussians.inputs(view.camera_from_world, view.K, torch.zeros(len(gaussians), BLOCK))
     settings = Settings(width, height, variance=False, depth=False, eps2d=view.eps2d)
     forward = rasterize_forward((*inputs[:5], None, *inputs[6:]), None, settings)
     seen = forward.visible[0].numpy().nonzero()[0]
