@@ -16,16 +16,14 @@ OBJECT = 1  # the only class in class-agnostic evaluation
 class Overlap:
     """Sizes and intersections in points, for P predictions in input order and G true instances by ascending id.
 
-    pred_ids, pred_classes, pred_sizes, pred_void [P] int64; pred_scores [P] float64; gt_ids, gt_classes, gt_sizes [G]
-    int64; intersections [P, G] int64. pred_void: number of points of a prediction that are void in the ground truth.
+    pred_classes, pred_sizes, pred_void [P] int64; pred_scores [P] float64; gt_classes, gt_sizes [G] int64;
+    intersections [P, G] int64. pred_void: number of points of a prediction that are void in the ground truth.
     """
 
-    pred_ids: np.ndarray
     pred_scores: np.ndarray
     pred_classes: np.ndarray
     pred_sizes: np.ndarray
     pred_void: np.ndarray
-    gt_ids: np.ndarray
     gt_classes: np.ndarray
     gt_sizes: np.ndarray
     intersections: np.ndarray
@@ -148,12 +146,10 @@ def _overlap(
     if not np.isfinite(confidence).all():
         raise InputError(f"prediction: score of instance {ids[~np.isfinite(confidence)][0]} is not a finite number")
     return Overlap(
-        pred_ids=ids,
         pred_scores=confidence,
         pred_classes=np.asarray(classes, np.int64).reshape(len(ids)),
         pred_sizes=table.sum(axis=1),
         pred_void=table[:, -1],
-        gt_ids=truth.ids,
         gt_classes=truth.classes,
         gt_sizes=truth.sizes,
         intersections=table[:, :-1],

@@ -72,7 +72,7 @@ def group(
         parts = np.full(len(ids), -1, np.int64)
         parents = np.zeros(0, np.int64)
     else:
-        ids, parts, parents = _by_consensus(means, opacities, features, votes, config, seed)
+        ids, parts, parents = _by_consensus(means, opacities, features, votes, seed)
     if config.settle:
         ids = reassign(ids, means, opacities, votes, MIN_OPACITY)
         ids = _without_small(ids, votes, config)
@@ -81,12 +81,7 @@ def group(
 
 
 def _by_consensus(
-    means: np.ndarray,
-    opacities: np.ndarray,
-    features: np.ndarray,
-    votes: MaskVotes,
-    config: InstanceConfig,
-    seed: int,
+    means: np.ndarray, opacities: np.ndarray, features: np.ndarray, votes: MaskVotes, seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """ids [N] int32 and parts [N] int64 (−1 = none in both), and the instance of each part."""
     ids, parts = np.full(len(means), -1, np.int32), np.full(len(means), -1, np.int64)

@@ -110,7 +110,7 @@ def measure(points: np.ndarray) -> Body | None:
     margin = 0.05 * (high - low) + 1e-9
     points = points[((points >= low - margin) & (points <= high + margin)).all(axis=1)]
     center = np.median(points, axis=0)
-    normal = plane_normal(points, center)
+    normal = plane_normal(points)
     in_plane = level_frame(normal)
     local = (points - center) @ in_plane.T
     spread = np.percentile(local, 75, axis=0) - np.percentile(local, 25, axis=0)
@@ -208,7 +208,7 @@ def room_scores(bodies: list[Body], e: float) -> dict[str, np.ndarray]:
     }
 
 
-def plane_normal(points: np.ndarray, center: np.ndarray) -> np.ndarray:
+def plane_normal(points: np.ndarray) -> np.ndarray:
     """Normal of the dominant plane of points: principal axes, refitted twice to the points nearest to the plane."""
     kept = points
     normal = np.array([0.0, 0.0, 1.0])

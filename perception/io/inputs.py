@@ -93,11 +93,9 @@ def _kind(source: Path) -> Any:
 
 @dataclass(frozen=True)
 class PhotoSizes:
-    """(width, height) of every photo of an input; posed: the input has camera poses; what: their number as text; depth:
-    photos have depth images."""
+    """(width, height) of every photo of an input; what: their number as text; depth: photos have depth images."""
 
     sizes: list[tuple[int, int]]
-    posed: bool
     what: str
     depth: bool = False
 
@@ -113,19 +111,19 @@ def photo_sizes(source: Path) -> PhotoSizes:
 
     kind = _kind(source)
     if kind == "video":
-        return PhotoSizes([frame_size(source)] * MOST_FRAMES, False, f"at most {MOST_FRAMES} frames")
+        return PhotoSizes([frame_size(source)] * MOST_FRAMES, f"at most {MOST_FRAMES} frames")
     if isinstance(kind, Recording) and kind.frames:
         count = len(kind.frames)
         size = _size(kind.frames[0].photo) or (640, 480)
         taken = min(count, MOST_RECORDED)
-        return PhotoSizes([size] * taken, True, f"at most {taken} of {count} frames", bool(kind.frames[0].depth))
+        return PhotoSizes([size] * taken, f"at most {taken} of {count} frames", bool(kind.frames[0].depth))
     depth = False
     if isinstance(kind, Path):
         photos, depth = listed_photos(kind)
     else:
         photos = list_photos(source / "images" if kind == "workspace" else source)
     sizes = [size for size in map(_size, photos) if size is not None]
-    return PhotoSizes(sizes, kind != "photos", f"{len(sizes)} photos", depth)
+    return PhotoSizes(sizes, f"{len(sizes)} photos", depth)
 
 
 def _size(photo: Path) -> tuple[int, int] | None:

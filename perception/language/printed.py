@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from perception.language.colors import color_words
-from perception.language.shape_words import head_noun
+from perception.language.shape_words import head_noun, singular
 
 QUALITY = 0.75  # least quality of a match: one wrong character in four
 PART = 0.6  # least share of a word that a text cut off at either end must hold
@@ -74,7 +74,7 @@ class Printed:
         """[I] in [0, 1]: share of the prompt's telling words that each instance bears; squared unless the prompt names
         a thing known by its print, because COFFEE may be on a poster as well as on a coffee mug."""
         words = [word for word in _WORD.findall(prompt.lower()) if not color_words(f"{word} thing")]
-        telling = [_folded(word)[0] for word in words if _singular(word) not in _KIND]
+        telling = [_folded(word)[0] for word in words if singular(word) not in _KIND]
         share = self._borne(telling, [1] * len(telling))
         return share if len(telling) == 1 == len(words) or _KIND.get(head_noun(prompt)) == "carrier" else share**2
 
@@ -122,10 +122,4 @@ def _quality(distance: int, length: int) -> float:
 
 def _folded(text: str) -> list[str]:
     """Its words in lower case, singular, with characters that OCR confuses made equal."""
-    return [_singular(word).translate(_SAME) for word in _WORD.findall(text.lower())]
-
-
-def _singular(word: str) -> str:
-    if word.endswith("xes"):
-        return word[:-2]
-    return word[:-1] if len(word) > SHORT and word.endswith("s") and not word.endswith("ss") else word
+    return [singular(word).translate(_SAME) for word in _WORD.findall(text.lower())]

@@ -54,7 +54,7 @@ def shape_kind(text: str) -> str | None:
 
 
 def singular(word: str) -> str:
-    """The word without its plural s."""
+    """The word without its plural s; words of up to three letters, such as "bus", as they are."""
     if word.endswith("xes"):
         return word[:-2]
-    return word[:-1] if word.endswith("s") and not word.endswith("ss") else word
+    return word[:-1] if len(word) > 3 and word.endswith("s") and not word.endswith("ss") else word

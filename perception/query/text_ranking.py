@@ -133,7 +133,7 @@ def extents(gmap: Map) -> np.ndarray:
         points = gmap.index.of(entry["id"]).astype(np.float64)
         points = points[:: len(points) // SAMPLES + 1]
         if len(points):
-            axes = np.vstack([entry["obb"]["rotation"], plane_normal(points, np.median(points, axis=0))])
+            axes = np.vstack([entry["obb"]["rotation"], plane_normal(points)])
             a, b, c, thickness = np.diff(np.quantile(points @ axes.T, [TRIM, 1 - TRIM], axis=0), axis=0)[0]
             sides[n] = np.array([a, b, min(c, thickness)]) / (1 - 2 * TRIM)
     return sides

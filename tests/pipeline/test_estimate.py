@@ -22,11 +22,11 @@ GIB = 2**30
     [(50, (270, 480), 100_000, 1.2), (50, (270, 480), 50_000, 1.1), (86, (640, 480), 100_000, 1.4)],
 )
 def test_the_estimate_is_near_what_was_read(count: int, size: tuple[int, int], budget: int, gib: float) -> None:
-    assert needed_bytes(PhotoSizes([size] * count, True, ""), 800, budget) / GIB == pytest.approx(gib, rel=0.2)
+    assert needed_bytes(PhotoSizes([size] * count, ""), 800, budget) / GIB == pytest.approx(gib, rel=0.2)
 
 
 def test_what_grows_the_estimate() -> None:
-    base, more = (PhotoSizes([(640, 480)] * count, True, "") for count in (50, 100))
+    base, more = (PhotoSizes([(640, 480)] * count, "") for count in (50, 100))
     small = needed_bytes(base, 800, 100_000)
     assert needed_bytes(more, 800, 100_000) - small == 50 * 640 * 480 * 7  # photo and labels
     assert needed_bytes(base, 800, 200_000) - small == 100_000 * 2400
@@ -37,7 +37,7 @@ def test_what_grows_the_estimate() -> None:
 
 def test_a_run_that_cannot_fit_says_what_to_change() -> None:
     """It was ended by the system after hours, without a word."""
-    photos = PhotoSizes([(4032, 3024)] * 3000, False, "3000 photos")
+    photos = PhotoSizes([(4032, 3024)] * 3000, "3000 photos")
     words = ["photos.max_side=2000", "train.budget=1000000", "photos.memory=90G"]
     with pytest.raises(InputError, match=r"^3000 photos need about [\d.]+ GiB with .* give --max-side \d+") as told:
         check_memory(photos, load_config(None, words), 6 * GIB)
@@ -52,7 +52,7 @@ def test_the_line_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     for index in range(4):
         Image.new("RGB", (64, 48)).save(tmp_path / f"{index}.png")
     (tmp_path / "3.png").write_bytes(b"broken")
-    assert photo_sizes(tmp_path) == PhotoSizes([(64, 48)] * 3, False, "3 photos")
+    assert photo_sizes(tmp_path) == PhotoSizes([(64, 48)] * 3, "3 photos")
     lines: list[str] = []
     log_estimate(tmp_path, load_config(None, []), lines.append)
     assert lines == ["3 photos, trained at up to 800 pixels: about 1.1 GiB"]
@@ -63,4 +63,4 @@ def test_the_line_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_sizes_of_posed_inputs(small_scene: Path) -> None:
     found = photo_sizes(small_scene)
-    assert found == photo_sizes(small_scene / "transforms.json") == PhotoSizes([(128, 96)] * 12, True, "12 photos")
+    assert found == photo_sizes(small_scene / "transforms.json") == PhotoSizes([(128, 96)] * 12, "12 photos")
