@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from perception.bags.poses import Poses
-from perception.bags.read import CAMERA_INFO, IMAGES, Bag, raw_rows, stamp_of
+from perception.bags.read import CAMERA_INFO, DEPTH_TRANSPORT, IMAGES, Bag, camera_of, raw_rows, stamp_of
 from perception.errors import InputError
 from perception.io.camera_file import read_camera, write_camera_info
 from perception.io.lens import camera_from_lens, rescale_lens
@@ -23,7 +23,7 @@ MILLIMETRES, LARGEST = 1000.0, 65534
 """Stored units per metre, and the largest: 65535 means saturated to many programs."""
 _SAME_LENS = 0.01
 """Largest relative difference between focal lengths for which depth in the photos' frame counts as registered."""
-_COMPRESSED, _HEADER = "compressedDepth", 12
+_HEADER = 12
 _NAMED = ("aligned", "registered")
 _TYPES = {"16UC1": "u2", "32FC1": "f4"}
 
@@ -34,7 +34,7 @@ def depth_topics(bag: Bag) -> list[str]:
     for topic in bag.of_type(*IMAGES):
         first = next(bag.messages([topic]), None)
         kind = "" if first is None else str(getattr(first[2], "encoding", None) or first[2].format)
-        if _COMPRESSED in kind or kind.startswith(("16UC1", "32FC1")):
+        if DEPTH_TRANSPORT in kind or kind.startswith(("16UC1", "32FC1")):
             found.append(topic)
     return found
 
@@ -47,7 +47,7 @@ def choose_depth(bag: Bag, topics: list[str], wanted: str | None, frame: str) ->
 
     def rank(topic: str) -> tuple[bool, bool, bool]:
         other = _frame_of(next(bag.messages([topic]))[2]) != frame.lstrip("/")
-        return other, not any(word in topic for word in _NAMED), topic.endswith(_COMPRESSED)
+        return other, not any(word in topic for word in _NAMED), topic.endswith(DEPTH_TRANSPORT)
 
     ranks = {topic: rank(topic) for topic in topics}
     best = topics if wanted else [topic for topic in topics if ranks[topic] == min(ranks.values())]
@@ -60,7 +60,7 @@ def decode_depth(message: Any, where: str) -> np.ndarray:
     image: np.ndarray | None
     if hasattr(message, "encoding"):
         image = _raw(message, kind, where)
-    elif _COMPRESSED in kind:
+    elif DEPTH_TRANSPORT in kind:
         image = _compressed(bytes(message.data), kind)
     else:
         image = cv2.imdecode(np.frombuffer(bytes(message.data) or b"\0", np.uint8), cv2.IMREAD_UNCHANGED)
@@ -157,8 +157,7 @@ def _frame_of(message: Any) -> str:
 
 
 def _depth_lens(bag: Bag, topic: str) -> Lens | None:
-    base = topic.removesuffix(f"/{_COMPRESSED}").removesuffix("/compressed").rpartition("/")
-    name = f"{base[0]}/camera_info"
+    name, rectified = camera_of(topic)
     if name not in bag.of_type(CAMERA_INFO):
         return None
     message = next((message for _, _, message in bag.messages([name])), None)
@@ -166,7 +165,7 @@ def _depth_lens(bag: Bag, topic: str) -> Lens | None:
         return None
     with TemporaryDirectory() as folder:
         file = Path(folder) / "camera_info.yaml"
-        write_camera_info(file, message, rectified="rect" in base[2].partition("_")[2])
+        write_camera_info(file, message, rectified=rectified)
         return read_camera(file)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from perception.bags.depth import MILLIMETRES, choose_depth, depth_topics, write_depth
 from perception.bags.poses import FIXED_FRAMES, Poses, gravity, read_poses
-from perception.bags.read import CAMERA_INFO, IMAGES, Bag, decode_image, encoded, open_bag, stamp_of
+from perception.bags.read import CAMERA_INFO, IMAGES, Bag, camera_of, decode_image, encoded, open_bag, stamp_of
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.atomic import atomic_directory
@@ -97,8 +97,7 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
 def _camera_info(bag: Bag, topic: str, wanted: str | None) -> Any:
     """The first CameraInfo of the camera that publishes `topic`."""
     topics = bag.of_type(CAMERA_INFO)
-    base = topic.removesuffix("/compressed").rpartition("/")[0]
-    beside = f"{base}/camera_info"
+    beside, _ = camera_of(topic)
     name = wanted or (beside if beside in topics else topics[0] if len(topics) == 1 else beside)
     if name not in topics:
         advice = "give its topic with --camera-info, or a camera file with --camera (perception calibrate makes one)"
@@ -113,7 +112,7 @@ def _write_camera(path: Path, camera: Path | None, info: Any, topic: str, size: 
         path.write_bytes(Path(camera).read_bytes() if Path(camera).is_file() else b"")
         lens = read_camera(camera)
     else:
-        write_camera_info(path, info, rectified="rect" in topic.rpartition("/")[2].partition("_")[2])
+        write_camera_info(path, info, rectified=camera_of(topic)[1])
         lens = read_camera(path)
     if (lens.width, lens.height) != size:
         found = f"images of {topic} are {size[0]}x{size[1]} pixels, the camera {lens.width}x{lens.height}"

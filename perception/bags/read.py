@@ -16,6 +16,7 @@ IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 ODOMETRY = "nav_msgs/msg/Odometry"
+DEPTH_TRANSPORT = "compressedDepth"
 
 
 class Bag:
@@ -47,6 +48,15 @@ class Bag:
                 yield connection.topic, time, self._reader.deserialize(raw, connection.msgtype)
             except Exception as error:  # the library's exceptions have no common base class
                 raise InputError(f"{self.path}: a message on {connection.topic} cannot be read ({error})") from error
+
+
+def camera_of(topic: str) -> tuple[str, bool]:
+    """(its camera_info, whether its images are rectified) of an image topic, as ROS's image_pipeline names them:
+    /front/image_rect_color/compressed has /front/camera_info, and is rectified."""
+    for transport in ("/compressed", f"/{DEPTH_TRANSPORT}"):
+        topic = topic.removesuffix(transport)
+    namespace, _, image = topic.rpartition("/")
+    return f"{namespace}/camera_info", "rect" in image.partition("_")[2]
 
 
 @contextmanager

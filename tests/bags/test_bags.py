@@ -107,6 +107,23 @@ def test_poses_are_those_recorded(tmp_path: Path) -> None:
     assert plain["with_pose"] == 0 and "--camera" in text and not (tmp_path / "plain" / "transforms.json").exists()
 
 
+@pytest.mark.parametrize("topic", ["/cam/image_rect", "/cam/image_rect_color/compressed", "/cam/image_raw/compressed"])
+def test_rectified_images_take_the_camera_of_rectified_images(tmp_path: Path, topic: str) -> None:
+    """image_pipeline's names: camera_info holds K and D of the raw images, and P of the rectified ones."""
+    bag = Recorder(tmp_path / "drive", "mcap")
+    bag.info("/cam/camera_info", TIMES[0], (128, 96), K, D)
+    for i, time in enumerate(TIMES[:3]):
+        bag.jpeg(topic, time, cv2.imencode(".jpg", photo(i))[1].tobytes())
+    bag.close()
+    run_frames(tmp_path / "drive", tmp_path / "out", FrameOptions(poses=False))
+    params = np.array(read_camera(tmp_path / "out" / "camera.yaml").params)
+    if "rect" in topic:  # the recorder writes P = .9 K
+        np.testing.assert_allclose(params[:4], 0.9 * (np.array([80, 82, 63.5, 47.5]) - [0, 0, 0.5, 0.5]) + [0, 0, 0.5, 0.5])
+        assert not params[4:].any()
+    else:
+        np.testing.assert_allclose(params[4:8], D[:4])
+
+
 def test_interpolation_and_gaps() -> None:
     poses = Poses()
     poses.add("world", "base", 0, pose(0.0, 0.0))
