@@ -14,6 +14,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "perception"
 # Bottom to top; a module may import from its own layer and those below.
 LAYERS = [
     {
+        "cores",
         "errors",
         "types",
         "config",

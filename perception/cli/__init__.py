@@ -13,6 +13,7 @@ from importlib import import_module
 
 from perception import __version__
 from perception.cli.parser import Parser
+from perception.cores import limit_threads
 from perception.errors import InputError
 
 _MODULES = ("mapping", "maps", "scoring", "serving", "models")
@@ -44,6 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code: 0, 2 for bad usage or input, 130 on Ctrl-C."""
     # Threads of torch's OpenMP that spin while they wait would take the cores from the kernels' own threads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    limit_threads()
     args = argparse.Namespace()
     warnings.showwarning = _warn  # type: ignore[assignment]
     try:

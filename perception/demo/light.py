@@ -6,7 +6,6 @@ computed once per texel of a light map: rendering equation, one diffuse bounce o
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -14,10 +13,11 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
+from perception.cores import cores
 from perception.demo.cameras import Camera
 from perception.demo.shapes import Box, Shape, placed, spin, to_local, to_world
 
-WORKERS = min(os.cpu_count() or 1, 8)  # one photo being rendered needs about 150 MB
+WORKERS = min(cores(), 8)  # one photo being rendered needs about 150 MB
 
 
 @dataclass(frozen=True)

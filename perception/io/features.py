@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import sqlite3
 import time
@@ -21,10 +20,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from perception.cores import cores
 from perception.io.atomic import atomic_directory, recover
 from perception.io.ignore_masks import stage_masks
 from perception.io.lens import load_pycolmap
-from perception.io.memory import cores
 from perception.io.photos import LARGE_PIXELS, exif_of, open_photo, photo_size, read_photo
 from perception.progress import Progress
 from perception.types import Lens
@@ -51,7 +50,7 @@ def stage_photos(folder: Path, photos: list[Path], progress: Progress) -> list[s
             converted.append((photo, folder / names[-1]))
         else:
             _link(photo.resolve(), folder / names[-1])
-    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(4, cores())) as pool:
         for done, _ in enumerate(pool.map(_convert, *zip(*converted, strict=True)) if converted else (), start=1):
             progress.update("poses: turning and converting photos", done, len(converted))
     return names

@@ -99,11 +99,6 @@ def available_memory() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def cores() -> int:
-    """Number of CPU cores available to this process."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def require_memory(needed: float, what: str, advice: str) -> None:
     """InputError naming `what` and `advice` when `needed` bytes exceed 90 % of the available memory."""
     free = available_memory()

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from perception.cores import cores
 from perception.errors import InputError
 from perception.io.photos import SUFFIXES, decode, open_photo, photo_size, upright
 from perception.io.video import FRAMES_RECORD, THUMBNAIL, motion_between
@@ -105,7 +106,7 @@ def choose_photos(folder: Path, strict: bool, progress: Progress) -> PhotoSet:
     paths = list_photos(folder)
     looks: list[_Look] = []
     taken: set[str] = set()
-    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(4, cores())) as pool:
         for done, look in enumerate(pool.map(lambda path: _look(path, folder, strict), paths), start=1):
             while look.name in taken:  # an escaped name that is already in use
                 look.name += "_"

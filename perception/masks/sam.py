@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from perception.config import SamConfig
-from perception.io.memory import cores
+from perception.cores import cores
 from perception.masks.sam_models import SamModel, open_sam
 from perception.types import View
 

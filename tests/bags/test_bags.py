@@ -118,7 +118,9 @@ def test_rectified_images_take_the_camera_of_rectified_images(tmp_path: Path, to
     run_frames(tmp_path / "drive", tmp_path / "out", FrameOptions(poses=False))
     params = np.array(read_camera(tmp_path / "out" / "camera.yaml").params)
     if "rect" in topic:  # the recorder writes P = .9 K
-        np.testing.assert_allclose(params[:4], 0.9 * (np.array([80, 82, 63.5, 47.5]) - [0, 0, 0.5, 0.5]) + [0, 0, 0.5, 0.5])
+        np.testing.assert_allclose(
+            params[:4], 0.9 * (np.array([80, 82, 63.5, 47.5]) - [0, 0, 0.5, 0.5]) + [0, 0, 0.5, 0.5]
+        )
         assert not params[4:].any()
     else:
         np.testing.assert_allclose(params[4:8], D[:4])
