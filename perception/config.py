@@ -83,7 +83,7 @@ class SamConfig(Settings):
 
 
 class TrainConfig(Settings):
-    iterations: int = Field(3000, ge=1, le=10**8, description="iterations of training; all schedules scale with them")
+    iterations: int = Field(2000, ge=1, le=10**8, description="iterations of training; all schedules scale with them")
     time_limit: float | None = Field(None, gt=0, description="seconds of training; all schedules shrink to fit")
     exchange_db: float = Field(
         0.03,
@@ -101,7 +101,7 @@ class TrainConfig(Settings):
 class DensifyConfig(Settings):
     every: int = Field(100, ge=1, le=10**8, description="iterations between two steps of growth and pruning")
     grad_threshold: float = Field(
-        2e-4, ge=0, description="gradient of the 2D mean from which a Gaussian grows; units of half the long side"
+        1e-4, ge=0, description="gradient of the 2D mean from which a Gaussian grows; units of half the long side"
     )
 
 
@@ -113,7 +113,7 @@ class LossConfig(Settings):
         0.5, ge=0, le=1000, description="weight of the depth loss of photos with depth images; 0: depth is not used"
     )
     start: float = Field(0.3, ge=0, le=1, description="share of the training after which features are trained")
-    every: int = Field(2, ge=1, le=10**8, description="features are trained in every N-th iteration")
+    every: int = Field(3, ge=1, le=10**8, description="features are trained in every N-th iteration")
     half_resolution: bool = Field(
         True, description="features, and everything at the start, are trained at half the resolution of the photos"
     )
@@ -195,9 +195,9 @@ What still differs from the paper stands in docs/benchmarks.md.
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
-    "fast": {"train.iterations": 1200, "train.budget": 40_000, "train.exchange_db": 0.1},
+    "fast": {"train.iterations": 800, "train.budget": 40_000, "train.exchange_db": 0.1},
     "quality": {
-        "train.iterations": 6000,
+        "train.iterations": 4000,
         "train.budget": 300_000,
         "train.exchange_db": 0.005,
         "photos.max_side": 1280,

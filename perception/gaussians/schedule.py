@@ -2,7 +2,7 @@
 
 progress   0 ─ .05 ───── .3 ─ .4 ─── .6 ────────── .9 ── 1
 photos     half size          │ full size (small photos: from .15)
-features                 │      rendered every 2nd step (`losses.start`, `losses.every`)
+features                 │      rendered every 3rd step (`losses.start`, `losses.every`)
 growth         densified every 100 steps, holes filled
 harmonics                            one more degree per trial, then unneeded degrees are removed
 rates                                              cool down

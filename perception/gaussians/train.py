@@ -239,7 +239,7 @@ class Trainer:
         return total, (colors, alphas, depths, features, variance)
 
     def _rates(self, progress: float) -> dict[str, float | torch.Tensor]:
-        return learning_rates(progress, self.extent, self.gaussians.sh.shape[1])
+        return learning_rates(progress, self.extent, self.gaussians.sh.shape[1], self.config.train.iterations)
 
     # ---------------------------------------------------------------- progress
 

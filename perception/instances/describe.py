@@ -17,6 +17,7 @@ from perception.language.description import InstanceDescription, unseen
 from perception.progress import Progress
 
 COLOR_SAMPLES = 2000  # pixels of a mask per view, from which the palette is computed
+AT_ONCE = 24  # crops from which they are encoded together, so that no thread waits at the end of each photo
 Load = Callable[[int], tuple[np.ndarray, np.ndarray]]
 
 
@@ -38,20 +39,23 @@ def describe_instances(
         for rank, view in enumerate(views):
             wanted.setdefault(int(view), []).append((instance, rank))
     seen: list[dict[int, Any]] = [{} for _ in choices]
-    for done, view in enumerate(sorted(wanted)):
+    crops: list[np.ndarray] = []
+    waiting: list[tuple[int, int, Any]] = []
+    for done, view in enumerate(sorted(wanted), start=1):
         photo, ids = load(view)
-        shown = [(i, rank, ids == i) for i, rank in wanted[view]]
-        crops = [crop_levels(photo, mask, levels) for _, _, mask in shown]
-        flat = [crop for group in crops for crop in group]
-        embedded = encoder.encode_images(flat) if flat else np.zeros((0, encoder.dim), np.float32)
-        start = 0
-        for (instance, rank, mask), group in zip(shown, crops, strict=True):
-            if group:
-                rows = embedded[start : start + len(group)]
-                seen[instance][rank] = (view_names[view], mask_box(mask), rows, _color_sample(photo, mask))
-            start += len(group)
+        for instance, rank in wanted[view]:
+            mask = ids == instance
+            if levelled := crop_levels(photo, mask, levels):
+                rows = slice(len(crops), len(crops) + len(levelled))
+                waiting.append((instance, rank, (view_names[view], mask_box(mask), rows, _color_sample(photo, mask))))
+                crops += levelled
+        if len(crops) >= AT_ONCE or (crops and done == len(wanted)):
+            embedded = encoder.encode_images(crops)
+            for instance, rank, (name, box, rows, colors) in waiting:
+                seen[instance][rank] = (name, box, embedded[rows], colors)
+            crops, waiting = [], []
         if progress:
-            progress.update("language", done + 1, len(wanted))
+            progress.update("language", done, len(wanted))
     return [_summary(found, encoder.dim) for found in seen]
 
 

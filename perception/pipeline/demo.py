@@ -22,7 +22,7 @@ from perception.progress import Progress
 from perception.query import QueryMap, load_map
 from perception.types import PointCloud
 
-SETTINGS = ["train.iterations=2000", "train.budget=40000"]
+SETTINGS = ["train.iterations=1300", "train.budget=40000"]
 """Settings of the demo, for a small scene in about four minutes on two cores."""
 
 

@@ -103,7 +103,7 @@ def describe(
     def language_of(ids: np.ndarray, seen: list[Silhouettes]) -> dict[str, np.ndarray]:
         if encoder is None:
             return {}
-        return prefixed(_embed(encoder, ids, seen, views, min(2, words.views), 1, progress))
+        return prefixed(_embed(encoder, ids, seen, views, 1, 1, progress))  # a crop of the best view
 
     if grouped.parents:
         found.parts = {"ids": grouped.part_ids, **language_of(local, parts_seen)}
