@@ -1,7 +1,7 @@
 """Learning rates as functions of training progress (Kerbl et al. 2023), larger in runs of fewer iterations.
 
-A step of Adam is about as long as the rate, so in fewer iterations a parameter can move less far. The rates of means and
-rotations make up for that: they are times sqrt(2000 / iterations).
+A step of Adam is about as long as the rate, so in fewer iterations a parameter can move less far. The rates of means
+and rotations make up for that: they are times sqrt(2000 / iterations).
 """
 
 from __future__ import annotations
