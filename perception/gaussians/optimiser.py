@@ -99,6 +99,13 @@ class SparseAdam:
             for name, tensor in table.items():
                 table[name] = _leaf_like(tensor, tensor.detach()[index].contiguous())
 
+    def resize(self, name: str, count: int) -> None:
+        """Cuts the rows of `name`, [N, K, ...], to K = count, or extends them by zeros, and their moments alike."""
+        for table in (self.params, self._first, self._second):
+            old = table[name].detach()
+            more = old.new_zeros(len(old), max(0, count - old.shape[1]), *old.shape[2:])
+            table[name] = _leaf_like(table[name], torch.cat([old[:, :count], more], dim=1))
+
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Appends rows (name -> [M, ...], the same M for all) with zero moments."""
         if set(rows) != set(self.params):
@@ -111,11 +118,12 @@ class SparseAdam:
                 table[name] = torch.cat([table[name], torch.zeros_like(new)])
         self._check_rows()
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue: copies of params and moments on the CPU, rates, step count."""
+    def state_dict(self, copy: bool = True) -> dict[str, Any]:
+        """Everything needed to continue: params and moments on the CPU, rates, step count. copy: of what is there now,
+        else, on the CPU, the tensors themselves, which the next step changes."""
         tables = {"params": self.params, "first": self._first, "second": self._second}
         copies: dict[str, Any] = {
-            key: {name: t.detach().to("cpu", copy=True) for name, t in table.items()} for key, table in tables.items()
+            key: {name: t.detach().to("cpu", copy=copy) for name, t in table.items()} for key, table in tables.items()
         }
         return copies | {"rates": dict(self.rates), "steps": self.steps}
 

@@ -280,12 +280,8 @@ class Trainer:
 
     def set_degree(self, degree: int) -> None:
         """Truncates the spherical harmonics to `degree`, or adds zero coefficients up to it."""
-        state, count = self.optimiser.state_dict(), (degree + 1) ** 2
-        for table in ("params", "first", "second"):
-            sh = state[table]["sh"]
-            more = sh.new_zeros(len(sh), max(0, count - sh.shape[1]), 3)
-            state[table]["sh"] = torch.cat([sh[:, :count], more], dim=1)
-        self._restart_optimiser(state)
+        self.optimiser.resize("sh", (degree + 1) ** 2)
+        self._sync()
 
     @torch.no_grad()
     def depth(self, name: str) -> np.ndarray:
@@ -296,12 +292,6 @@ class Trainer:
         view = next(view for view in self.views if view.name == name)
         rendered = depth_image(self.gaussians, view.camera_from_world, view.K, *view.photo.shape[1::-1])
         return (rendered if view.depth is None else torch.where(view.depth > 0, view.depth, rendered)).numpy()
-
-    def _restart_optimiser(self, state: dict[str, Any]) -> None:
-        self.gaussians = Gaussians(**state["params"]).to(self.device)
-        self.optimiser = SparseAdam(vars(self.gaussians), self._rates(0.0))
-        self.optimiser.load_state_dict(state)
-        self._sync()
 
     def _sync(self) -> None:
         """Makes `gaussians` share the optimiser's tensors, which are replaced when rows are added or removed.
@@ -314,12 +304,12 @@ class Trainer:
 
     # -------------------------------------------------------------- checkpoint
 
-    def state(self) -> dict[str, Any]:
-        """All values needed to resume, for a checkpoint."""
+    def state(self, copy: bool = True) -> dict[str, Any]:
+        """All values needed to resume, for a checkpoint; without `copy` they are those of now until the next step."""
         return {
             "iteration": self.iteration,
             "initial_count": self.initial_count,
-            "optimiser": self.optimiser.state_dict(),
+            "optimiser": self.optimiser.state_dict(copy),
             "statistics": {name: tensor.cpu() for name, tensor in vars(self.statistics).items()},
             "record": dict(vars(self.record), seconds=self.elapsed, iterations=self.iteration),
             "stopping": asdict(self.schedule.stopping),
@@ -329,7 +319,10 @@ class Trainer:
 
     def load(self, state: dict[str, Any]) -> None:
         """Restores the result of `state`."""
-        self._restart_optimiser(state["optimiser"])
+        self.gaussians = Gaussians(**state["optimiser"]["params"]).to(self.device)
+        self.optimiser = SparseAdam(vars(self.gaussians), self._rates(0.0))
+        self.optimiser.load_state_dict(state["optimiser"])
+        self._sync()
         sums = {name: tensor.to(self.device) for name, tensor in state["statistics"].items()}
         self.statistics = Statistics(**sums)
         self.record = TrainRecord(**state["record"])

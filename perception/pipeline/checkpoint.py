@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import io
 import json
 import pickle
 import shutil
@@ -26,7 +25,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 from perception.config import MapConfig
 from perception.errors import InputError
@@ -116,7 +115,7 @@ class TrainingObserver:
 
     def _save(self, trainer: Trainer, name: str) -> None:
         masks = self.masks if self.entered else None
-        state = {"masks": masks, "masks_enter": self.masks_enter, "trainer": trainer.state()}
+        state = {"masks": masks, "masks_enter": self.masks_enter, "trainer": trainer.state(copy=False)}
         save_checkpoint(self.work / name, state, self.mark)
 
     def _draw(self, trainer: Trainer, now: float) -> None:
@@ -140,10 +139,30 @@ def save_checkpoint(path: Path, state: dict[str, Any], mark: str) -> None:
     """Writes `state` with the fingerprint `mark` of its settings, atomically."""
     import torch
 
-    buffer = io.BytesIO()  # torch's file writer aborts the process if the disk is full
-    torch.save({"mark": mark, "state": state}, buffer)
-    with atomic_file(path) as aside:
-        aside.write_bytes(buffer.getbuffer())
+    with atomic_file(path) as aside, aside.open("wb") as file:
+        writer = _Writer(file)
+        torch.save({"mark": mark, "state": state}, cast(BinaryIO, writer))
+        if writer.error is not None:
+            raise writer.error
+
+
+class _Writer:
+    """A file as torch writes to one, but for errors: those are kept, as torch aborts the process at a full disk."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file = file
+        self.error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        if self.error is None:
+            try:
+                self.file.write(data)
+            except OSError as error:
+                self.error = error
+        return memoryview(data).nbytes
+
+    def flush(self) -> None:
+        """Nothing: the file is flushed when it is closed, where errors can be raised."""
 
 
 def load_checkpoint(path: Path, mark: str) -> dict[str, Any] | None:

@@ -127,6 +127,24 @@ def test_keep_and_append_carry_the_state():
     assert torch.allclose(moved, torch.full_like(moved, 1.6e-4 * (0.1 / 0.19) / (0.001 / (1 - 0.999**2)) ** 0.5))
 
 
+def test_resized_columns_go_on_as_if_the_others_had_never_been_there():
+    """Columns are independent: those that stay take the steps of an optimiser without the others."""
+    few, many = ({"sh": tensors(50)["sh"][:, :n].contiguous()} for n in (4, 16))
+    alone, resized = (SparseAdam(tables, {"sh": 1e-2}) for tables in (few, many))
+    for step in range(4):
+        grads = tensors(50, seed=step + 1)["sh"]
+        if step == 2:
+            resized.resize("sh", 4)
+        alone.step(None, {"sh": grads[:, :4].contiguous()})
+        resized.step(None, {"sh": grads[:, : 16 if step < 2 else 4].contiguous()})
+    assert torch.equal(alone.params["sh"], resized.params["sh"])
+    resized.resize("sh", 9)
+    state = resized.state_dict()
+    for table in ("params", "first", "second"):
+        assert state[table]["sh"].shape == (50, 9, 3) and not state[table]["sh"][:, 4:].any()
+    assert torch.equal(state["params"]["sh"][:, :4], alone.params["sh"])
+
+
 def test_resume_goes_on_with_the_same_bits():
     whole = SparseAdam(leaves(100), RATES)
     for step in range(4):
