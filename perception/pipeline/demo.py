@@ -23,7 +23,7 @@ from perception.query import QueryMap, load_map
 from perception.types import PointCloud
 
 SETTINGS = ["train.iterations=1300", "train.budget=40000"]
-"""Settings of the demo, for a small scene in about four minutes on two cores."""
+"""Settings of the demo, for a small scene in about a minute on two cores."""
 
 
 def write_scene(folder: Path, scene: str, seed: int) -> tuple[dict[str, Any], str]:
