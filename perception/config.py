@@ -83,7 +83,15 @@ class SamConfig(Settings):
 
 
 class TrainConfig(Settings):
-    iterations: int = Field(2000, ge=1, le=10**8, description="iterations of training; all schedules scale with them")
+    effort: float = Field(
+        1.0,
+        ge=0.01,
+        le=100,
+        description="multiple of the iterations and Gaussians that the number of photos suggests",
+    )
+    iterations: int = Field(
+        0, ge=0, le=10**8, description="iterations of training, all schedules scale with them; 0: 2000, or 46 a photo"
+    )
     time_limit: float | None = Field(None, gt=0, description="seconds of training; all schedules shrink to fit")
     exchange_db: float = Field(
         0.03,
@@ -91,7 +99,10 @@ class TrainConfig(Settings):
         le=1000,
         description="dB of held-out PSNR that 10 % more time must gain, else growth or training ends; 0: never",
     )
-    budget: int = Field(100_000, ge=100, le=10**8, description="most Gaussians the map may have")
+    budget: int = Field(0, ge=0, le=10**8, description="most Gaussians the map may have; 0: 100,000, or 2,300 a photo")
+    block_photos: int = Field(
+        400, ge=0, le=10**6, description="a place seen by more photos is trained in overlapping blocks; 0: never"
+    )
     transients: bool = Field(
         False, description="leave out parts of photos that disagree with the others, such as people who walk"
     )
@@ -164,6 +175,8 @@ PAPER: dict[str, Any] = {
     "sam.skip_covered": False,
     "photos.max_side": 1600,
     "photos.poses": "keep",
+    "train.effort": 1.0,
+    "train.block_photos": 0,
     "train.iterations": 30_000,
     "train.exchange_db": 0.0,
     "train.budget": 2_000_000,
@@ -195,13 +208,8 @@ What still differs from the paper stands in docs/benchmarks.md.
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
-    "fast": {"train.iterations": 800, "train.budget": 40_000, "train.exchange_db": 0.1},
-    "quality": {
-        "train.iterations": 4000,
-        "train.budget": 300_000,
-        "train.exchange_db": 0.005,
-        "photos.max_side": 1280,
-    },
+    "fast": {"train.effort": 0.4, "train.exchange_db": 0.1},
+    "quality": {"train.effort": 2.0, "train.exchange_db": 0.005, "photos.max_side": 1280},
     "paper": PAPER,
 }
 

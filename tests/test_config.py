@@ -35,8 +35,8 @@ def test_the_papers_preset_is_the_published_method() -> None:
     }
     assert found == {
         "train": {
-            "iterations": 30_000, "time_limit": None, "exchange_db": 0, "budget": 2_000_000,
-            "transients": False, "sh_degree": 3,
+            "effort": 1, "iterations": 30_000, "time_limit": None, "exchange_db": 0, "budget": 2_000_000,
+            "block_photos": 0, "transients": False, "sh_degree": 3,
         },
         "densify": {"every": 100, "grad_threshold": 3.5e-4},
         "losses": {
@@ -66,9 +66,9 @@ def test_values_take_their_field_type() -> None:
 @pytest.mark.parametrize(
     ("pair", "told"),
     [
-        ("train.iterations=many", "--set train.iterations: found 'many', expected a whole number from 1 to 100000000"),
+        ("train.iterations=many", "--set train.iterations: found 'many', expected a whole number from 0 to 100000000"),
         ("train.iterations=1.5", "train.iterations: found '1.5'"),
-        ("train.budget=3", "a whole number from 100 to"),
+        ("train.budget=-3", "a whole number from 0 to"),
         ("train.time_limit=-1", "train.time_limit: found '-1', expected a number above 0 or none"),
         ("train.time_limit=inf", "found 'inf'"),
         ("train.time_limit=nan", "found 'nan'"),
@@ -78,8 +78,8 @@ def test_values_take_their_field_type() -> None:
         ("losses.half_resolution=perhaps", "true or false"),
         ("instances.min_samples=0", "instances.min_samples: found '0'"),
         ("device=tpu", "auto, cpu or cuda"),
-        ("train.lr_means=0", "unknown setting 'train.lr_means', expected one of: train.iterations, "),
-        ("train.lr_scales=nan", "unknown setting 'train.lr_scales', expected one of: train.iterations, "),
+        ("train.lr_means=0", "unknown setting 'train.lr_means', expected one of: train.effort, "),
+        ("train.lr_scales=nan", "unknown setting 'train.lr_scales', expected one of: train.effort, "),
         ("train.min_samples=3", "did you mean instances.min_samples?"),
         ("trian.iteratons=3", "did you mean train.iterations?"),
         ("losses.geometry_start=2", "unknown setting 'losses.geometry_start'"),

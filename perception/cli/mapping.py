@@ -77,6 +77,10 @@ def _add_map(commands: Any) -> None:
     for key, (metavar, text) in _SHORTCUTS.items():
         p.add_argument(f"--{key.rpartition('.')[2].replace('_', '-')}", metavar=metavar, help=text, dest=key)
     p.add_argument("--resume", action="store_true", help="go on with an interrupted run")
+    p.add_argument(
+        "--engine", choices=("local", "ray"), default="local", help="where blocks of a large place are trained"
+    )
+    p.add_argument("--address", metavar="HOST:PORT", help="of the Ray cluster, or auto; default: one on this machine")
 
 
 def _settings() -> str:
@@ -116,12 +120,14 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.config import load_config
 
     config = load_config(args.config, settings_given(args), args.preset)
+    from perception.pipeline.engine import Engine
     from perception.pipeline.mapping import build_map
     from perception.pipeline.summary import map_facts
     from perception.progress import Progress
 
+    engine = Engine(args.engine, args.address)
     with _sigterm_as_interrupt(), Progress() as progress:
-        gmap = build_map(args.input, args.output, config, resume=args.resume, progress=progress)
+        gmap = build_map(args.input, args.output, config, resume=args.resume, progress=progress, engine=engine)
         _write_own_report(args.output, progress)
 
     return map_facts(args.output, gmap.info, len(gmap), len(gmap.instances)), ""

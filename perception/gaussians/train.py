@@ -12,6 +12,7 @@ run resumed from a checkpoint takes the same steps as one without interruption.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
@@ -35,11 +36,12 @@ from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.rasterize import Forward, Settings, passes, torch_on_one_thread
 from perception.gaussians.rates import learning_rates
 from perception.gaussians.schedule import Schedule
-from perception.gaussians.views import TrainingView, depth_image, psnr, render_view, scene_extent, target_photo
+from perception.gaussians.size import sized
+from perception.gaussians.views import TrainingView, scene_extent, surface_depth, target_photo
 from perception.interrupts import uninterrupted
 from perception.progress import timed
 
-__all__ = ["TrainRecord", "Trainer", "TrainingView", "depth_image", "psnr", "render_view", "scene_extent"]
+__all__ = ["TrainRecord", "Trainer", "TrainingView", "scene_extent"]
 
 SSIM_WEIGHT = 0.2
 """β of the photometric loss (eq. 4), as in Kerbl et al. 2023."""
@@ -64,6 +66,17 @@ class TrainRecord:
     seconds: float = 0.0
     iterations: int = 0
     skipped_gradients: int = 0
+
+    @staticmethod
+    def joined(records: Sequence[TrainRecord]) -> TrainRecord:
+        """The record of a model that was trained in blocks: sums, and the decisions of each; it has no curve."""
+        whole = TrainRecord()
+        for number, record in enumerate(records, start=1):
+            whole.decisions += [f"block {number}: {told}" for told in record.decisions]
+            whole.profile = {part: whole.profile.get(part, 0.0) + s for part, s in record.profile.items()}
+            for name in ("pairs", "evaluated_pairs", "seconds", "iterations", "skipped_gradients"):
+                setattr(whole, name, getattr(whole, name) + getattr(record, name))
+        return whole
 
     def timed(self, part: str) -> AbstractContextManager[None]:
         """Adds the wall-clock seconds of its block to `part` of the profile. A nested block counts in both parts."""
@@ -94,13 +107,17 @@ class Trainer:
         held_out: list[TrainingView],
         device: torch.device | None = None,
     ):
-        self.config = config
+        self.config = sized(config, len(views))
         self.device = device or torch.device("cpu")
         self._forward, self._backward = passes(self.device)
         self._max_records = 0
         self.held_out = held_out
         self.extent = scene_extent(views)
         self.record = TrainRecord()
+        if self.config != config:
+            train = self.config.train
+            told = f"size: {len(views)} photos, {train.iterations} iterations, at most {train.budget} Gaussians"
+            self.record.decisions.append(told)
         self.iteration = 0
         self.complete = False  # finished, unless a longer training is requested
         self.skipped = 0.0  # share of training progress skipped by early stopping
@@ -283,15 +300,9 @@ class Trainer:
         self.optimiser.resize("sh", (degree + 1) ** 2)
         self._sync()
 
-    @torch.no_grad()
-    def depth(self, name: str) -> np.ndarray:
-        """Depth [H, W] float32 along the optical axis of training view `name`, 0 = no surface.
-
-        It is what a sensor measured, and rendered where nothing was.
-        """
-        view = next(view for view in self.views if view.name == name)
-        rendered = depth_image(self.gaussians, view.camera_from_world, view.K, *view.photo.shape[1::-1])
-        return (rendered if view.depth is None else torch.where(view.depth > 0, view.depth, rendered)).numpy()
+    def depth(self, view: TrainingView) -> np.ndarray:
+        """`surface_depth` of the Gaussians as they are now."""
+        return surface_depth(self.gaussians, view)
 
     def _sync(self) -> None:
         """Makes `gaussians` share the optimiser's tensors, which are replaced when rows are added or removed.

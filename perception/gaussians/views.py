@@ -131,6 +131,13 @@ def depth_image(
     return torch.where(alpha > 0.5, out.depths[0] / alpha.clamp(min=1e-6), torch.zeros_like(alpha)).cpu()
 
 
+def surface_depth(gaussians: Gaussians, view: TrainingView) -> np.ndarray:
+    """Depth [H, W] float32 along the optical axis of `view`, 0 = no surface: what a sensor measured, and rendered where
+    nothing was."""
+    rendered = depth_image(gaussians, view.camera_from_world, view.K, *view.photo.shape[1::-1])
+    return (rendered if view.depth is None else torch.where(view.depth > 0, view.depth, rendered)).numpy()
+
+
 def psnr(image: torch.Tensor, photo: torch.Tensor, weight: torch.Tensor | None = None) -> float:
     """Peak signal-to-noise ratio in dB of image [H, W, 3] in [0, 1] against photo uint8, where weight [H, W] > 0."""
     # In numpy: the order of torch's sum depends on the number of threads, and growth decisions depend on the result.

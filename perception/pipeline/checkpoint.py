@@ -48,14 +48,14 @@ def fingerprint(source: Path, config: MapConfig) -> str:
     """Hash of the input path and all settings that change the map, without memory, time_limit and device."""
     settings = config.to_json() | {"device": "auto"}
     del settings["photos"]["memory"], settings["train"]["time_limit"]
-    return _digest(str(source.resolve()), settings)
+    return digest(str(source.resolve()), settings)
 
 
 def poses_mark(source: Path, config: MapConfig) -> str:
     """Hash of the input path and the settings that change the poses and the sparse cloud."""
     photos = config.photos
     chosen = (photos.camera, photos.strict, photos.poses, photos.ignore_masks, photos.init_points)
-    return _digest(str(source.resolve()), *chosen, config.frame.model_dump(), config.seed)
+    return digest(str(source.resolve()), *chosen, config.frame.model_dump(), config.seed)
 
 
 def training_mark(source: Path, config: MapConfig) -> str:
@@ -64,7 +64,8 @@ def training_mark(source: Path, config: MapConfig) -> str:
     return fingerprint(source, config.model_copy(update={name: getattr(usual, name) for name in LATER}))
 
 
-def _digest(*parts: Any) -> str:
+def digest(*parts: Any) -> str:
+    """Hash of JSON-able values, as 16 digits."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 

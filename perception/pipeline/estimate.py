@@ -12,6 +12,7 @@ from pathlib import Path
 
 from perception.config import MapConfig
 from perception.errors import InputError
+from perception.gaussians.size import sized
 from perception.io.inputs import PhotoSizes, photo_sizes
 
 BASE_BYTES, BYTES_PER_GAUSSIAN, BYTES_PER_PIXEL, DEPTH_BYTES = 900 << 20, 2400, 7, 5
@@ -35,13 +36,24 @@ def needed_bytes(photos: PhotoSizes, max_side: int, budget: int, memory: int = 1
     return int(BASE_BYTES + budget * BYTES_PER_GAUSSIAN + min(per_pixel * sum(pixels), memory) + at_once)
 
 
+def largest_budget(limit: int | None) -> int | None:
+    """Gaussians that fit into half of the `limit` of the process in bytes, beside the program."""
+    return None if limit is None else max(0, limit // 2 - BASE_BYTES) // BYTES_PER_GAUSSIAN
+
+
+def _sized(photos: PhotoSizes, config: MapConfig, limit: int | None) -> MapConfig:
+    """The settings with the budget of the run, of one block in a large place."""
+    count, block = len(photos.sizes), config.train.block_photos
+    return sized(config, min(count, block) if block else count, largest_budget(limit))
+
+
 def log_estimate(source: Path, config: MapConfig, log: Callable[[str], None]) -> None:
     """Passes the estimate for the input `source` to `log` as one line; InputError if memory is not sufficient."""
     photos = photo_sizes(source)
     if photos.sizes:
         check_memory(photos, config)
-        memory = image_memory(config, memory_limit())
-        needed = needed_bytes(photos, config.photos.max_side, config.train.budget, memory)
+        memory, budget = image_memory(config, memory_limit()), _sized(photos, config, memory_limit()).train.budget
+        needed = needed_bytes(photos, config.photos.max_side, budget, memory)
         log(f"{photos.what}, trained at up to {config.photos.max_side} pixels: about {needed / 2**30:.1f} GiB")
 
 
@@ -51,7 +63,8 @@ def check_memory(photos: PhotoSizes, config: MapConfig, limit: int | None = None
     limit None: the memory available to this process; nothing is checked if that is unknown.
     """
     limit = memory_limit() if limit is None else limit
-    side, budget, memory = config.photos.max_side, config.train.budget, image_memory(config, limit)
+    side, budget = config.photos.max_side, _sized(photos, config, limit).train.budget
+    memory = image_memory(config, limit)
     needed = needed_bytes(photos, side, budget, memory)
     if limit is None or needed <= limit:
         return

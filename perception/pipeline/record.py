@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.train import TrainingView, depth_image
+from perception.gaussians.views import TrainingView, depth_image
 
 
 def peak_memory_mib() -> float:

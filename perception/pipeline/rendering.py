@@ -14,7 +14,7 @@ from perception.errors import InputError
 from perception.evaluate.rendered import evaluate_rendered
 from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
-from perception.gaussians.train import depth_image
+from perception.gaussians.views import depth_image
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.documents import safe_name
 from perception.io.recentre import map_from_input, moved

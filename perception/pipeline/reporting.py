@@ -20,7 +20,7 @@ from perception.colors import instance_palette
 from perception.config import MapConfig, flat
 from perception.errors import InputError
 from perception.gaussians.render import render
-from perception.gaussians.train import TrainingView, render_view
+from perception.gaussians.views import TrainingView, render_view
 from perception.instances.crops import expand_box, mask_box
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.atomic import atomic_file

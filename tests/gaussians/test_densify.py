@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from perception.config import DensifyConfig
 from perception.gaussians.densify import START, STOP, Statistics, densify, rotation_matrices, target_count
 from perception.gaussians.model import Gaussians, from_points
-from perception.gaussians.train import depth_image
+from perception.gaussians.views import depth_image
 
 THRESHOLD = DensifyConfig().grad_threshold
 

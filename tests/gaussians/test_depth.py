@@ -14,7 +14,8 @@ from perception.errors import InputError
 from perception.gaussians.depth_start import fuse_depth, start_on_surface
 from perception.gaussians.losses import depth_loss
 from perception.gaussians.model import from_points
-from perception.gaussians.train import Trainer, TrainingView, depth_image
+from perception.gaussians.train import Trainer
+from perception.gaussians.views import TrainingView, depth_image
 from perception.geometry import look_at
 
 LOW, HIGH = np.array([-0.5, -0.5, 0.0]), np.array([0.5, 0.5, 0.6])

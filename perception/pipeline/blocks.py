@@ -1,0 +1,218 @@
+"""Large places: cut into overlapping blocks by what the cameras see, optimised block by block, joined to one model.
+
+A block owns a box of space; the boxes tile the space. It is trained on all photos that see enough of its box, from
+nothing but these, so it comes out the same wherever it runs. The joined model takes from each block the Gaussians in
+its box. Instances are found afterwards, from the masks of all photos, so a thing on a seam is one instance.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from perception.config import MapConfig
+from perception.errors import InputError
+from perception.gaussians.device import choose_device
+from perception.gaussians.model import Gaussians
+from perception.gaussians.train import TrainRecord
+from perception.geometry import camera_centres
+from perception.io.atomic import atomic_file, writing
+from perception.io.inputs import load_saved_scene, save_scene
+from perception.masks import make_source
+from perception.masks.builtin import BuiltinSegmentation
+from perception.pipeline.checkpoint import BEFORE_MASKS, CHECKPOINT, digest, load_checkpoint, save_checkpoint
+from perception.pipeline.engine import Engine
+from perception.pipeline.optimise import Photos, Run, optimise
+from perception.pipeline.record import versions
+from perception.progress import Progress
+from perception.types import Scene, View
+
+SAMPLE = 20_000
+"""Sparse points by which the place is cut."""
+GRID, HIDDEN = 16, 1.3
+"""A point is hidden from a photo if it is HIDDEN times as far as the nearest point in its cell of GRID × GRID."""
+SEEN = 0.15
+"""Least share of a photo's points in a block's box for which the block is trained on the photo."""
+LEAST_GAIN = 0.85
+"""Largest share of a block's photos that either half may have after a cut; a place that all photos see stays whole."""
+APART = 4.0
+"""Distance between the features of two blocks, which are not comparable: more than the loss's margin of 1."""
+TASK, RESULT = "block.json", "result.pt"
+
+
+@dataclass(frozen=True)
+class Block:
+    """low, high: [3] corners of the box of space it owns, infinite at the outside; views [n] indices of its photos."""
+
+    low: np.ndarray
+    high: np.ndarray
+    views: np.ndarray
+
+    def owns(self, points: np.ndarray) -> np.ndarray:
+        """[P] bool of points [P, 3]."""
+        return np.asarray(((points >= self.low) & (points < self.high)).all(axis=1))
+
+
+def cut(scene: Scene, most: int) -> list[Block]:
+    """Blocks of at most about `most` photos each, together all photos; one block where that is enough, with most = 0,
+    and where the cameras' view of the place cannot be cut.
+
+    A block is halved at the plane, of those at several quantiles of its points along each axis, for which the larger
+    half has the fewest photos, if that is at most LEAST_GAIN of the block's.
+    """
+    count = len(scene.views)
+    whole = Block(np.full(3, -np.inf), np.full(3, np.inf), np.arange(count))
+    if most == 0 or count <= most or len(scene.points) == 0 or scene.report.get("points_from") == "random":
+        return [whole]
+    step = -(-len(scene.points) // SAMPLE)
+    points = scene.points[::step]
+    seen = np.stack([visible_points(view, points) for view in scene.views])
+    centres = camera_centres(np.stack([view.camera_from_world for view in scene.views]))
+    return _halved(whole, points, seen, centres, most)
+
+
+def visible_points(view: View, points: np.ndarray) -> np.ndarray:
+    """[P] bool: the points [P, 3] in the photo that no nearer points hide."""
+    pose = view.camera_from_world
+    x, y, z = pose[:3, :3] @ points.T + pose[:3, 3:]
+    front = z > 1e-6
+    depth = np.where(front, z, 1.0)
+    u = (view.K[0, 0] * x / depth + view.K[0, 2]) / view.width
+    v = (view.K[1, 1] * y / depth + view.K[1, 2]) / view.height
+    inside = front & (u >= 0) & (u < 1) & (v >= 0) & (v < 1)
+    cell = (v[inside] * GRID).astype(int) * GRID + (u[inside] * GRID).astype(int)
+    nearest = np.full(GRID * GRID, np.inf)
+    np.minimum.at(nearest, cell, z[inside])
+    inside[inside] = z[inside] <= HIDDEN * nearest[cell]
+    return np.asarray(inside)
+
+
+def _halved(block: Block, points: np.ndarray, seen: np.ndarray, centres: np.ndarray, most: int) -> list[Block]:
+    if len(block.views) <= most:
+        return [block]
+    inside = points[block.owns(points) & seen[block.views].any(axis=0)]
+    best, fewest = None, (np.inf, np.inf)
+    for axis in range(3) if len(inside) else ():
+        for place in np.quantile(inside[:, axis], np.arange(0.2, 0.81, 0.1)):
+            halves = _divided(block, axis, float(place), points, seen, centres)
+            sizes = [len(half.views) for half in halves]
+            if min(sizes) > 0 and max(sizes) <= LEAST_GAIN * len(block.views) and (max(sizes), sum(sizes)) < fewest:
+                best, fewest = halves, (max(sizes), sum(sizes))
+    if best is None:
+        return [block]
+    return [part for half in best for part in _halved(half, points, seen, centres, most)]
+
+
+def _divided(
+    block: Block, axis: int, place: float, points: np.ndarray, seen: np.ndarray, centres: np.ndarray
+) -> list[Block]:
+    """The block's halves below and above `place`. A photo that sees too little of both is with the one it stands in."""
+    sides, counts = [], np.maximum(seen[block.views].sum(axis=1), 1)
+    middle = np.where(np.arange(3) == axis, place, np.nan)
+    for low, high in ((block.low, np.fmin(block.high, middle)), (np.fmax(block.low, middle), block.high)):
+        half = replace(block, low=low, high=high)
+        share = seen[block.views] @ half.owns(points).astype(np.float32) / counts
+        sides.append((half, share >= SEEN))
+    neither = ~(sides[0][1] | sides[1][1])
+    below = centres[block.views, axis] < place
+    return [
+        replace(half, views=block.views[sees | (neither & stands)])
+        for (half, sees), stands in zip(sides, (below, ~below), strict=True)
+    ]
+
+
+def optimise_blocks(
+    run: Run, scene: Scene, blocks: Sequence[Block], held_out: Sequence[View], engine: Engine
+) -> tuple[Gaussians, TrainRecord, list[dict[str, Any]]]:
+    """The joined Gaussians of all blocks, their training's record, and a report of each block.
+
+    Each block is a task of the engine, in its own folder below `run.work`. A task that is finished is not run again.
+    """
+    held = {view.name for view in held_out}
+    folders = [_task(run, scene, block, held) for block in blocks]
+    with run.stage("train"):
+        engine.run(optimise_block, [str(folder) for folder in folders], "block", run.progress)
+    parts, records, reports = [], [], []
+    for folder, block in zip(folders, blocks, strict=True):
+        state = load_checkpoint(folder / RESULT, folder.name)
+        if state is None:
+            raise InputError(f"{folder}: has no {RESULT} after its task; workers must share the output's folder")
+        gaussians, record = Gaussians(**state["gaussians"]), TrainRecord(**state["record"])
+        own = torch.from_numpy(np.flatnonzero(block.owns(gaussians.means.numpy())))
+        parts.append(gaussians.rows(own))
+        records.append(record)
+        box = [[float(x) if np.isfinite(x) else None for x in corner] for corner in (block.low, block.high)]
+        reports.append({"photos": len(block.views), "gaussians": len(own), "trained": len(gaussians), "box": box})
+    return joined(parts), TrainRecord.joined(records), reports
+
+
+def joined(parts: Sequence[Gaussians]) -> Gaussians:
+    """All Gaussians of the blocks. Features of different blocks are APART, as they are not comparable."""
+    degree = max(part.sh.shape[1] for part in parts)
+    placed = []
+    for number, part in enumerate(parts):
+        features = part.features.clone()
+        features[:, 0] += APART * number
+        missing = part.sh.new_zeros(len(part), degree - part.sh.shape[1], 3)
+        placed.append(replace(part, features=features, sh=torch.cat([part.sh, missing], dim=1)))
+    return Gaussians.concatenate(placed)
+
+
+def _task(run: Run, scene: Scene, block: Block, held: set[str]) -> Path:
+    """Writes the task of a block: the part of the scene that it is trained on, and the settings. Returns its folder."""
+    views = [scene.views[i] for i in block.views]
+    names = [view.name for view in views]
+    box = [block.low.tolist(), block.high.tolist()]
+    folder = run.work / f"block-{digest(run.mark, names, box)}"
+    if not (folder / TASK).is_file():
+        seen = np.zeros(len(scene.points), bool)
+        for view in views:
+            seen |= visible_points(view, scene.points)
+        part = replace(scene, views=views, points=scene.points[seen], point_colors=scene.point_colors[seen])
+        save_scene(folder / "scene", part)
+        shared = not isinstance(make_source(run.config.masks, run.config.sam), BuiltinSegmentation)
+        facts = {
+            "source": str(run.source.resolve()),
+            "config": run.config.to_json(),
+            "held_out": sorted(held & set(names)),
+            "masks": str((run.masks if shared else folder / "masks").resolve()),
+            "versions": versions(),
+        }
+        with atomic_file(folder / TASK) as aside:
+            aside.write_text(json.dumps(facts), encoding="utf-8")
+    return folder
+
+
+def optimise_block(folder: str, progress: Progress | None = None) -> None:
+    """Trains the block whose task lies in `folder`, and writes RESULT there. Goes on from its checkpoint, if any.
+
+    InputError where the task was written by another version of the program.
+    """
+    home = Path(folder)
+    if load_checkpoint(home / RESULT, home.name) is not None:
+        return
+    facts = json.loads((home / TASK).read_text(encoding="utf-8"))
+    own = versions()
+    if (theirs := facts["versions"]) != own:
+        name = next(name for name in own if own[name] != theirs.get(name))
+        raise InputError(f"{home}: this worker has {name} {own[name]}, the run {theirs.get(name)}; install the same")
+    config, scene = MapConfig.model_validate(facts["config"]), load_saved_scene(home / "scene")
+    if scene is None:
+        raise InputError(f"{home}: the part of the scene is missing; delete the folder and run again")
+    with writing(home / RESULT):
+        device = choose_device(config.device)[0]
+        run = Run(Path(facts["source"]), config, home, Path(facts["masks"]), device, progress or Progress(quiet=True))
+        held = set(facts["held_out"])
+        training = [view for view in scene.views if view.name not in held]
+        photos = Photos.load(run, training, [view for view in scene.views if view.name in held])
+        gaussians, record, _ = optimise(run, scene, photos, make_source(config.masks, config.sam))
+        state = {"gaussians": {name: tensor.contiguous() for name, tensor in vars(gaussians).items()}}
+        save_checkpoint(home / RESULT, {**state, "record": asdict(record)}, home.name)
+        for name in (CHECKPOINT, BEFORE_MASKS):
+            (home / name).unlink(missing_ok=True)

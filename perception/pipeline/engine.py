@@ -1,0 +1,74 @@
+"""Where independent tasks run: one after the other in this process, or on the machines of a Ray cluster."""
+
+from __future__ import annotations
+
+import logging
+import socket
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from perception.errors import InputError, missing_extra
+from perception.progress import Progress
+
+ENGINES = ("local", "ray")
+CONNECT = 10.0
+"""Seconds in which a cluster must answer."""
+RETRIES = 5
+"""How often a task is run again whose worker was lost."""
+
+
+@dataclass(frozen=True)
+class Engine:
+    """kind: of ENGINES. address: of a running Ray cluster ("auto": the one of this machine); None starts one here.
+
+    Tasks get and leave all data in folders that every worker can reach, under the same path. The results do not depend
+    on the kind and on the number of workers.
+    """
+
+    kind: str = "local"
+    address: str | None = None
+
+    def run(self, task: Callable[..., Any], folders: Sequence[str], what: str, progress: Progress) -> None:
+        """Calls task(folder) for each folder, and raises the first error. what: a task's name in messages.
+
+        A task must take up what an interrupted call has left in its folder.
+        """
+        if self.kind == "local":
+            for number, folder in enumerate(folders, start=1):
+                progress.log(f"{what} {number} of {len(folders)}")
+                task(folder, progress)
+        else:
+            self._on_ray(task, folders, what, progress)
+
+    def _on_ray(self, task: Callable[..., Any], folders: Sequence[str], what: str, progress: Progress) -> None:
+        try:
+            import ray
+        except ImportError as error:
+            raise missing_extra("ray", "ray") from error
+        started = not ray.is_initialized()
+        try:
+            if self.address not in (None, "auto"):  # Ray itself tries for seven minutes
+                host, _, port = str(self.address).rpartition(":")
+                socket.create_connection((host, int(port)), timeout=CONNECT).close()
+            ray.init(address=self.address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR)
+        except (OSError, ValueError) as error:
+            told = f"--address {self.address}: no Ray cluster there ({str(error).splitlines()[0]})"
+            raise InputError(f"{told}; start one: ray start --head, and give its HOST:PORT") from error
+        try:
+            # A task uses all cores of its machine, so each machine has one task at a time.
+            cores = min(node["Resources"].get("CPU", 1) for node in ray.nodes() if node["Alive"])
+            remote = ray.remote(task).options(num_cpus=cores, max_retries=RETRIES)
+            waiting = [remote.remote(folder) for folder in folders]
+            while waiting:
+                done, waiting = ray.wait(waiting, num_returns=1)
+                ray.get(done)
+                progress.update(f"{what}s", len(folders) - len(waiting), len(folders))
+        except ray.exceptions.RayTaskError as error:
+            raise (error.cause if isinstance(error.cause, InputError) else error) from None
+        except ray.exceptions.RayError as error:
+            why = str(error).splitlines()[0]
+            raise InputError(f"a worker was lost {RETRIES + 1} times ({why}); go on with --resume") from error
+        finally:
+            if started:
+                ray.shutdown()

@@ -1,0 +1,149 @@
+"""Optimises the Gaussians of a scene, or of one block of a large place, together with the masks of its photos."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from perception.config import MapConfig
+from perception.gaussians.depth_start import start_on_surface
+from perception.gaussians.model import Gaussians, from_points
+from perception.gaussians.size import sized
+from perception.gaussians.train import Trainer, TrainingView, TrainRecord
+from perception.gaussians.transients import train_without_transients
+from perception.io.memory import DiskArrays, Keep
+from perception.io.photos import load_photo
+from perception.masks import MaskSource, compute_masks
+from perception.masks.builtin import BuiltinSegmentation
+from perception.pipeline.checkpoint import TrainingObserver, training_mark
+from perception.pipeline.estimate import image_memory, largest_budget, memory_limit
+from perception.pipeline.photos import load_all, with_labels
+from perception.progress import Progress, timed
+from perception.types import Scene, View
+
+GEOMETRY_START = 0.3
+"""Training progress at which masks that use the depth of the map (the built-in ones) are made."""
+
+
+@dataclass
+class Run:
+    """What every stage of a run needs. source: the input; work: its folder of intermediate results; masks: the folder
+    of label images; seconds: of each stage so far."""
+
+    source: Path
+    config: MapConfig
+    work: Path
+    masks: Path
+    device: torch.device
+    progress: Progress
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.keep: Keep = DiskArrays(self.work, image_memory(self.config, memory_limit())).keep
+
+    def stage(self, name: str) -> AbstractContextManager[None]:
+        """Adds the seconds of its block to the stage `name`."""
+        return timed(self.seconds, name)
+
+    @property
+    def mark(self) -> str:
+        """Hash of all that the optimisation depends on, apart from mask images."""
+        return training_mark(self.source, self.config)
+
+
+@dataclass
+class Photos:
+    """The photos of a run: posed (training, held_out), and decoded at training size (views, held)."""
+
+    training: list[View]
+    held_out: list[View]
+    views: list[TrainingView]
+    held: list[TrainingView]
+
+    @classmethod
+    def load(cls, run: Run, training: list[View], held_out: list[View]) -> Photos:
+        """Decodes all photos; the memory they fill is bounded by `photos.memory`."""
+        side = run.config.photos.max_side
+        with run.stage("photos"):
+            views = load_all(training, side, run.progress, run.keep)
+            return cls(training, held_out, views, load_all(held_out, side, run.progress, run.keep))
+
+
+def optimise(
+    run: Run, scene: Scene, photos: Photos, source: MaskSource
+) -> tuple[Gaussians, TrainRecord, dict[str, Any]]:
+    """Trained Gaussians on the CPU, the training's record and the masks' report; `photos.views` then have labels.
+
+    Goes on from the checkpoint in `run.work`, if there is one.
+    """
+    config = sized(run.config, len(photos.views), largest_budget(memory_limit()))
+    trainer = Trainer(initial_gaussians(scene, config, photos.views), photos.views, config, photos.held, run.device)
+    from_geometry = isinstance(source, BuiltinSegmentation)
+    masks_enter = GEOMETRY_START if from_geometry else config.losses.start
+    observer = TrainingObserver(run.work, run.mark, source.identity, masks_enter, run.progress)
+    observer.take_up(trainer)
+    if config.train.transients:
+        with run.stage("train"):
+            photos.views = train_without_transients(
+                trainer, photos.views, observer, run.work / "transients.npz", run.progress
+            )
+
+    # Instance masks M_v,i of every photo (§3.2). Some need the depth of the map, which is then trained first.
+    if from_geometry and trainer.progress < GEOMETRY_START:
+        with run.stage("train"):
+            trainer.run(observer, until=GEOMETRY_START)
+    report = label_photos(run, photos, source, trainer.depth)
+    trainer.show(photos.views)
+
+    # Optimise colours and features together: L_RGB + λ_inst2d L_inst2d + λ_var L_var (§3.1 to 3.2.3, eq. 14).
+    with run.stage("train"):
+        trainer.run(observer)
+    return trainer.gaussians.to("cpu"), trainer.record, report
+
+
+def initial_gaussians(scene: Scene, config: MapConfig, views: Sequence[TrainingView] = ()) -> Gaussians:
+    """One Gaussian per voxel of the surface that depth sensors measured in `views`, and per point of the sparse cloud
+    elsewhere; a random subset if there are more points than the budget."""
+    points, colors = scene.points, scene.point_colors
+    feature_dim, budget, seed = config.losses.feature_dim, config.train.budget, config.seed
+    real = slice(0) if scene.report.get("points_from") == "random" else slice(None)
+    surface = start_on_surface(views, points[real], colors[real], budget, feature_dim, seed)
+    if surface is not None:
+        return surface
+    if len(points) > budget:
+        keep = np.random.default_rng(seed).choice(len(points), budget, replace=False)
+        points, colors = points[np.sort(keep)], colors[np.sort(keep)]
+    return from_points(points, colors, feature_dim=feature_dim, seed=seed)
+
+
+def label_photos(
+    run: Run, photos: Photos, source: MaskSource, depth: Callable[[TrainingView], np.ndarray]
+) -> dict[str, Any]:
+    """Gives `photos.views` their label images, which are made where they are missing or out of date; their report.
+
+    depth: depth image of a view, for masks from geometry.
+    """
+    side, from_geometry = run.config.photos.max_side, isinstance(source, BuiltinSegmentation)
+    by_name = {view.name: view for view in photos.views}
+    with run.stage("masks"):
+        report = compute_masks(
+            photos.training,
+            source,
+            lambda view: load_photo(view, side),
+            run.masks,
+            run.progress,
+            load_depth=(lambda view: depth(by_name[view.name])) if from_geometry else None,
+            depth_key=f"{run.mark} at progress {GEOMETRY_START}" if from_geometry else f"{side} px",
+            keep=run.keep,
+        )
+        for warning in report["warnings"]:
+            run.progress.log(f"warning: {warning}")
+        labelled = zip(photos.views, photos.training, strict=True)
+        photos.views = [with_labels(view, of, run.masks) for view, of in labelled]
+    return report

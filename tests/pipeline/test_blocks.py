@@ -1,0 +1,207 @@
+"""Blocks of a large place: how it is cut, that they tile it, and that the joined map has each thing once."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from perception.config import MapConfig, load_config
+from perception.errors import InputError
+from perception.gaussians.model import from_points
+from perception.geometry import look_at
+from perception.io.store import Map
+from perception.pipeline import blocks as module
+from perception.pipeline.blocks import APART, TASK, cut, joined, optimise_block, visible_points
+from perception.pipeline.checkpoint import work_folder
+from perception.pipeline.engine import Engine
+from perception.pipeline.mapping import build_map
+from perception.pipeline.optimise import Run
+from perception.progress import Progress
+from perception.types import Scene, View
+from support.interrupts import interrupt_at
+from support.row_scene import centres, write_row
+
+BALLS = 8
+SETTINGS = [
+    "train.iterations=400",
+    "train.budget=1200",
+    "densify.every=20",
+    "language.encoder=none",
+    "photos.poses=keep",
+]
+SETTINGS += ["train.block_photos=14", "frame.keep_world=true"]
+
+
+@pytest.fixture(scope="module")
+def row(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_row(tmp_path_factory.mktemp("row"), BALLS)
+
+
+def settings(row: Path, *more: str) -> MapConfig:
+    return load_config(None, [*SETTINGS, f"masks=labels:{row.parent / 'labels'}", *more])
+
+
+@pytest.fixture(scope="module")
+def whole(row: Path, tmp_path_factory: pytest.TempPathFactory) -> Map:
+    return build_map(row, tmp_path_factory.mktemp("map") / "whole.gsmap", settings(row))
+
+
+def same(a: Map, b: Map) -> None:
+    for name in ("means", "sh", "features", "instance_ids"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def corridor(count: int = 40) -> Scene:
+    """Cameras that walk along x and look at a wall in front of them, of 2000 points."""
+    rng = np.random.default_rng(1)
+    points = np.stack([rng.uniform(-1, 21, 2000), rng.uniform(1.9, 2.1, 2000), rng.uniform(-1, 1, 2000)], axis=1)
+    K = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
+    views = []
+    for number, x in enumerate(np.linspace(0, 20, count)):
+        pose = look_at(np.array([x, 0, 0.0]), np.array([x, 1.0, 0]), np.array([0, 0, 1.0]))
+        views.append(View(f"{number:03d}.png", Path("x.png"), K, 64, 48, pose))
+    return Scene(views, points, np.zeros((2000, 3), np.uint8))
+
+
+def test_a_point_is_visible_if_no_nearer_one_hides_it() -> None:
+    """Against a loop over the points, two walls one behind the other."""
+    rng = np.random.default_rng(2)
+    view = corridor().views[20]
+    points = rng.uniform([5, 1, -2], [15, 8, 2], (400, 3)) * [1, -1, 1] ** rng.integers(0, 2, (400, 1))
+    found = visible_points(view, points)
+    nearest: dict[tuple[int, int], float] = {}
+    cells: list[tuple[int, int] | None] = []
+    for point in points:
+        x, y, z = view.camera_from_world[:3, :3] @ point + view.camera_from_world[:3, 3]
+        u, v = (50 * x / z + 32) / 64, (50 * y / z + 24) / 48
+        cells.append((int(16 * v), int(16 * u)) if z > 0 and 0 <= u < 1 and 0 <= v < 1 else None)
+        if cells[-1] is not None:
+            nearest[cells[-1]] = min(nearest.get(cells[-1], np.inf), z)
+    depths = (points @ view.camera_from_world[:3, :3].T + view.camera_from_world[:3, 3])[:, 2]
+    wanted = [cell is not None and z <= 1.3 * nearest[cell] for cell, z in zip(cells, depths, strict=True)]
+    assert found.tolist() == wanted and 10 < sum(wanted) < sum(cell is not None for cell in cells)
+
+
+def test_blocks_tile_space_and_have_all_photos_of_their_box() -> None:
+    scene = corridor()
+    found = cut(scene, 15)
+    assert len(found) >= 3 and max(len(block.views) for block in found) <= 15
+    anywhere = np.random.default_rng(3).uniform(-100, 100, (500, 3))
+    assert (np.sum([block.owns(anywhere) for block in found], axis=0) == 1).all()
+    seen = np.stack([visible_points(view, scene.points) for view in scene.views])
+    for number in range(len(scene.views)):
+        shares = np.array([block.owns(scene.points)[seen[number]].mean() for block in found])
+        inside = [number in block.views for block in found]
+        assert any(inside) and all(np.array(inside)[shares > 0.2])
+    overlap = sum(len(block.views) for block in found) - len(scene.views)
+    assert 0 < overlap <= 12  # neighbours share the photos that see across their seam
+
+
+def test_a_place_that_every_photo_sees_stays_whole() -> None:
+    scene = corridor()
+    assert len(cut(scene, 0)) == len(cut(scene, 40)) == 1
+    around = [replace(scene.views[20], name=str(n)) for n in range(40)]
+    assert len(cut(replace(scene, views=around), 10)) == 1
+    assert len(cut(replace(scene, report={"points_from": "random"}), 10)) == 1
+
+
+def test_joined_gaussians_keep_their_order_harmonics_and_blocks() -> None:
+    a, b = (from_points(np.eye(3) * n, np.full((3, 3), 90, np.uint8), feature_dim=2, seed=0) for n in (1, 2))
+    b = replace(b, sh=torch.arange(36.0).reshape(3, 4, 3))
+    both = joined([a, b])
+    assert torch.equal(both.means, torch.cat([a.means, b.means])) and torch.equal(both.sh[3:], b.sh)
+    assert torch.equal(both.sh[:3, :1], a.sh) and not both.sh[:3, 1:].any()
+    assert torch.equal(both.features[:3], a.features)
+    assert torch.equal(both.features[3:] - b.features, torch.tensor([APART, 0.0]).expand(3, 2))
+
+
+@pytest.mark.slow
+def test_each_thing_of_a_row_is_one_instance_also_on_seams(row: Path, whole: Map, tmp_path: Path) -> None:
+    assert len(whole.info["blocks"]) >= 2
+    seams = {x for block in whole.info["blocks"] for x in (block["box"][0][0], block["box"][1][0]) if x is not None}
+    assert any(abs(x - ball) < 0.3 for x in seams for ball in range(BALLS)), seams  # a seam goes through a ball
+    solid = whole.opacities > 0.3
+    ball = np.argmin(np.linalg.norm(whole.means[:, None] - centres(BALLS), axis=2), axis=1)
+    owners = [np.bincount(whole.instance_ids[solid & (ball == n)] + 1) for n in range(BALLS)]
+    assert len({int(own[1:].argmax()) for own in owners}) == BALLS == len(whole.instances)
+    assert all(own[1:].max() > 0.75 * own.sum() for own in owners)
+    piece = build_map(row, tmp_path / "piece.gsmap", settings(row, "train.block_photos=0"))
+    assert whole.info["quality"]["psnr"] > piece.info["quality"]["psnr"] - 1.0  # both are about 28 dB
+
+
+@pytest.mark.slow
+def test_a_run_that_was_stopped_in_a_block_ends_in_the_same_map(
+    row: Path, whole: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, trained, original = tmp_path / "m.gsmap", list[object](), module.optimise
+
+    def second(run: Run, *rest: Any) -> Any:
+        trained.append(run)
+        if len(trained) == 2:
+            raise KeyboardInterrupt
+        return original(run, *rest)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("perception.pipeline.checkpoint.TrainingObserver.after_step", interrupt_at(70))
+        build_map(row, out, settings(row))
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(module, "optimise", second)
+        build_map(row, out, settings(row), resume=True)
+    build_map(row, out, settings(row), resume=True)
+    same(Map.open(out), whole)
+    assert not work_folder(out).exists()
+
+
+def test_a_worker_of_another_version_is_refused(tmp_path: Path) -> None:
+    (tmp_path / TASK).write_text(json.dumps({"versions": {"perception": "9.9"}}))
+    with pytest.raises(InputError, match=r"this worker has perception .*, the run 9\.9; install the same"):
+        optimise_block(str(tmp_path))
+
+
+class KilledOnce(Engine):
+    """An engine whose first task kills its worker in the middle of the training, once."""
+
+    def run(self, task: Callable[..., Any], folders: Sequence[str], what: str, progress: Progress) -> None:
+        mark = Path(folders[0]).parents[1] / "killed"
+
+        def killed(folder: str) -> None:  # runs in the worker, which cannot import this module
+            import os
+            import signal
+
+            from perception.pipeline import checkpoint
+
+            original = checkpoint.TrainingObserver.after_step
+
+            def after_step(self: Any, trainer: Any, loss: float) -> None:
+                original(self, trainer, loss)
+                if trainer.iteration == 70 and not mark.exists():
+                    mark.touch()
+                    os.kill(os.getpid(), signal.SIGKILL)
+
+            checkpoint.CHECKPOINT_SECONDS = 0.0
+            checkpoint.TrainingObserver.after_step = after_step  # type: ignore[method-assign]
+            task(folder)
+
+        super().run(killed, folders, what, progress)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra ray")
+def test_ray_gives_the_same_map_although_a_worker_is_killed(row: Path, whole: Map, tmp_path: Path) -> None:
+    made = build_map(row, tmp_path / "m.gsmap", settings(row), engine=KilledOnce("ray"))
+    assert (tmp_path / "killed").exists()
+    same(made, whole)
+
+
+def test_no_cluster_at_an_address_is_one_line() -> None:
+    pytest.importorskip("ray")
+    with pytest.raises(InputError, match=r"--address 127\.0\.0\.1:1: no Ray cluster there .*ray start --head"):
+        Engine("ray", "127.0.0.1:1").run(optimise_block, ["x"], "block", None)  # type: ignore[arg-type]
