@@ -13,12 +13,16 @@ from perception.errors import InputError
 from perception.interrupts import handled
 
 if TYPE_CHECKING:
-    from perception.progress import Progress
+    pass
 
 
 def register(commands: Any) -> None:
     """Adds this module's subcommands."""
     _add_map(commands)
+    p = command(commands, "fleet", _fleet, "build the maps of a list of jobs, here or on a Ray cluster")
+    p.add_argument("jobs", type=Path, metavar="JOBS.yaml", help="a list of {input, output, preset, config, set}")
+    _add_engine(p, "where maps are built")
+
     p = map_command(commands, "info", _info, "what a map holds, how it was made, how good it is")
     p.add_argument("--verify", action="store_true", help="read every byte and compare it with the checksums")
 
@@ -77,9 +81,11 @@ def _add_map(commands: Any) -> None:
     for key, (metavar, text) in _SHORTCUTS.items():
         p.add_argument(f"--{key.rpartition('.')[2].replace('_', '-')}", metavar=metavar, help=text, dest=key)
     p.add_argument("--resume", action="store_true", help="go on with an interrupted run")
-    p.add_argument(
-        "--engine", choices=("local", "ray"), default="local", help="where blocks of a large place are trained"
-    )
+    _add_engine(p, "where blocks are trained")
+
+
+def _add_engine(p: argparse.ArgumentParser, what: str) -> None:
+    p.add_argument("--engine", choices=("local", "ray"), default="local", help=what)
     p.add_argument("--address", metavar="HOST:PORT", help="of the Ray cluster, or auto; default: one on this machine")
 
 
@@ -122,27 +128,32 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     config = load_config(args.config, settings_given(args), args.preset)
     from perception.pipeline.engine import Engine
     from perception.pipeline.mapping import build_map
+    from perception.pipeline.reporting import write_own_report
     from perception.pipeline.summary import map_facts
     from perception.progress import Progress
 
     engine = Engine(args.engine, args.address)
     with _sigterm_as_interrupt(), Progress() as progress:
         gmap = build_map(args.input, args.output, config, resume=args.resume, progress=progress, engine=engine)
-        _write_own_report(args.output, progress)
+        write_own_report(args.output, progress)
 
     return map_facts(args.output, gmap.info, len(gmap), len(gmap.instances)), ""
 
 
-def _write_own_report(path: Path, progress: Progress) -> None:
-    """Writes report.html into the map. A failure is only a warning: `perception report` can be run later."""
-    from perception.io.store import REPORT
-    from perception.pipeline.reporting import write_map_report
-    from perception.query import load_map
+def _fleet(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.pipeline.engine import Engine
+    from perception.pipeline.fleet import run_fleet
+    from perception.progress import Progress
 
-    try:
-        write_map_report(load_map(path), path / REPORT, [])
-    except InputError as error:
-        progress.log(f"warning: no report: {error}")
+    with _sigterm_as_interrupt(), Progress() as progress:
+        made = run_fleet(args.jobs, Engine(args.engine, args.address), progress)
+    failed = [job for job in made if "error" in job]
+    if failed:
+        progress.log("\n".join(f"{job['output']}: {job['error']}" for job in failed))
+        raise InputError(
+            f"{args.jobs}: {len(failed)} of {len(made)} maps could not be made; mend the jobs and run it again"
+        )
+    return {"maps": made}, "\n".join("{output}: {instances} instances".format(**job) for job in made)
 
 
 def _sigterm_as_interrupt() -> AbstractContextManager[None]:

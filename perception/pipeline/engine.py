@@ -22,26 +22,27 @@ RETRIES = 5
 class Engine:
     """kind: of ENGINES. address: of a running Ray cluster ("auto": the one of this machine); None starts one here.
 
-    Tasks get and leave all data in folders that every worker can reach, under the same path. The results do not depend
+    Tasks get and leave their data in folders that every worker reaches under the same path. The results do not depend
     on the kind and on the number of workers.
     """
 
     kind: str = "local"
     address: str | None = None
 
-    def run(self, task: Callable[..., Any], folders: Sequence[str], what: str, progress: Progress) -> None:
-        """Calls task(folder) for each folder, and raises the first error. what: a task's name in messages.
+    def run(self, task: Callable[..., Any], items: Sequence[str], what: str, progress: Progress) -> list[Any]:
+        """task(item) of each item, in order; the first error is raised. what: a task's name in messages.
 
-        A task must take up what an interrupted call has left in its folder.
+        A task must take up what an interrupted call has left.
         """
-        if self.kind == "local":
-            for number, folder in enumerate(folders, start=1):
-                progress.log(f"{what} {number} of {len(folders)}")
-                task(folder, progress)
-        else:
-            self._on_ray(task, folders, what, progress)
+        if self.kind == "ray":
+            return self._on_ray(task, items, what, progress)
+        found = []
+        for number, item in enumerate(items, start=1):
+            progress.log(f"{what} {number} of {len(items)}")
+            found.append(task(item, progress))
+        return found
 
-    def _on_ray(self, task: Callable[..., Any], folders: Sequence[str], what: str, progress: Progress) -> None:
+    def _on_ray(self, task: Callable[..., Any], items: Sequence[str], what: str, progress: Progress) -> list[Any]:
         try:
             import ray
         except ImportError as error:
@@ -59,11 +60,13 @@ class Engine:
             # A task uses all cores of its machine, so each machine has one task at a time.
             cores = min(node["Resources"].get("CPU", 1) for node in ray.nodes() if node["Alive"])
             remote = ray.remote(task).options(num_cpus=cores, max_retries=RETRIES)
-            waiting = [remote.remote(folder) for folder in folders]
+            asked = [remote.remote(item) for item in items]
+            waiting = list(asked)
             while waiting:
                 done, waiting = ray.wait(waiting, num_returns=1)
                 ray.get(done)
-                progress.update(f"{what}s", len(folders) - len(waiting), len(folders))
+                progress.update(f"{what}s", len(items) - len(waiting), len(items))
+            return list(ray.get(asked))
         except ray.exceptions.RayTaskError as error:
             raise (error.cause if isinstance(error.cause, InputError) else error) from None
         except ray.exceptions.RayError as error:

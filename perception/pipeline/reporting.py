@@ -25,11 +25,12 @@ from perception.instances.crops import expand_box, mask_box
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.atomic import atomic_file
 from perception.io.photos import load_photo, scaled_K
-from perception.io.store import Map
+from perception.io.store import REPORT, Map
 from perception.pictures import error_map, features_to_rgb, outline, overlay, titled_row
 from perception.pipeline.rendering import as_gaussians
 from perception.pipeline.summary import depth_text
-from perception.query import QueryMap
+from perception.progress import Progress
+from perception.query import QueryMap, load_map
 from perception.query.hit import printed_texts
 
 SHOWN = ("worst", "middle", "best")
@@ -38,6 +39,14 @@ LIMIT = 3_000_000
 """Maximum size of the page in bytes."""
 SIZES = ((460, 82), (360, 74), (260, 66), (180, 55), (120, 45))
 """(longest side, quality) of the images, tried in this order."""
+
+
+def write_own_report(path: Path, progress: Progress) -> None:
+    """Writes report.html into the map. A failure is only a warning: `perception report` can be run later."""
+    try:
+        write_map_report(load_map(path), path / REPORT, [])
+    except InputError as error:
+        progress.log(f"warning: no report: {error}")
 
 
 def write_map_report(opened: QueryMap, path: Path, queries: list[str]) -> Path:
