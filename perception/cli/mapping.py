@@ -6,14 +6,11 @@ import argparse
 import signal
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from perception.cli.parser import command, map_command
 from perception.errors import InputError
 from perception.interrupts import handled
-
-if TYPE_CHECKING:
-    pass
 
 
 def register(commands: Any) -> None:
