@@ -57,7 +57,8 @@ def make_photos(
         path.mkdir(parents=True, exist_ok=True)
     made: Scene = maker.build(seed, light_samples)
     cameras = made.cameras(views, width, height)
-    names = [f"{i:03d}.jpg" for i in range(views)]
+    digits = max(3, len(str(views - 1)))
+    names = [f"{i:0{digits}d}.jpg" for i in range(views)]
     stuff = {number for number, body in enumerate(made.bodies, start=1) if body.is_stuff}
 
     def shoot(i: int) -> Picture:
@@ -71,7 +72,7 @@ def make_photos(
             "labels_sam": erring_labels(picture.ids, picture.parts, stuff, rng),
         }
         for name, image in images.items():
-            cv2.imwrite(str(home / name / f"{i:03d}.png"), image)
+            cv2.imwrite(str(home / name / f"{i:0{digits}d}.png"), image)
         return picture
 
     with ThreadPoolExecutor(WORKERS) as pool:  # numpy and OpenCV release the GIL in their loops
