@@ -1,7 +1,8 @@
 """Gaussians as `.spz` (Niantic's open format, version 2): a tenth of the size of the PLY, for viewers in the browser.
 
 A gzip stream: header, then per attribute one byte a value: positions (24 bits fixed point each), alphas, colours,
-scales, rotations, harmonics. Axes are right, up, back, where those of a 3DGS PLY are right, down, front: y and z change sign.
+scales, rotations, harmonics. Axes are right, up, back, where those of a 3DGS PLY are right, down, front: y and z change
+sign.
 """
 
 from __future__ import annotations

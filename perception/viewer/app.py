@@ -18,6 +18,7 @@ from perception.colors import instance_palette
 from perception.errors import InputError, missing_extra
 from perception.listening import check_address, is_local, listen, url_host
 from perception.viewer.guard import Guard, guarded_server
+from perception.viewer.levels import MOST, Level, level
 from perception.viewer.panel import Panel
 from perception.viewer.picking import covariances
 from perception.viewer.session import HIGHLIGHT, Session
@@ -75,6 +76,11 @@ class Viewer:
         low, high = np.percentile(gmap.means, [5, 95], axis=0) if len(gmap) else (np.zeros(3), np.ones(3))
         self.scale = 10 / max(float(np.linalg.norm(high - low)), 1e-9)
         self._covariances = covariances(gmap) * np.float32(self.scale**2)
+        self._level: Level | None = None
+        if len(gmap) > MOST:
+            ids = self.session.finest_ids()
+            self._level = level(gmap.means * np.float32(self.scale), self._covariances, gmap.opacities, ids)
+            self._covariances = self._level.covariances
         poses = gmap.poses
         if len(poses) == 0:
             return
@@ -88,8 +94,17 @@ class Viewer:
 
     def _gaussians(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Centres [N, 3], covariances [N, 3, 3], colours [N, 3] uint8 and opacities [N, 1] as the page shows them."""
+        if self._level is not None:
+            shown = self._level.colors(self.session.colors()), self._level.opacities(self.session.shown())[:, None]
+            return self._level.means, self._covariances, *shown
         centers = (self._drawn.means * np.float32(self.scale)).astype(np.float32)
         return centers, self._covariances, self.session.colors(), self.session.opacities()[:, None]
+
+    @property
+    def detail(self) -> str:
+        """How much of the map the page shows, as text; empty if all of it."""
+        count = len(self._drawn)
+        return "" if self._level is None else f"{len(self._level) / 1e6:.1f} of {count / 1e6:.1f} million Gaussians"
 
     def redraw(self) -> None:
         """Sends the Gaussians to every browser, in one message, and redraws the visible overlays."""

@@ -132,7 +132,8 @@ class Panel:
         """Updates all texts of the panel from the session's state."""
         session, editor = self.session, self.session.editor
         unit = "m" if editor.original.metric else "map units"
-        self._facts.content = f"**{len(editor.ids):,} Gaussians · instances: {len(editor.instances)}**"
+        shown = f" (shown: {self.viewer.detail})" if self.viewer.detail else ""
+        self._facts.content = f"**{len(editor.ids):,} Gaussians{shown} · instances: {len(editor.instances)}**"
         self._refresh_answer()
         photo = None
         if not session.selected:

@@ -165,11 +165,15 @@ class Session:
     def colors(self) -> np.ndarray:
         """[N, 3] uint8 in the current mode, with the selection (or the hits) highlighted."""
         ids, parts = self.editor.ids, self.editor.part_ids
-        shown = np.where(parts >= 0, parts, ids) if self.mode == "parts" else ids
+        shown = self.finest_ids() if self.mode == "parts" else ids
         colors = paint(self.editor.original, shown, self.mode)
         if self.part is not None:
             return highlight(colors, parts, [self.part])
         return highlight(colors, ids, self.lit())
+
+    def finest_ids(self) -> np.ndarray:
+        """[N] the part of each Gaussian, else its instance, −1 = none: what is never shown in one colour."""
+        return np.where(self.editor.part_ids >= 0, self.editor.part_ids, self.editor.ids)
 
     def lit(self) -> list[int]:
         """The highlighted instances: the selected ones, else those of all hits; empty when there are neither."""
