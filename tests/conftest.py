@@ -24,7 +24,7 @@ def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     The label images carry other ids in every photo, as a segmenter's would. truth/ holds the truth.
     """
-    from perception.demo import make_photos
+    from worlds import make_photos
 
     root = tmp_path_factory.mktemp("small")
     make_photos(root / "images", views=12, width=128, height=96, light_samples=2)

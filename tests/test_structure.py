@@ -28,7 +28,7 @@ LAYERS = [
         "colors",
     },
     {"io"},
-    {"masks", "demo", "calibration", "bags", "frame"},
+    {"masks", "calibration", "bags", "frame"},
     {"gaussians"},
     {"language", "instances"},
     {

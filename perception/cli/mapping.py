@@ -27,11 +27,8 @@ def register(commands: Any) -> None:
     p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.html")
     p.add_argument("--ask", action="append", default=[], metavar="TEXT", help="a prompt to answer on the page")
 
-    p = command(commands, "demo", _demo, "photos -> SfM -> map -> export -> text query, on a scene it makes itself")
+    p = command(commands, "demo", _demo, "photos -> SfM -> map -> export -> text query, on photos that come with it")
     p.add_argument("-o", "--output", type=Path, default=Path("perception-demo"), metavar="DIR")
-    p.add_argument("--scene", choices=("tabletop", "room"), default="tabletop", help="what is made (default: tabletop)")
-    p.add_argument("--seed", type=int, default=0, metavar="N", help="another N makes another scene (default: 0)")
-    p.add_argument("--photos-only", type=Path, metavar="DIR", help="write photos, masks and truth to DIR; no map")
 
     p = command(commands, "calibrate", _calibrate, "a camera file from photos or a video of a calibration board")
     p.add_argument("input", type=Path, metavar="INPUT", help="a folder of photos, or a video")
@@ -185,15 +182,11 @@ def _report(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _demo(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.pipeline.demo import run_demo, write_scene
+    from perception.pipeline.demo import run_demo
     from perception.progress import Progress
 
-    if args.seed < 0:
-        raise InputError(f"--seed: found {args.seed}, expected 0 or more")
-    if args.photos_only is not None:
-        return write_scene(args.photos_only, args.scene, args.seed)
     with _sigterm_as_interrupt(), Progress() as progress:
-        return run_demo(args.output, progress, args.scene, args.seed)
+        return run_demo(args.output, progress)
 
 
 def _calibrate(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

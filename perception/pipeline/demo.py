@@ -1,16 +1,17 @@
-"""`perception demo`: renders photos of a synthetic scene, maps them, and evaluates the map with exact ground truth."""
+"""`perception demo`: maps the photos of a made scene that comes with the package, and scores the map with its truth."""
 
 from __future__ import annotations
 
 import json
+import shutil
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from perception.config import MapConfig, load_config
-from perception.demo import DemoTruth, make_photos
 from perception.errors import InputError
 from perception.evaluate.instances import evaluate
 from perception.export.transfer import export_labels, write_export
@@ -22,35 +23,50 @@ from perception.progress import Progress
 from perception.query import QueryMap, load_map
 from perception.types import PointCloud
 
+SCENE = Path(__file__).parents[1] / "demo_scene"
+"""40 rendered photos of a table, and their truth (tests/worlds/make.py)."""
 SETTINGS = ["train.iterations=1300", "train.budget=40000"]
-"""Settings of the demo, for a small scene in about a minute on two cores."""
+"""Settings of the demo, for a small scene in under a minute on two cores."""
 
 
-def write_scene(folder: Path, scene: str, seed: int) -> tuple[dict[str, Any], str]:
-    """Writes photos of a synthetic scene to `folder`/images, with poses and truth; returns figures and a text."""
-    _require_empty(folder)
-    truth = make_photos(folder / "images", scene=scene, seed=seed, truth_folder=folder)
-    facts = {"scene": str(folder), "photos": len(truth.names), "instances": len(truth.instances)}
-    facts |= {"prompts": len(truth.queries), "points": len(truth.points)}
-    return facts, "{photos} photos, {instances} instances, {prompts} prompts in {scene}".format(**facts)
+@dataclass(frozen=True)
+class DemoTruth:
+    """Ground truth of the scene; it is used to score the map, never to build it. Metres.
+
+    asked: the prompts of the demo. queries: every prompt with the ids of what it means. instances: name of each id.
+    centres: camera centre [3] of each photo. points: of the surfaces that two photos see, with normals and colours;
+    instance_ids [P] int64: of each point.
+    """
+
+    asked: list[str]
+    queries: dict[str, list[int]]
+    instances: dict[int, str]
+    centres: dict[str, list[float]]
+    points: PointCloud
+    instance_ids: np.ndarray
+
+    @classmethod
+    def read(cls, folder: Path = SCENE) -> DemoTruth:
+        """The truth beside the photos in `folder`."""
+        facts = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+        with np.load(folder / "truth.npz") as stored:
+            normals = stored["normals"].astype(np.float32)
+            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+            points = PointCloud((stored["points"] * 1e-4).astype(np.float32), stored["colors"], normals)
+            ids = stored["instance_ids"].astype(np.int64)
+        names = {int(number): name for number, name in facts["instances"].items()}
+        return cls(facts["asked"], dict(facts["queries"]), names, facts["centres"], points, ids)
 
 
-def _require_empty(folder: Path) -> None:
-    if folder.exists() and any(folder.iterdir()):
-        raise InputError(f"{folder}: is not empty; choose another folder or remove it first")
-
-
-def run_demo(
-    output: Path, progress: Progress | None = None, scene: str = "tabletop", seed: int = 0
-) -> tuple[dict[str, Any], str]:
+def run_demo(output: Path, progress: Progress | None = None) -> tuple[dict[str, Any], str]:
     """Photos → SfM → masks → map → export → queries, all in `output`; returns figures and a text."""
     progress = progress or Progress()
     started = time.monotonic()
-    _require_empty(output)
+    if output.exists() and any(output.iterdir()):
+        raise InputError(f"{output}: is not empty; choose another folder or remove it first")
     photos, map_path = output / "photos", output / "demo.gsmap"
-    progress.log(f"making photos of a {scene} in {photos}")
-    truth = make_photos(photos, scene=scene, seed=seed)
-    made = time.monotonic() - started
+    shutil.copytree(SCENE / "photos", photos)
+    truth = DemoTruth.read()
 
     config: MapConfig = load_config(None, SETTINGS)
     build_map(photos, map_path, config, progress=progress)
@@ -59,16 +75,13 @@ def run_demo(
     cloud, scale = truth_in_map_frame(truth, gmap)
     labels = export_labels(gmap.means, gmap.instance_ids, cloud)
     write_export(output / "instances.ply", cloud, labels, {entry["id"]: entry for entry in gmap.instances})
-    scored = evaluate(
-        labels, {entry["id"]: entry["score"] for entry in gmap.instances}, truth.instance_ids.astype(np.int64)
-    )
-    answers = dict(truth.queries)
-    queries = [_ask(gmap, text, answers.get(text, []), truth, labels) for text in truth.asked]
+    scored = evaluate(labels, {entry["id"]: entry["score"] for entry in gmap.instances}, truth.instance_ids)
+    queries = [_ask(gmap, text, truth, labels) for text in truth.asked]
     facts = {
         "map": str(map_path),
-        "seconds": {"photos": round(made, 1), "total": round(time.monotonic() - started, 1)},
+        "seconds": {"total": round(time.monotonic() - started, 1)},
         "registered": len(gmap.views),
-        "photos": len(truth.names),
+        "photos": len(truth.centres),
         "gaussians": len(gmap),
         "instances": len(gmap.instances),
         "true_instances": len(truth.instances),
@@ -91,30 +104,29 @@ def truth_in_map_frame(truth: DemoTruth, gmap: Map) -> tuple[PointCloud, float]:
 
     SfM determines neither scale nor frame, so the true camera centres are aligned with the estimated ones.
     """
-    by_name = dict(zip(truth.names, truth.cameras, strict=True))
     mapped = camera_centres(gmap.poses)
-    true = np.stack([by_name[view.name].center for view in gmap.views])
+    true = np.array([truth.centres[view.name] for view in gmap.views])
     scale, rotation, shift = align_similarity(mapped, true)
-    points = scale * truth.points.astype(np.float64) @ rotation.T + shift
-    normals = (truth.normals.astype(np.float64) @ rotation.T).astype(np.float32)
-    return PointCloud(points.astype(np.float32), truth.colors, normals), float(scale)
+    assert truth.points.normals is not None  # in the file
+    points = scale * truth.points.points.astype(np.float64) @ rotation.T + shift
+    normals = (truth.points.normals.astype(np.float64) @ rotation.T).astype(np.float32)
+    return PointCloud(points.astype(np.float32), truth.points.colors, normals), float(scale)
 
 
-def _ask(gmap: QueryMap, text: str, ids: list[int], truth: DemoTruth, labels: np.ndarray) -> dict[str, Any]:
+def _ask(gmap: QueryMap, text: str, truth: DemoTruth, labels: np.ndarray) -> dict[str, Any]:
     """A prompt, its answer, and whether it is correct: the true object of most points of the first hit is compared."""
-    hits = gmap.query(text, top_k=1)
+    hits, ids = gmap.query(text, top_k=1), truth.queries.get(text, [])
     found = None
     if hits:
         under = truth.instance_ids[labels == hits[0].instance_id]
         if len(under):
             found = int(np.bincount(under).argmax())
-    names = {instance.id: instance.name for instance in truth.instances}
     return {
         "text": text,
         "present": bool(hits),
         "instance_id": hits[0].instance_id if hits else None,
         "score": hits[0].score if hits else None,
-        "found": names.get(found) if found is not None else None,
+        "found": truth.instances.get(found) if found is not None else None,
         "right": (found in ids) if ids else not hits,
     }
 

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from perception.demo import room
-from perception.demo.light import Body
 from support.building import make_building
+from worlds import room
+from worlds.light import Body
 
 pytestmark = pytest.mark.slow
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from perception.demo import DemoTruth, make_photos
 from perception.errors import InputError
 from support.demo_truth import labels_of, load_truth, things
+from worlds import DemoTruth, make_photos
 
 pytestmark = pytest.mark.slow
 

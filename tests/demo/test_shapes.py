@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perception.demo.shapes import (
+from worlds.shapes import (
     Box,
     Ellipsoid,
     Lathe,

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from perception.bench.queries import read_queries
-from perception.cli import main
-from perception.demo import make_photos, tabletop
 from perception.io.cloud import read_cloud
+from perception.pipeline.demo import SCENE, DemoTruth
+from worlds import make, make_photos, tabletop
+from worlds.render import cast
 
 pytestmark = pytest.mark.slow
 
@@ -27,7 +28,7 @@ def image(path: Path) -> np.ndarray:
 
 @pytest.fixture(scope="module", params=["tabletop", pytest.param("room", marks=pytest.mark.slow)])
 def scene(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder as `perception demo --photos-only` writes it, of small photos; seeds that choose for themselves."""
+    """A folder as tests/worlds/make.py writes it, of small photos; seeds that choose for themselves."""
     folder = tmp_path_factory.mktemp(request.param)
     made = {"scene": request.param, "seed": 5, "views": 10, "width": 160, "height": 120, "light_samples": 1}
     make_photos(folder / "images", truth_folder=folder, **made)
@@ -113,15 +114,35 @@ def test_the_command_writes_the_scene_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small = partial(make_photos, views=3, width=64, height=48, light_samples=1)
-    monkeypatch.setattr("perception.pipeline.demo.make_photos", small)
-    assert main(["demo", "--scene", "tabletop", "--seed", "0", "--photos-only", str(tmp_path / "s")]) == 0
+    monkeypatch.setattr(make, "make_photos", small)
+    monkeypatch.setattr("sys.argv", ["make.py", "tabletop", str(tmp_path / "s")])
+    make.main()
     assert sorted(path.name for path in (tmp_path / "s").iterdir()) == [
         "depth", "gt_points.ply", "images", "labels", "labels_sam", "masks_gt", "scene.json", "transforms.json",
     ]  # fmt: skip
-    capsys.readouterr()
-    assert main(["demo", "--photos-only", str(tmp_path / "s")]) == 2
+    with pytest.raises(SystemExit):
+        make.main()
     assert "is not empty" in capsys.readouterr().err
-    assert main(["demo", "--seed", "-1", "--photos-only", str(tmp_path / "t")]) == 2
+
+
+def test_the_shipped_scene_is_the_one_that_is_made() -> None:
+    """Photos against renders without a sensor's noise; centres, names and prompts against the scene."""
+    made, truth = tabletop.build(0, 20), DemoTruth.read()
+    cameras = made.cameras(40, 640, 480)
+    assert (
+        sorted(path.name for path in (SCENE / "photos").iterdir())
+        == sorted(truth.centres)
+        == [f"{i:03d}.jpg" for i in range(40)]
+    )
+    for i in (0, 21):
+        name = f"{i:03d}.jpg"
+        np.testing.assert_allclose(truth.centres[name], cameras[i].center, atol=1e-9)
+        photo = image(SCENE / "photos" / name)[..., ::-1].astype(np.float64)
+        error = photo - cast(made.bodies, made.lighting.lamps[0], cameras[i]).rgb
+        assert np.sqrt(np.square(error).mean()) < 6  # 4.4: noise of 1.6 levels, and JPEG with half the colours
+    assert truth.asked == made.asked
+    assert truth.instances == {number: body.name for number, body in enumerate(made.bodies, start=1)}
+    assert set(truth.instance_ids.tolist()) <= set(truth.instances)
 
 
 def test_another_seed_is_another_scene(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -125,7 +125,7 @@ def _do(work: Callable[[], int], folder: Path) -> float:
 
 def _make_scene(scene: Path) -> None:
     """Nine neighbouring photos of the demo's tabletop with their label images."""
-    from perception.demo import make_photos
+    from worlds import make_photos
 
     truth = make_photos(scene / "images", views=24, width=320, height=240, light_samples=2)
     (scene / "labels").mkdir()

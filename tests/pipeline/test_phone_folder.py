@@ -11,11 +11,11 @@ import pytest
 from PIL import Image
 
 from perception.cli import main
-from perception.demo import make_photos
 from perception.geometry import align_similarity, camera_centres
 from perception.io.photo_folder import view_name
 from perception.io.store import read_map
 from support.videos import turn_video, write_video
+from worlds import make_photos
 
 pytestmark = pytest.mark.slow
 

@@ -20,10 +20,10 @@ import numpy as np
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
 
-from perception.demo import make_photos  # noqa: E402
 from perception.io.cloud import read_cloud  # noqa: E402
 from perception.query.relations import Places  # noqa: E402
 from perception.query.scene_graph import MATCH, holders  # noqa: E402
+from worlds import make_photos  # noqa: E402
 
 LEAST = 30  # points of an instance that is asked about
 

@@ -19,15 +19,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from perception.boxes import oriented_box
-from perception.demo import room
-from perception.demo.light import Body, casters, first_hits
-from perception.demo.scene import _surface
-from perception.demo.shapes import to_world
 from perception.errors import InputError
 from perception.frame.floor_grid import HEIGHT, STEP
 from perception.query.query_map import QueryMap
 from perception.query.standing import where_to_stand
 from perception.types import View
+from worlds import room
+from worlds.light import Body, casters, first_hits
+from worlds.scene import _surface
+from worlds.shapes import to_world
 
 RADIUS, SENSOR, RAYS, MARGIN = 0.25, 1.2, 200, 0.02  # metres, metres, rays to an object, metres before its surface
 

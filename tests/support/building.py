@@ -2,7 +2,7 @@
 
 python tests/support/building.py FOLDER [--rooms 6] [--photos 1200] [--size 480x360] [--seed 0]
 
-The walk goes round each room and on through the opening. FOLDER then holds what `perception demo --photos-only` writes.
+The walk goes round each room and on through the opening. FOLDER then holds what tests/worlds/make.py writes.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.demo import room, scene
-from perception.demo.cameras import UP, Camera, intrinsics, walk
-from perception.demo.light import Body, Part, Scene, corners
-from perception.demo.shapes import Sheet, to_world
 from perception.geometry import look_at
+from worlds import room, scene
+from worlds.cameras import UP, Camera, intrinsics, walk
+from worlds.light import Body, Part, Scene, corners
+from worlds.shapes import Sheet, to_world
 
 VIEWS, FOCAL_35MM, POINTS = 1200, 26, 600_000
 OPENING, HIGH, CORNER = 0.95, 2.1, 0.12

@@ -1,4 +1,4 @@
-"""Reads the truth that `perception demo` writes beside its photos."""
+"""Reads the truth that `make_photos` writes."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from perception.demo.cameras import Camera
-from perception.demo.truth import DemoTruth, Truth
 from perception.geometry import OPENCV_FROM_OPENGL
 from perception.io.cloud import read_cloud
+from worlds.cameras import Camera
+from worlds.truth import DemoTruth, Truth
 
 
 def load_truth(folder: Path) -> DemoTruth:

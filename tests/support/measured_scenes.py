@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from perception.demo.cameras import orbit, walk
 from perception.io.recentre import moved
 from perception.types import View
 from support.rotations import rotation_from_quaternion
+from worlds.cameras import orbit, walk
 
 SIZE = (640, 480)
 

@@ -1,7 +1,7 @@
 """Writes a scene of printed words: python tests/support/packages.py FOLDER [SEED] [VIEWS]
 
 A table with packages, tins and books that bear words: across, downwards, around a tin, on a spine, partly hidden. Seeds
-select places and turns. The folder then holds what `perception demo --photos-only` writes; scene.json has 20 prompts
+select places and turns. The folder then holds what tests/worlds/make.py writes; scene.json has 20 prompts
 with a word in capitals, and as `absent` six whose words are on nothing. `perception bench queries MAP FOLDER` scores
 them on a map of FOLDER/transforms.json.
 """
@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.demo import scene, things
-from perception.demo.cameras import orbit
-from perception.demo.light import Body, Scene, bake_all
-from perception.demo.shapes import placed, spin
-from perception.demo.tabletop import FOCAL_35MM, LIGHTING, POINTS, VIEWS, room_around, spots
+from worlds import scene, things
+from worlds.cameras import orbit
+from worlds.light import Body, Scene, bake_all
+from worlds.shapes import placed, spin
+from worlds.tabletop import FOCAL_35MM, LIGHTING, POINTS, VIEWS, room_around, spots
 
 __all__ = ["FOCAL_35MM", "POINTS", "VIEWS", "build"]
 

@@ -7,11 +7,11 @@ from functools import partial
 
 import numpy as np
 
-from perception.demo import textures as tex
-from perception.demo.cameras import orbit
-from perception.demo.furniture import block
-from perception.demo.light import Body, Lamp, Lighting, Part, Scene, bake_all
-from perception.demo.shapes import Ellipsoid, Lathe, Sheet, Tube, rotation_from_axes, spin
+from worlds import textures as tex
+from worlds.cameras import orbit
+from worlds.furniture import block
+from worlds.light import Body, Lamp, Lighting, Part, Scene, bake_all
+from worlds.shapes import Ellipsoid, Lathe, Sheet, Tube, rotation_from_axes, spin
 
 VIEWS, FOCAL_35MM, POINTS = 24, 30, 40_000
 REACH = 0.42  # metres from the centre within which things stand

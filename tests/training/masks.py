@@ -28,7 +28,6 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from perception.bench.output import Column, table
-from perception.demo import scene as scenes
 from perception.masks.boundaries import WEIGHTS as BORDERS
 from perception.masks.boundaries import inputs_of
 from perception.masks.merging import (
@@ -47,6 +46,7 @@ from perception.masks.surface import FOOTPRINTS
 from perception.masks.surface_graph import SurfaceGraph
 from support.mask_scores import leaf_sums
 from training import boundaries, clutter, patchwork
+from worlds import scene as scenes
 
 scenes.SCENES |= {"clutter": clutter, "patchwork": patchwork}
 PATCHWORK = (("patchwork", 4000, 2), ("patchwork", 4001, 2))  # first seed, step

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.demo import textures as tex
-from perception.demo.furniture import block
-from perception.demo.light import Body, Part, Scene
-from perception.demo.shapes import Ellipsoid, Lathe, Tube, rotation_from_axes, spin
 from training import clutter
 from training.clutter import FOCAL_35MM, POINTS, VIEWS, Group
+from worlds import textures as tex
+from worlds.furniture import block
+from worlds.light import Body, Part, Scene
+from worlds.shapes import Ellipsoid, Lathe, Tube, rotation_from_axes, spin
 
 __all__ = ["FOCAL_35MM", "POINTS", "VIEWS", "build"]
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from perception.demo.scene import make_photos
 from perception.masks.boundaries import REACH, forward, scaled
 from training import boundaries, patchwork
 from training.masks import border_samples, fit, learn, make_world, pairs_of, plain_rule
+from worlds.scene import make_photos
 
 
 @pytest.fixture(scope="module")

@@ -7,12 +7,12 @@ from functools import partial
 
 import numpy as np
 
-from perception.demo import furniture as fur
-from perception.demo import textures as tex
-from perception.demo import things
-from perception.demo.cameras import walk
-from perception.demo.light import Body, Lamp, Lighting, Part, Scene, bake_all
-from perception.demo.shapes import Sheet, rotation_from_axes, spin
+from worlds import furniture as fur
+from worlds import textures as tex
+from worlds import things
+from worlds.cameras import walk
+from worlds.light import Body, Lamp, Lighting, Part, Scene, bake_all
+from worlds.shapes import Sheet, rotation_from_axes, spin
 
 VIEWS = 72
 FOCAL_35MM = 26  # 35 mm equivalent of a phone's wide camera

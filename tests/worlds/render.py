@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from perception.demo.cameras import Camera
-from perception.demo.light import Body, Lamp, Part, corners
-from perception.demo.shapes import to_local, to_world
+from worlds.cameras import Camera
+from worlds.light import Body, Lamp, Part, corners
+from worlds.shapes import to_local, to_world
 
 
 @dataclass

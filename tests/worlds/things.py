@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from perception.demo import textures as tex
-from perception.demo.light import Body, Part
-from perception.demo.shapes import Ellipsoid, Lathe, Sheet, Tube, rotation_from_axes, spin
+from worlds import textures as tex
+from worlds.light import Body, Part
+from worlds.shapes import Ellipsoid, Lathe, Sheet, Tube, rotation_from_axes, spin
 
 COLORS = {
     "red": "#c3161c", "blue": "#1c4fb5", "green": "#2c7a3f", "yellow": "#e3b81d", "white": "#e9e6dc",

@@ -8,11 +8,11 @@ from itertools import product
 
 import numpy as np
 
-from perception.demo import textures as tex
-from perception.demo import things
-from perception.demo.cameras import orbit
-from perception.demo.light import Body, Lamp, Lighting, Part, Scene, bake_all
-from perception.demo.shapes import Sheet, rotation_from_axes, spin
+from worlds import textures as tex
+from worlds import things
+from worlds.cameras import orbit
+from worlds.light import Body, Lamp, Lighting, Part, Scene, bake_all
+from worlds.shapes import Sheet, rotation_from_axes, spin
 
 VIEWS = 40
 FOCAL_35MM = 32  # 35 mm equivalent of a phone camera

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from perception.demo import room, tabletop
-from perception.demo.cameras import Camera
-from perception.demo.light import WORKERS, Scene
-from perception.demo.render import Picture, cast
-from perception.demo.segmenter import erring_labels, perfect_labels
-from perception.demo.shapes import Box, Ellipsoid, Shape, to_world
-from perception.demo.truth import DemoTruth, Truth
 from perception.errors import InputError
+from worlds import room, tabletop
+from worlds.cameras import Camera
+from worlds.light import WORKERS, Scene
+from worlds.render import Picture, cast
+from worlds.segmenter import erring_labels, perfect_labels
+from worlds.shapes import Box, Ellipsoid, Shape, to_world
+from worlds.truth import DemoTruth, Truth
 
 SCENES = {"tabletop": tabletop, "room": room}
 LEAST_POINTS = 1200  # minimum per object, before points that fewer than two photos see are dropped

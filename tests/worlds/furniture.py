@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from perception.demo import textures as tex
-from perception.demo.light import Body, Part
-from perception.demo.shapes import Box, Ellipsoid, Lathe, Tube, rotation_from_axes, spin
-from perception.demo.things import lathe
+from worlds import textures as tex
+from worlds.light import Body, Part
+from worlds.shapes import Box, Ellipsoid, Lathe, Tube, rotation_from_axes, spin
+from worlds.things import lathe
 
 PIXELS = 260  # pixels per metre of a box's texture
 WOODS = {

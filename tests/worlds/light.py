@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from perception.cores import cores
-from perception.demo.cameras import Camera
-from perception.demo.shapes import Box, Shape, placed, spin, to_local, to_world
+from worlds.cameras import Camera
+from worlds.shapes import Box, Shape, placed, spin, to_local, to_world
 
 WORKERS = min(cores(), 8)  # one photo being rendered needs about 150 MB
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from perception.demo.cameras import Camera
 from perception.geometry import OPENCV_FROM_OPENGL
 from perception.io.cloud import write_cloud
 from perception.types import PointCloud
+from worlds.cameras import Camera
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Truth:
 class DemoTruth:
     """Ground truth of a set of photos. Metres, z up.
 
-    instances: by id. asked: the prompts of `perception demo`. names: photo file names. cameras: one per photo.
+    instances: by id. asked: prompts of `perception demo`. names: photo file names. cameras: one per photo.
     points [N, 3] float32, normals [N, 3] float32, colors [N, 3] uint8, instance_ids [N] int32: surface points that at
     least two photos see. folder: folder of the ground truth. photos: path of the photos relative to that folder.
     """
