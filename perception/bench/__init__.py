@@ -1,7 +1,7 @@
 """Benchmarks: `perception bench NAME`."""
 
 BENCHES = {
-    **{name: f"{name}:main" for name in ("rasterizer", "map", "instances", "queries")},
+    **{name: f"{name}:main" for name in ("rasterizer", "instances", "queries")},
     **{"lerf-mask": "lerf:LerfMask.main", "lerf-ovs": "lerf:LerfOvs.main", "scannetpp": "scannetpp:ScanNetPP.main"},
 }
 """Name on the command line -> module of this package and function in it, which takes the arguments."""

@@ -99,8 +99,13 @@ def check_images(images: Sequence[np.ndarray]) -> None:
             )
 
 
+AT_ONCE = 4096
+
+
 def unit_rows(x: np.ndarray) -> np.ndarray:
     """Rows scaled to length 1, float32. Zero rows stay zero."""
+    if x.ndim == 2 and len(x) > AT_ONCE:  # float64 copies of all rows of many maps would take gigabytes
+        return np.concatenate([unit_rows(x[at : at + AT_ONCE]) for at in range(0, len(x), AT_ONCE)])
     norms = np.linalg.norm(x.astype(np.float64), axis=-1, keepdims=True)
     return (x / np.where(norms > 0, norms, 1.0)).astype(np.float32)
 

@@ -138,8 +138,9 @@ class QueryStore(QueryMap):
             )
         check_encoder(self._facts["encoder"], encoder.identity)
         rows = self._rows
+        embeddings = rows.pop("embeddings", np.zeros((0, encoder.dim), np.float32))  # the ranker has its own copy
         descriptions = [
-            InstanceDescription(rows["embeddings"][i], rows["embeddings"][:0], rows["palettes"][i], ["x"] * int(seen))
+            InstanceDescription(embeddings[i], embeddings[:0], rows["palettes"][i], ["x"] * int(seen))
             for i, seen in enumerate(rows.get("seen", ()))
         ]
         read = any(facts["texts_read"] for facts in self.maps)

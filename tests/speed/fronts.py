@@ -1,5 +1,7 @@
 """Minutes against quality: the Pareto front over presets, budget, resolution, iterations, harmonics, features.
 
+python tests/speed/fronts.py SCENE [--set KEY=VALUE] [--only TEXT] [-o OUTPUT]
+
 `perception map` runs in a process of its own for each variant. A finished map stays in OUTPUT/maps with its row, named
 by a key of the scene, the settings and the source code, so a stopped sweep goes on. Held-out views are scored at each
 variant's own resolution; those of another resolution than the default's are marked and kept off the front, since a
@@ -151,8 +153,8 @@ def pareto(points: Sequence[tuple[float, float | None]]) -> list[int]:
 
 
 def sweep_parser() -> argparse.ArgumentParser:
-    """The options of `bench map`."""
-    parser = bench_parser("map", __doc__)
+    """The options of the command."""
+    parser = bench_parser("fronts", __doc__)
     parser.add_argument("scene", type=Path, metavar="SCENE", help="input of `map`; its truth, where there, gives AP")
     parser.add_argument("--masks", metavar="SOURCE", help="as of `map`; default: SCENE/labels where there, else auto")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
@@ -172,4 +174,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for index in pareto(list(zip((row["cpu_minutes"] for row in rows), values, strict=True))):
             rows[index]["front"] = f"{rows[index]['front']} {key}".strip()
     text = f"{options.scene.name}; on the front (CPU minutes against ...):\n{table(rows, COLUMNS)}"
-    finish("map", options, {"scene": options.scene.name, "rows": rows}, text)
+    finish("fronts", options, {"scene": options.scene.name, "rows": rows}, text)
+
+
+if __name__ == "__main__":
+    main()

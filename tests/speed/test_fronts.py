@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perception.bench import map as bench_map
-from perception.bench.map import Variant, pareto, run_sweep, settings_of, sweep_parser, variants
 from perception.bench.output import table
 from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
 from perception.evaluate.layouts import run_instances
+from speed import fronts
+from speed.fronts import Variant, pareto, run_sweep, settings_of, sweep_parser, variants
 
 
 def test_the_front_is_what_brute_force_says() -> None:
@@ -55,7 +55,7 @@ def test_an_interrupted_sweep_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
         trained.append(variant.name)
         return {"minutes": 1.0, "psnr": 20.0}
 
-    monkeypatch.setattr(bench_map, "map_variant", train)
+    monkeypatch.setattr(fronts, "map_variant", train)
     cells = [Variant("g", name, (f"losses.margin={margin}",)) for name, margin in (("a", 1), ("b", 2), ("c", 3))]
     with pytest.raises(KeyboardInterrupt):
         run_sweep(options_of(tmp_path), cells)
@@ -73,7 +73,7 @@ def test_a_table_shows_what_is_missing() -> None:
 
 
 @pytest.mark.slow
-def test_a_bench_maps_and_scores_a_scene(small_scene: Path, tmp_path: Path) -> None:
+def test_a_front_maps_and_scores_a_scene(small_scene: Path, tmp_path: Path) -> None:
     """The AP of a row is that of `export` and `eval` on its map."""
     scene, out = tmp_path / "scene", tmp_path / "out"
     shutil.copytree(small_scene, scene)
@@ -82,9 +82,8 @@ def test_a_bench_maps_and_scores_a_scene(small_scene: Path, tmp_path: Path) -> N
         shutil.copy(small_scene / "truth" / name, scene / name)
     small = ["train.iterations=60", "train.budget=3000", "densify.every=10", "instances.min_cluster_size=15"]
     small.append("language.encoder=none")
-    command = ["bench", "map", str(scene), "-o", str(out), "--only", "feature_dim 4"]
-    assert main([*command, *(f"--set={pair}" for pair in small)]) == 0
-    rows = json.loads((out / "map.json").read_text())["rows"]
+    fronts.main([str(scene), "-o", str(out), "--only", "feature_dim 4", *(f"--set={pair}" for pair in small)])
+    rows = json.loads((out / "fronts.json").read_text())["rows"]
     assert [(row["group"], row["name"]) for row in rows] == [("preset", "default"), ("feature_dim", "4")]
     info = json.loads((Path(rows[1]["map"]) / "map.json").read_text())
     assert (info["num_gaussians"], info["quality"]["psnr"]) == (rows[1]["gaussians"], rows[1]["psnr"])
