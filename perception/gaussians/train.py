@@ -114,10 +114,6 @@ class Trainer:
         self.held_out = held_out
         self.extent = scene_extent(views)
         self.record = TrainRecord()
-        if self.config != config:
-            train = self.config.train
-            told = f"size: {len(views)} photos, {train.iterations} iterations, at most {train.budget} Gaussians"
-            self.record.decisions.append(told)
         self.iteration = 0
         self.complete = False  # finished, unless a longer training is requested
         self.skipped = 0.0  # share of training progress skipped by early stopping

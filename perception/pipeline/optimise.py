@@ -84,6 +84,9 @@ def optimise(
     """
     config = sized(run.config, len(photos.views), largest_budget(memory_limit()))
     trainer = Trainer(initial_gaussians(scene, config, photos.views), photos.views, config, photos.held, run.device)
+    if config != run.config:
+        size = f"{config.train.iterations} iterations, at most {config.train.budget} Gaussians"
+        trainer.record.decisions.append(f"size: {size}, for {len(photos.views)} photos")
     from_geometry = isinstance(source, BuiltinSegmentation)
     masks_enter = GEOMETRY_START if from_geometry else config.losses.start
     observer = TrainingObserver(run.work, run.mark, source.identity, masks_enter, run.progress)
