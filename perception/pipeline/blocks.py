@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy import sparse
 
 from perception.config import MapConfig
 from perception.errors import InputError
@@ -72,7 +73,7 @@ def cut(scene: Scene, most: int) -> list[Block]:
         return [whole]
     step = -(-len(scene.points) // SAMPLE)
     points = scene.points[::step]
-    seen = np.stack([visible_points(view, points) for view in scene.views])
+    seen = sparse.csr_matrix(sparse.vstack([_row(visible_points(view, points)) for view in scene.views]))
     centres = camera_centres(np.stack([view.camera_from_world for view in scene.views]))
     return _halved(whole, points, seen, centres, most)
 
@@ -93,10 +94,15 @@ def visible_points(view: View, points: np.ndarray) -> np.ndarray:
     return np.asarray(inside)
 
 
-def _halved(block: Block, points: np.ndarray, seen: np.ndarray, centres: np.ndarray, most: int) -> list[Block]:
+def _row(visible: np.ndarray) -> sparse.csr_matrix:
+    return sparse.csr_matrix(visible[None].astype(np.float32))
+
+
+def _halved(block: Block, points: np.ndarray, seen: sparse.csr_matrix, centres: np.ndarray, most: int) -> list[Block]:
+    """seen [V, P]: 1 where a photo sees a point."""
     if len(block.views) <= most:
         return [block]
-    inside = points[block.owns(points) & seen[block.views].any(axis=0)]
+    inside = points[block.owns(points) & (seen[block.views].getnnz(axis=0) > 0)]
     best, fewest = None, (np.inf, np.inf)
     for axis in range(3) if len(inside) else ():
         for place in np.quantile(inside[:, axis], np.arange(0.2, 0.81, 0.1)):
@@ -110,14 +116,15 @@ def _halved(block: Block, points: np.ndarray, seen: np.ndarray, centres: np.ndar
 
 
 def _divided(
-    block: Block, axis: int, place: float, points: np.ndarray, seen: np.ndarray, centres: np.ndarray
+    block: Block, axis: int, place: float, points: np.ndarray, seen: sparse.csr_matrix, centres: np.ndarray
 ) -> list[Block]:
     """The block's halves below and above `place`. A photo that sees too little of both is with the one it stands in."""
-    sides, counts = [], np.maximum(seen[block.views].sum(axis=1), 1)
+    sides, own = [], seen[block.views]
+    counts = np.maximum(own.getnnz(axis=1), 1)
     middle = np.where(np.arange(3) == axis, place, np.nan)
     for low, high in ((block.low, np.fmin(block.high, middle)), (np.fmax(block.low, middle), block.high)):
         half = replace(block, low=low, high=high)
-        share = seen[block.views] @ half.owns(points).astype(np.float32) / counts
+        share = own @ half.owns(points).astype(np.float32) / counts
         sides.append((half, share >= SEEN))
     neither = ~(sides[0][1] | sides[1][1])
     below = centres[block.views, axis] < place
