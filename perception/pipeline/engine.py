@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import socket
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -47,6 +48,7 @@ class Engine:
             import ray
         except ImportError as error:
             raise missing_extra("ray", "ray") from error
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is told to others
         started = not ray.is_initialized()
         try:
             if self.address not in (None, "auto"):  # Ray itself tries for seven minutes
