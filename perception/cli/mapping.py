@@ -6,11 +6,14 @@ import argparse
 import signal
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from perception.cli.parser import command, map_command
 from perception.errors import InputError
 from perception.interrupts import handled
+
+if TYPE_CHECKING:
+    pass
 
 
 def register(commands: Any) -> None:

@@ -1,4 +1,4 @@
-"""What users ask of finished maps: `perception query`, `index`, `export`, `render`, `label` and others."""
+"""What users ask of a finished map: `perception query`, `export`, `render`, `label`, `relink`, `upgrade`, `scale`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from perception.cli.parser import command, map_command
+from perception.cli.parser import map_command
 from perception.errors import InputError
 
 
@@ -17,10 +17,6 @@ def register(commands: Any) -> None:
     p.add_argument("--top", type=int, default=20, metavar="K", help="at most so many hits of those that answer (20)")
     p.add_argument("--min-score", type=float, metavar="X", help="all with this score instead of those that answer")
     p.add_argument("--points", type=Path, metavar="OUT.ply", help="write the hits' points, labelled by instance_id")
-    p = command(commands, "index", _index, "one store of many maps, which answers prompts across all of them")
-    p.add_argument("maps", nargs="*", type=Path, metavar="MAP", help="added, or replaced where they have changed")
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="STORE")
-    p.add_argument("--remove", nargs="+", type=Path, default=[], metavar="MAP", help="maps to be forgotten")
     p = map_command(commands, "export", _export, "instances onto a point cloud or mesh, or onto the map's own points")
     p.add_argument("--points", type=Path, metavar="CLOUD")
     place = p.add_mutually_exclusive_group()
@@ -70,28 +66,15 @@ def register(commands: Any) -> None:
 
 
 def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.map_files import is_store
     from perception.pipeline.summary import query_text, write_hits
     from perception.query import load_map
 
     opened = load_map(args.map)
     answers = [(text, opened.query(text, args.top, args.min_score)) for text in args.text]
     if args.points:
-        if is_store(args.map):
-            raise InputError("--points: the hits lie in the frames of their maps; ask one of these maps")
         write_hits(args.points, [hit for _, hits in answers for hit in hits])
     results = [{"text": text, "present": bool(hits), "hits": [h.to_json() for h in hits]} for text, hits in answers]
     return {"results": results, "frame": opened.frame, "metric": opened.metric}, query_text(answers, opened.metric)
-
-
-def _index(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.progress import Progress
-    from perception.query.store import index_maps
-
-    with Progress(quiet=args.json) as progress:
-        facts = index_maps(args.maps, args.output, args.remove, progress)
-    counts = ", ".join(f"{facts[name]} {name}" for name in ("added", "replaced", "unchanged", "removed") if facts[name])
-    return facts, f"{args.output}: {counts}; {facts['instances']} instances of {facts['maps']} maps"
 
 
 def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

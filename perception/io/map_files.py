@@ -151,22 +151,11 @@ def read_info(path: Path) -> dict[str, Any]:
     return _read_facts(standing(Path(path)))[0]
 
 
-STORE_FACTS, STORED = "store.json", "maps"
-"""Of a store of many maps (`perception index`): its facts, and its folder with a file for each map."""
-
-
-def is_store(path: Path) -> bool:
-    """Whether `path` is a store of many maps."""
-    return (path / STORE_FACTS).is_file()
-
-
 def map_signature(path: Path) -> Signature:
-    """Inodes, times and sizes that change when the map or its labels at `path` change, or the store of maps there.
-    InputError when none exists."""
+    """Inodes, times and sizes that change when the map or its labels at `path` change. InputError when none exists."""
     folder = standing(path)
-    files = (STORE_FACTS, STORED) if is_store(folder) else (FACTS, EDITABLE)
     try:
-        stats = [file.stat() for file in (folder, *(folder / name for name in files))]
+        stats = [file.stat() for file in (folder, folder / FACTS, folder / EDITABLE)]
     except OSError as error:
         raise InputError(f"{path}: the map is gone ({error.strerror}); build it again or put it back") from error
     return tuple((stat.st_ino, stat.st_mtime_ns if n else 0, stat.st_size if n else 0) for n, stat in enumerate(stats))

@@ -56,11 +56,10 @@ def quoted_text(prompt: str) -> tuple[str, str] | None:
 
 
 class Printed:
-    """The texts of instances, prepared for prompts. texts: of each instance, entries {"text", "score"}. starts: the
-    first instance of each map, where they are of several."""
+    """The texts of a map's instances, prepared for prompts. texts: of each instance, entries {"text", "score"}."""
 
-    def __init__(self, texts: Sequence[Sequence[dict[str, Any]]], starts: Sequence[int] = (0,)) -> None:
-        self.count, self._starts = len(texts), starts
+    def __init__(self, texts: Sequence[Sequence[dict[str, Any]]]) -> None:
+        self.count = len(texts)
         self._lines = [(i, _folded(e["text"]), float(e["score"])) for i, es in enumerate(texts) for e in es]
 
     def __bool__(self) -> bool:
@@ -84,9 +83,8 @@ class Printed:
         for n, word in enumerate(words):
             for i, line, score in self._lines:
                 best[n, i] = max(best[n, i], score * match_quality(word, line))
-        for a, b in zip(self._starts, [*self._starts[1:], self.count], strict=True):
-            most = best[:, a:b].max(axis=1, initial=1e-9, keepdims=True)
-            best[:, a:b] *= (best[:, a:b] / most) ** RIVAL
+        most = best.max(axis=1, initial=1e-9, keepdims=True)
+        best *= (best / most) ** RIVAL
         return np.asarray(weights, np.float64) @ best / max(sum(weights), 1)
 
 

@@ -30,7 +30,6 @@ from pathlib import Path
 from statistics import NormalDist
 
 import numpy as np
-from scipy.special import erfc
 
 from perception.errors import InputError
 from perception.language.base import Encoder, Part, check_texts, reading_of, unit_rows
@@ -94,18 +93,15 @@ class Ranker:
         shapes: Callable[[], np.ndarray] | None = None,
         printed: Printed | None = None,
         extents: np.ndarray | None = None,
-        starts: Sequence[int] = (0,),
     ) -> None:
         """labels: the user's name of each instance, or None. shapes: returns scores [I, K] of `shape_words.KINDS`. It
         is called at the first prompt. printed: the texts of the instances; None: not looked for.
-        extents: [I, 3] sides of their boxes in metres, NaN or None if the map's scale is unknown. starts: the first
-        instance of each map, ascending, where they are of several; each is scored as in its own map.
+        extents: [I, 3] sides of their boxes in metres; None if the map's scale is unknown.
         """
         if labels is not None and len(labels) != len(descriptions):
             raise InputError(f"labels: expected one per instance ({len(descriptions)}), found {len(labels)}")
         self._encoder, self._measure_shapes, self._printed = encoder, shapes, printed
         self._extents = extents
-        self._maps = [slice(a, b) for a, b in zip(starts, [*starts[1:], len(descriptions)], strict=True)]
         self.seen = np.array([d.seen for d in descriptions], bool)
         rows = np.array([d.embedding for d in descriptions], np.float32).reshape(
             len(descriptions), len(descriptions[0].embedding) if descriptions else encoder.dim
@@ -139,8 +135,7 @@ class Ranker:
             return Answer(text, [], False)
         quoted = quoted_text(text) if self._printed is not None else None
         scores = self._scores(text if quoted is None else quoted[0], quoted and quoted[1], gain)
-        order = np.argsort(-scores, kind="stable")
-        hits = list(zip(order.tolist(), scores[order].tolist(), strict=True))
+        hits = [(int(i), float(scores[i])) for i in np.argsort(-scores, kind="stable")]
         return Answer(text, hits, bool(answering(hits)))
 
     def _scores(self, text: str, quoted: str | None = None, gain: np.ndarray | float = 0.0) -> np.ndarray:
@@ -152,7 +147,7 @@ class Ranker:
         borne, (middle, spread) = np.ones(len(self._plain)), self._null
         z = (relevancy - middle) / spread + self._shape_bonus(text) + gain
         if self._extents is not None and (known := household_thing(text)):
-            length, thickness = np.nan_to_num(np.minimum(size_misfits(self._extents, known), 2.0))
+            length, thickness = np.minimum(size_misfits(self._extents, known), 2.0)
             z = z - SIZE_WEIGHT * length - THICK_WEIGHT * thickness
         if quoted is not None and self._printed is not None:
             borne = self._printed.quoted(quoted)
@@ -162,7 +157,7 @@ class Ranker:
         if colors:
             z = z + COLOR_WEIGHT * (color_match(self._palettes, colors) - 0.5)
         slope, offset = self._reading.calibration
-        scores = 0.5 * erfc(-(slope * z + offset) / math.sqrt(2.0)) * np.minimum(1.0, QUOTED_LEAST + borne)
+        scores = np.array([_phi(slope * x + offset) for x in z]) * np.minimum(1.0, QUOTED_LEAST + borne)
         if len(self._canonical):
             scores = np.minimum(scores, 2 * PRESENT * self._against_canonical(row))
         scores[~self.seen] = 0.0
@@ -219,15 +214,13 @@ class Ranker:
         return x
 
     def _compared(self, rows: np.ndarray) -> list[_Part]:
-        """The parts of the embeddings [I, D]: each minus BETA times its map's mean, then scaled to length 1."""
-        start, parts = 0, []
+        """The parts of the embeddings [I, D]: each minus BETA times the map's mean, then scaled to length 1."""
+        seen, start, parts = rows[self.seen], 0, []
         for part in self._reading.parts or (Part(self._encoder.dim),):
             place = slice(start, part.stop)
-            own = rows[:, place].copy()
-            for of_map in self._maps:
-                seen, lengths = own[of_map][self.seen[of_map]], np.linalg.norm(own[of_map], axis=1, keepdims=True)
-                if len(seen) > 1:
-                    own[of_map] -= BETA * unit_rows(seen).mean(axis=0) * lengths
+            own = rows[:, place]
+            if len(seen) > 1:
+                own = own - BETA * unit_rows(seen[:, place]).mean(axis=0) * np.linalg.norm(own, axis=1, keepdims=True)
             parts.append(_Part(place, part.weight, unit_rows(own), part.references))
             start = part.stop
         return parts
@@ -246,16 +239,13 @@ class Ranker:
         rows = self._encoder.encode_texts(filled).reshape(len(templates), len(texts), -1)
         return unit_rows(rows.mean(axis=0))
 
-    def _best_of_absent(self, probe_rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """m and s [I] of the module docstring: median and scale of the probes' best relevancies in its map."""
-        middles, spreads = np.zeros(len(self._plain)), np.ones(len(self._plain))
-        relevancy = self._relevancy(probe_rows)
-        for of_map in self._maps:
-            if self.seen[of_map].any():
-                best = relevancy[:, of_map][:, self.seen[of_map]].max(axis=1)
-                middle, high = np.quantile(best, [0.5, QUANTILE])
-                middles[of_map], spreads[of_map] = middle, max(float(high - middle) / NORMAL_QUANTILE, 1e-6)
-        return middles, spreads
+    def _best_of_absent(self, probe_rows: np.ndarray) -> tuple[float, float]:
+        """m and s of the module docstring: median and scale of the probes' best relevancies in this map."""
+        if not self.seen.any():
+            return 0.0, 1.0
+        best = self._relevancy(probe_rows)[:, self.seen].max(axis=1)
+        middle, high = np.quantile(best, [0.5, QUANTILE])
+        return float(middle), max(float(high - middle) / NORMAL_QUANTILE, 1e-6)
 
 
 def probes() -> list[str]:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from perception.query import Hit
-from perception.query.store import StoredHit
 
 
 def map_facts(path: Path, info: dict[str, Any], gaussians: int, instances: int) -> dict[str, Any]:
@@ -104,11 +103,10 @@ def query_text(answers: list[tuple[str, list[Hit]]], metric: bool) -> str:
             name = f" ({hit.label})" if hit.label else ""
             name += "" if hit.part is None else f", part {hit.part}"
             name += f", together {', '.join(map(str, hit.instances))}" if hit.instances else ""
-            name += f" in {hit.map}" if isinstance(hit, StoredHit) else ""
             lines.append(
                 f'"{text}" {rank}. instance {hit.instance_id}{name}  score {hit.score:.2f}'
                 f"  at {x:.3f} {y:.3f} {z:.3f}{unit}"
-                f"  size {a:.3f} x {b:.3f} x {c:.3f}{unit}  {hit.num_points} points"
+                f"  size {a:.3f} x {b:.3f} x {c:.3f}{unit}  {len(hit.points)} points"
             )
     return "\n".join(lines)
 

@@ -42,11 +42,6 @@ class Hit:
     instances: tuple[int, ...] = ()
     colors: Callable[[], np.ndarray] | None = field(default=None, repr=False, compare=False)
 
-    @property
-    def num_points(self) -> int:
-        """P"""
-        return len(self.points)
-
     def transformed(self, a_from_b: np.ndarray, frame: str | None = None) -> Hit:
         """The same hit in frame a, given a_from_b [4, 4] (rigid or similarity) from the frame it is in now.
 
@@ -79,7 +74,7 @@ class Hit:
         answer: dict[str, Any] = {
             "instance_id": self.instance_id,
             "score": round(float(self.score), 4),
-            "num_points": self.num_points,
+            "num_points": len(self.points),
             "centroid": [float(x) for x in self.centroid],
             "obb": self.obb.to_json(),
             "label": self.label,

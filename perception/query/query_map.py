@@ -12,7 +12,6 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import move_points
 from perception.io.map import Map
-from perception.io.map_files import is_store
 from perception.language.ranking import Ranker, answering
 from perception.query.hit import Description, Hit, Neighbor
 from perception.query.nodes import Nodes
@@ -291,15 +290,9 @@ class QueryMap(Map):
 def load_map(path: str | Path, encoders: Encoders | None = None) -> QueryMap:
     """Opens a map directory, a million Gaussians in well under a second.
 
-    A store of many maps (`perception index`) opens as a `QueryStore`, which answers prompts.
-
     encoders: makes an encoder from its name in the map's config; perception.language.encoders.make_encoder when None.
     Raises InputError when `path` is no map, damaged, or of another format version.
     """
-    if is_store(Path(path)):
-        from perception.query.store import QueryStore
-
-        return QueryStore(Path(path), encoders)
     gmap = QueryMap.open(Path(path))
     gmap.encoders = encoders
     return gmap
