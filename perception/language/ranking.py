@@ -258,7 +258,8 @@ class Ranker:
         """Combines image score and label: 1 if the label equals the prompt, else max(score, Φ(z − LABEL_MARGIN))."""
         if not len(self._named):
             return scores
-        z = (self._label_rows @ self._encode([text])[0] - self._label_null[0]) / self._label_null[1]
+        fits = self._label_rows @ self._encode([text])[0]
+        z = ((fits - self._label_null[0]) / self._label_null[1]).astype(np.float64)
         words = _words(text)
         same = np.array([self._names[i] == words for i in self._named])
         scores[self._named] = np.where(same, 1.0, np.maximum(scores[self._named], ndtr(z - LABEL_MARGIN)))

@@ -58,8 +58,8 @@ def index_maps(
                 entries[str(path)] = _indexed(store, gmap, facts)
             counts["added" if before is None else "unchanged" if entries[str(path)] is before else "replaced"] += 1
             progress.update("maps", n, len(paths))
-        if not entries and not (store / STORE).is_file():
-            raise InputError(f"{store}: nothing to index; give maps")
+        if not entries:
+            raise InputError(f"{store}: would hold no map; give maps, or delete it")
         facts["maps"] = [entries[path] for path in sorted(entries)]
         with atomic_file(store / STORE) as aside:
             aside.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
@@ -82,13 +82,14 @@ def _facts(store: Path) -> dict[str, Any]:
 def _indexed(store: Path, gmap: QueryMap, facts: dict[str, Any]) -> dict[str, Any]:
     """Writes the file of a map, unless it is there; returns its entry for `facts`, whose encoder is set or compared."""
     path = Path(str(gmap.path))
+    if (problem := gmap.problem) is not None:
+        raise InputError(problem if str(path) in problem else f"{path}: {problem}")
     spec = gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
-    identity = str(gmap.language.get("encoder", ""))
-    known = facts["encoder"] if facts["maps"] or facts["encoder"] else None
-    if known is not None and known["identity"] != identity:
-        found = f"its embeddings were made by '{identity}', those of the store by '{known['identity']}'"
+    identity = str(gmap.language["encoder"])
+    known = facts["encoder"] = facts["encoder"] or {"name": "conse" if spec == "auto" else spec, "identity": identity}
+    if known["identity"] != identity:
+        found = f"its embeddings were made by '{identity}', those of {store} by '{known['identity']}'"
         raise InputError(f"{path}: {found}; run: perception upgrade MAP, or give another store")
-    facts["encoder"] = known or {"name": "conse" if spec == "auto" else spec, "identity": identity}
     key = json.dumps([str(path), gmap.map_id, identity, FORMAT_VERSION])
     file = hashlib.sha256(key.encode()).hexdigest()[:32] + ".npz"
     if not (store / "maps" / file).is_file():

@@ -237,8 +237,8 @@ class MapStore(QueryMap):
             except (ValueError, TypeError, KeyError) as error:
                 raise _damaged(file, error) from error
         try:
-            records = {name: rows.pop(name).view(kind)[:, 0] for name, kind in _RECORDS.items()} if rows else {}
-            self._told = records.get("told", np.zeros(0, TOLD))
+            records = {name: rows.pop(name).view(kind)[:, 0] for name, kind in _RECORDS.items()}
+            self._told = records["told"]
             labels = {name: np.concatenate(ragged[name]) for name in ("label_rows", "label_null")}
             self._arrays = {**rows, **labels, "things": records["things"]}
             self._names = [json.loads(names.tobytes()) for names in ragged["names"]]
@@ -262,6 +262,8 @@ def read_store(path: Path) -> tuple[dict[str, Any], bytes]:
                 "index the maps into a new store"
             )
         _ = facts["encoder"]["name"], facts["encoder"]["identity"]
+        if not facts["maps"]:
+            raise ValueError("it holds no map")
         for entry in facts["maps"]:
             kinds = {"map": str, "map_id": str, "frame": str, "metric": bool, "instances": int, "file": str}
             wrong = [key for key, kind in kinds.items() if not isinstance(entry[key], kind)]
