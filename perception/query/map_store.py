@@ -68,8 +68,7 @@ class MapStore(QueryMap):
 
         def __getattr__(self, name: str) -> Any:
             if name in {field.name for field in fields(Map)}:
-                count = len(self.maps)
-                raise InputError(f"{self.path}: is a store of {count} maps, and this needs one map; give one of them")
+                raise InputError(f"{self.path}: is a store of many maps, and this needs one map; give one of them")
             raise AttributeError(f"{type(self).__name__} has no attribute '{name}'")
 
     @classmethod
