@@ -148,11 +148,10 @@ class MapStore(QueryMap):
         if encoder is None:
             raise InputError(f"{self.path}: names no encoder; index its maps anew")
         check_encoder(identity, encoder.identity)
-        groups = np.repeat(np.arange(len(self.maps)), [entry["instances"] for entry in self.maps])
         texts = [text for names in self._names for text in names["texts"] or [[]] * len(names["labels"])]
         labels = [label for names in self._names for label in names["labels"]]
-        reads = np.array([names["texts"] is not None for names in self._names], bool)[groups]
-        return Ranker.joined(encoder, self._arrays, labels, Printed(texts, groups), reads)
+        reads = np.array([names["texts"] is not None for names in self._names], bool)[self._groups]
+        return Ranker.joined(encoder, self._arrays, labels, Printed(texts, self._groups), reads)
 
     # --------------------------------------------------------------- internals
 
@@ -160,10 +159,9 @@ class MapStore(QueryMap):
         """(index, score) of at most MAX_TOP instances that answer, best first."""
         with one_thread():
             scores = self._scores(text)
-        least = np.full(len(scores), min_score, np.float64)
-        for own in self._slices if min_score is None else ():
-            least[own] = least_score(scores[own].max(initial=0.0))
-        found = np.flatnonzero(scores >= least)
+        best = np.zeros(len(self.maps))
+        np.maximum.at(best, self._groups, scores)
+        found = np.flatnonzero(scores >= (least_score(best)[self._groups] if min_score is None else min_score))
         return [(int(n), float(scores[n])) for n in found[np.argsort(-scores[found], kind="stable")][:MAX_TOP]]
 
     def _scores(self, text: str) -> np.ndarray:
@@ -183,7 +181,7 @@ class MapStore(QueryMap):
         return scores
 
     def _hit(self, position: int, score: float) -> Hit:
-        told, n = self._told[position], int(np.searchsorted(self._stops, position, side="right"))
+        told, n = self._told[position], int(self._groups[position])
         entry, place = self.maps[n], position - self._slices[n].start
         number = int(told["id"])
         return Hit(
@@ -219,8 +217,9 @@ class MapStore(QueryMap):
     def _read(self) -> None:
         """Reads all arrays; those with a row per instance are put after each other."""
         counts = [entry["instances"] for entry in self.maps]
-        self._stops = np.cumsum(counts, dtype=np.int64)
-        self._slices = [slice(int(stop) - count, int(stop)) for stop, count in zip(self._stops, counts, strict=True)]
+        self._groups = np.repeat(np.arange(len(counts)), counts)
+        stops = np.cumsum(counts).tolist()
+        self._slices = [slice(stop - count, stop) for stop, count in zip(stops, counts, strict=True)]
         rows: dict[str, np.ndarray] = {}
         ragged: dict[str, list[Any]] = {name: [] for name in _RAGGED}
         for own, entry in zip(self._slices, self.maps, strict=True):

@@ -208,7 +208,9 @@ def lance(rows: np.ndarray, folder: Path, metric: str, index: bool) -> Callable[
         table.create_index(metric=metric, vector_column_name="vector", index_type="IVF_HNSW_SQ")
 
     def search(row: np.ndarray, top: int) -> list[int]:
-        query = table.search(row, vector_column_name="vector").distance_type(metric).select(["n"]).limit(top)
+        query = (
+            table.search(row, vector_column_name="vector").distance_type(metric).select(["n", "_distance"]).limit(top)
+        )
         return [int(n) for n in query.to_arrow()["n"].to_numpy()]
 
     return search
@@ -274,10 +276,9 @@ def main() -> None:
     parser.add_argument("--maps", type=int, default=1000, metavar="N")
     parser.add_argument("--instances", type=int, default=60, metavar="N", help="of each map")
     parser.add_argument("--prompts", type=int, default=120, metavar="N")
+    parser.add_argument("--every", type=int, default=6, metavar="N", help="ask every N-th prompt of each map alone too")
     parser.add_argument("--compare", action="store_true", help="with LanceDB and Qdrant Edge, which must be installed")
-    parser.add_argument(
-        "--folder", type=Path, help="where to work, and to find the maps of an earlier run; else temporary"
-    )
+    parser.add_argument("--folder", type=Path, help="where to work, with what lies there; else temporary")
     parser.add_argument("--json", type=Path, metavar="OUT.json")
     args = parser.parse_args()
     folder = args.folder or Path(tempfile.mkdtemp(prefix="store-"))
@@ -286,27 +287,29 @@ def main() -> None:
         if not maps.exists():
             apart(make_maps, folder / "making", args.maps, args.instances)
             (folder / "making").rename(maps)
-        shutil.rmtree(store, ignore_errors=True)
-        facts: dict[str, Any] = {"build": apart(build, maps, store), "ask": apart(ask, store, texts)}
-        answers = facts["ask"].pop("answers")
-        facts["agreement"] = agreement(answers, apart(alone, maps, texts)["answers"])
-        show(facts)
-        for name in DATABASES if args.compare else ():
-            for folded in (False, True):
+        facts: dict[str, Any] = {}
+
+        def done(key: str, values: dict[str, Any]) -> None:
+            facts[key] = values
+            print(f"{key}: " + ", ".join(f"{name} {value:.4g}" for name, value in values.items()), flush=True)
+
+        if not store.exists() or args.folder is None:
+            done("build", apart(build, maps, store))
+        asked = apart(ask, store, texts)
+        answers = asked.pop("answers")
+        done("ask", asked)
+        some = slice(None, None, args.every)
+        done("agreement", agreement(answers[some], apart(alone, maps, texts[some])["answers"]))
+        for folded in (False, True) if args.compare else ():
+            for name in DATABASES:
                 with tempfile.TemporaryDirectory(dir=folder) as place:
-                    key = f"{name}, {'folded' if folded else 'cosine'}"
-                    facts[key] = apart(compared, store, Path(place), texts, answers, name, folded)
-                    show({key: facts[key]})
+                    values = apart(compared, store, Path(place), texts, answers, name, folded)
+                    done(f"{name}, {'folded' if folded else 'cosine'}", values)
         if args.json is not None:
             args.json.write_text(json.dumps(facts, indent=1) + "\n")
     finally:
         if args.folder is None:
             shutil.rmtree(folder)
-
-
-def show(facts: dict[str, Any]) -> None:
-    for key, values in facts.items():
-        print(f"{key}: " + ", ".join(f"{name} {value:.4g}" for name, value in values.items()), flush=True)
 
 
 if __name__ == "__main__":
