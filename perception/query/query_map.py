@@ -11,6 +11,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import move_points
+from perception.io.checksums import STORE
 from perception.io.map import Map
 from perception.language.ranking import Ranker, answering
 from perception.query.hit import Description, Hit, Neighbor
@@ -50,6 +51,11 @@ class QueryMap(Map):
     def ranker(self) -> Ranker:
         """The ranker of instances for prompts; InputError when the map has no embeddings or encoder."""
         return self._ranking.ranker
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How much it holds."""
+        return {"instances": len(self.instances), "gaussians": int(self.info.get("num_gaussians", 0))}
 
     def warm(self) -> None:
         """Prepares what the first queries need: spatial index, shape scores, text encoder."""
@@ -288,11 +294,13 @@ class QueryMap(Map):
 
 
 def load_map(path: str | Path, encoders: Encoders | None = None) -> QueryMap:
-    """Opens a map directory, a million Gaussians in well under a second.
+    """Opens a map directory, a million Gaussians in well under a second, or a store of many maps (`MapStore`).
 
     encoders: makes an encoder from its name in the map's config; perception.language.encoders.make_encoder when None.
-    Raises InputError when `path` is no map, damaged, or of another format version.
+    Raises InputError when `path` is neither, damaged, or of another format version.
     """
-    gmap = QueryMap.open(Path(path))
+    from perception.query.map_store import MapStore
+
+    gmap = (MapStore if (Path(path) / STORE).is_file() else QueryMap).open(Path(path))
     gmap.encoders = encoders
     return gmap

@@ -62,9 +62,9 @@ class TextRanking:
             if (answer := self._by_label(text)) is not None:
                 return answer
             raise
-        with _one_thread():
+        with one_thread():
             named = self._by_label(text) is not None
-            answer = ranker.rank(text) if named else ranked(ranker, self._places, text)
+            answer = ranker.rank(text) if named else ranked(ranker, self.places, text)
         with self._lock:
             self._ranked[key] = answer
             if len(self._ranked) > REMEMBERED:
@@ -107,7 +107,8 @@ class TextRanking:
         return Ranker(descriptions, encoder, labels, self._shapes, printed_on(self._gmap, self._texts), sizes)
 
     @cached_property
-    def _places(self) -> Places | None:
+    def places(self) -> Places | None:
+        """Where the instances stand to each other; None where up is not known."""
         return Places.of(self._gmap)
 
     def _shapes(self) -> np.ndarray:
@@ -146,7 +147,7 @@ def printed_on(gmap: Map, use: bool = True) -> Printed | None:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """Limits torch to one thread. A prompt has a few tokens, so a second thread costs more than it saves: 10 ms on one
     core against 24 on two, far more on a busy machine. Servers run several prompts in parallel instead."""
     torch = sys.modules.get("torch")
