@@ -1,4 +1,5 @@
-"""What users ask of finished maps: `perception query`, `index`, `export`, `render`, `label` and others."""
+"""What users ask of a finished map: `perception query`, `index`, `export`, `render`, `label`, `relink`, `upgrade`,
+`scale`."""
 
 from __future__ import annotations
 
@@ -17,10 +18,10 @@ def register(commands: Any) -> None:
     p.add_argument("--top", type=int, default=20, metavar="K", help="at most so many hits of those that answer (20)")
     p.add_argument("--min-score", type=float, metavar="X", help="all with this score instead of those that answer")
     p.add_argument("--points", type=Path, metavar="OUT.ply", help="write the hits' points, labelled by instance_id")
-    p = command(commands, "index", _index, "one store of many maps, which answers prompts across all of them")
-    p.add_argument("maps", nargs="*", type=Path, metavar="MAP", help="added, or replaced where they have changed")
+    p = command(commands, "index", _index, "many maps into one store, which is asked as a map is: query, serve")
+    p.add_argument("maps", type=Path, nargs="*", metavar="MAP", help="maps that are new or may have changed")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="STORE")
-    p.add_argument("--remove", nargs="+", type=Path, default=[], metavar="MAP", help="maps to be forgotten")
+    p.add_argument("--remove", type=Path, action="append", default=[], metavar="MAP", help="take it out of the store")
     p = map_command(commands, "export", _export, "instances onto a point cloud or mesh, or onto the map's own points")
     p.add_argument("--points", type=Path, metavar="CLOUD")
     place = p.add_mutually_exclusive_group()
@@ -70,15 +71,14 @@ def register(commands: Any) -> None:
 
 
 def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.map_files import is_store
     from perception.pipeline.summary import query_text, write_hits
     from perception.query import load_map
 
     opened = load_map(args.map)
     answers = [(text, opened.query(text, args.top, args.min_score)) for text in args.text]
+    if args.points and any(hit.map is not None for _, hits in answers for hit in hits):
+        raise InputError(f"{args.map}: is a store, whose maps have their own frames; give --points with one map")
     if args.points:
-        if is_store(args.map):
-            raise InputError("--points: the hits lie in the frames of their maps; ask one of these maps")
         write_hits(args.points, [hit for _, hits in answers for hit in hits])
     results = [{"text": text, "present": bool(hits), "hits": [h.to_json() for h in hits]} for text, hits in answers]
     return {"results": results, "frame": opened.frame, "metric": opened.metric}, query_text(answers, opened.metric)
@@ -86,12 +86,15 @@ def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _index(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.progress import Progress
-    from perception.query.store import index_maps
+    from perception.query.indexing import index_maps
 
+    if not args.maps and not args.remove:
+        raise InputError("index: give maps, or --remove MAP")
     with Progress(quiet=args.json) as progress:
-        facts = index_maps(args.maps, args.output, args.remove, progress)
-    counts = ", ".join(f"{facts[name]} {name}" for name in ("added", "replaced", "unchanged", "removed") if facts[name])
-    return facts, f"{args.output}: {counts}; {facts['instances']} instances of {facts['maps']} maps"
+        facts = index_maps(args.output, args.maps, args.remove, progress=progress)
+    changes = ", ".join(f"{facts[word]} {word}" for word in ("added", "replaced", "unchanged", "removed"))
+    text = f"{args.output}: {facts['instances']} instances of {facts['maps']} maps ({changes})"
+    return {"store": str(args.output), **facts}, text
 
 
 def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

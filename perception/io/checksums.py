@@ -11,6 +11,8 @@ from perception.errors import InputError
 
 REPORT = "report.html"
 FACTS = "map.json"
+STORE = "store.json"
+"""In the folder of a store of many maps, the list of its maps."""
 EDITABLE = "instances.json"
 """Users may edit labels in this file by hand, so a changed checksum is reported and not an error."""
 

@@ -14,7 +14,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.arrays import map_npy, read_npz
 from perception.io.atomic import standing
-from perception.io.checksums import EDITABLE, FACTS, check_file, check_sizes, damaged
+from perception.io.checksums import EDITABLE, FACTS, STORE, check_file, check_sizes, damaged
 from perception.io.documents import DAMAGE, brief
 from perception.io.map_views import check_names, views_of_facts
 from perception.io.ply import map_ply
@@ -151,22 +151,13 @@ def read_info(path: Path) -> dict[str, Any]:
     return _read_facts(standing(Path(path)))[0]
 
 
-STORE_FACTS, STORED = "store.json", "maps"
-"""Of a store of many maps (`perception index`): its facts, and its folder with a file for each map."""
-
-
-def is_store(path: Path) -> bool:
-    """Whether `path` is a store of many maps."""
-    return (path / STORE_FACTS).is_file()
-
-
 def map_signature(path: Path) -> Signature:
-    """Inodes, times and sizes that change when the map or its labels at `path` change, or the store of maps there.
-    InputError when none exists."""
+    """Inodes, times and sizes that change when the map or its labels, or the store, at `path` change. InputError when
+    none exists."""
     folder = standing(path)
-    files = (STORE_FACTS, STORED) if is_store(folder) else (FACTS, EDITABLE)
+    names = (STORE,) if (folder / STORE).is_file() else (FACTS, EDITABLE)
     try:
-        stats = [file.stat() for file in (folder, *(folder / name for name in files))]
+        stats = [file.stat() for file in (folder, *(folder / name for name in names))]
     except OSError as error:
         raise InputError(f"{path}: the map is gone ({error.strerror}); build it again or put it back") from error
     return tuple((stat.st_ino, stat.st_mtime_ns if n else 0, stat.st_size if n else 0) for n, stat in enumerate(stats))
@@ -182,6 +173,8 @@ def _folder_identity(path: Path) -> tuple[int, int]:
 
 def _read_facts(path: Path) -> tuple[dict[str, Any], bytes]:
     file = path / FACTS
+    if (path / STORE).is_file():
+        raise InputError(f"{path}: is a store of many maps, and this needs one map; give one of them")
     if not file.is_file():
         raise InputError(f"{path}: is no map (no map.json inside); give a directory made by `perception map`")
     try:

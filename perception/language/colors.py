@@ -42,6 +42,8 @@ _SYNONYMS = {
     "cream": "beige", "navy": "blue", "bluish": "blue", "golden": "gold", "silvery": "silver",
     "olive": "green", "greenish": "green", "amber": "orange", "yellowish": "yellow", "brownish": "brown",
 }  # fmt: skip
+COLOR_WORDS = (*COLOR_NAMES, "many")
+"""All that `color_words` returns."""
 _MANY = {"colorful", "colourful", "multicolored", "multicoloured", "rainbow"}
 _PATTERN = re.compile(r"[^\W\d_]+")
 # Fruit and metals: before one of these nouns the word is part of the object's name, not a colour.
@@ -120,10 +122,15 @@ def color_share(palettes: np.ndarray, word: str) -> np.ndarray:
 
 def color_match(palettes: np.ndarray, words: Sequence[str]) -> np.ndarray:
     """Match of each instance with all colour words: [I] in [0, 1]; 1 where half of the instance has the colour."""
-    match = np.ones(len(palettes))
-    for word in words:
-        match *= np.minimum(1.0, color_share(palettes, word) / (0.5 / len(words)))
-    return match ** (1.0 / max(len(words), 1))
+    return match_of_shares([color_share(palettes, word) for word in words])
+
+
+def match_of_shares(shares: Sequence[np.ndarray]) -> np.ndarray:
+    """`color_match` from the shares [I] of each word; at least one."""
+    match = np.ones(len(shares[0]))
+    for share in shares:
+        match *= np.minimum(1.0, share / (0.5 / len(shares)))
+    return match ** (1.0 / len(shares))
 
 
 def _variety(palettes: np.ndarray) -> np.ndarray:

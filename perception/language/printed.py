@@ -56,12 +56,12 @@ def quoted_text(prompt: str) -> tuple[str, str] | None:
 
 
 class Printed:
-    """The texts of instances, prepared for prompts. texts: of each instance, entries {"text", "score"}. starts: the
-    first instance of each map, where they are of several."""
+    """The texts of a map's instances, prepared for prompts. texts: of each instance, entries {"text", "score"}. groups:
+    [I], the map of each instance, 0 to G - 1, where they are of several maps; each is matched within its own map."""
 
-    def __init__(self, texts: Sequence[Sequence[dict[str, Any]]], starts: Sequence[int] = (0,)) -> None:
-        self.count, self._starts = len(texts), starts
-        self._lines = [(i, _folded(e["text"]), float(e["score"])) for i, es in enumerate(texts) for e in es]
+    def __init__(self, texts: Sequence[Sequence[dict[str, Any]]], groups: np.ndarray | None = None) -> None:
+        self.count, self._groups = len(texts), np.zeros(len(texts), int) if groups is None else groups
+        self._lines = [(i, tuple(_folded(e["text"])), float(e["score"])) for i, es in enumerate(texts) for e in es]
 
     def __bool__(self) -> bool:
         return bool(self._lines)
@@ -80,13 +80,14 @@ class Printed:
         return share if len(telling) == 1 == len(words) or _KIND.get(head_noun(prompt)) == "carrier" else share**2
 
     def _borne(self, words: Sequence[str], weights: Sequence[float]) -> np.ndarray:
-        best = np.zeros((len(words), self.count))
+        best, most = np.zeros((len(words), self.count)), np.full((len(words), self._groups.max(initial=0) + 1), 1e-9)
+        different = {line for _, line, _ in self._lines}
         for n, word in enumerate(words):
+            quality = {line: match_quality(word, line) for line in different}
             for i, line, score in self._lines:
-                best[n, i] = max(best[n, i], score * match_quality(word, line))
-        for a, b in zip(self._starts, [*self._starts[1:], self.count], strict=True):
-            most = best[:, a:b].max(axis=1, initial=1e-9, keepdims=True)
-            best[:, a:b] *= (best[:, a:b] / most) ** RIVAL
+                best[n, i] = max(best[n, i], score * quality[line])
+                most[n, self._groups[i]] = max(most[n, self._groups[i]], best[n, i])
+        best *= (best / most[:, self._groups]) ** RIVAL
         return np.asarray(weights, np.float64) @ best / max(sum(weights), 1)
 
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from perception.query import Hit
-from perception.query.store import StoredHit
 
 
 def map_facts(path: Path, info: dict[str, Any], gaussians: int, instances: int) -> dict[str, Any]:
@@ -91,9 +90,8 @@ def depth_text(errors: dict[str, Any]) -> str:
     return f"depth error {median} in the median, {errors['close']:.0%} within {tolerance}"
 
 
-def query_text(answers: list[tuple[str, list[Hit]]], metric: bool) -> str:
+def query_text(answers: list[tuple[str, list[Hit]]], metric: bool | None) -> str:
     """Ranked hits of each prompt, one per line, or "not present"."""
-    unit = " m" if metric else ""
     lines = []
     for text, hits in answers:
         if not hits:
@@ -101,14 +99,15 @@ def query_text(answers: list[tuple[str, list[Hit]]], metric: bool) -> str:
         for rank, hit in enumerate(hits, start=1):
             x, y, z = hit.centroid
             a, b, c = hit.obb.extent
+            unit = " m" if (metric if hit.metric is None else hit.metric) else ""
             name = f" ({hit.label})" if hit.label else ""
             name += "" if hit.part is None else f", part {hit.part}"
             name += f", together {', '.join(map(str, hit.instances))}" if hit.instances else ""
-            name += f" in {hit.map}" if isinstance(hit, StoredHit) else ""
             lines.append(
                 f'"{text}" {rank}. instance {hit.instance_id}{name}  score {hit.score:.2f}'
                 f"  at {x:.3f} {y:.3f} {z:.3f}{unit}"
                 f"  size {a:.3f} x {b:.3f} x {c:.3f}{unit}  {hit.num_points} points"
+                + ("" if hit.map is None else f"  in {hit.map}")
             )
     return "\n".join(lines)
 

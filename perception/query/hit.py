@@ -15,6 +15,18 @@ from perception.types import OrientedBox
 _NO_SPREAD = np.zeros((3, 3))
 
 
+class _Points:
+    """The field `points`: an array, or a function that is called when they are first read."""
+
+    def __get__(self, hit: Hit, owner: type) -> np.ndarray:
+        if callable(given := hit.__dict__["_points"]):
+            given = hit.__dict__["_points"] = given()
+        return np.asarray(given)
+
+    def __set__(self, hit: Hit, given: np.ndarray | Callable[[], np.ndarray]) -> None:
+        hit.__dict__["_points"] = given
+
+
 @dataclass(frozen=True)
 class Hit:
     """One instance in the result of a query.
@@ -26,6 +38,9 @@ class Hit:
     part: id of the part that fits better than its instance; instances: ids of the group that fits better than its
     members; points, box and colours are then the part's or the group's. colors(): [P, 3] uint8 of the points, read when
     called; None where they are not known. All of it is in `frame`, in metres when the map is metric.
+
+    A hit of a store also has the path of its `map`, `map_id`, and whether that is `metric`. Its points are read from
+    the map's folder when asked for: InputError when that is gone or holds another map.
     """
 
     instance_id: int
@@ -41,11 +56,15 @@ class Hit:
     part: int | None = None
     instances: tuple[int, ...] = ()
     colors: Callable[[], np.ndarray] | None = field(default=None, repr=False, compare=False)
+    map: str | None = None
+    map_id: str | None = None
+    metric: bool | None = None
+    count: int | None = None
 
     @property
     def num_points(self) -> int:
-        """P"""
-        return len(self.points)
+        """P, without reading the points where it is known."""
+        return len(self.points) if self.count is None else self.count
 
     def transformed(self, a_from_b: np.ndarray, frame: str | None = None) -> Hit:
         """The same hit in frame a, given a_from_b [4, 4] (rigid or similarity) from the frame it is in now.
@@ -88,7 +107,12 @@ class Hit:
         }
         answer |= {} if self.part is None else {"part": self.part}
         answer |= {"instances": list(self.instances)} if self.instances else {}
+        if self.map is not None:
+            answer |= {"map": self.map, "map_id": self.map_id, "frame": self.frame, "metric": self.metric}
         return answer if self.distance is None else {**answer, "distance": float(self.distance)}
+
+
+Hit.points = _Points()  # type: ignore[assignment]
 
 
 @dataclass(frozen=True)

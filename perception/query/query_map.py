@@ -11,8 +11,8 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import move_points
+from perception.io.checksums import STORE
 from perception.io.map import Map
-from perception.io.map_files import is_store
 from perception.language.ranking import Ranker, answering
 from perception.query.hit import Description, Hit, Neighbor
 from perception.query.nodes import Nodes
@@ -51,6 +51,11 @@ class QueryMap(Map):
     def ranker(self) -> Ranker:
         """The ranker of instances for prompts; InputError when the map has no embeddings or encoder."""
         return self._ranking.ranker
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How much it holds."""
+        return {"instances": len(self.instances), "gaussians": int(self.info.get("num_gaussians", 0))}
 
     def warm(self) -> None:
         """Prepares what the first queries need: spatial index, shape scores, text encoder."""
@@ -289,17 +294,13 @@ class QueryMap(Map):
 
 
 def load_map(path: str | Path, encoders: Encoders | None = None) -> QueryMap:
-    """Opens a map directory, a million Gaussians in well under a second.
-
-    A store of many maps (`perception index`) opens as a `QueryStore`, which answers prompts.
+    """Opens a map directory, a million Gaussians in well under a second, or a store of many maps (`MapStore`).
 
     encoders: makes an encoder from its name in the map's config; perception.language.encoders.make_encoder when None.
-    Raises InputError when `path` is no map, damaged, or of another format version.
+    Raises InputError when `path` is neither, damaged, or of another format version.
     """
-    if is_store(Path(path)):
-        from perception.query.store import QueryStore
+    from perception.query.map_store import MapStore
 
-        return QueryStore(Path(path), encoders)
-    gmap = QueryMap.open(Path(path))
+    gmap = (MapStore if (Path(path) / STORE).is_file() else QueryMap).open(Path(path))
     gmap.encoders = encoders
     return gmap

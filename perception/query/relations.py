@@ -9,10 +9,13 @@ not in the map, no instance gains. The other words may hold a relation too: "the
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from perception.language.ranking import PRESENT
 
 if TYPE_CHECKING:
     from perception.io.map import Map
@@ -68,20 +71,22 @@ def ranked(ranker: Ranker, places: Places | None, text: str) -> Answer:
     relation = parse(text)
     if relation is None or places is None or quoted_text(text) is not None:
         return ranker.rank(text)
-    gain = WEIGHT * _standing(ranker, places, relation)
+    gain = WEIGHT * standing(ranker, [(slice(None), places)], relation)
     return replace(ranker.rank(relation.thing, gain), text=" ".join(text.split()))
 
 
-def _standing(ranker: Ranker, places: Places, relation: Relation) -> np.ndarray:
+def standing(ranker: Ranker, maps: Sequence[tuple[slice, Places]], relation: Relation) -> np.ndarray:
     """[I] in [0, 1]: how well each instance stands in the relation to what its other words mean, "the desk next to the
-    monitor" for one."""
-    nested, score = parse(relation.other), np.zeros(len(places.lows))
-    others = ranker.rank(relation.other if nested is None else nested.thing)
-    for n, value in others.hits if others.present else ():
-        score[n] = value
-    if nested is not None:
-        score *= _standing(ranker, places, nested)
-    return np.asarray((places.match(relation.kind) * score[None]).max(axis=1, initial=0.0))
+    monitor" for one. maps: of each map whose places are known, its slice of the ranker's instances, and the places."""
+    nested = parse(relation.other)
+    score = ranker.scores(relation.other if nested is None else nested.thing)
+    further = np.ones(len(score)) if nested is None else standing(ranker, maps, nested)
+    found = np.zeros(len(score))
+    for own, places in maps:
+        if score[own].max(initial=0.0) >= PRESENT:
+            others = score[own] * further[own]
+            found[own] = (places.match(relation.kind) * others[None]).max(axis=1, initial=0.0)
+    return found
 
 
 def level_from_map(gmap: Map) -> np.ndarray | None:
@@ -99,7 +104,7 @@ class Places:
 
     def __init__(self, lows: np.ndarray, highs: np.ndarray, poses: np.ndarray) -> None:
         self.lows, self.highs = np.asarray(lows, np.float64), np.asarray(highs, np.float64)
-        self._poses = poses
+        self.poses = poses
 
     @classmethod
     def of(cls, gmap: Map) -> Places | None:
@@ -150,7 +155,7 @@ class Places:
         """[I, I]: share of the photos showing both in which the row's instance is left, right, in front or behind."""
         middles, count = (self.lows + self.highs) / 2, len(self.lows)
         yes, all_ = np.zeros((2, count, count))
-        for pose in self._poses:
+        for pose in self.poses:
             x, y, z = pose[:3, :3] @ middles.T + pose[:3, 3:]
             ahead = (z > 0) & (np.maximum(np.abs(x), np.abs(y)) < z)  # within 45° of the axis
             x = x / np.maximum(z, 1e-9)

@@ -92,7 +92,8 @@ def error_line(error: BaseException | str) -> str:
 
 
 def source(gmap: QueryMap, frame: Frame | None = None) -> dict[str, Any]:
-    """What every answer tells of the map: the frame of its coordinates, whether they are metres, the map's id."""
+    """What every answer tells of the map: the frame of its coordinates, whether they are metres, the map's id. Frame
+    and metres of a store's answer are None, and stand in each hit."""
     return {"frame": frame.name if frame else gmap.frame, "metric": gmap.metric, "map_id": gmap.map_id}
 
 
@@ -131,7 +132,8 @@ class Request:
 
 @dataclass(frozen=True)
 class Reply:
-    """The answer to a request, computed on the map map_id alone. seconds: from submission to answer."""
+    """The answer to a request, computed on the map map_id alone. seconds: from submission to answer. A store's frame
+    and metric are None."""
 
     request: Request
     hits: tuple[Hit, ...]

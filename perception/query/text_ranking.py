@@ -7,14 +7,13 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
 from perception.errors import InputError
 from perception.io.map import Map
 from perception.language.base import Encoder
-from perception.language.description import InstanceDescription, check_encoder
 from perception.language.encoders import make_encoder
 from perception.language.printed import Printed
 from perception.language.ranking import Answer, Ranker
@@ -65,7 +64,7 @@ class TextRanking:
             raise
         with one_thread():
             named = self._by_label(text) is not None
-            answer = ranker.rank(text) if named else ranked(ranker, self._places, text)
+            answer = ranker.rank(text) if named else ranked(ranker, self.places, text)
         with self._lock:
             self._ranked[key] = answer
             if len(self._ranked) > REMEMBERED:
@@ -91,40 +90,37 @@ class TextRanking:
             return self._made
 
     def _make(self) -> Ranker:
-        descriptions, identity, spec = described(self._gmap)
-        encoder = self._encoders(spec)
+        from perception.language.description import check_encoder, from_arrays
+
+        if not self._gmap.language:
+            raise InputError(
+                f"{self._gmap.path}: holds no language embeddings; map again with an encoder (language.encoder=…)"
+            )
+        descriptions, identity = from_arrays(self._gmap.language)
+        spec = self._gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
+        encoder = self._encoders("conse" if spec == "auto" else spec)
         if encoder is None:
             raise InputError(f"{self._gmap.path}: was mapped without an encoder; map again with language.encoder=conse")
         check_encoder(identity, encoder.identity)
         labels = [entry.get("label") for entry in self._gmap.instances]
         sizes = extents(self._gmap) if self._gmap.metric else None
-        shapes = partial(shapes_of, self._gmap)
-        return Ranker(descriptions, encoder, labels, shapes, printed_on(self._gmap, self._texts), sizes)
+        return Ranker(descriptions, encoder, labels, self._shapes, printed_on(self._gmap, self._texts), sizes)
 
     @cached_property
-    def _places(self) -> Places | None:
+    def places(self) -> Places | None:
+        """Where the instances stand to each other; None where up is not known."""
         return Places.of(self._gmap)
 
+    def _shapes(self) -> np.ndarray:
+        from perception.frame.gravity import Gravity
+        from perception.instances.shapes import shape_scores
 
-def described(gmap: Map) -> tuple[list[InstanceDescription], str, str]:
-    """The descriptions of a map's instances, the identity of their encoder, and its name for `make_encoder`."""
-    from perception.language.description import from_arrays
-
-    if not gmap.language:
-        raise InputError(f"{gmap.path}: holds no language embeddings; map again with an encoder (language.encoder=…)")
-    spec = gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
-    return *from_arrays(gmap.language), "conse" if spec == "auto" else spec
-
-
-def shapes_of(gmap: Map) -> np.ndarray:
-    """Scores [I, K] of `shape_words.KINDS` of a map's instances."""
-    from perception.frame.gravity import Gravity
-    from perception.instances.shapes import shape_scores
-
-    index, gravity = gmap.index, gmap.info.get("gravity")
-    owners = np.repeat(index.ids, np.diff(index.starts))
-    down = None if gravity is None else Gravity.from_json(gravity)
-    return shape_scores(index.points, owners, [entry["id"] for entry in gmap.instances], gmap.poses, down)
+        index = self._gmap.index
+        owners = np.repeat(index.ids, np.diff(index.starts))
+        poses = self._gmap.poses
+        gravity = self._gmap.info.get("gravity")
+        down = None if gravity is None else Gravity.from_json(gravity)
+        return shape_scores(index.points, owners, [entry["id"] for entry in self._gmap.instances], poses, down)
 
 
 def extents(gmap: Map) -> np.ndarray:

@@ -42,7 +42,7 @@ def world(kitchen: Path) -> Iterator[dict[str, Any]]:
     """The names after all Python snippets have run, a server at the port they speak of."""
     before = read_map(kitchen)
     patch = pytest.MonkeyPatch()
-    for module in ("text_ranking", "engine"):
+    for module in ("text_ranking", "engine", "map_store", "indexing"):
         patch.setattr(f"perception.query.{module}.make_encoder", encoders)
     patch.chdir(kitchen.parent)
     names: dict[str, Any] = {"before": before}

@@ -1,0 +1,127 @@
+"""`perception index`: writes the instances of many maps into a store (`map_store` describes its files)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.atomic import atomic_file, writing
+from perception.io.checksums import FACTS, STORE
+from perception.language.encoders import make_encoder
+from perception.progress import Progress
+from perception.query.map_store import FORMAT_VERSION, TOLD, read_store
+from perception.query.query_map import QueryMap, load_map
+from perception.query.relations import Places
+from perception.query.text_ranking import Encoders, printed_on
+
+
+def index_maps(
+    store: Path,
+    maps: Sequence[Path],
+    remove: Sequence[Path] = (),
+    encoders: Encoders | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Brings `maps` into the store at `store`, made if there is none, and takes those of `remove` out of it.
+
+    Maps that the store holds already are replaced if they changed. Returns the counts `added`, `replaced`, `unchanged`
+    and `removed`, and of the whole store `maps` and `instances`. The store changes at the end, all at once. What an
+    interrupted run has prepared is used by the next one. InputError, and no change, for a folder that is no map, a map
+    without embeddings or of another encoder than the store's, a path to remove that the store does not hold, a folder
+    that is no store, and while another process writes the store.
+    """
+    encoders, progress = lru_cache(encoders or make_encoder), progress or Progress(quiet=True)
+    with writing(store):
+        facts = _facts(store)
+        entries = {entry["map"]: entry for entry in facts["maps"]}
+        counts = dict.fromkeys(("added", "replaced", "unchanged", "removed"), 0)
+        for path in remove:
+            if entries.pop(str(path.resolve()), None) is None:
+                raise InputError(f"{path}: is not one of the {len(entries)} maps in {store}; nothing was removed")
+            counts["removed"] += 1
+        paths = list(dict.fromkeys(path.resolve() for path in maps))
+        for path in paths:
+            if not (path / FACTS).is_file():
+                raise InputError(f"{path}: is no map (no {FACTS} inside); the store is as it was")
+        for n, path in enumerate(paths, start=1):
+            before = entries.get(str(path))
+            gmap = load_map(path, encoders)
+            if before is None or before["map_id"] != gmap.map_id:
+                entries[str(path)] = _indexed(store, gmap, facts)
+            counts["added" if before is None else "unchanged" if entries[str(path)] is before else "replaced"] += 1
+            progress.update("maps", n, len(paths))
+        if not entries:
+            raise InputError(f"{store}: would hold no map; give maps, or delete it")
+        facts["maps"] = [entries[path] for path in sorted(entries)]
+        with atomic_file(store / STORE) as aside:
+            aside.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+        listed = {entry["file"] for entry in facts["maps"]}
+        for file in (store / "maps").iterdir():  # of other maps, and of writers that were killed
+            if file.name not in listed:
+                file.unlink(missing_ok=True)
+    return {**counts, "maps": len(entries), "instances": sum(entry["instances"] for entry in entries.values())}
+
+
+def _facts(store: Path) -> dict[str, Any]:
+    """What store.json holds, or will hold in a new store."""
+    if (store / STORE).is_file():
+        return read_store(store)[0]
+    if store.exists() and (not store.is_dir() or {item.name for item in store.iterdir()} - {"maps"}):
+        raise InputError(f"{store}: is no store, and something lies there; give a new folder with -o")
+    return {"format_version": FORMAT_VERSION, "encoder": None, "maps": []}
+
+
+def _indexed(store: Path, gmap: QueryMap, facts: dict[str, Any]) -> dict[str, Any]:
+    """Writes the file of a map, unless it is there; returns its entry for `facts`, whose encoder is set or compared."""
+    path = Path(str(gmap.path))
+    if (problem := gmap.problem) is not None:
+        raise InputError(problem if str(path) in problem else f"{path}: {problem}")
+    spec = gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
+    identity = str(gmap.language["encoder"])
+    known = facts["encoder"] = facts["encoder"] or {"name": "conse" if spec == "auto" else spec, "identity": identity}
+    if known["identity"] != identity:
+        found = f"its embeddings were made by '{identity}', those of {store} by '{known['identity']}'"
+        raise InputError(f"{path}: {found}; run: perception upgrade MAP, or give another store")
+    key = json.dumps([str(path), gmap.map_id, identity, FORMAT_VERSION])
+    file = hashlib.sha256(key.encode()).hexdigest()[:32] + ".npz"
+    if not (store / "maps" / file).is_file():
+        arrays = _arrays(gmap)
+        with atomic_file(store / "maps" / file) as aside, aside.open("wb") as stream:
+            np.savez(stream, **arrays)  # type: ignore[arg-type]
+    written = datetime.fromtimestamp((path / FACTS).stat().st_mtime, timezone.utc).isoformat(timespec="seconds")
+    entry = {"map": str(path), "map_id": gmap.map_id, "frame": gmap.frame, "metric": gmap.metric, "written": written}
+    return {**entry, "instances": len(gmap.instances), "file": file}
+
+
+def _arrays(gmap: QueryMap) -> dict[str, np.ndarray]:
+    """The arrays of a map's file."""
+    prepared, places, told = gmap.ranker.prepared(), Places.of(gmap), np.zeros(len(gmap.instances), TOLD)
+    views = []
+    for n in range(len(told)):
+        hit = gmap.hit(n)
+        box = hit.obb.center, hit.obb.rotation, hit.obb.extent
+        told[n] = (hit.instance_id, len(hit.points), hit.centroid, *box, hit.covariance)
+        views.append(hit.views)
+    texts = None if printed_on(gmap) is None else [entry.get("texts", []) for entry in gmap.instances]
+    names = {"labels": [entry.get("label") for entry in gmap.instances], "texts": texts}
+    where = {} if places is None else {"places": np.stack([places.lows, places.highs], axis=1), "poses": places.poses}
+    records = {"things": _rows(prepared.pop("things")), "told": _rows(told)}
+    return {**prepared, **records, **where, "names": _text(names), "views": _text(views)}
+
+
+def _rows(records: np.ndarray) -> np.ndarray:
+    """[I, bytes] uint8."""
+    return np.frombuffer(records.tobytes(), np.uint8).reshape(len(records), records.dtype.itemsize)
+
+
+def _text(value: Any) -> np.ndarray:
+    """JSON as UTF-8, [bytes] uint8."""
+    return np.frombuffer(json.dumps(value).encode(), np.uint8)
