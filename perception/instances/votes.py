@@ -17,9 +17,11 @@ from scipy import sparse
 from perception.gaussians.model import Gaussians
 from perception.gaussians.rasterize import Settings, rasterize_backward, rasterize_forward, torch_on_one_thread
 from perception.gaussians.train import TrainingView
+from perception.io.memory import return_free_memory
 from perception.progress import Progress
 
 BLOCK = 16  # masks per pass: a feature width that the kernel is specialised for
+TRIM = 16  # views between which freed memory is returned: the kept votes split what one view's arrays filled
 FAINTEST = 0.02  # pixels; smaller weights are dropped to keep the matrix sparse
 
 
@@ -98,8 +100,8 @@ def mask_votes(
     half_resolution: uses every other pixel per axis, at a quarter of the time. Masks are smooth enough for this. Areas
     are then in pixels of that size too.
     """
-    parts: list[sparse.csr_matrix] = []
-    voids: list[sparse.csr_matrix] = []
+    parts: list[sparse.csc_matrix] = []  # by column: a row pointer per view would be as large as the model
+    voids: list[sparse.csc_matrix] = []
     owner: list[np.ndarray] = []
     areas: list[np.ndarray] = []
     for index, view in enumerate(views):
@@ -110,17 +112,22 @@ def mask_votes(
             voids.append(weights[:, :1])
             areas.append(area[1:])
             owner.append(np.full(len(area) - 1, len(owner), np.int64))
+        if index % TRIM == TRIM - 1:
+            return_free_memory()
         if progress is not None:
             progress.update("mask votes", index + 1, len(views))
     if not parts:
         none = sparse.csr_matrix((len(gaussians), 0), dtype=np.float32)
         return MaskVotes(none, none, np.zeros(0, np.int64), np.zeros(0))
-    weights, void = (sparse.hstack(blocks, format="csr") for blocks in (parts, voids))
+    void = sparse.hstack(voids, format="csc").tocsr()
+    weights = sparse.hstack(parts, format="csc")
+    parts.clear()
+    weights = weights.tocsr()
     return MaskVotes(weights, void, np.concatenate(owner), np.concatenate(areas))
 
 
 @torch.no_grad()
-def _of_view(gaussians: Gaussians, view: TrainingView) -> tuple[sparse.csr_matrix, np.ndarray]:
+def _of_view(gaussians: Gaussians, view: TrainingView) -> tuple[sparse.csc_matrix, np.ndarray]:
     """Weights [N, 1 + masks] and areas of one view. Column 0 holds the pixels that no mask covers."""
     assert view.labels is not None  # told by the caller
     height, width = view.photo.shape[:2]
@@ -144,5 +151,5 @@ def _of_view(gaussians: Gaussians, view: TrainingView) -> tuple[sparse.csr_matri
         row, column = np.nonzero(weights > FAINTEST)
         found.append((weights[row, column], seen[row], column + first))
     weights, row, column = map(np.concatenate, zip(*found, strict=True))
-    table = sparse.csr_matrix((weights, (row, column)), shape=(len(gaussians), len(names)))
+    table = sparse.csc_matrix((weights, (row, column)), shape=(len(gaussians), len(names)))
     return table, np.bincount(dense.reshape(-1)[:-1], minlength=len(names)).astype(float)
