@@ -144,7 +144,7 @@ def optimise_blocks(
     held = {view.name for view in held_out}
     folders = [_task(run, scene, block, held) for block in blocks]
     with run.stage("train"):
-        engine.run(optimise_block, [str(folder) for folder in folders], "block", run.progress)
+        engine.run(optimise_block, [str(folder.resolve()) for folder in folders], "block", run.progress)
     parts, records, reports = [], [], []
     for folder, block in zip(folders, blocks, strict=True):
         state = load_checkpoint(folder / RESULT, folder.name)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import logging
 import os
 import socket
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from perception.errors import InputError, missing_extra
@@ -17,6 +20,17 @@ CONNECT = 10.0
 """Seconds in which a cluster must answer."""
 RETRIES = 5
 """How often a task is run again whose worker was lost."""
+
+
+@contextmanager
+def _elsewhere() -> Iterator[None]:
+    """Another current folder: workers import from the driver's first, which in a clone has no compiled core."""
+    before = Path.cwd()
+    os.chdir(tempfile.gettempdir())
+    try:
+        yield
+    finally:
+        os.chdir(before)
 
 
 @dataclass(frozen=True)
@@ -54,7 +68,10 @@ class Engine:
             if self.address not in (None, "auto"):  # Ray itself tries for seven minutes
                 host, _, port = str(self.address).rpartition(":")
                 socket.create_connection((host, int(port)), timeout=CONNECT).close()
-            ray.init(address=self.address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR)
+            with _elsewhere():
+                ray.init(
+                    address=self.address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR
+                )
         except (OSError, ValueError) as error:
             told = f"--address {self.address}: no Ray cluster there ({str(error).splitlines()[0]})"
             raise InputError(f"{told}; start one: ray start --head, and give its HOST:PORT") from error

@@ -271,7 +271,7 @@ class ViewerTarget:
 
         server = SimpleNamespace(gui=gui, get_clients=dict)
         page = SimpleNamespace(
-            session=session, server=server, guarded=guarded, redraw=redraw, show_boxes=lambda _: None
+            session=session, server=server, guarded=guarded, redraw=redraw, show_boxes=lambda _: None, detail=""
         )
         panel = Panel(page)
         for _ in range(dice.below(8)):
