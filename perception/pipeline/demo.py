@@ -50,9 +50,7 @@ class DemoTruth:
         """The truth beside the photos in `folder`."""
         facts = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
         with np.load(folder / "truth.npz") as stored:
-            normals = stored["normals"].astype(np.float32)
-            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-            points = PointCloud((stored["points"] * 1e-4).astype(np.float32), stored["colors"], normals)
+            points = PointCloud(stored["points"], stored["colors"], stored["normals"])
             ids = stored["instance_ids"].astype(np.int64)
         names = {int(number): name for number, name in facts["instances"].items()}
         return cls(facts["asked"], dict(facts["queries"]), names, facts["centres"], points, ids)

@@ -43,7 +43,7 @@ def ship(folder: Path) -> None:
 
 
 def write_truth(folder: Path, truth: DemoTruth) -> None:
-    """truth.json and truth.npz, as `pipeline.demo` reads them: points in tenths of a millimetre."""
+    """truth.json and truth.npz, as `pipeline.demo` reads them."""
     facts = {
         "asked": truth.asked,
         "queries": [[text, ids] for text, ids in truth.queries],
@@ -53,8 +53,8 @@ def write_truth(folder: Path, truth: DemoTruth) -> None:
     (folder / "truth.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     np.savez_compressed(
         folder / "truth.npz",
-        points=np.rint(1e4 * truth.points).astype(np.int16),
-        normals=np.rint(127 * truth.normals).astype(np.int8),
+        points=truth.points,
+        normals=truth.normals,
         colors=truth.colors,
         instance_ids=truth.instance_ids.astype(np.uint8),
     )
