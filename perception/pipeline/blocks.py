@@ -21,14 +21,15 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians
+from perception.gaussians.size import sized
 from perception.gaussians.train import TrainRecord
 from perception.geometry import camera_centres
 from perception.io.atomic import atomic_file, writing
 from perception.io.inputs import load_saved_scene, save_scene
 from perception.masks import make_source
-from perception.masks.builtin import BuiltinSegmentation
 from perception.pipeline.checkpoint import BEFORE_MASKS, CHECKPOINT, digest, load_checkpoint, save_checkpoint
 from perception.pipeline.engine import Engine
+from perception.pipeline.estimate import largest_budget, memory_limit
 from perception.pipeline.optimise import Photos, Run, optimise
 from perception.pipeline.record import versions
 from perception.progress import Progress
@@ -135,14 +136,15 @@ def _divided(
 
 
 def optimise_blocks(
-    run: Run, scene: Scene, blocks: Sequence[Block], held_out: Sequence[View], engine: Engine
+    run: Run, scene: Scene, blocks: Sequence[Block], held_out: Sequence[View], from_geometry: bool, engine: Engine
 ) -> tuple[Gaussians, TrainRecord, list[dict[str, Any]]]:
     """The joined Gaussians of all blocks, their training's record, and a report of each block.
 
     Each block is a task of the engine, in its own folder below `run.work`. A task that is finished is not run again.
+    from_geometry: masks are made from a block's own depth, and not once per photo.
     """
     held = {view.name for view in held_out}
-    folders = [_task(run, scene, block, held) for block in blocks]
+    folders = [_task(run, scene, block, held, from_geometry) for block in blocks]
     with run.stage("train"):
         engine.run(optimise_block, [str(folder.resolve()) for folder in folders], "block", run.progress)
     parts, records, reports = [], [], []
@@ -155,7 +157,8 @@ def optimise_blocks(
         parts.append(gaussians.rows(own))
         records.append(record)
         box = [[float(x) if np.isfinite(x) else None for x in corner] for corner in (block.low, block.high)]
-        reports.append({"photos": len(block.views), "gaussians": len(own), "trained": len(gaussians), "box": box})
+        counts = {"photos": len(block.views), "gaussians": len(own), "trained": len(gaussians)}
+        reports.append({**counts, "iterations": record.iterations, "box": box})
     return joined(parts), TrainRecord.joined(records), reports
 
 
@@ -171,7 +174,7 @@ def joined(parts: Sequence[Gaussians]) -> Gaussians:
     return Gaussians.concatenate(placed)
 
 
-def _task(run: Run, scene: Scene, block: Block, held: set[str]) -> Path:
+def _task(run: Run, scene: Scene, block: Block, held: set[str], from_geometry: bool) -> Path:
     """Writes the task of a block: the part of the scene that it is trained on, and the settings. Returns its folder."""
     views = [scene.views[i] for i in block.views]
     names = [view.name for view in views]
@@ -183,12 +186,12 @@ def _task(run: Run, scene: Scene, block: Block, held: set[str]) -> Path:
             seen |= visible_points(view, scene.points)
         part = replace(scene, views=views, points=scene.points[seen], point_colors=scene.point_colors[seen])
         save_scene(folder / "scene", part)
-        shared = not isinstance(make_source(run.config.masks, run.config.sam), BuiltinSegmentation)
+        trained = len(set(names) - held)
         facts = {
             "source": str(run.source.resolve()),
-            "config": run.config.to_json(),
+            "config": sized(run.config, trained, largest_budget(memory_limit())).to_json(),  # not by a worker's memory
             "held_out": sorted(held & set(names)),
-            "masks": str((run.masks if shared else folder / "masks").resolve()),
+            "masks": str((folder / "masks" if from_geometry else run.masks).resolve()),
             "versions": versions(),
         }
         with atomic_file(folder / TASK) as aside:
@@ -205,10 +208,11 @@ def optimise_block(folder: str, progress: Progress | None = None) -> None:
     if load_checkpoint(home / RESULT, home.name) is not None:
         return
     facts = json.loads((home / TASK).read_text(encoding="utf-8"))
-    own = versions()
-    if (theirs := facts["versions"]) != own:
-        name = next(name for name in own if own[name] != theirs.get(name))
-        raise InputError(f"{home}: this worker has {name} {own[name]}, the run {theirs.get(name)}; install the same")
+    own, theirs = versions(), facts["versions"]
+    for name in sorted({*own, *theirs}):
+        if own.get(name) != theirs.get(name):
+            found = f"this worker has {name} {own.get(name)}, the run {theirs.get(name)}"
+            raise InputError(f"{home}: {found}; install the same")
     config, scene = MapConfig.model_validate(facts["config"]), load_saved_scene(home / "scene")
     if scene is None:
         raise InputError(f"{home}: the part of the scene is missing; delete the folder and run again")

@@ -84,7 +84,7 @@ def build_map(
         training, held_out = split_views(scene.views, config.photos.holdout, config.photos.held_out)
         held_out = exposed_as_neighbours(held_out, training)
         scene = replace(scene, views=sorted([*training, *held_out], key=lambda view: view.name))
-        blocks = cut(scene, config.train.block_photos)
+        blocks, from_geometry = cut(scene, config.train.block_photos), isinstance(mask_source, BuiltinSegmentation)
 
         # Optimise Gaussians on the photos and their masks (§3.1 to 3.2.3), block by block in a large place.
         if len(blocks) == 1:
@@ -92,10 +92,10 @@ def build_map(
             gaussians, trained, mask_report = optimise(run, scene, photos, mask_source)
             of_blocks: list[dict[str, Any]] = []
         else:
-            gaussians, trained, of_blocks = optimise_blocks(run, scene, blocks, held_out, engine or Engine())
+            where = engine or Engine()
+            gaussians, trained, of_blocks = optimise_blocks(run, scene, blocks, held_out, from_geometry, where)
             photos = Photos.load(run, training, held_out)
             mask_report = label_photos(run, photos, mask_source, lambda view: surface_depth(gaussians, view))
-        from_geometry = isinstance(mask_source, BuiltinSegmentation)
         del mask_source  # with the views of stereo
 
         # Group the Gaussians by their features into instances (§3.2.1), describe these from their best views (§3.2.2).

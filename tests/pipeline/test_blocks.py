@@ -24,6 +24,7 @@ from perception.pipeline.checkpoint import work_folder
 from perception.pipeline.engine import Engine
 from perception.pipeline.mapping import build_map
 from perception.pipeline.optimise import Run
+from perception.pipeline.record import versions
 from perception.progress import Progress
 from perception.types import Scene, View
 from support.interrupts import interrupt_at
@@ -161,9 +162,13 @@ def test_a_run_that_was_stopped_in_a_block_ends_in_the_same_map(
 
 
 def test_a_worker_of_another_version_is_refused(tmp_path: Path) -> None:
-    (tmp_path / TASK).write_text(json.dumps({"versions": {"perception": "9.9"}}))
-    with pytest.raises(InputError, match=r"this worker has perception .*, the run 9\.9; install the same"):
-        optimise_block(str(tmp_path))
+    for theirs, told in (
+        ({**versions(), "perception": "9.9"}, r"this worker has perception .*, the run 9\.9; install the same"),
+        ({**versions(), "zlib": "1"}, r"this worker has zlib None, the run 1; install the same"),
+    ):
+        (tmp_path / TASK).write_text(json.dumps({"versions": theirs}))
+        with pytest.raises(InputError, match=told):
+            optimise_block(str(tmp_path))
 
 
 class KilledOnce(Engine):
