@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.size import sized
 from perception.gaussians.train import Trainer, TrainingView, TrainRecord
 from perception.gaussians.transients import train_without_transients
-from perception.io.memory import DiskArrays, Keep
+from perception.io.memory import DiskArrays, Keep, return_free_memory
 from perception.io.photos import load_photo
 from perception.masks import MaskSource, compute_masks
 from perception.masks.builtin import BuiltinSegmentation
@@ -107,7 +108,11 @@ def optimise(
     # Optimise colours and features together: L_RGB + λ_inst2d L_inst2d + λ_var L_var (§3.1 to 3.2.3, eq. 14).
     with run.stage("train"):
         trainer.run(observer)
-    return trainer.gaussians.to("cpu"), trainer.record, report
+    found = trainer.gaussians.to("cpu"), trainer.record, report
+    del trainer, observer
+    gc.collect()  # a trainer and its schedule refer to each other, and to all photos
+    return_free_memory()
+    return found
 
 
 def initial_gaussians(scene: Scene, config: MapConfig, views: Sequence[TrainingView] = ()) -> Gaussians:
