@@ -71,9 +71,9 @@ class Gaussians:
         return rgb_from_sh(self.sh[:, 0])
 
     def inputs(self, camera_from_world: torch.Tensor, K: torch.Tensor, features: torch.Tensor | None = None) -> Inputs:
-        """The inputs of `rasterize_forward` for one camera, on the same device, with colours that do not depend on the
-        view. camera_from_world [4, 4], K [3, 3] pixels; features [N, D]."""
-        camera = (camera_from_world[None].contiguous(), K[None].contiguous())
+        """The inputs of `rasterize_forward` for one camera, with colours that do not depend on the view.
+        camera_from_world [4, 4], K [3, 3] pixels, on any device; features [N, D], where the Gaussians are."""
+        camera = (of[None].contiguous().to(self.means.device) for of in (camera_from_world, K))
         return (self.means, self.quats, self.scales, self.opacities, self.base_colors, features, *camera)
 
 

@@ -188,6 +188,10 @@ def label_images(
     """
     means = inputs[0]
     assert means is not None  # for the type checker
+    if means.device.type != "cpu":
+        from perception.gaussians.cuda import rasterize as on_device
+
+        return on_device.label_images(inputs, labels, least, settings)
     images = np.empty((len(labels), settings.height, settings.width), np.int32)
     visible = np.zeros(len(means), np.uint8)
     core = _core_function("rasterize_labels", means)

@@ -10,6 +10,7 @@ dimmed backgrounds, and blurred backgrounds.
 from __future__ import annotations
 
 import numpy as np
+from scipy import sparse
 
 Box = tuple[int, int, int, int]
 
@@ -18,17 +19,20 @@ FILL = 127  # grey value of the padding: mid-range, near zero after any encoder'
 
 
 def view_scores(mask_pixels: np.ndarray, image_pixels: np.ndarray, visible_fraction: np.ndarray) -> np.ndarray:
-    """s_vi [I, V] from mask_pixels [I, V], image_pixels [V], and visible_fraction [I, V] in [0, 1]."""
-    return np.asarray(mask_pixels, np.float64) / np.asarray(image_pixels, np.float64)[None] * visible_fraction
+    """s_vi [I, V], or [L] of some pairs of both, from mask_pixels, image_pixels and visible_fraction in [0, 1], arrays
+    of this shape, or [V] for all instances."""
+    return np.asarray(mask_pixels, np.float64) / np.asarray(image_pixels, np.float64) * visible_fraction
 
 
-def choose_views(scores: np.ndarray, k: int = 5) -> list[np.ndarray]:
+def choose_views(scores: np.ndarray | sparse.coo_matrix, k: int = 5) -> list[np.ndarray]:
     """The k views with the highest score of each instance, best first: I arrays of at most k view indices, int64.
 
-    scores: [I, V] ≥ 0. Views with score 0 are never chosen.
+    scores: [I, V] ≥ 0, dense or sparse. Views with score 0 are never chosen; of equal ones the first.
     """
-    orders = (np.argsort(-row, kind="stable")[:k] for row in scores)
-    return [order[row[order] > 0].astype(np.int64) for order, row in zip(orders, scores, strict=True)]
+    table = sparse.csr_matrix(scores)
+    table.sort_indices()
+    runs = (slice(*table.indptr[row : row + 2]) for row in range(table.shape[0]))
+    return [table.indices[run][np.argsort(-table.data[run], kind="stable")[:k]].astype(np.int64) for run in runs]
 
 
 def mask_box(mask: np.ndarray) -> Box | None:

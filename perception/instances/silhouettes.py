@@ -15,11 +15,12 @@ from perception.gaussians.rasterize import Settings, label_images
 
 @dataclass(frozen=True)
 class Silhouettes:
-    """One view of shape (H, W). packed: `ids`, compressed; pixels [M]: number of pixels per instance; visible [M]:
-    Gaussians per instance that contribute to any pixel."""
+    """One view of shape (H, W). packed: `ids`, compressed; shown [S]: ids of the instances with pixels; pixels [S]: how
+    many; visible [S]: how many of their Gaussians contribute to any pixel."""
 
     packed: bytes
     shape: tuple[int, ...]
+    shown: np.ndarray
     pixels: np.ndarray
     visible: np.ndarray
 
@@ -50,9 +51,8 @@ def render_silhouettes(
     images, visible = label_images(inputs, owners, threshold, Settings(width, height, depth=False, eps2d=eps2d))
     found = []
     for ids, image in zip(owners, images, strict=True):
-        count = int(ids.max(initial=-1)) + 1
-        shown = ids[visible & (ids >= 0)]
-        pixels = np.bincount(image[image >= 0], minlength=count)
+        shown, pixels = np.unique(image[image >= 0], return_counts=True)
+        seen = np.bincount(ids[visible & (ids >= 0)])[shown]
         packed = zlib.compress(image.astype(np.int32).tobytes(), 1)
-        found.append(Silhouettes(packed, image.shape, pixels, np.bincount(shown, minlength=count)))
+        found.append(Silhouettes(packed, image.shape, shown, pixels, seen))
     return found

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from scipy import sparse
 
-from perception.gaussians.model import Gaussians
-from perception.gaussians.rasterize import Settings, rasterize_backward, rasterize_forward, torch_on_one_thread
+from perception.gaussians.nearby import Nearby
+from perception.gaussians.rasterize import Settings, passes, torch_on_one_thread
 from perception.gaussians.train import TrainingView
 from perception.io.memory import return_free_memory
 from perception.progress import Progress
@@ -89,7 +89,7 @@ def summed(
 
 @torch_on_one_thread()
 def mask_votes(
-    gaussians: Gaussians,
+    nearby: Nearby,
     views: Sequence[TrainingView],
     *,
     half_resolution: bool = True,
@@ -107,7 +107,7 @@ def mask_votes(
     for index, view in enumerate(views):
         shown = view.halved() if half_resolution and min(view.photo.shape[:2]) > 1 else view
         if shown.labels is not None and bool((shown.labels > 0).any()):
-            weights, area = _of_view(gaussians, shown)
+            weights, area = _of_view(nearby, shown)
             parts.append(weights[:, 1:])
             voids.append(weights[:, :1])
             areas.append(area[1:])
@@ -117,7 +117,7 @@ def mask_votes(
         if progress is not None:
             progress.update("mask votes", index + 1, len(views))
     if not parts:
-        none = sparse.csr_matrix((len(gaussians), 0), dtype=np.float32)
+        none = sparse.csr_matrix((len(nearby.gaussians), 0), dtype=np.float32)
         return MaskVotes(none, none, np.zeros(0, np.int64), np.zeros(0))
     void = sparse.hstack(voids, format="csc").tocsr()
     weights = sparse.hstack(parts, format="csc")
@@ -127,17 +127,20 @@ def mask_votes(
 
 
 @torch.no_grad()
-def _of_view(gaussians: Gaussians, view: TrainingView) -> tuple[sparse.csc_matrix, np.ndarray]:
+def _of_view(nearby: Nearby, view: TrainingView) -> tuple[sparse.csc_matrix, np.ndarray]:
     """Weights [N, 1 + masks] and areas of one view. Column 0 holds the pixels that no mask covers."""
     assert view.labels is not None  # told by the caller
     height, width = view.photo.shape[:2]
     names, dense = np.unique(np.append(view.labels.numpy(), 0), return_inverse=True)
     labels = torch.from_numpy(dense.reshape(-1)[:-1].reshape(height, width))
     masks = range(len(names))
-    inputs = gaussians.inputs(view.camera_from_world, view.K, torch.zeros(len(gaussians), BLOCK))
+    gaussians, rows = nearby.of(view.name)
+    device = gaussians.means.device
+    run_forward, run_backward = passes(device)
+    inputs = gaussians.inputs(view.camera_from_world, view.K, torch.zeros(len(gaussians), BLOCK, device=device))
     settings = Settings(width, height, variance=False, depth=False, eps2d=view.eps2d)
-    forward = rasterize_forward((*inputs[:5], None, *inputs[6:]), None, settings)
-    seen = forward.visible[0].numpy().nonzero()[0]
+    forward = run_forward((*inputs[:5], None, *inputs[6:]), None, settings)
+    seen = forward.visible[0].cpu().numpy().nonzero()[0]
     found: list[tuple[np.ndarray, ...]] = []
     for first in range(0, len(masks), BLOCK):
         block = masks[first : first + BLOCK]
@@ -145,11 +148,10 @@ def _of_view(gaussians: Gaussians, view: TrainingView) -> tuple[sparse.csc_matri
         for channel, mask in enumerate(block):
             inside[0, ..., channel] = labels == mask
         wanted = tuple(name == 5 for name in range(7))  # the gradient of features, and no other
-        gradients = rasterize_backward(inputs, None, settings, forward, (None, None, None, inside, None), wanted)
-        assert gradients[5] is not None  # wanted
-        weights = gradients[5].numpy()[seen]
+        cotangents = (None, None, None, inside.to(device), None)
+        weights = run_backward(inputs, None, settings, forward, cotangents, wanted)[5].cpu().numpy()[seen]
         row, column = np.nonzero(weights > FAINTEST)
-        found.append((weights[row, column], seen[row], column + first))
+        found.append((weights[row, column], rows[seen[row]], column + first))
     weights, row, column = map(np.concatenate, zip(*found, strict=True))
-    table = sparse.csc_matrix((weights, (row, column)), shape=(len(gaussians), len(names)))
+    table = sparse.csc_matrix((weights, (row, column)), shape=(len(nearby.gaussians), len(names)))
     return table, np.bincount(dense.reshape(-1)[:-1], minlength=len(names)).astype(float)

@@ -21,6 +21,7 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians
+from perception.gaussians.nearby import Nearby
 from perception.gaussians.size import sized
 from perception.gaussians.train import TrainRecord
 from perception.geometry import camera_centres
@@ -137,8 +138,9 @@ def _divided(
 
 def optimise_blocks(
     run: Run, scene: Scene, blocks: Sequence[Block], held_out: Sequence[View], from_geometry: bool, engine: Engine
-) -> tuple[Gaussians, TrainRecord, list[dict[str, Any]]]:
-    """The joined Gaussians of all blocks, their training's record, and a report of each block.
+) -> tuple[Nearby, TrainRecord, list[dict[str, Any]]]:
+    """The joined Gaussians of all blocks, near a photo those of the blocks that were trained on it; their training's
+    record, and a report of each block.
 
     Each block is a task of the engine, in its own folder below `run.work`. A task that is finished is not run again.
     from_geometry: masks are made from a block's own depth, and not once per photo.
@@ -159,7 +161,21 @@ def optimise_blocks(
         box = [[float(x) if np.isfinite(x) else None for x in corner] for corner in (block.low, block.high)]
         counts = {"photos": len(block.views), "gaussians": len(own), "trained": len(gaussians)}
         reports.append({**counts, "iterations": record.iterations, "box": box})
-    return joined(parts), TrainRecord.joined(records), reports
+    rows = nearby_rows(scene, blocks, [len(part) for part in parts])
+    return Nearby(joined(parts).to(run.device), rows), TrainRecord.joined(records), reports
+
+
+def nearby_rows(scene: Scene, blocks: Sequence[Block], counts: Sequence[int]) -> dict[str, np.ndarray]:
+    """By photo, the rows of the joined Gaussians that blocks trained on it own; counts: Gaussians of each block."""
+    of_block = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+    holds = np.zeros((len(scene.views), len(blocks)), bool)
+    for number, block in enumerate(blocks):
+        holds[block.views, number] = True
+    sets: dict[bytes, np.ndarray] = {}
+    return {
+        view.name: sets.setdefault(held.tobytes(), np.concatenate([of_block[number] for number in held.nonzero()[0]]))
+        for view, held in zip(scene.views, holds, strict=True)
+    }
 
 
 def joined(parts: Sequence[Gaussians]) -> Gaussians:
@@ -222,7 +238,8 @@ def optimise_block(folder: str, progress: Progress | None = None) -> None:
         held = set(facts["held_out"])
         training = [view for view in scene.views if view.name not in held]
         photos = Photos.load(run, training, [view for view in scene.views if view.name in held])
-        gaussians, record, _ = optimise(run, scene, photos, make_source(config.masks, config.sam))
+        nearby, record, _ = optimise(run, scene, photos, make_source(config.masks, config.sam))
+        gaussians = nearby.gaussians.to("cpu")
         state = {"gaussians": {name: tensor.contiguous() for name, tensor in vars(gaussians).items()}}
         save_checkpoint(home / RESULT, {**state, "record": asdict(record)}, home.name)
         for name in (CHECKPOINT, BEFORE_MASKS):

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy import sparse
 
 from perception import _core
 from perception.boxes import instance_entry
 from perception.config import LanguageConfig, MapConfig
 from perception.gaussians.model import Gaussians
+from perception.gaussians.nearby import Nearby
 from perception.gaussians.train import TrainingView
 from perception.instances.crops import choose_views, view_scores
 from perception.instances.describe import describe_instances
@@ -46,7 +48,7 @@ class FoundInstances:
 
 
 def group_gaussians(
-    gaussians: Gaussians,
+    nearby: Nearby,
     views: list[TrainingView],
     config: MapConfig,
     progress: Progress,
@@ -57,8 +59,9 @@ def group_gaussians(
     cuts: of the surface, if the masks come from one."""
     if not any(view.labels is not None and bool((view.labels > 0).any()) for view in views):
         return None
-    progress.log(f"grouping {len(gaussians)} Gaussians")
-    votes = mask_votes(gaussians, views, half_resolution=config.losses.half_resolution, progress=progress)
+    progress.log(f"grouping {len(nearby.gaussians)} Gaussians")
+    votes = mask_votes(nearby, views, half_resolution=config.losses.half_resolution, progress=progress)
+    gaussians = nearby.gaussians.to("cpu")
     found = group(
         gaussians.means.detach().numpy(),
         gaussians.scales.detach().numpy(),
@@ -73,7 +76,7 @@ def group_gaussians(
 
 
 def describe(
-    gaussians: Gaussians,
+    nearby: Nearby,
     grouped: Grouping | None,
     views: list[TrainingView],
     words: LanguageConfig,
@@ -83,15 +86,15 @@ def describe(
 ) -> FoundInstances:
     """Geometry, score and views of each instance; with an encoder its language embeddings (§3.2.2), with a reader its
     printed texts."""
-    count = len(gaussians)
+    count = len(nearby.gaussians)
     if grouped is None:
         report = {"warnings": ["no photo has masks"]}
         return FoundInstances(np.full(count, -1, np.int32), np.zeros(count, np.float32), report=report)
     local = np.where(grouped.part_ids >= 0, grouped.part_ids - grouped.count, -1).astype(np.int32)
     together = np.append(grouped.groups, -1).astype(np.int32)
     levels = [grouped.ids, local, together[grouped.ids] if len(grouped.group_scores) else np.full_like(local, -1)]
-    seen, parts_seen, groups_seen = _silhouettes(gaussians, levels, views, progress) if grouped.count else ([], [], [])
-    found = FoundInstances(grouped.ids, grouped.membership, _entries(grouped, gaussians, seen))
+    seen, parts_seen, groups_seen = _silhouettes(nearby, levels, views, progress) if grouped.count else ([], [], [])
+    found = FoundInstances(grouped.ids, grouped.membership, _entries(grouped, nearby.gaussians.to("cpu"), seen))
     if reader is not None and grouped.count:
         choices = _best_views(grouped.ids, seen, words.views)
         # The networks of the copy are freed with it, before the encoder needs as much memory.
@@ -123,7 +126,7 @@ def describe(
 
 
 def _silhouettes(
-    gaussians: Gaussians, levels: list[np.ndarray], views: list[TrainingView], progress: Progress
+    nearby: Nearby, levels: list[np.ndarray], views: list[TrainingView], progress: Progress
 ) -> list[list[Silhouettes]]:
     """Of each level, the silhouettes of all views."""
     seen = []
@@ -133,7 +136,9 @@ def _silhouettes(
         if max(height, width) >= HALVED_FROM:  # as in `TrainingView.halved`
             height, width, eps2d = height // 2, width // 2, (eps2d + 0.25) / 4
             K = K * torch.tensor([[0.5], [0.5], [1.0]])
-        seen.append(render_silhouettes(gaussians, levels, view.camera_from_world, K, width, height, eps2d=eps2d))
+        gaussians, rows = nearby.of(view.name)
+        owners = [ids[rows] for ids in levels]
+        seen.append(render_silhouettes(gaussians, owners, view.camera_from_world, K, width, height, eps2d=eps2d))
         progress.update("silhouettes", done, len(views))
     _core.rasterizer_release_memory()  # hundreds of MiB, next to which the encoder's activations would lie
     return [list(level) for level in zip(*seen, strict=True)]
@@ -148,7 +153,9 @@ def _shown(view: TrainingView, seen: Silhouettes) -> tuple[np.ndarray, np.ndarra
 
 def _entries(grouped: Grouping, gaussians: Gaussians, seen: list[Silhouettes]) -> list[dict[str, Any]]:
     """instances.json's list, the parts of each instance inside its entry."""
-    views = np.sum([view.pixels > 0 for view in seen], axis=0) if seen else np.zeros(grouped.count)
+    views = np.zeros(grouped.count, int)
+    for view in seen:
+        views[view.shown] += 1
     points, weights = (t.detach().numpy().astype(np.float64) for t in (gaussians.means, gaussians.opacities))
 
     def entry(number: int, ids: np.ndarray, score: float, shown: int) -> dict[str, Any]:
@@ -188,8 +195,10 @@ def _embed(
 
 def _best_views(ids: np.ndarray, seen: list[Silhouettes], best: int) -> list[np.ndarray]:
     """The `best` views of each instance (eq. 10), see `crops.choose_views`."""
-    pixels = np.stack([view.pixels for view in seen], axis=1)
-    total = np.maximum(np.bincount(ids[ids >= 0], minlength=len(pixels)), 1)
-    visible = np.stack([view.visible for view in seen], axis=1) / total[:, None]
-    sizes = np.array([int(np.prod(view.shape)) for view in seen])
-    return choose_views(view_scores(pixels, sizes, visible), best)
+    total = np.bincount(ids[ids >= 0])
+    index = np.repeat(np.arange(len(seen)), [len(view.shown) for view in seen])
+    shown = np.concatenate([view.shown for view in seen])
+    pixels, visible = (np.concatenate([getattr(view, name) for view in seen]) for name in ("pixels", "visible"))
+    sizes = np.array([int(np.prod(view.shape)) for view in seen])[index]
+    scores = view_scores(pixels, sizes, visible / total[shown])
+    return choose_views(sparse.coo_matrix((scores, (shown, index)), shape=(len(total), len(seen))), best)

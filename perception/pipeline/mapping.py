@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from perception.errors import InputError
 from perception.frame.place import placed_scene
 from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians
+from perception.gaussians.nearby import Nearby
 from perception.gaussians.views import TrainingView, psnr, render_view, surface_depth
 from perception.io.inputs import load_saved_scene, load_scene, save_scene
 from perception.io.map_files import read_info
@@ -89,20 +91,22 @@ def build_map(
         # Optimise Gaussians on the photos and their masks (§3.1 to 3.2.3), block by block in a large place.
         if len(blocks) == 1:
             photos = Photos.load(run, training, held_out)
-            gaussians, trained, mask_report = optimise(run, scene, photos, mask_source)
+            nearby, trained, mask_report = optimise(run, scene, photos, mask_source)
             of_blocks: list[dict[str, Any]] = []
         else:
             where = engine or Engine()
-            gaussians, trained, of_blocks = optimise_blocks(run, scene, blocks, held_out, from_geometry, where)
+            nearby, trained, of_blocks = optimise_blocks(run, scene, blocks, held_out, from_geometry, where)
             photos = Photos.load(run, training, held_out)
-            mask_report = label_photos(run, photos, mask_source, lambda view: surface_depth(gaussians, view))
+            depth = partial(_depth_nearby, nearby)
+            mask_report = label_photos(run, photos, mask_source, depth)
         del mask_source  # with the views of stereo
 
         # Group the Gaussians by their features into instances (§3.2.1), describe these from their best views (§3.2.2).
         with run.stage("instances"):
             cuts = load_segmentation(run.masks) if from_geometry else None
-            grouped = group_gaussians(gaussians, photos.views, config, progress, cuts)
-            found = describe(gaussians, grouped, photos.views, config.language, encoder, progress, reader)
+            grouped = group_gaussians(nearby, photos.views, config, progress, cuts)
+            found = describe(nearby, grouped, photos.views, config.language, encoder, progress, reader)
+        gaussians = nearby.gaussians.to("cpu")
 
         with run.stage("score"):
             quality = score_views(gaussians, photos.held, scene.metric)
@@ -162,6 +166,10 @@ def _scene(source: Path, output: Path, work: Path, config: MapConfig, progress: 
     if config.losses.depth_weight == 0:
         return replace(scene, views=[replace(view, depth=None) for view in scene.views])
     return scene
+
+
+def _depth_nearby(nearby: Nearby, view: TrainingView) -> np.ndarray:
+    return surface_depth(nearby.of(view.name)[0], view)
 
 
 def score_views(gaussians: Gaussians, views: list[TrainingView], metric: bool = False) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import torch
 from perception.config import MapConfig
 from perception.gaussians.depth_start import start_on_surface
 from perception.gaussians.model import Gaussians, from_points
+from perception.gaussians.nearby import Nearby
 from perception.gaussians.size import sized
 from perception.gaussians.train import Trainer, TrainingView, TrainRecord
 from perception.gaussians.transients import train_without_transients
@@ -76,10 +77,8 @@ class Photos:
             return cls(training, held_out, views, load_all(held_out, side, run.progress, run.keep))
 
 
-def optimise(
-    run: Run, scene: Scene, photos: Photos, source: MaskSource
-) -> tuple[Gaussians, TrainRecord, dict[str, Any]]:
-    """Trained Gaussians on the CPU, the training's record and the masks' report; `photos.views` then have labels.
+def optimise(run: Run, scene: Scene, photos: Photos, source: MaskSource) -> tuple[Nearby, TrainRecord, dict[str, Any]]:
+    """The trained Gaussians, the training's record and the masks' report; `photos.views` then have labels.
 
     Goes on from the checkpoint in `run.work`, if there is one.
     """
@@ -108,7 +107,7 @@ def optimise(
     # Optimise colours and features together: L_RGB + λ_inst2d L_inst2d + λ_var L_var (§3.1 to 3.2.3, eq. 14).
     with run.stage("train"):
         trainer.run(observer)
-    found = trainer.gaussians.to("cpu"), trainer.record, report
+    found = Nearby(trainer.gaussians), trainer.record, report
     del trainer, observer
     gc.collect()  # a trainer and its schedule refer to each other, and to all photos
     return_free_memory()

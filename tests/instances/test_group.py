@@ -13,6 +13,7 @@ from sklearn.metrics import adjusted_rand_score
 pytest.importorskip("perception._core")
 from perception.config import InstanceConfig
 from perception.gaussians.model import from_points
+from perception.gaussians.nearby import Nearby
 from perception.gaussians.rasterize import rasterize
 from perception.gaussians.views import TrainingView
 from perception.instances.group import Grouping, group
@@ -22,7 +23,7 @@ from support.blob_scenes import BlobScene, make_scene, orbit, random_scene, with
 
 def run(scene: BlobScene, **changes: object) -> Grouping:
     g = scene.gaussians
-    votes = mask_votes(g, scene.views)
+    votes = mask_votes(Nearby(g), scene.views)
     arrays = (t.numpy() for t in (g.means, g.scales, g.opacities, g.features))
     return group(*arrays, votes, InstanceConfig(**changes))  # type: ignore[arg-type]
 
@@ -43,7 +44,7 @@ CAMERAS = orbit(8, 3.0, 1.5, np.zeros(3))
 def test_votes_are_the_weights_with_which_gaussians_enter_the_picture() -> None:
     scene = make_scene(row(3), CODES[:3, :8], CAMERAS[:2])
     g, view = scene.gaussians, scene.views[0]
-    votes = mask_votes(g, [view], half_resolution=False)
+    votes = mask_votes(Nearby(g), [view], half_resolution=False)
     names = np.unique(view.labels[view.labels > 0])
     for n in (0, 200, 449):  # render one Gaussian white among the others and add up the mask's pixels
         white = torch.zeros(len(g), 1)
@@ -70,7 +71,7 @@ def test_votes_at_half_resolution_weigh_what_the_full_picture_does() -> None:
     K = torch.tensor([[64.0, 0, 32], [0, 64, 32], [0, 0, 1]])
     labels = torch.ones(64, 64, dtype=torch.int32)
     view = TrainingView("a", torch.zeros(64, 64, 3, dtype=torch.uint8), labels, K, torch.eye(4))
-    full, half = (mask_votes(g, [view], half_resolution=choice).weights[0, 0] for choice in (False, True))
+    full, half = (mask_votes(Nearby(g), [view], half_resolution=choice).weights[0, 0] for choice in (False, True))
     expected = (deviation**2 + 0.3 + 0.25) / (deviation**2 + 0.3)
     assert 4 * half / full == pytest.approx(expected, rel=0.02)  # alpha under 1/255 is cut; with eps2d 0.3: 23 % more
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,6 +25,9 @@ KernelsFor = Callable[[KernelOptions, torch.device], Kernels]
 _TILE, _SPLAT, _MOMENTS = 16, 12, 10  # as in device.h: pixels, numbers of a splat, of a record before its features
 _NAMES = ("means", "quats", "scales", "opacities", "colors", "features", "viewmats", "Ks", "background")
 _MAX_RECORDS = 1 << 24  # with eight feature channels 1.2 GB of records, and 0.4 GB of lists
+_AT_ONCE = 64
+_NO_LABEL = np.iinfo(np.int32).max
+"""Labels whose weights are rendered at once, and a label beyond all others."""
 
 
 def _structure(name: str, pointers: str, numbers: str = "", reals: str = "", real: Any = ctypes.c_float) -> Any:
@@ -227,3 +231,28 @@ def rasterize_backward(
             if gradient is not None and value is not None:
                 gradient.mul_(slope(value))
     return [*grads, None if [index for index, w in enumerate(wanted) if w] == [5] else mean2d]
+
+
+def label_images(
+    inputs: tuple[Tensor | None, ...], labels: np.ndarray, least: float, settings: Settings
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `perception.gaussians.rasterize.label_images`: the weights of _AT_ONCE labels are rendered as features."""
+    viewmats = inputs[6]
+    assert viewmats is not None  # for the type checker
+    settings = replace(settings, variance=False, depth=False)
+    visible = rasterize_forward((*inputs[:5], None, *inputs[6:]), None, settings).visible[0].cpu().numpy().view(bool)
+    images = []
+    for row in labels:
+        names = torch.from_numpy(np.unique(row[visible & (row >= 0)])).to(viewmats.device)
+        of = torch.from_numpy(np.ascontiguousarray(row)).to(viewmats.device)
+        best = viewmats.new_full((settings.height, settings.width), least)
+        image = torch.full_like(best, -1, dtype=torch.int32)
+        for some in names.split(_AT_ONCE) if len(names) else ():
+            features = (of[:, None] == some).to(best.dtype)
+            weights = rasterize_forward((*inputs[:5], features, *inputs[6:]), None, settings).features
+            assert weights is not None  # for the type checker
+            most = weights[0].amax(dim=2)
+            first = torch.where(weights[0] == most[..., None], some, _NO_LABEL).amin(dim=2)  # of equal ones the smaller
+            image, best = torch.where(most > best, first, image), torch.maximum(most, best)
+        images.append(image.cpu().numpy())
+    return np.stack(images), visible
