@@ -18,8 +18,10 @@ from perception.gaussians.cuda import rasterize as on_device
 from perception.gaussians.cuda import training
 from perception.gaussians.losses import assign_labels, instance_loss
 from perception.gaussians.model import from_points
+from perception.gaussians.nearby import Nearby
 from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView
+from perception.instances.votes import mask_votes
 from support import pretend_device
 from support.cuda_emulator import emulated
 from support.pretend_device import pretended_device
@@ -180,6 +182,25 @@ def test_a_whole_training_runs_there_and_resumes_with_the_same_bits(pretended):
     for name, tensor in vars(whole.gaussians).items():
         assert torch.equal(tensor.cpu(), getattr(second.gaussians, name).cpu()), name
     assert whole.depth(whole.views[0]).shape == (32, 40)
+
+
+def test_labels_and_votes_of_a_photo_are_those_of_the_cpu(pretended, monkeypatch):
+    monkeypatch.setattr(on_device, "_AT_ONCE", 2)  # several times
+    of, view = trainer(None), painted_wall(0.0)
+    g = of.gaussians
+    settings = cpu.Settings(40, 32, depth=False)
+    labels = np.stack([np.arange(60) % 7 - 1, np.full(60, -1), np.zeros(60)]).astype(np.int32)
+    for least in (0.0, 0.1):
+        (expected, seen), (found, seen_there) = (
+            cpu.label_images(where.inputs(view.camera_from_world, view.K), labels, least, settings)
+            for where in (g, g.to(pretended))
+        )
+        np.testing.assert_array_equal(seen_there, seen)
+        assert found.dtype == expected.dtype and (found != expected).mean() < 0.002  # single precision at near ties
+        assert len(np.unique(expected[0])) > 4 and (expected[1] == -1).all()
+    here, there = (mask_votes(Nearby(where), [view], half_resolution=False) for where in (g, g.to(pretended)))
+    np.testing.assert_allclose(there.weights.toarray(), here.weights.toarray(), atol=2e-2)  # FAINTEST is dropped
+    assert here.weights.nnz > 20
 
 
 def test_a_full_memory_is_met_with_fewer_records_then_refused(pretended, monkeypatch):

@@ -8,6 +8,7 @@ import hdbscan
 import numpy as np
 import pytest
 import torch
+from scipy import sparse
 from sklearn.metrics import adjusted_rand_score
 
 pytest.importorskip("perception._core")
@@ -17,7 +18,7 @@ from perception.gaussians.nearby import Nearby
 from perception.gaussians.rasterize import rasterize
 from perception.gaussians.views import TrainingView
 from perception.instances.group import Grouping, group
-from perception.instances.votes import mask_votes
+from perception.instances.votes import beside, mask_votes
 from support.blob_scenes import BlobScene, make_scene, orbit, random_scene, with_errors
 
 
@@ -39,6 +40,31 @@ def row(count: int, gap: float = 0.8) -> np.ndarray:
 
 CODES = np.random.default_rng(0).normal(0, 0.5, (400, 32))
 CAMERAS = orbit(8, 3.0, 1.5, np.zeros(3))
+
+
+@pytest.mark.parametrize("widths", [[3], [1, 0, 4, 2], [2] * 40])
+def test_matrices_stand_beside_each_other_as_scipy_puts_them(widths: list[int]) -> None:
+    rng = np.random.default_rng(0)
+    parts = [sparse.random(30, width, 0.2, format="csc", dtype=np.float32, rng=rng) for width in widths]
+    expected = sparse.hstack(parts).tocsr()
+    found = beside(list(parts))
+    assert found.shape == expected.shape and found.has_canonical_format
+    for name in ("data", "indices", "indptr"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+def test_a_photo_votes_for_the_gaussians_near_it_as_if_there_were_no_others() -> None:
+    scene = make_scene(row(3), CODES[:3, :8], CAMERAS[:2])
+    g, (one, other) = scene.gaussians, scene.views
+    near = np.arange(100, 300)
+    votes = mask_votes(Nearby(g, {one.name: near}), [one, other])
+    of_near, of_all = mask_votes(Nearby(g.rows(torch.from_numpy(near))), [one]), mask_votes(Nearby(g), [other])
+    for name in ("weights", "void"):
+        both = getattr(votes, name).toarray()
+        width = getattr(of_near, name).shape[1]
+        np.testing.assert_array_equal(both[near, :width], getattr(of_near, name).toarray())
+        assert both[:, :width].sum() == both[near, :width].sum()
+        np.testing.assert_array_equal(both[:, width:], getattr(of_all, name).toarray())
 
 
 def test_votes_are_the_weights_with_which_gaussians_enter_the_picture() -> None:

@@ -19,7 +19,7 @@ from perception.gaussians.model import from_points
 from perception.geometry import look_at
 from perception.io.store import Map
 from perception.pipeline import blocks as module
-from perception.pipeline.blocks import APART, TASK, cut, joined, optimise_block, visible_points
+from perception.pipeline.blocks import APART, TASK, cut, joined, nearby_rows, optimise_block, visible_points
 from perception.pipeline.checkpoint import work_folder
 from perception.pipeline.engine import Engine
 from perception.pipeline.mapping import build_map
@@ -136,6 +136,18 @@ def test_each_thing_of_a_row_is_one_instance_also_on_seams(row: Path, whole: Map
     assert all(own[1:].max() > 0.75 * own.sum() for own in owners)
     piece = build_map(row, tmp_path / "piece.gsmap", settings(row, "train.block_photos=0"))
     assert whole.info["quality"]["psnr"] > piece.info["quality"]["psnr"] - 1.0  # both are about 28 dB
+
+
+def test_near_a_photo_are_the_gaussians_of_the_blocks_trained_on_it() -> None:
+    scene = corridor()
+    blocks = cut(scene, 15)
+    counts = list(range(2, 2 + len(blocks)))
+    owner = np.repeat(np.arange(len(blocks)), counts)
+    rows = nearby_rows(scene, blocks, counts)
+    for number, view in enumerate(scene.views):
+        expected = [i for i, block in enumerate(owner) if number in blocks[block].views]
+        assert rows[view.name].tolist() == expected
+    assert len(blocks) > 2 and len({id(array) for array in rows.values()}) < len(scene.views)  # shared
 
 
 @pytest.mark.slow

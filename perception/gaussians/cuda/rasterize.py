@@ -205,7 +205,10 @@ def rasterize_backward(
         ]
     features, viewmats = grads[5:]
     cameras = None if viewmats is None else call.means.new_zeros((count, call.n, 12))
-    images = (forward.colors, forward.alphas, forward.depths, forward.features, forward.feature_variance)
+    rendered = forward.features
+    if rendered is None and call.dims:  # the forward pass had no features: these are zeros, wanted for their gradient
+        rendered = call.means.new_zeros((*forward.alphas.shape, call.dims))
+    images = (forward.colors, forward.alphas, forward.depths, rendered, forward.feature_variance)
     given = tuple(None if g is None else g.contiguous() for g in cotangents)
     for camera, strips in enumerate(frames.views):
         visible, of_camera = frames.visible[camera], None if cameras is None else cameras[camera]
