@@ -73,11 +73,14 @@ def cut(scene: Scene, most: int) -> list[Block]:
     whole = Block(np.full(3, -np.inf), np.full(3, np.inf), np.arange(count))
     if most == 0 or count <= most or len(scene.points) == 0 or scene.report.get("points_from") == "random":
         return [whole]
-    step = -(-len(scene.points) // SAMPLE)
-    points = scene.points[::step]
+    points = _sample(scene.points)
     seen = sparse.csr_matrix(sparse.vstack([_row(visible_points(view, points)) for view in scene.views]))
     centres = camera_centres(np.stack([view.camera_from_world for view in scene.views]))
     return _halved(whole, points, seen, centres, most)
+
+
+def _sample(points: np.ndarray) -> np.ndarray:
+    return points[:: -(-len(points) // SAMPLE)]
 
 
 def visible_points(view: View, points: np.ndarray) -> np.ndarray:
@@ -139,8 +142,7 @@ def _divided(
 def optimise_blocks(
     run: Run, scene: Scene, blocks: Sequence[Block], held_out: Sequence[View], from_geometry: bool, engine: Engine
 ) -> tuple[Nearby, TrainRecord, list[dict[str, Any]]]:
-    """The joined Gaussians of all blocks, near a photo those of the blocks that were trained on it; their training's
-    record, and a report of each block.
+    """The joined Gaussians of all blocks, with those near each photo; their training's record, a report of each block.
 
     Each block is a task of the engine, in its own folder below `run.work`. A task that is finished is not run again.
     from_geometry: masks are made from a block's own depth, and not once per photo.
@@ -166,9 +168,12 @@ def optimise_blocks(
 
 
 def nearby_rows(scene: Scene, blocks: Sequence[Block], counts: Sequence[int]) -> dict[str, np.ndarray]:
-    """By photo, the rows of the joined Gaussians that blocks trained on it own; counts: Gaussians of each block."""
+    """By photo, the rows of the joined Gaussians of the blocks that it was used for or of which it sees a point.
+    counts: Gaussians of each block, in order."""
     of_block = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
-    holds = np.zeros((len(scene.views), len(blocks)), bool)
+    points = _sample(scene.points)
+    owned = np.stack([block.owns(points) for block in blocks])
+    holds = np.stack([owned[:, visible_points(view, points)].any(axis=1) for view in scene.views])
     for number, block in enumerate(blocks):
         holds[block.views, number] = True
     sets: dict[bytes, np.ndarray] = {}
