@@ -5,20 +5,26 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import os
 import pkgutil
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+import perception
 from perception.bench import BENCHES
 from perception.cli import build_parser, main
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "launch/README.md", ROOT / "calib/README.md"]
+
+SCRIPT = re.compile(r"\bpython (tests/[a-z_/]+\.py)")
 
 # Run elsewhere: servers by their own tests, calibration on rendered boards, bags on written ones, models on built ones.
 ELSEWHERE = {"demo", "serve", "mcp", "node", "view", "bench", "calibrate", "frames", "models"}
@@ -50,6 +56,16 @@ def test_documented_commands_are_understood(page: str, command: str, capsys: pyt
         build_parser().parse_args(arguments(command))
     except SystemExit as done:  # --help
         assert done.code == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", sorted({name for page in PAGES for name in SCRIPT.findall(page.read_text("utf-8"))}))
+def test_documented_scripts_find_what_they_import(script: str, tmp_path: Path) -> None:
+    """From any folder, with the package installed and nothing set."""
+    code = f"import runpy; runpy.run_path({str(ROOT / script)!r}, run_name='imported')"
+    environment = {**os.environ, "PYTHONPATH": str(Path(perception.__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_no_line_installs_the_stranger_called_perception() -> None:

@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 HOMES = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(HOMES), str(HOMES.parent)]
+sys.path.insert(0, str(HOMES))
 os.environ["PYTHONPATH"] = os.pathsep.join([str(HOMES), str(HOMES.parent), os.environ.get("PYTHONPATH", "")])
 from kills.cases import contents  # noqa: E402
 from support.row_scene import write_row  # noqa: E402

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 HOMES = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(HOMES), str(HOMES.parent)]
+sys.path.insert(0, str(HOMES))
 
 
 def render(

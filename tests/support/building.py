@@ -17,11 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from perception.geometry import look_at
-from worlds import room, scene
-from worlds.cameras import UP, Camera, intrinsics, walk
-from worlds.light import Body, Part, Scene, corners
-from worlds.shapes import Sheet, to_world
+HOMES = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(HOMES))
+from perception.geometry import look_at  # noqa: E402
+from worlds import room, scene  # noqa: E402
+from worlds.cameras import UP, Camera, intrinsics, walk  # noqa: E402
+from worlds.light import Body, Part, Scene, corners  # noqa: E402
+from worlds.shapes import Sheet, to_world  # noqa: E402
 
 VIEWS, FOCAL_35MM, POINTS = 1200, 26, 600_000
 OPENING, HIGH, CORNER = 0.95, 2.1, 0.12
@@ -162,7 +164,6 @@ def _sparse(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--rooms", type=int, default=6)

@@ -16,11 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from worlds import scene, things
-from worlds.cameras import orbit
-from worlds.light import Body, Scene, bake_all
-from worlds.shapes import placed, spin
-from worlds.tabletop import FOCAL_35MM, LIGHTING, POINTS, VIEWS, room_around, spots
+HOMES = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(HOMES))
+from worlds import scene, things  # noqa: E402
+from worlds.cameras import orbit  # noqa: E402
+from worlds.light import Body, Scene, bake_all  # noqa: E402
+from worlds.shapes import placed, spin  # noqa: E402
+from worlds.tabletop import FOCAL_35MM, LIGHTING, POINTS, VIEWS, room_around, spots  # noqa: E402
 
 __all__ = ["FOCAL_35MM", "POINTS", "VIEWS", "build"]
 
