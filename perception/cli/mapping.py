@@ -11,6 +11,7 @@ from typing import Any
 from perception.cli.parser import command, map_command
 from perception.errors import InputError
 from perception.interrupts import handled
+from perception.io.object_store import place
 
 
 def register(commands: Any) -> None:
@@ -61,8 +62,8 @@ def _add_map(commands: Any) -> None:
         commands, "map", _map, "build a map from photos, a video, a COLMAP workspace, a transforms.json or RGB-D"
     )
     p.formatter_class, p.late_epilog = argparse.RawDescriptionHelpFormatter, _settings
-    p.add_argument("input", type=Path, metavar="INPUT")
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="MAP")
+    p.add_argument("input", type=place, metavar="INPUT", help="a path, or the URL of a copy in an object store")
+    p.add_argument("-o", "--output", type=place, required=True, metavar="MAP", help="a path or URL")
     p.add_argument("--config", type=Path, metavar="FILE.toml")
     p.add_argument("--preset", default="default", help="fast, default, quality or paper")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
@@ -121,17 +122,15 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     config = load_config(args.config, settings_given(args), args.preset)
     from perception.pipeline.engine import Engine
-    from perception.pipeline.mapping import build_map
-    from perception.pipeline.reporting import write_own_report
+    from perception.pipeline.remote import make_map
     from perception.pipeline.summary import map_facts
     from perception.progress import Progress
 
     engine = Engine(args.engine, args.address)
     with _sigterm_as_interrupt(), Progress() as progress:
-        gmap = build_map(args.input, args.output, config, resume=args.resume, progress=progress, engine=engine)
-        write_own_report(args.output, progress)
+        info = make_map(args.input, args.output, config, resume=args.resume, progress=progress, engine=engine)
 
-    return map_facts(args.output, gmap.info, len(gmap), len(gmap.instances)), ""
+    return map_facts(args.output, info), ""
 
 
 def _fleet(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

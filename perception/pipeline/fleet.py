@@ -9,14 +9,14 @@ from typing import Any
 
 from perception.config import MapConfig, Settings, load_config, settings_from
 from perception.errors import InputError, refuse_named_pipe
+from perception.io.object_store import is_url, place
 from perception.pipeline.engine import Engine
-from perception.pipeline.mapping import build_map
-from perception.pipeline.reporting import write_own_report
+from perception.pipeline.remote import make_map
 from perception.progress import Progress
 
 
 class Job(Settings):
-    """One map: paths of its input and output, relative to the list, and its settings as `perception map` takes them."""
+    """One map: its input and output, URLs or paths relative to the list; its settings as `perception map` has them."""
 
     input: str
     output: str
@@ -55,8 +55,8 @@ def read_jobs(file: Path) -> list[dict[str, Any]]:
             if key not in given:
                 raise InputError(f"{where}: has no {key}")
         job = settings_from(Job, given)
-        paths = {key: str((file.parent / getattr(job, key)).resolve()) for key in ("input", "output")}
-        if not Path(paths["input"]).exists():
+        paths = {key: _place(getattr(job, key), file.parent) for key in ("input", "output")}
+        if not is_url(paths["input"]) and not Path(paths["input"]).exists():
             raise InputError(f"{where}: {paths['input']} does not exist")
         if (other := outputs.setdefault(paths["output"], number)) != number:
             raise InputError(f"{where}: has the output of job {other}, {paths['output']}")
@@ -65,14 +65,17 @@ def read_jobs(file: Path) -> list[dict[str, Any]]:
     return jobs
 
 
+def _place(text: str, folder: Path) -> str:
+    return text if is_url(text) else str((folder / text).resolve())
+
+
 def map_one(task: str, progress: Progress | None = None) -> dict[str, Any]:
     """Makes the map of one job. An InputError is in its result, so that the other maps are made."""
     job, progress = json.loads(task), progress or Progress(quiet=True)
     told = {"input": job["input"], "output": job["output"]}
     try:
         config = MapConfig.model_validate(job["settings"])
-        gmap = build_map(Path(job["input"]), Path(job["output"]), config, resume=True, progress=progress)
+        info = make_map(place(job["input"]), place(job["output"]), config, resume=True, progress=progress)
     except InputError as error:
         return {**told, "error": " ".join(str(error).split())}
-    write_own_report(Path(job["output"]), progress)
-    return {**told, "seconds": gmap.info["seconds"]["total"], "instances": len(gmap.instances)}
+    return {**told, "seconds": info["seconds"]["total"], "instances": info["num_instances"]}

@@ -55,13 +55,14 @@ def build_map(
     resume: bool = False,
     progress: Progress | None = None,
     engine: Engine | None = None,
+    origin: str | None = None,
 ) -> Map:
     """Builds a map from photos, a video, a COLMAP workspace or a transforms.json, and writes it to `output`.
 
     Raises InputError for bad input. Intermediate results are kept beside `output` until the map is written; with
     `resume` a run continues from them and repeats only what has changed (see `pipeline.checkpoint`). A run that fails
     before training leaves no files. Resuming a finished run returns its map. engine: where the blocks of a large place
-    are trained; None: here.
+    are trained; None: here. origin: the input's name in map.json, where `source` is a copy of it.
     """
     progress, started = progress or Progress(quiet=True), time.monotonic()
     if resume and output.exists() and read_info(output).get("fingerprint") == fingerprint(source, config):
@@ -114,7 +115,7 @@ def build_map(
             "frame": scene.frame,
             "metric": scene.metric,
             **{key: scene.report[key] for key in FRAME_FACTS if key in scene.report},
-            "source": str(source),
+            "source": origin or str(source),
             "seed": config.seed,
             "fingerprint": fingerprint(source, config),
             "config": config.to_json(),

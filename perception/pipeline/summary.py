@@ -10,13 +10,13 @@ import numpy as np
 from perception.query import Hit
 
 
-def map_facts(path: Path, info: dict[str, Any], gaussians: int, instances: int) -> dict[str, Any]:
+def map_facts(path: Path | str, info: dict[str, Any]) -> dict[str, Any]:
     """The JSON output of `perception map`; info: content of map.json."""
     scene = info["scene"]
     return {
         "map": str(path),
-        "gaussians": gaussians,
-        "instances": instances,
+        "gaussians": info["num_gaussians"],
+        "instances": info["num_instances"],
         "quality": info["quality"],
         "seconds": info["seconds"],
         "peak_memory_mib": info["peak_memory_mib"],
