@@ -48,7 +48,8 @@ def model_warnings(models: list[Any], database: Path, photos: int) -> list[str]:
         warnings.append(f"only {registered} of {photos} photos are registered")
     if len(models) > 1 and models[1].num_reg_images() > MAX_SECOND_MODEL * registered:
         sizes = ", ".join(str(model.num_reg_images()) for model in models)
-        warnings.append(f"the photos split into {len(models)} unconnected models ({sizes}); the largest is used")
+        split = f"the photos split into {len(models)} unconnected models ({sizes}); the largest is mapped"
+        warnings.append(f"{split}; for another, put the photos that are left out into a folder of their own")
     pairs = verified_pairs(best, database)
     wrong = len(stronger_contradictions(pairs))
     if len(pairs) >= 5 and wrong > MAX_CONTRADICTED * len(pairs):

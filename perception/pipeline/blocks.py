@@ -7,7 +7,6 @@ its box. Instances are found afterwards, from the masks of all photos, so a thin
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -25,14 +24,13 @@ from perception.gaussians.nearby import Nearby
 from perception.gaussians.size import sized
 from perception.gaussians.train import TrainRecord
 from perception.geometry import camera_centres
-from perception.io.atomic import atomic_file, writing
-from perception.io.inputs import load_saved_scene, save_scene
+from perception.io.atomic import writing
 from perception.masks import make_source
 from perception.pipeline.checkpoint import BEFORE_MASKS, CHECKPOINT, digest, load_checkpoint, save_checkpoint
 from perception.pipeline.engine import Engine
 from perception.pipeline.estimate import largest_budget, memory_limit
 from perception.pipeline.optimise import Photos, Run, optimise
-from perception.pipeline.record import versions
+from perception.pipeline.tasks import has_task, read_task, write_task
 from perception.progress import Progress
 from perception.types import Scene, View
 
@@ -46,7 +44,7 @@ LEAST_GAIN = 0.85
 """Largest share of a block's photos that either half may have after a cut; a place that all photos see stays whole."""
 APART = 4.0
 """Distance between the features of two blocks, which are not comparable: more than the loss's margin of 1."""
-TASK, RESULT = "block.json", "result.pt"
+RESULT = "result.pt"
 
 
 @dataclass(frozen=True)
@@ -201,42 +199,28 @@ def _task(run: Run, scene: Scene, block: Block, held: set[str], from_geometry: b
     names = [view.name for view in views]
     box = [block.low.tolist(), block.high.tolist()]
     folder = run.work / f"block-{digest(run.mark, names, box)}"
-    if not (folder / TASK).is_file():
+    if not has_task(folder):
         seen = np.zeros(len(scene.points), bool)
         for view in views:
             seen |= visible_points(view, scene.points)
-        part = replace(scene, views=views, points=scene.points[seen], point_colors=scene.point_colors[seen])
-        save_scene(folder / "scene", part)
-        trained = len(set(names) - held)
-        facts = {
-            "source": str(run.source.resolve()),
-            "config": sized(run.config, trained, largest_budget(memory_limit())).to_json(),  # not by a worker's memory
-            "held_out": sorted(held & set(names)),
-            "masks": str((folder / "masks" if from_geometry else run.masks).resolve()),
-            "versions": versions(),
-        }
-        with atomic_file(folder / TASK) as aside:
-            aside.write_text(json.dumps(facts), encoding="utf-8")
+        write_task(
+            folder,
+            replace(scene, views=views, points=scene.points[seen], point_colors=scene.point_colors[seen]),
+            source=str(run.source.resolve()),
+            config=sized(run.config, len(set(names) - held), largest_budget(memory_limit())).to_json(),  # the driver's
+            held_out=sorted(held & set(names)),
+            masks=str((folder / "masks" if from_geometry else run.masks).resolve()),
+        )
     return folder
 
 
 def optimise_block(folder: str, progress: Progress | None = None) -> None:
-    """Trains the block whose task lies in `folder`, and writes RESULT there. Goes on from its checkpoint, if any.
-
-    InputError where the task was written by another version of the program.
-    """
+    """Trains the block whose task lies in `folder`, and writes RESULT there. Goes on from its checkpoint, if any."""
     home = Path(folder)
     if load_checkpoint(home / RESULT, home.name) is not None:
         return
-    facts = json.loads((home / TASK).read_text(encoding="utf-8"))
-    own, theirs = versions(), facts["versions"]
-    for name in sorted({*own, *theirs}):
-        if own.get(name) != theirs.get(name):
-            found = f"this worker has {name} {own.get(name)}, the run {theirs.get(name)}"
-            raise InputError(f"{home}: {found}; install the same")
-    config, scene = MapConfig.model_validate(facts["config"]), load_saved_scene(home / "scene")
-    if scene is None:
-        raise InputError(f"{home}: the part of the scene is missing; delete the folder and run again")
+    scene, facts = read_task(home)
+    config = MapConfig.model_validate(facts["config"])
     with writing(home / RESULT):
         device = choose_device(config.device)[0]
         run = Run(Path(facts["source"]), config, home, Path(facts["masks"]), device, progress or Progress(quiet=True))

@@ -36,7 +36,7 @@ from perception.pipeline.checkpoint import clear_work, fingerprint, frames_folde
 from perception.pipeline.engine import Engine
 from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
-from perception.pipeline.optimise import Photos, Run, label_photos, optimise
+from perception.pipeline.optimise import Photos, Run, label_by_tasks, label_photos, optimise
 from perception.pipeline.photos import exposed_as_neighbours, split_views
 from perception.pipeline.record import depth_errors, depth_used, finite, peak_memory_mib, versions
 from perception.pipeline.summary import depth_text, frame_lines
@@ -88,6 +88,8 @@ def build_map(
         held_out = exposed_as_neighbours(held_out, training)
         scene = replace(scene, views=sorted([*training, *held_out], key=lambda view: view.name))
         blocks, from_geometry = cut(scene, config.train.block_photos), isinstance(mask_source, BuiltinSegmentation)
+
+        label_by_tasks(run, training, mask_source, engine or Engine())
 
         # Optimise Gaussians on the photos and their masks (§3.1 to 3.2.3), block by block in a large place.
         if len(blocks) == 1:

@@ -21,16 +21,21 @@ from perception.gaussians.train import Trainer, TrainingView, TrainRecord
 from perception.gaussians.transients import train_without_transients
 from perception.io.memory import DiskArrays, Keep, return_free_memory
 from perception.io.photos import load_photo
-from perception.masks import MaskSource, compute_masks
+from perception.masks import MaskSource, compute_masks, make_source
 from perception.masks.builtin import BuiltinSegmentation
-from perception.pipeline.checkpoint import TrainingObserver, training_mark
+from perception.masks.sam import SamSource
+from perception.pipeline.checkpoint import TrainingObserver, digest, training_mark
+from perception.pipeline.engine import Engine
 from perception.pipeline.estimate import image_memory, largest_budget, memory_limit
 from perception.pipeline.photos import load_all, with_labels
+from perception.pipeline.tasks import has_task, read_task, write_task
 from perception.progress import Progress, timed
 from perception.types import Scene, View
 
 GEOMETRY_START = 0.3
 """Training progress at which masks that use the depth of the map (the built-in ones) are made."""
+PHOTOS_A_TASK = 8
+"""Photos whose masks one task makes: minutes with SAM on a CPU, and reading the model takes seconds."""
 
 
 @dataclass
@@ -127,6 +132,31 @@ def initial_gaussians(scene: Scene, config: MapConfig, views: Sequence[TrainingV
         keep = np.random.default_rng(seed).choice(len(points), budget, replace=False)
         points, colors = points[np.sort(keep)], colors[np.sort(keep)]
     return from_points(points, colors, feature_dim=feature_dim, seed=seed)
+
+
+def label_by_tasks(run: Run, views: Sequence[View], source: MaskSource, engine: Engine) -> None:
+    """Has the label images of `views` made on other machines where they are slow and need nothing but the photo: by a
+    model. `label_photos` then finds them."""
+    if engine.kind == "local" or not isinstance(source, SamSource):
+        return
+    folders = []
+    for start in range(0, len(views), PHOTOS_A_TASK):
+        some = list(views[start : start + PHOTOS_A_TASK])
+        folders.append(run.work / f"labels-{digest(run.mark, source.identity, [view.name for view in some])}")
+        if not has_task(folders[-1]):
+            scene = Scene(some, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+            write_task(folders[-1], scene, config=run.config.to_json(), masks=str(run.masks.resolve()))
+    with run.stage("masks"):
+        engine.run(label_task, [str(folder.resolve()) for folder in folders], "photo set", run.progress)
+
+
+def label_task(folder: str, progress: Progress | None = None) -> None:
+    """Makes the label images of the photos whose task lies in `folder`, where they are missing or out of date."""
+    scene, facts = read_task(Path(folder))
+    config = MapConfig.model_validate(facts["config"])
+    side = config.photos.max_side
+    source, masks = make_source(config.masks, config.sam), Path(facts["masks"])
+    compute_masks(scene.views, source, lambda view: load_photo(view, side), masks, progress, depth_key=f"{side} px")
 
 
 def label_photos(

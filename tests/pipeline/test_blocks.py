@@ -19,12 +19,13 @@ from perception.gaussians.model import from_points
 from perception.geometry import look_at
 from perception.io.store import Map
 from perception.pipeline import blocks as module
-from perception.pipeline.blocks import APART, TASK, cut, joined, nearby_rows, optimise_block, visible_points
+from perception.pipeline.blocks import APART, cut, joined, nearby_rows, optimise_block, visible_points
 from perception.pipeline.checkpoint import work_folder
 from perception.pipeline.engine import Engine
 from perception.pipeline.mapping import build_map
 from perception.pipeline.optimise import Run
 from perception.pipeline.record import versions
+from perception.pipeline.tasks import TASK
 from perception.progress import Progress
 from perception.types import Scene, View
 from support.interrupts import interrupt_at
@@ -136,6 +137,19 @@ def test_each_thing_of_a_row_is_one_instance_also_on_seams(row: Path, whole: Map
     assert all(own[1:].max() > 0.75 * own.sum() for own in owners)
     piece = build_map(row, tmp_path / "piece.gsmap", settings(row, "train.block_photos=0"))
     assert whole.info["quality"]["psnr"] > piece.info["quality"]["psnr"] - 1.0  # both are about 28 dB
+
+
+def test_places_without_a_photo_in_common_are_blocks_of_one_frame() -> None:
+    one = corridor()
+    away = np.array([60.0, 0, 0])  # 39 m between them
+    shift = np.eye(4)
+    shift[:3, 3] = -away
+    moved = [replace(view, camera_from_world=view.camera_from_world @ shift) for view in one.views]
+    points = np.concatenate([one.points, one.points + away])
+    found = cut(Scene([*one.views, *moved], points, np.zeros((4000, 3), np.uint8)), 40)
+    first = [block for block in found if block.views.min() < 40]
+    assert all(block.views.max() < 40 for block in first) and 0 < len(first) < len(found)
+    assert {int(i) for block in found for i in block.views} == set(range(80))
 
 
 def test_near_a_photo_are_the_gaussians_of_the_blocks_that_it_sees() -> None:
