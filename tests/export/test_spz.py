@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import gzip
 import math
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -16,33 +14,10 @@ from perception.errors import InputError
 from perception.export.spz import FLIPS, spz_bytes
 from perception.gaussians.rasterize import rasterize
 from perception.io.store import Map, read_map
+from support.compressed import read_spz
 from support.query_maps import write_map_of
 
 SHIFT = np.array([1, -1, -1])
-
-
-def decoded(data: bytes) -> dict[str, np.ndarray]:
-    raw = gzip.decompress(data)
-    magic, version, count, degree, bits, flags, reserved = struct.unpack("<IIIBBBB", raw[:16])
-    assert (magic, version, flags, reserved) == (0x5053474E, 2, 0, 0)
-    at, found = 16, {}
-    rest = (degree + 1) ** 2 - 1
-    for name, width in (("xyz", 9), ("alpha", 1), ("color", 3), ("scale", 3), ("rotation", 3), ("sh", 3 * rest)):
-        found[name] = np.frombuffer(raw, np.uint8, count * width, at).reshape(count, width).astype(np.int64)
-        at += count * width
-    assert at == len(raw)
-    triples = found["xyz"].reshape(count, 3, 3) @ [1, 256, 65536]
-    xyz = np.where(triples >= 1 << 23, triples - (1 << 24), triples) / 2.0**bits
-    vector = found["rotation"] / 127.5 - 1
-    w = np.sqrt(np.maximum(0, 1 - (vector**2).sum(axis=1)))
-    return {
-        "means": xyz,
-        "opacities": found["alpha"][:, 0] / 255,
-        "dc": (found["color"] / 255 - 0.5) / 0.15,
-        "log_scales": found["scale"] / 16 - 10,
-        "quats": np.column_stack([w, vector]),
-        "sh": (found["sh"].reshape(count, rest, 3) - 128) / 128,
-    }
 
 
 def a_map(degree: int = 3, size: float = 5.0, count: int = 200) -> Map:
@@ -63,7 +38,7 @@ def a_map(degree: int = 3, size: float = 5.0, count: int = 200) -> Map:
 @pytest.mark.parametrize(("degree", "size"), [(0, 5.0), (1, 0.1), (3, 5.0), (3, 3000.0)])
 def test_values_are_what_the_bits_can_hold(degree: int, size: float) -> None:
     gmap = a_map(degree, size)
-    found = decoded(spz_bytes(gmap))
+    found = read_spz(spz_bytes(gmap))
     bits = min(12, 22 - math.ceil(math.log2(max(1, size))))
     assert np.abs(found["means"] - gmap.means * SHIFT).max() <= 0.5 / 2**bits
     assert np.abs(found["opacities"] - gmap.opacities).max() <= 0.5 / 255 + 1e-6
@@ -104,7 +79,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     path = write_map_of(tmp_path / "a.gsmap")
     assert main(["export", str(path), "-o", str(tmp_path / "a.spz")]) == 0
     gmap = read_map(path)
-    found = decoded((tmp_path / "a.spz").read_bytes())
+    found = read_spz((tmp_path / "a.spz").read_bytes())
     assert len(found["means"]) == len(gmap)
     np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), gmap.instance_ids)
     assert "3000 Gaussians" in capsys.readouterr().out
