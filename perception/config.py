@@ -103,9 +103,6 @@ class TrainConfig(Settings):
     block_photos: int = Field(
         400, ge=0, le=10**6, description="a place seen by more photos is trained in overlapping blocks; 0: never"
     )
-    transients: bool = Field(
-        False, description="leave out parts of photos that disagree with the others, such as people who walk"
-    )
     sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics that is tried")
 
 
@@ -180,7 +177,6 @@ PAPER: dict[str, Any] = {
     "train.iterations": 30_000,
     "train.exchange_db": 0.0,
     "train.budget": 2_000_000,
-    "train.transients": False,
     "train.sh_degree": 3,
     "densify.every": 100,
     "densify.grad_threshold": 3.5e-4,

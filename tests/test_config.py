@@ -36,7 +36,7 @@ def test_the_papers_preset_is_the_published_method() -> None:
     assert found == {
         "train": {
             "effort": 1, "iterations": 30_000, "time_limit": None, "exchange_db": 0, "budget": 2_000_000,
-            "block_photos": 0, "transients": False, "sh_degree": 3,
+            "block_photos": 0, "sh_degree": 3,
         },
         "densify": {"every": 100, "grad_threshold": 3.5e-4},
         "losses": {

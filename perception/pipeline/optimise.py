@@ -18,7 +18,6 @@ from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.nearby import Nearby
 from perception.gaussians.size import sized
 from perception.gaussians.train import Trainer, TrainingView, TrainRecord
-from perception.gaussians.transients import train_without_transients
 from perception.io.memory import DiskArrays, Keep, return_free_memory
 from perception.io.photos import load_photo
 from perception.masks import MaskSource, compute_masks, make_source
@@ -96,11 +95,6 @@ def optimise(run: Run, scene: Scene, photos: Photos, source: MaskSource) -> tupl
     masks_enter = GEOMETRY_START if from_geometry else config.losses.start
     observer = TrainingObserver(run.work, run.mark, source.identity, masks_enter, run.progress)
     observer.take_up(trainer)
-    if config.train.transients:
-        with run.stage("train"):
-            photos.views = train_without_transients(
-                trainer, photos.views, observer, run.work / "transients.npz", run.progress
-            )
 
     # Instance masks M_v,i of every photo (§3.2). Some need the depth of the map, which is then trained first.
     if from_geometry and trainer.progress < GEOMETRY_START:
