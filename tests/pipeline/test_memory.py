@@ -1,6 +1,6 @@
 """Memory that does not grow with the number of photos. As a command it reads the peak of whole runs:
 
-python tests/pipeline/test_memory.py SCENE --photos 100 300 1000 --memory 500M
+python tests/pipeline/test_memory.py SCENE --photos 100 300 1000 --memory 500M [--plot peaks.png]
 """
 
 from __future__ import annotations
@@ -117,10 +117,12 @@ def main() -> None:
     parser.add_argument("--memory", help="as of `map`")
     parser.add_argument("--builtin", action="store_true", help="masks of the built-in segmentation, not of labels/")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draws both against the photos (matplotlib)")
     options = parser.parse_args()
     few = ["train.iterations=40", "train.budget=5000", "language.encoder=none", "photos.poses=keep", *options.pairs]
     more = ["--memory", options.memory] if options.memory else []
     paths = {**os.environ, "PYTHONPATH": str(Path(perception.__file__).resolve().parents[1])}
+    measured = []
     for count in options.photos:
         with tempfile.TemporaryDirectory() as folder:
             scene = repeated(options.scene, count, Path(folder) / "scene")
@@ -135,6 +137,23 @@ def main() -> None:
             cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
             peak = json.loads(done.stdout)["peak_memory_mib"]
             print(f"{count} photos: peak {peak:.0f} MiB, {cpu:.0f} s of CPU", flush=True)
+            measured.append((count, cpu, peak))
+    if options.plot:
+        draw(measured, options.plot)
+
+
+def draw(measured: list[tuple[int, float, float]], file: Path) -> None:
+    from matplotlib import pyplot as plt
+
+    counts, *curves = zip(*measured, strict=True)
+    _, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
+    for axis, values, label in zip(axes, curves, ("CPU seconds", "peak memory, MiB"), strict=True):
+        axis.plot(counts, values, "o-")
+        axis.set(xlabel="photos", ylabel=label, ylim=(0, 1.15 * max(values)))
+        for count, value in zip(counts, values, strict=True):
+            axis.annotate(f"{value:.0f}", (count, value), (0, 6), textcoords="offset points", ha="center")
+        axis.grid(alpha=0.3)
+    plt.savefig(file, dpi=110)
 
 
 if __name__ == "__main__":
