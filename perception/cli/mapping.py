@@ -122,15 +122,23 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     config = load_config(args.config, settings_given(args), args.preset)
     from perception.pipeline.engine import Engine
-    from perception.pipeline.remote import make_map
+    from perception.pipeline.mapping import build_map
+    from perception.pipeline.remote import local_places
     from perception.pipeline.summary import map_facts
     from perception.progress import Progress
 
     engine = Engine(args.engine, args.address)
-    with _sigterm_as_interrupt(), Progress() as progress:
-        info = make_map(args.input, args.output, config, resume=args.resume, progress=progress, engine=engine)
-
-    return map_facts(args.output, info), ""
+    with (
+        _sigterm_as_interrupt(),
+        Progress() as progress,
+        local_places(args.input, args.output, config, args.resume, progress) as at,
+    ):
+        if at.info is None:
+            build_map(
+                at.source, at.output, config, resume=at.resume, progress=progress, engine=engine, origin=at.origin
+            )
+    assert at.info is not None
+    return map_facts(args.output, at.info), ""
 
 
 def _fleet(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

@@ -11,7 +11,8 @@ from perception.config import MapConfig, Settings, load_config, settings_from
 from perception.errors import InputError, refuse_named_pipe
 from perception.io.object_store import is_url, place
 from perception.pipeline.engine import Engine
-from perception.pipeline.remote import make_map
+from perception.pipeline.mapping import build_map
+from perception.pipeline.remote import local_places
 from perception.progress import Progress
 
 
@@ -75,7 +76,10 @@ def map_one(task: str, progress: Progress | None = None) -> dict[str, Any]:
     told = {"input": job["input"], "output": job["output"]}
     try:
         config = MapConfig.model_validate(job["settings"])
-        info = make_map(place(job["input"]), place(job["output"]), config, resume=True, progress=progress)
+        with local_places(place(job["input"]), place(job["output"]), config, True, progress) as at:
+            if at.info is None:
+                build_map(at.source, at.output, config, resume=at.resume, progress=progress, origin=at.origin)
     except InputError as error:
         return {**told, "error": " ".join(str(error).split())}
-    return {**told, "seconds": info["seconds"]["total"], "instances": info["num_instances"]}
+    assert at.info is not None
+    return {**told, "seconds": at.info["seconds"]["total"], "instances": at.info["num_instances"]}

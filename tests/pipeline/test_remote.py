@@ -18,14 +18,18 @@ from perception.errors import InputError
 from perception.io.model_store import cache_folder
 from perception.io.object_store import fetch
 from perception.io.store import Map
-from perception.pipeline import remote
+from perception.pipeline import mapping, remote
 from perception.pipeline.mapping import build_map
-from perception.pipeline.remote import make_map
+from perception.pipeline.optimise import optimise
 from perception.progress import Progress
 
 SETTINGS = ["train.iterations=12", "train.budget=500", "language.encoder=none", "masks=builtin"]
 ARRAYS = ("means", "sh", "features", "instance_ids", "membership")
 QUIET = Progress(quiet=True)
+
+
+def mapped(source: str, output: Path | str, *more: str) -> int:
+    return main(["map", source, "-o", str(output), "--json", *(f"--set={pair}" for pair in SETTINGS), *more])
 
 
 @pytest.fixture
@@ -43,7 +47,11 @@ def photos(small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.slow
 def test_a_map_between_urls_is_that_of_files(
-    photos: str, small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    photos: str,
+    small_scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     config, url = load_config(None, SETTINGS), "memory://b/maps/x.gsmap"
     alone = build_map(small_scene / "transforms.json", tmp_path / "alone.gsmap", config)
@@ -53,14 +61,15 @@ def test_a_map_between_urls_is_that_of_files(
 
     publish = remote.publish
     monkeypatch.setattr(remote, "publish", full)
-    with pytest.raises(InputError, match="store is full"):
-        make_map(photos, url, config)
+    assert mapped(photos, url) == 2 and "the store is full" in capsys.readouterr().err
     monkeypatch.setattr(remote, "publish", publish)
     trained = []
-    monkeypatch.setattr(remote, "build_map", lambda *a, **b: trained.append(0) or build_map(*a, **b))
-    info = make_map(photos, url, config)  # what was made before is taken up
-    assert info["source"] == photos and info["num_gaussians"] == len(alone)
-    assert info["seconds"] and not list((cache_folder() / "unpublished").iterdir())
+    monkeypatch.setattr(mapping, "optimise", lambda *a: trained.append(0) or optimise(*a))
+    assert mapped(photos, url) == 0  # what was made before is taken up
+    told = json.loads(capsys.readouterr().out)
+    info = json.loads(fsspec.filesystem("memory").cat_file("/b/maps/x.gsmap/map.json"))
+    assert info["source"] == photos and info["num_gaussians"] == len(alone) and not trained
+    assert not list((cache_folder() / "unpublished").iterdir())
 
     fetch(url, tmp_path / "back.gsmap", QUIET)
     back = Map.open(tmp_path / "back.gsmap")
@@ -68,16 +77,14 @@ def test_a_map_between_urls_is_that_of_files(
         np.testing.assert_array_equal(getattr(back, name), getattr(alone, name))
     assert (tmp_path / "back.gsmap" / "report.html").is_file()
 
-    count = len(trained)
-    assert make_map(photos, url, config, resume=True) == info and len(trained) == count
-    with pytest.raises(InputError, match=r"memory://b/maps/x.gsmap: exists already"):
-        make_map(photos, url, config)
-    with pytest.raises(InputError, match="exists already"):
-        make_map(photos, url, load_config(None, [*SETTINGS, "seed=1"]), resume=True)
+    assert mapped(photos, url, "--resume") == 0 and json.loads(capsys.readouterr().out) == told and not trained
+    for more in ([], ["--resume", "--seed", "1"]):
+        assert mapped(photos, url, *more) == 2
+        assert "memory://b/maps/x.gsmap: exists already" in capsys.readouterr().err
 
 
 def test_photos_at_a_url_are_kept_beside_a_local_map(photos: str, tmp_path: Path) -> None:
-    make_map(photos, tmp_path / "x.gsmap", load_config(None, SETTINGS))
+    assert mapped(photos, tmp_path / "x.gsmap") == 0
     gmap = Map.open(tmp_path / "x.gsmap")
     assert all(Path(view.photo).is_relative_to(tmp_path / "x.input") for view in gmap.views)
     assert not cache_folder().exists()
