@@ -121,7 +121,7 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.config import load_config
 
     config = load_config(args.config, settings_given(args), args.preset)
-    from perception.pipeline.engine import Engine
+    from perception.io.engine import Engine
     from perception.pipeline.mapping import build_map
     from perception.pipeline.remote import local_places
     from perception.pipeline.summary import map_facts
@@ -142,7 +142,7 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _fleet(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.pipeline.engine import Engine
+    from perception.io.engine import Engine
     from perception.pipeline.fleet import run_fleet
     from perception.progress import Progress
 

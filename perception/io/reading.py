@@ -11,6 +11,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import nearest_rotation
 from perception.io.cloud import read_cloud
+from perception.io.engine import Engine
 from perception.io.lens import is_pinhole, pinhole_from_lens, rescale_lens
 from perception.io.photos import photo_size, reduced_size, stored_size
 from perception.progress import Progress
@@ -34,7 +35,8 @@ class Reading:
     ROS camera_info with the intrinsics of all photos, for photos, videos and recordings. frames: folder for the frames
     of a video (None: workdir/frames), which the map needs later. init_points: cloud in the frame of the input's poses,
     read as `cloud` and used instead of sparse points. poses: "keep", "refine", or "auto": checked where features are
-    matched anyway or views have depth, and refined where they are wrong (see io.pose_refinement).
+    matched anyway or views have depth, and refined where they are wrong (see io.pose_refinement). engine:
+    where features are made.
     """
 
     workdir: Path
@@ -47,6 +49,7 @@ class Reading:
     init_points: Path | None = None
     cloud: Cloud | None = None
     poses: Literal["auto", "keep", "refine"] = "auto"
+    engine: Engine = field(default_factory=Engine)
 
 
 def start_points(path: Path) -> Cloud:

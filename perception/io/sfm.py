@@ -43,7 +43,9 @@ def reconstruct(folder: Path, lens: Lens | None, how: Reading) -> Scene:
             found = "×".join(map(str, photo_size(photo)))
             raise InputError(f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}")
     ignored = [mask_of(how.masks, name) for name in chosen.names]
-    store = build_features(photos, [lens] * len(photos), how.workdir, how.seed, how.progress, ignored)
+    store = build_features(
+        photos, [lens] * len(photos), how.workdir, how.seed, how.progress, ignored, engine=how.engine
+    )
     model, report = _map(store, chosen, folder, lens is not None, how)
     staged = dict(zip(store.names, zip(chosen.names, photos, strict=True), strict=True))
     located = {image_id: staged[model.images[image_id].name] for image_id in model.reg_image_ids()}

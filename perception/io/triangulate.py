@@ -33,7 +33,9 @@ def posed_scene(
     check = how.poses == "refine" or (how.poses == "auto" and (few or any(view.depth is not None for view in views)))
     if few or check:
         photos, lenses, masks = zip(*((view.photo, view_lens(view), view.mask) for view in views), strict=True)
-        store = build_features(list(photos), list(lenses), how.workdir, how.seed, how.progress, list(masks), posed=True)
+        store = build_features(
+            list(photos), list(lenses), how.workdir, how.seed, how.progress, list(masks), posed=True, engine=how.engine
+        )
         report["seconds"] = store.facts["seconds"]
         features = features_of(views, store)
         if check:

@@ -20,12 +20,14 @@ from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians
 from perception.gaussians.nearby import Nearby
 from perception.gaussians.views import TrainingView, psnr, render_view, surface_depth
+from perception.io.engine import Engine
 from perception.io.inputs import load_saved_scene, load_scene, save_scene
 from perception.io.map_files import read_info
 from perception.io.map_views import stored_view
 from perception.io.reading import Reading
 from perception.io.recentre import recentred
 from perception.io.store import Map, read_map, write_map
+from perception.io.tasks import versions
 from perception.language.base import Encoder
 from perception.language.ocr import make_reader
 from perception.masks import make_source
@@ -33,12 +35,11 @@ from perception.masks.builtin import BuiltinSegmentation
 from perception.masks.label_images import load_segmentation
 from perception.pipeline.blocks import cut, optimise_blocks
 from perception.pipeline.checkpoint import clear_work, fingerprint, frames_folder, poses_mark, working
-from perception.pipeline.engine import Engine
 from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
 from perception.pipeline.optimise import Photos, Run, label_by_tasks, label_photos, optimise
 from perception.pipeline.photos import exposed_as_neighbours, split_views
-from perception.pipeline.record import depth_errors, depth_used, finite, peak_memory_mib, versions
+from perception.pipeline.record import depth_errors, depth_used, finite, peak_memory_mib
 from perception.pipeline.summary import depth_text, frame_lines
 from perception.progress import Progress
 from perception.types import Scene, View
@@ -61,8 +62,8 @@ def build_map(
 
     Raises InputError for bad input. Intermediate results are kept beside `output` until the map is written; with
     `resume` a run continues from them and repeats only what has changed (see `pipeline.checkpoint`). A run that fails
-    before training leaves no files. Resuming a finished run returns its map. engine: where the blocks of a large place
-    are trained; None: here. origin: the input's name in map.json, where `source` is a copy of it.
+    before training leaves no files. Resuming a finished run returns its map. engine: where features, masks and the
+    blocks of a large place are made; None: here. origin: the input's name in map.json, where `source` is a copy of it.
     """
     progress, started = progress or Progress(quiet=True), time.monotonic()
     if resume and output.exists() and read_info(output).get("fingerprint") == fingerprint(source, config):
@@ -79,17 +80,18 @@ def build_map(
         encoder = _encoder(config.language.encoder, progress)
         reader = make_reader(config.language.texts)
         run = Run(source, config, work, work / "masks", device, progress)
+        where = engine or Engine()
 
         # Posed images I_v (§3.2) and a sparse cloud.
         with run.stage("poses"):
-            scene = _scene(source, output, work, config, progress)
+            scene = _scene(source, output, run, where)
         _tell_scene(scene, progress)
         training, held_out = split_views(scene.views, config.photos.holdout, config.photos.held_out)
         held_out = exposed_as_neighbours(held_out, training)
         scene = replace(scene, views=sorted([*training, *held_out], key=lambda view: view.name))
         blocks, from_geometry = cut(scene, config.train.block_photos), isinstance(mask_source, BuiltinSegmentation)
 
-        label_by_tasks(run, training, mask_source, engine or Engine())
+        label_by_tasks(run, training, mask_source, where)
 
         # Optimise Gaussians on the photos and their masks (§3.1 to 3.2.3), block by block in a large place.
         if len(blocks) == 1:
@@ -97,7 +99,6 @@ def build_map(
             nearby, trained, mask_report = optimise(run, scene, photos, mask_source)
             of_blocks: list[dict[str, Any]] = []
         else:
-            where = engine or Engine()
             nearby, trained, of_blocks = optimise_blocks(run, scene, blocks, held_out, from_geometry, where)
             photos = Photos.load(run, training, held_out)
             depth = partial(_depth_nearby, nearby)
@@ -154,7 +155,8 @@ def _encoder(spec: str, progress: Progress) -> Encoder | None:
         return None
 
 
-def _scene(source: Path, output: Path, work: Path, config: MapConfig, progress: Progress) -> Scene:
+def _scene(source: Path, output: Path, run: Run, engine: Engine) -> Scene:
+    config, work, progress = run.config, run.work, run.progress
     kept = work / f"poses-{poses_mark(source, config)}"
     scene = load_saved_scene(kept)
     if scene is None:
@@ -164,7 +166,8 @@ def _scene(source: Path, output: Path, work: Path, config: MapConfig, progress: 
             Path(p) if p else None for p in (photos.ignore_masks, photos.camera, photos.init_points)
         )
         how = Reading(work / "sfm", config.seed, progress, photos.strict, masks, camera, poses=photos.poses)
-        scene = load_scene(source, replace(how, frames=frames_folder(output), init_points=cloud))
+        how = replace(how, frames=frames_folder(output), init_points=cloud, engine=engine)
+        scene = load_scene(source, how)
         save_scene(kept, scene := placed_scene(recentred(scene), config.frame, config.seed))
     if config.losses.depth_weight == 0:
         return replace(scene, views=[replace(view, depth=None) for view in scene.views])

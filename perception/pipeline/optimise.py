@@ -18,16 +18,16 @@ from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.nearby import Nearby
 from perception.gaussians.size import sized
 from perception.gaussians.train import Trainer, TrainingView, TrainRecord
+from perception.io.engine import Engine
 from perception.io.memory import DiskArrays, Keep, return_free_memory
 from perception.io.photos import load_photo
+from perception.io.tasks import has_task, read_task, write_task
 from perception.masks import MaskSource, compute_masks, make_source
 from perception.masks.builtin import BuiltinSegmentation
 from perception.masks.sam import SamSource
 from perception.pipeline.checkpoint import TrainingObserver, digest, training_mark
-from perception.pipeline.engine import Engine
 from perception.pipeline.estimate import image_memory, largest_budget, memory_limit
 from perception.pipeline.photos import load_all, with_labels
-from perception.pipeline.tasks import has_task, read_task, write_task
 from perception.progress import Progress, timed
 from perception.types import Scene, View
 

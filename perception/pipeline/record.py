@@ -1,14 +1,12 @@
-"""Run record: peak memory, versions, and what a run made of depth images: how much was measured, and
+"""Run record: peak memory, and what a run made of depth images: how much was measured, and
 how far rendered depth is from it.
 """
 
 from __future__ import annotations
 
 import math
-import platform
 import resource
 import sys
-from importlib import metadata
 from typing import Any
 
 import numpy as np
@@ -21,19 +19,6 @@ def peak_memory_mib() -> float:
     """Largest resident memory of this process so far, MiB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(peak / (1024 * 1024 if sys.platform == "darwin" else 1024), 1)
-
-
-def versions() -> dict[str, str]:
-    """Versions of this program, Python, and the libraries that can affect a map."""
-    from perception import __version__
-
-    found = {"perception": __version__, "python": platform.python_version(), "machine": platform.machine()}
-    for name in ("torch", "numpy", "pycolmap", "hdbscan", "onnxruntime", "opencv-contrib-python-headless"):
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
 
 
 def finite(value: Any) -> Any:

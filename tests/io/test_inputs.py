@@ -10,7 +10,7 @@ from PIL import Image
 
 from perception.errors import InputError
 from perception.geometry import align_similarity, inverse_se3, look_at
-from perception.io import atomic, features, triangulate
+from perception.io import atomic, pairs, triangulate
 from perception.io.atomic import atomic_directory, atomic_file, recover
 from perception.io.camera_file import read_camera
 from perception.io.inputs import load_scene
@@ -235,8 +235,8 @@ def test_mutual_matches_count_the_planted_ones():
     b = rng.normal(size=(40, 128)).astype(np.float32)
     b[:7] = a[10:17]
     unit = [x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b)]
-    votes = features._coarse_votes(unit, np.ones((2, 2), bool), Progress(quiet=True))
-    assert votes.tolist() == [[0, 7], [7, 0]]
+    votes = pairs.coarse_votes(unit, np.ones((2, 2), bool), Progress(quiet=True))
+    assert votes.toarray().tolist() == [[0, 7], [7, 0]]
 
 
 def test_atomic_writes_leave_old_or_new(tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("pycolmap")
-from perception.io import features
+from perception.io import pairs as module
 from support.progress import Told
 
 SEEN, STEP, LANDMARKS = 100, 14, 2100
@@ -36,17 +36,17 @@ def walk(photos: int, seed: int = 0) -> tuple[list[np.ndarray], np.ndarray]:
 
 def test_photos_of_one_place_are_similar_also_rounds_apart() -> None:
     descriptors, shared = walk(300)
-    similar = features.similar_photos(descriptors)
+    similar = module.similar_photos(descriptors)
     assert (similar == similar.T).all() and similar.diagonal().all()
     apart = np.abs(np.subtract.outer(np.arange(300), np.arange(300))) > 100
     assert similar[shared >= 0.3].mean() > 0.98 and similar[(shared >= 0.3) & apart].mean() > 0.98
-    assert np.triu(similar, 1).sum() <= 300 * features.RETRIEVED
+    assert np.triu(similar, 1).sum() <= 300 * module.RETRIEVED
 
 
 def test_pairs_of_many_photos_are_those_that_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
     descriptors, shared = walk(205)
-    monkeypatch.setattr(features, "_largest_features", lambda *_: descriptors)
-    pairs = features._select_pairs(Path(), [""] * 205, 205, Told())
+    monkeypatch.setattr(module, "_largest_features", lambda *_: descriptors)
+    pairs = module.select_pairs(Path(), [""] * 205, 205, Told())
     assert pairs == sorted({(i, j) for i, j in pairs if i < j})
     chosen = np.zeros((205, 205), bool)
     chosen[tuple(np.transpose(pairs))] = True
@@ -57,13 +57,13 @@ def test_pairs_of_many_photos_are_those_that_overlap(monkeypatch: pytest.MonkeyP
 def test_of_few_photos_all_pairs_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the same votes as comparing each two photos alone."""
     descriptors, _ = walk(30)
-    monkeypatch.setattr(features, "_largest_features", lambda *_: descriptors)
-    monkeypatch.setattr(features, "similar_photos", None)
-    features._select_pairs(Path(), [""] * 30, 30, Told())
-    votes = features._coarse_votes(descriptors, np.ones((30, 30), bool), Told())
+    monkeypatch.setattr(module, "_largest_features", lambda *_: descriptors)
+    monkeypatch.setattr(module, "similar_photos", None)
+    module.select_pairs(Path(), [""] * 30, 30, Told())
+    votes = module.coarse_votes(descriptors, np.ones((30, 30), bool), Told())
     for i, j in ((0, 1), (3, 8), (2, 29)):
-        assert votes[i, j] == votes[j, i] == features._mutual_matches(descriptors[i] @ descriptors[j].T)
+        assert votes[i, j] == votes[j, i] == module._mutual_matches(descriptors[i] @ descriptors[j].T)
 
 
 def test_photos_without_features_are_all_compared() -> None:
-    assert features.similar_photos([np.zeros((0, 128), np.float32)] * 3).all()
+    assert module.similar_photos([np.zeros((0, 128), np.float32)] * 3).all()

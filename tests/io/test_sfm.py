@@ -179,7 +179,8 @@ def test_photos_with_few_features_are_upsampled(corner, tmp_path, monkeypatch):
         monkeypatch.setattr(features, "MIN_FEATURES", least)
         database = tmp_path / f"{least}.db"
         photos = [corner[0] / name for name in names]
-        features._extract(database, corner[0], photos, names, [None] * 3, Told())
+        groups = features.import_photos(database, corner[0], photos, names, [None] * 3)
+        features.extract(database, corner[0], groups, Told())
         db = load_pycolmap().Database.open(database)
         assert db.num_cameras() == 1 and db.num_images() == 3
         count[least] = db.num_keypoints()

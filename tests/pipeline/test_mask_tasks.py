@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,22 +10,9 @@ import pytest
 pytest.importorskip("perception._core")
 from perception.config import load_config
 from perception.pipeline import optimise
-from perception.pipeline.engine import Engine
 from perception.pipeline.mapping import build_map
-from perception.progress import Progress
+from support.elsewhere import Elsewhere
 from support.onnx_files import FLOAT, SAM_DECODER, write_onnx
-
-
-class Elsewhere(Engine):
-    """Runs tasks as a cluster does, from nothing but their folders, here; in backward order and each twice."""
-
-    asked: int = 0
-
-    def run(self, task: Any, items: Any, what: str, progress: Progress) -> list[Any]:
-        for item in [*reversed(items), *items]:
-            task(item)
-        object.__setattr__(self, "asked", len(items))
-        return [None] * len(items)
 
 
 @pytest.fixture
@@ -50,12 +36,12 @@ def test_masks_are_those_made_here(
     words = ["train.iterations=8", "train.budget=500", "language.encoder=none", f"masks=sam:{model}"]
     config = load_config(None, [*words, "sam.points_per_side=2"])
     monkeypatch.setattr(optimise, "PHOTOS_A_TASK", 4)
-    engine = Elsewhere("ray")
+    engine = Elsewhere()
     here, there = (
         build_map(small_scene / "transforms.json", tmp_path / f"{name}.gsmap", config, engine=where)
         for name, where in (("here", None), ("there", engine))
     )
-    assert engine.asked == 3  # 10 training photos of 12
+    assert engine.asked == [3]  # 10 training photos of 12
     assert here.info["masks"]["masks"] > 0
     assert (here.info["masks"]["skipped"], there.info["masks"]["skipped"]) == (0, 10)
     for name in ("means", "features", "instance_ids"):
