@@ -172,6 +172,14 @@ def test_contradictions_count_when_stronger_than_every_chain():
     assert incremental_sfm.outvoted_photos([*chain, Pair(0, 2, 70, 0.1)]) == {2}
 
 
+@pytest.mark.parametrize(
+    ("count", "wrong", "told"), [(400, 2, False), (400, 3, True), (9000, 4, False), (9000, 5, True)]
+)
+def test_a_few_strong_contradictions_are_enough_also_in_a_large_place(count, wrong, told):
+    chain = [Pair(i, i + 1, 100, 1.0) for i in range(count - wrong)]
+    assert incremental_sfm.is_contradicted([*chain, *(Pair(i, i + 50, 200, 0.0) for i in range(wrong))]) is told
+
+
 def test_photos_with_few_features_are_upsampled(corner, tmp_path, monkeypatch):
     names = sorted(corner[1])[:3]
     count = {}
