@@ -17,7 +17,7 @@ from scipy import sparse
 from perception.gaussians.nearby import Nearby
 from perception.gaussians.rasterize import Settings, passes, torch_on_one_thread
 from perception.gaussians.train import TrainingView
-from perception.io.memory import return_free_memory
+from perception.io.memory import Keep, return_free_memory
 from perception.progress import Progress
 
 BLOCK = 16  # masks per pass: a feature width that the kernel is specialised for
@@ -94,11 +94,12 @@ def mask_votes(
     *,
     half_resolution: bool = True,
     progress: Progress | None = None,
+    keep: Keep = np.asarray,
 ) -> MaskVotes:
     """The votes of all masks of all views. Label 0 means unlabelled: such pixels count as void.
 
     half_resolution: uses every other pixel per axis, at a quarter of the time. Masks are smooth enough for this. Areas
-    are then in pixels of that size too.
+    are then in pixels of that size too. keep: where the weights are kept, which grow with photos × visible Gaussians.
     """
     parts: list[sparse.csc_matrix] = []  # by column: a row pointer per view would be as large as the model
     voids: list[sparse.csc_matrix] = []
@@ -108,8 +109,8 @@ def mask_votes(
         shown = view.halved() if half_resolution and min(view.photo.shape[:2]) > 1 else view
         if shown.labels is not None and bool((shown.labels > 0).any()):
             weights, area = _of_view(nearby, shown)
-            parts.append(weights[:, 1:])
-            voids.append(weights[:, :1])
+            parts.append(_kept(weights[:, 1:], keep))
+            voids.append(_kept(weights[:, :1], keep))
             areas.append(area[1:])
             owner.append(np.full(len(area) - 1, len(owner), np.int64))
         if index % TRIM == TRIM - 1:
@@ -119,17 +120,21 @@ def mask_votes(
     if not parts:
         none = sparse.csr_matrix((len(nearby.gaussians), 0), dtype=np.float32)
         return MaskVotes(none, none, np.zeros(0, np.int64), np.zeros(0))
-    return MaskVotes(beside(parts), beside(voids), np.concatenate(owner), np.concatenate(areas))
+    return MaskVotes(beside(parts, keep), beside(voids, keep), np.concatenate(owner), np.concatenate(areas))
 
 
-def beside(parts: list[sparse.csc_matrix]) -> sparse.csr_matrix:
+def _kept(part: sparse.csc_matrix, keep: Keep) -> sparse.csc_matrix:
+    return sparse.csc_matrix((keep(part.data), keep(part.indices), part.indptr), shape=part.shape)
+
+
+def beside(parts: list[sparse.csc_matrix], keep: Keep = np.asarray) -> sparse.csr_matrix:
     """The matrices [N, M_i] beside each other, by row. Empties `parts` on the way, so that nothing is in memory twice;
     scipy's functions hold three copies."""
     starts = np.zeros(parts[0].shape[0] + 1, np.int64)
     for part in parts:
         starts[1:] += np.bincount(part.indices, minlength=len(starts) - 1)
     starts = starts.cumsum()
-    columns, values = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.float32)
+    columns, values = keep(np.zeros(starts[-1], np.int32)), keep(np.zeros(starts[-1], np.float32))
     free, width = starts[:-1].copy(), 0
     for index, part in enumerate(parts):
         order = np.argsort(part.indices, kind="stable")

@@ -24,6 +24,7 @@ from perception.instances.silhouettes import Silhouettes, render_silhouettes
 from perception.instances.texts import Reader, read_texts, store_texts
 from perception.instances.votes import mask_votes
 from perception.io.map import prefixed
+from perception.io.memory import Keep
 from perception.language.base import Encoder, reading_of
 from perception.language.description import to_arrays
 from perception.masks.merging import Segmentation
@@ -53,14 +54,16 @@ def group_gaussians(
     config: MapConfig,
     progress: Progress,
     cuts: Segmentation | None = None,
+    keep: Keep = np.asarray,
 ) -> Grouping | None:
     """Groups Gaussians into instances by features and votes of all masks (§3.2.1); None if no photo has masks.
 
-    cuts: of the surface, if the masks come from one."""
+    cuts: of the surface, if the masks come from one. keep: for the votes."""
     if not any(view.labels is not None and bool((view.labels > 0).any()) for view in views):
         return None
     progress.log(f"grouping {len(nearby.gaussians)} Gaussians")
-    votes = mask_votes(nearby, views, half_resolution=config.losses.half_resolution, progress=progress)
+    half = config.losses.half_resolution
+    votes = mask_votes(nearby, views, half_resolution=half, progress=progress, keep=keep)
     gaussians = nearby.gaussians.to("cpu")
     found = group(
         gaussians.means.detach().numpy(),

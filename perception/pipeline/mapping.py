@@ -108,7 +108,7 @@ def build_map(
         # Group the Gaussians by their features into instances (§3.2.1), describe these from their best views (§3.2.2).
         with run.stage("instances"):
             cuts = load_segmentation(run.masks) if from_geometry else None
-            grouped = group_gaussians(nearby, photos.views, config, progress, cuts)
+            grouped = group_gaussians(nearby, photos.views, config, progress, cuts, run.new_keep())
             found = describe(nearby, grouped, photos.views, config.language, encoder, progress, reader)
         gaussians = nearby.gaussians.to("cpu")
 

@@ -51,7 +51,11 @@ class Run:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.keep: Keep = DiskArrays(self.work, image_memory(self.config, memory_limit())).keep
+        self.keep = self.new_keep()
+
+    def new_keep(self) -> Keep:
+        """A place for arrays whose bytes in memory are bounded by `photos.memory`; it goes with the last of them."""
+        return DiskArrays(self.work, image_memory(self.config, memory_limit())).keep
 
     def stage(self, name: str) -> AbstractContextManager[None]:
         """Adds the seconds of its block to the stage `name`."""
