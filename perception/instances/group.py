@@ -21,6 +21,7 @@ from perception.instances.consensus import (
 )
 from perception.instances.segments import over_segment, touching
 from perception.instances.votes import MaskVotes
+from perception.io.memory import return_free_memory
 
 PER_SEGMENT = 16  # Gaussians; smaller segments have too little evidence in the photos
 MAX_SEGMENTS, PER_SEGMENT_BEYOND = 1000, 300  # a larger map has one segment per 300 Gaussians instead
@@ -77,6 +78,7 @@ def group(
         ids = reassign(ids, means, opacities, votes, MIN_OPACITY)
         ids = _without_small(ids, votes, config)
         ids = reassign(ids, means, opacities, votes, MIN_OPACITY)
+    return_free_memory()
     return _scored(ids, parts, parents, votes)
 
 
@@ -99,7 +101,9 @@ def _by_consensus(
     sums = [np.bincount(segments, column, minlength=count) for column in features[solid].T]
     near = touching(means[solid], segments, count)
     tree = merge_tree(table, np.stack(sums, axis=1) / sizes[:, None], sizes, near)
+    return_free_memory()  # tables grow with the photos; without this, those of each step lie beside the next one's
     found = node_evidence(tree, table)
+    return_free_memory()
     instance, part, parents = _cut(tree, found)
     ids[solid], parts[solid] = instance[segments], part[segments]
     return ids, parts, parents

@@ -24,7 +24,7 @@ from perception.instances.silhouettes import Silhouettes, render_silhouettes
 from perception.instances.texts import Reader, read_texts, store_texts
 from perception.instances.votes import mask_votes
 from perception.io.map import prefixed
-from perception.io.memory import Keep
+from perception.io.memory import Keep, return_free_memory
 from perception.language.base import Encoder, reading_of
 from perception.language.description import to_arrays
 from perception.masks.merging import Segmentation
@@ -62,6 +62,7 @@ def group_gaussians(
     if not any(view.labels is not None and bool((view.labels > 0).any()) for view in views):
         return None
     progress.log(f"grouping {len(nearby.gaussians)} Gaussians")
+    return_free_memory()
     half = config.losses.half_resolution
     votes = mask_votes(nearby, views, half_resolution=half, progress=progress, keep=keep)
     gaussians = nearby.gaussians.to("cpu")
@@ -144,6 +145,7 @@ def _silhouettes(
         seen.append(render_silhouettes(gaussians, owners, view.camera_from_world, K, width, height, eps2d=eps2d))
         progress.update("silhouettes", done, len(views))
     _core.rasterizer_release_memory()  # hundreds of MiB, next to which the encoder's activations would lie
+    return_free_memory()
     return [list(level) for level in zip(*seen, strict=True)]
 
 
