@@ -23,6 +23,9 @@ OPACITY_DECAY = 1e-2
 """Share by which every opacity is reduced before each densification."""
 SPLIT_SHRINK = 1.6
 """Scales of the two halves of a split Gaussian are divided by this (Kerbl et al. 2023)."""
+BEYOND = 0.3
+"""Factor on the gradient of a Gaussian beyond the box for which a block of a large place is trained: it will be dropped
+later, and is needed only for what photos show behind or beside the box."""
 
 
 @dataclass
@@ -70,15 +73,20 @@ def densify(
     extent: float,
     grad_threshold: float,
     seed: int,
+    box: torch.Tensor | None = None,
 ) -> Change:
     """Prunes, then clones or splits the best candidates while there are at most `allowed` Gaussians.
 
     extent: scene size in world units. grad_threshold: mean gradient (see Statistics) above which a Gaussian is
-    cloned or split. Opacities of cloned Gaussians change in place. Global random state is not used.
+    cloned or split. box: [2, 3] corners of the part of space that matters, see BEYOND; None: all of it. Opacities of
+    cloned Gaussians change in place. Global random state is not used.
     """
     needed = _needed(gaussians, statistics)
     room = max(0, allowed - int(needed.sum()))
     score = statistics.mean_gradient()
+    if box is not None:
+        inside = ((gaussians.means >= box[0]) & (gaussians.means < box[1])).all(dim=1)
+        score = torch.where(inside, score, BEYOND * score)
     wanted = needed & (score > grad_threshold)
     candidates = torch.nonzero(wanted).flatten()
     if len(candidates) > room:

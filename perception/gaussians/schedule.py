@@ -115,7 +115,7 @@ class Schedule:
         trainer = self.trainer
         decay_opacities(trainer.gaussians)
         threshold = self.config.densify.grad_threshold
-        change = densify(trainer.gaussians, trainer.statistics, allowed, trainer.extent, threshold, seed)
+        change = densify(trainer.gaussians, trainer.statistics, allowed, trainer.extent, threshold, seed, trainer.box)
         trainer.keep(change.keep)
         trainer.append(change.born)
 

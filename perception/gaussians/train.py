@@ -96,7 +96,8 @@ class Observer(Protocol):
 class Trainer:
     """All state of one optimisation; `state` exports it for a checkpoint, and `load` restores it.
 
-    gaussians, views, held_out: on the CPU. Gaussians, optimiser and training views are then kept on `device`.
+    gaussians, views, held_out: on the CPU. Gaussians, optimiser and training views are then kept on `device`. box:
+    [2, 3] corners of the space that matters, in which most Gaussians are added; None: all.
     """
 
     def __init__(
@@ -106,12 +107,14 @@ class Trainer:
         config: MapConfig,
         held_out: list[TrainingView],
         device: torch.device | None = None,
+        box: np.ndarray | None = None,
     ):
         self.config = sized(config, len(views))
         self.device = device or torch.device("cpu")
         self._forward, self._backward = passes(self.device)
         self._max_records = 0
         self.held_out = held_out
+        self.box = None if box is None else torch.tensor(box, dtype=torch.float32, device=self.device)
         self.extent = scene_extent(views)
         self.record = TrainRecord()
         self.iteration = 0

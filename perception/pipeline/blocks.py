@@ -209,6 +209,7 @@ def _task(run: Run, scene: Scene, block: Block, held: set[str], from_geometry: b
             source=str(run.source.resolve()),
             config=sized(run.config, len(set(names) - held), largest_budget(memory_limit())).to_json(),  # the driver's
             held_out=sorted(held & set(names)),
+            box=box,
             masks=str((folder / "masks" if from_geometry else run.masks).resolve()),
         )
     return folder
@@ -227,7 +228,8 @@ def optimise_block(folder: str, progress: Progress | None = None) -> None:
         held = set(facts["held_out"])
         training = [view for view in scene.views if view.name not in held]
         photos = Photos.load(run, training, [view for view in scene.views if view.name in held])
-        nearby, record, _ = optimise(run, scene, photos, make_source(config.masks, config.sam))
+        source, box = make_source(config.masks, config.sam), np.array(facts["box"])
+        nearby, record, _ = optimise(run, scene, photos, source, box)
         gaussians = nearby.gaussians.to("cpu")
         state = {"gaussians": {name: tensor.contiguous() for name, tensor in vars(gaussians).items()}}
         save_checkpoint(home / RESULT, {**state, "record": asdict(record)}, home.name)

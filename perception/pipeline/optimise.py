@@ -85,13 +85,16 @@ class Photos:
             return cls(training, held_out, views, load_all(held_out, side, run.progress, run.keep))
 
 
-def optimise(run: Run, scene: Scene, photos: Photos, source: MaskSource) -> tuple[Nearby, TrainRecord, dict[str, Any]]:
+def optimise(
+    run: Run, scene: Scene, photos: Photos, source: MaskSource, box: np.ndarray | None = None
+) -> tuple[Nearby, TrainRecord, dict[str, Any]]:
     """The trained Gaussians, the training's record and the masks' report; `photos.views` then have labels.
 
-    Goes on from the checkpoint in `run.work`, if there is one.
+    Goes on from the checkpoint in `run.work`, if there is one. box: of a block, see `Trainer`.
     """
     config = sized(run.config, len(photos.views), largest_budget(memory_limit()))
-    trainer = Trainer(initial_gaussians(scene, config, photos.views), photos.views, config, photos.held, run.device)
+    start = initial_gaussians(scene, config, photos.views)
+    trainer = Trainer(start, photos.views, config, photos.held, run.device, box)
     if config != run.config:
         size = f"{config.train.iterations} iterations, at most {config.train.budget} Gaussians"
         trainer.record.decisions.append(f"size: {size}, for {len(photos.views)} photos")

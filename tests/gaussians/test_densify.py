@@ -66,6 +66,20 @@ def test_the_faint_the_unseen_and_the_broken_are_pruned() -> None:
     assert kept == [i for i in range(50) if i not in (3, 7, 11)]
 
 
+def test_beyond_the_box_of_a_block_growth_needs_a_larger_gradient() -> None:
+    gaussians = cloud()
+    gaussians.log_scales.fill_(-20.0)  # all are cloned
+    box = torch.tensor([[-np.inf, -0.5, 0.0], [0.3, np.inf, np.inf]])
+    x, y, z = gaussians.means.numpy().T
+    inside = (x < 0.3) & (y >= -0.5) & (z >= 0)
+    grown = densify(gaussians, statistics(50, 2 * THRESHOLD), 1000, 1.0, THRESHOLD, 1, box).born
+    np.testing.assert_array_equal(grown.means, gaussians.means[inside])
+    grown = densify(gaussians, statistics(50, 4 * THRESHOLD), 50 + inside.sum(), 1.0, THRESHOLD, 1, box).born
+    np.testing.assert_array_equal(grown.means, gaussians.means[inside])  # they are also the first
+    grown = densify(gaussians, statistics(50, 4 * THRESHOLD), 1000, 1.0, THRESHOLD, 1, box).born
+    assert len(grown) == 50
+
+
 def test_growth_is_a_ramp() -> None:
     counts = [target_count(p, 100, 1100) for p in (0.0, START, 0.325, STOP, 1.0)]
     assert counts == [100, 100, 600, 1100, 1100]
