@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception.bench import instances, queries, scannetpp
+from perception.bench import scannetpp
 from perception.bench.datasets import by_words
 from perception.bench.lerf import LerfMask, LerfOvs
 from perception.bench.scannetpp import ScanNetPP
@@ -23,6 +23,7 @@ from perception.io.store import read_map
 from perception.language.ranking import Ranker
 from perception.query import load_map
 from perception.types import PointCloud
+from score import instances, queries
 from support.demo_truth import labels_of, load_truth, things
 
 pytestmark = pytest.mark.slow
@@ -145,7 +146,7 @@ def test_published_rules_apply_to_cosines(
 
 
 def test_a_made_scene_is_a_truth_scene(ovs_run: Path, small_scene: Path, tmp_path: Path) -> None:
-    """bench instances and bench queries on the generator's truth and a map in its frame."""
+    """tests/score on the generator's truth and a map in its frame."""
     scene, gmap = str(small_scene / "truth"), str(ovs_run / "maps" / "table.gsmap")
     instances.main([scene, gmap, "-o", str(tmp_path)])
     found = json.loads((tmp_path / "instances.json").read_text())
