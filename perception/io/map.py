@@ -180,13 +180,6 @@ class Map:
         """Whether the unit of length is known to be the metre."""
         return bool(self.info.get("metric", False))
 
-    def to_open3d(self) -> Any:
-        """All Gaussians' means as an `open3d.t.geometry.PointCloud` in the map's frame: positions, colors (float32 in
-        [0, 1]), instance_id (int32, −1 = none). InputError without the package open3d."""
-        from perception.io.open3d import tensor_cloud
-
-        return tensor_cloud(self.means, rgb8_from_sh(self.sh[:, 0]), self.instance_ids)
-
     def colors_of(self, instance_id: int) -> np.ndarray:
         """Colours [P, 3] uint8 of an instance's points, in the order of `index`."""
         return rgb8_from_sh(self.sh[self.instance_ids == instance_id, 0])

@@ -31,17 +31,6 @@ def load_open3d() -> Any:
     return open3d
 
 
-def tensor_cloud(points: np.ndarray, colors: np.ndarray | None, instance_ids: np.ndarray) -> Any:
-    """An `open3d.t.geometry.PointCloud`: positions [P, 3] float32, colors [P, 3] float32 in [0, 1] of uint8 ones,
-    instance_id [P, 1] int32."""
-    o3d = load_open3d()
-    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.array(points, np.float32)))
-    if colors is not None:
-        cloud.point.colors = o3d.core.Tensor(colors.astype(np.float32) / 255)
-    cloud.point.instance_id = o3d.core.Tensor(np.array(instance_ids, np.int32).reshape(-1, 1))
-    return cloud
-
-
 def fuse_depth(shots: Iterable[Shot], voxel: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(vertices [V, 3] float32, colors [V, 3] uint8, faces [F, 3] int32) of the zero level of a truncated signed
     distance field (Curless & Levoy 1996) with voxels of this size and a truncation of four, where two views saw it.

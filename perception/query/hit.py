@@ -85,14 +85,6 @@ class Hit:
             distance=None if self.distance is None else self.distance * float(np.cbrt(np.linalg.det(linear))),
         )
 
-    def to_open3d(self) -> Any:
-        """The points as an `open3d.t.geometry.PointCloud` in `frame`: positions, colors (float32 in [0, 1], if known),
-        instance_id (int32). InputError without the package open3d."""
-        from perception.io.open3d import tensor_cloud
-
-        ids = np.full(len(self.points), self.instance_id, np.int32)
-        return tensor_cloud(self.points, None if self.colors is None else self.colors(), ids)
-
     def to_json(self) -> dict[str, Any]:
         """The hit as JSON, as in `perception query --json`."""
         answer: dict[str, Any] = {

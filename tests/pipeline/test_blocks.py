@@ -16,7 +16,6 @@ import torch
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.gaussians.model import from_points
-from perception.geometry import look_at
 from perception.io.store import Map
 from perception.pipeline import blocks as module
 from perception.pipeline.blocks import APART, cut, joined, nearby_rows, optimise_block, visible_points
@@ -28,6 +27,7 @@ from perception.pipeline.record import versions
 from perception.pipeline.tasks import TASK
 from perception.progress import Progress
 from perception.types import Scene, View
+from support.aimed import look_at
 from support.interrupts import interrupt_at
 from support.row_scene import centres, write_row
 

@@ -17,7 +17,6 @@ from perception.io.cloud import read_cloud, write_cloud
 from perception.io.open3d import load_open3d
 from perception.io.store import write_map
 from perception.pipeline.exporting import read_transform
-from perception.query import load_map
 from perception.types import PointCloud
 from support.viewer_maps import small_map
 
@@ -111,21 +110,6 @@ def test_voxels_and_one_body_need_no_open3d(path: Path, tmp_path: Path, monkeypa
     assert len(free) > 100 and (free[:, 2] > 0).all() and free[:, 2].max() < 7  # between the camera and the wall
 
 
-def test_an_instance_and_a_map_become_open3d_clouds(path: Path) -> None:
-    pytest.importorskip("open3d")
-    gmap, made = load_map(path), small_map()
-    whole = gmap.to_open3d()
-    np.testing.assert_array_equal(whole.point.positions.numpy(), made.means)
-    np.testing.assert_array_equal(whole.point.instance_id.numpy()[:, 0], made.instance_ids)
-    moved = gmap.get(2).transformed(SCAN_FROM_MAP, "scan")
-    cloud = moved.to_open3d()
-    np.testing.assert_array_equal(cloud.point.positions.numpy(), moved.points)
-    np.testing.assert_allclose(
-        cloud.point.colors.numpy(), np.tile([0.15, 0.2, 0.9], (len(moved.points), 1)), atol=0.003
-    )
-    assert (cloud.point.instance_id.numpy() == 2).all()
-
-
 @pytest.mark.parametrize(
     ("error", "told"),
     [
@@ -135,13 +119,11 @@ def test_an_instance_and_a_map_become_open3d_clouds(path: Path) -> None:
     ],
 )
 def test_a_missing_package_or_system_library_is_named(
-    error: Exception, told: str, monkeypatch: pytest.MonkeyPatch, path: Path
+    error: Exception, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     without(monkeypatch, error)
     with pytest.raises(InputError, match=told):
         load_open3d()
-    with pytest.raises(InputError, match=told):
-        load_map(path).get(0).to_open3d()
 
 
 def without(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
