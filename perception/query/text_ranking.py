@@ -26,12 +26,10 @@ REMEMBERED = 256
 
 
 class TextRanking:
-    """Ranks the instances of `gmap` for prompts; thread-safe. `encoders` makes an encoder from its name. texts: whether
-    the printed texts of the instances are used."""
+    """Ranks the instances of `gmap` for prompts; thread-safe. `encoders` makes an encoder from its name."""
 
-    def __init__(self, gmap: Map, encoders: Encoders | None, texts: bool = True) -> None:
-        self._gmap, self._texts = gmap, texts
-        self._encoders = encoders or make_encoder
+    def __init__(self, gmap: Map, encoders: Encoders | None) -> None:
+        self._gmap, self._encoders = gmap, encoders or make_encoder
         self._lock = threading.RLock()
         self._made: Ranker | InputError | None = None
         self._remembered = lru_cache(REMEMBERED)(self._ranked)
@@ -87,7 +85,7 @@ class TextRanking:
         check_encoder(identity, encoder.identity)
         labels = [entry.get("label") for entry in self._gmap.instances]
         sizes = extents(self._gmap) if self._gmap.metric else None
-        return Ranker(descriptions, encoder, labels, self._shapes, printed_on(self._gmap, self._texts), sizes)
+        return Ranker(descriptions, encoder, labels, self._shapes, printed_on(self._gmap), sizes)
 
     @cached_property
     def places(self) -> Places | None:
@@ -123,9 +121,9 @@ def extents(gmap: Map) -> np.ndarray:
     return sides
 
 
-def printed_on(gmap: Map, use: bool = True) -> Printed | None:
-    """The texts printed on the map's instances; None if the map was made without reading texts, or `use` is false."""
-    read = use and gmap.info.get("instances", {}).get("texts") is not None
+def printed_on(gmap: Map) -> Printed | None:
+    """The texts printed on the map's instances; None if the map was made without reading texts."""
+    read = gmap.info.get("instances", {}).get("texts") is not None
     return Printed([entry.get("texts", []) for entry in gmap.instances]) if read else None
 
 

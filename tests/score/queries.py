@@ -72,8 +72,9 @@ def measure(map_path: Path, scene: Path) -> dict[str, Any]:
     printed = [query for query in queries if PRINTED.search(query[0])]
     nowhere = [text for text in read_scene(scene).get("absent", []) if PRINTED.search(text)]
     report |= {"printed_prompts": len(printed), "printed_absent_prompts": len(nowhere)} if printed else {}
-    for name, texts in (("printed", True), ("printed_without_texts", False)) if printed else ():
-        found = _figures(TextRanking(opened, opened.encoders, texts).rank, owners, printed, nowhere)
+    unread = QueryMap.of(opened, info={**opened.info, "instances": {}})  # as mapped without reading texts
+    for name, gmap in (("printed", opened), ("printed_without_texts", unread)) if printed else ():
+        found = _figures(TextRanking(gmap, opened.encoders).rank, owners, printed, nowhere)
         report |= {f"{name}_{key}": found[key] for key in PRINTED_FIGURES}
     return report | latency(opened.ranker, [text for text, _ in queries])
 
