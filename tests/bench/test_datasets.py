@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception.bench import scannetpp
-from perception.bench.datasets import by_words
-from perception.bench.lerf import LerfMask, LerfOvs
-from perception.bench.scannetpp import ScanNetPP
-from perception.cli import main
+from bench import run, scannetpp
+from bench.datasets import by_words
+from bench.lerf import LerfMask, LerfOvs
+from bench.scannetpp import ScanNetPP
 from perception.errors import InputError
 from perception.io.cloud import read_cloud, write_cloud
 from perception.io.map_files import read_info
@@ -171,7 +170,7 @@ def test_lerf_mask_from_download_to_table(
     path = tmp_path / "maps" / "table.gsmap" / "instances.json"
     path.write_text(path.read_text().replace('"label": "ball"', f'"label": "{ball}"'))
     maps = ["--maps", str(tmp_path / "maps")]
-    assert main(["bench", "lerf-mask", str(downloads / "lerf_mask"), "-o", str(tmp_path), *maps]) == 0
+    assert run.main(["lerf-mask", str(downloads / "lerf_mask"), "-o", str(tmp_path), *maps]) == 0
     facts = json.loads((tmp_path / "lerf_mask.json").read_text())
     table = facts["result"]["scenes"]["table"]
     assert table["prompts"][ball]["miou"] > 0.5
