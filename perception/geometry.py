@@ -53,18 +53,6 @@ def interpolated_pose(times: np.ndarray, poses: np.ndarray, time: float, gap: fl
     return pose
 
 
-def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """camera_from_world [4, 4], OpenCV axes, of a camera at `eye` looking at `target`; `up` not parallel to it."""
-    forward = np.asarray(target, dtype=np.float64) - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    camera_from_world = np.eye(4)
-    camera_from_world[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ eye
-    return camera_from_world
-
-
 def align_similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Scale s, rotation R [3, 3] and translation t [3] that minimise Σ |a_i − (s R b_i + t)|² over points [N, 3].
 

@@ -12,12 +12,13 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 import perception
+from bench import run
 from perception.bench import BENCHES
 from perception.cli import build_parser, main
 
@@ -96,16 +97,18 @@ def test_documented_options_and_settings_exist() -> None:
                 options |= set(re.findall(r"(?<![\w-])--[a-z][\w-]+", code))
             settings |= set(re.findall(r"--set ([a-z][\w.]*=[\w:.]+)", code))
     assert len(options) > 15 and settings
-    known = " ".join([*(command.format_help() for command in _commands()), *map(_bench_help, sorted(BENCHES))])
+    benches = [pkgutil.resolve_name(f"perception.bench.{place}") for place in BENCHES.values()]
+    benches += [bench.main for bench in run.BENCHES.values()]
+    known = " ".join([*(command.format_help() for command in _commands()), *map(_bench_help, benches)])
     assert [option for option in sorted(options) if not re.search(rf"{option}\b", known)] == []
     load_config(None, sorted(settings))
 
 
-def _bench_help(name: str) -> str:
+def _bench_help(bench: Callable[[list[str]], object]) -> str:
     """The `bench` commands parse their own arguments."""
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
-        pkgutil.resolve_name(f"perception.bench.{BENCHES[name]}")(["--help"])
+        bench(["--help"])
     return text.getvalue()
 
 

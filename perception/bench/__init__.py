@@ -1,7 +1,6 @@
 """Benchmarks: `perception bench NAME`."""
 
 BENCHES = {
-    **{name: f"{name}:main" for name in ("rasterizer", "instances", "queries")},
-    **{"lerf-mask": "lerf:LerfMask.main", "lerf-ovs": "lerf:LerfOvs.main", "scannetpp": "scannetpp:ScanNetPP.main"},
+    "rasterizer": "rasterizer:main",
 }
 """Name on the command line -> module of this package and function in it, which takes the arguments."""

@@ -1,23 +1,19 @@
 """Evaluation of predictions in files: `perception eval instances`, and directory layouts of public datasets, as
 downloaded.
 
-LERF-mask (Gaussian Grouping): <scene>/test_mask/<view>/<prompt>.png|jpg; predictions alike. LERF-OVS:
-label/<scene>/frame_*.json with polygons. ScanNet and ScanNet++: <scene>.txt with true ids (1000 · class + instance, one
-per vertex); predictions are submission files <scene>.txt that name mask files.
+ScanNet and ScanNet++: <scene>.txt with true ids (1000 · class + instance, one per vertex); predictions are submission
+files <scene>.txt that name mask files.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from perception.errors import InputError
-from perception.evaluate.images import pictures
 from perception.evaluate.instances import Protocol, evaluate, evaluate_overlaps, get_protocol, mask_overlap
 from perception.io.cloud import read_cloud
 from perception.types import PointCloud
@@ -108,49 +104,6 @@ def instances_table(result: dict[str, Any]) -> str:
 def _row(name: str, row: dict[str, Any]) -> str:
     cells = ["-" if row[key] is None else f"{row[key]:.4f}" for key in ("ap", "ap50", "ap25")]
     return f"{name:<12}" + "".join(f"{cell:>8}" for cell in cells)
-
-
-def read_mask_folder(folder: str | Path) -> dict[tuple[str, str], np.ndarray]:
-    """{(view, prompt): grey mask [H, W] uint8} of <folder>/<view>/<prompt>.png|jpg."""
-    masks = {}
-    for stem, path in pictures(folder).items():
-        view, _, prompt = stem.rpartition("/")
-        image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise InputError(f"{path}: is not a readable picture")
-        masks[view, prompt.replace("_", " ")] = image
-    return masks
-
-
-def read_lerf_polygons(folder: str | Path) -> dict[tuple[str, str], np.ndarray]:
-    """{(view, category): mask [H, W] bool} of LERF-OVS label files frame_*.json. Polygons are united."""
-    masks: dict[tuple[str, str], np.ndarray] = {}
-    files = sorted(Path(folder).glob("*.json"))
-    if not files:
-        raise InputError(f"{folder}: holds no label files frame_*.json")
-    for path in files:
-        try:
-            data = json.loads(path.read_text(encoding="utf-8"))
-            size = (int(data["info"]["height"]), int(data["info"]["width"]))
-            for thing in data["objects"]:
-                mask = masks.setdefault((path.stem, thing["category"]), np.zeros(size, bool))
-                polygon = np.asarray(thing["segmentation"], np.float64).reshape(-1, 2).round().astype(np.int32)
-                mask |= cv2.fillPoly(np.zeros(size, np.uint8), [polygon], (1,)).astype(bool)
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path}: is no LERF-OVS label file ({error!r})") from error
-    return masks
-
-
-def scenes_result(scenes: dict[str, dict[str, Any]], keys: Sequence[str]) -> tuple[dict[str, Any], str]:
-    """(result, table) of the results of a LERF evaluation by scene: the figures `keys` by scene, and their means."""
-    mean = {key: float(np.mean([scene[key] for scene in scenes.values()])) for key in sorted(keys)}
-    width = max(len(name) for name in [*scenes, "mean"]) + 2
-    lines = [" " * width + "".join(f"{key:>10}" for key in keys)]
-    lines += [f"{name:<{width}}" + "".join(f"{s[key]:>10.4f}" for key in keys) for name, s in scenes.items()]
-    lines.append(f"{'mean':<{width}}" + "".join(f"{mean[key]:>10.4f}" for key in keys))
-    protocol = next(iter(scenes.values()))["protocol"]
-    lines.append("protocol " + "; ".join(f"{key}: {value}" for key, value in protocol.items()))
-    return {"mean": mean, "scenes": scenes, "protocol": protocol}, "\n".join(lines)
 
 
 def run_scannet(

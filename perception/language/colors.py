@@ -120,13 +120,9 @@ def color_share(palettes: np.ndarray, word: str) -> np.ndarray:
     return (weights * near).sum(axis=-1)
 
 
-def color_match(palettes: np.ndarray, words: Sequence[str]) -> np.ndarray:
-    """Match of each instance with all colour words: [I] in [0, 1]; 1 where half of the instance has the colour."""
-    return match_of_shares([color_share(palettes, word) for word in words])
-
-
 def match_of_shares(shares: Sequence[np.ndarray]) -> np.ndarray:
-    """`color_match` from the shares [I] of each word; at least one."""
+    """Match of each instance with all colour words [I] in [0, 1], from the share [I] of each word (at least one): 1
+    where half of the instance has the colour."""
     match = np.ones(len(shares[0]))
     for share in shares:
         match *= np.minimum(1.0, share / (0.5 / len(shares)))

@@ -41,7 +41,7 @@ from perception.language.household import household_thing, size_misfits
 from perception.language.printed import Printed, quoted_text
 from perception.language.shape_words import HINTS, KINDS, STUFF, shape_kind
 
-PRESENT = 0.8  # default minimum score of an answer; the probes are harder than typical absent objects (see bench)
+PRESENT = 0.8  # default minimum score of an answer; the probes are harder than typical absent objects
 BESIDE = 0.6  # largest difference in Φ⁻¹(score) to the best hit, of another one that answers the prompt too
 QUANTILE, NORMAL_QUANTILE = 0.8, 0.8416  # Φ(.8416) = .8
 BETA = 0.5  # fraction of the map's mean embedding that is subtracted

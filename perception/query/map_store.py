@@ -14,7 +14,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import fields
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -111,14 +111,6 @@ class MapStore(QueryMap):
     def counts(self) -> dict[str, int]:
         return {"maps": len(self.maps), "instances": len(self._told)}
 
-    @property
-    def problem(self) -> str | None:
-        try:
-            _ = self.ranker
-        except InputError as error:
-            return str(error)
-        return None
-
     def warm(self) -> None:
         if self.problem is None:
             self.query("thing")
@@ -187,7 +179,7 @@ class MapStore(QueryMap):
         return Hit(
             number,
             score,
-            partial(self._points, entry, number),  # type: ignore[arg-type]
+            lambda: self._map(entry).index.of(number),  # type: ignore[arg-type]
             told["centroid"],
             OrientedBox(told["center"], told["rotation"], told["extent"]),
             self._names[n]["labels"][place],
@@ -200,9 +192,6 @@ class MapStore(QueryMap):
             metric=entry["metric"],
             count=int(told["points"]),
         )
-
-    def _points(self, entry: dict[str, Any], number: int) -> np.ndarray:
-        return self._map(entry).index.of(number)
 
     def _map(self, entry: dict[str, Any]) -> QueryMap:
         path = Path(entry["map"])

@@ -45,7 +45,11 @@ class QueryMap(Map):
     @property
     def problem(self) -> str | None:
         """Why prompts cannot be answered (no embeddings, no encoder), one line; None when they can."""
-        return self._ranking.problem
+        try:
+            _ = self.ranker
+        except InputError as error:
+            return str(error)
+        return None
 
     @property
     def ranker(self) -> Ranker:

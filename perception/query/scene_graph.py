@@ -214,51 +214,13 @@ def _rooms(gmap: Map) -> list[int]:
 
 
 def write_graph(gmap: Map, path: Path) -> tuple[dict[str, Any], str]:
-    """Writes the scene graph as node-link JSON, or for spark_dsg where the path ends in .dsg.json; facts and a line."""
+    """Writes the scene graph as node-link JSON; facts and a line."""
     import networkx
 
     graph = scene_graph(gmap)
     with atomic_file(path) as aside:
-        if path.name.endswith(".dsg.json"):
-            of = aside.with_suffix(".json")
-            to_spark_dsg(graph).save(str(of), include_mesh=False)
-            of.replace(aside)
-        else:
-            aside.write_text(json.dumps(networkx.node_link_data(graph, edges="edges"), indent=1), encoding="utf-8")
+        aside.write_text(json.dumps(networkx.node_link_data(graph, edges="edges"), indent=1), encoding="utf-8")
     kinds = Counter(kind for _, kind in graph.nodes(data="kind"))
     relations = Counter(relation for _, _, relation in graph.edges(data="relation"))
     told = ", ".join(f"{count} {name}" for name, count in (*sorted(kinds.items()), *sorted(relations.items())))
     return {"path": str(path), "nodes": dict(kinds), "edges": dict(relations)}, f"{path}: {told}"
-
-
-def to_spark_dsg(graph: networkx.DiGraph) -> Any:
-    """The graph as a `spark_dsg.DynamicSceneGraph`: rooms in its layer of rooms, everything else in that of objects.
-
-    Relations stand in each object's metadata, beside the ids of the map. InputError without the package spark-dsg.
-    """
-    try:
-        import spark_dsg
-    except ImportError:
-        raise InputError("spark_dsg is not installed; run: pip install 'splat-perception[dsg]'") from None
-    dsg, symbols = spark_dsg.DynamicSceneGraph(), {}
-    for number, (node, facts) in enumerate(graph.nodes(data=True)):
-        room = facts["kind"] == "room"
-        attributes = spark_dsg.RoomNodeAttributes() if room else spark_dsg.ObjectNodeAttributes()
-        relations = [
-            {"relation": edge["relation"], "to": other, "score": edge["score"]}
-            for _, other, edge in graph.out_edges(node, data=True)
-        ]
-        attributes.name = str(facts.get("label") or node)
-        attributes.metadata.set({"id": node, "kind": facts["kind"], "relations": relations})
-        if "obb" in facts:
-            box = facts["obb"]
-            middle, extent = (np.array(box[key], np.float32) for key in ("center", "extent"))
-            attributes.position = middle.astype(np.float64)
-            turn = np.array(box["rotation"], np.float32).T
-            attributes.bounding_box = spark_dsg.BoundingBox(spark_dsg.BoundingBoxType.OBB, extent, middle, turn)
-        symbols[node] = spark_dsg.NodeSymbol("R" if room else "O", number)
-        layer = spark_dsg.DsgLayers.ROOMS if room else spark_dsg.DsgLayers.OBJECTS
-        dsg.add_node(layer, symbols[node], attributes)
-    for node, other in graph.edges:
-        dsg.insert_edge(symbols[other], symbols[node])
-    return dsg

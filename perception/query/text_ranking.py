@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -27,49 +26,31 @@ REMEMBERED = 256
 
 
 class TextRanking:
-    """Ranks the instances of `gmap` for prompts; thread-safe. `encoders` makes an encoder from its name. texts: whether
-    the printed texts of the instances are used."""
+    """Ranks the instances of `gmap` for prompts; thread-safe. `encoders` makes an encoder from its name."""
 
-    def __init__(self, gmap: Map, encoders: Encoders | None, texts: bool = True) -> None:
-        self._gmap, self._texts = gmap, texts
-        self._encoders = encoders or make_encoder
+    def __init__(self, gmap: Map, encoders: Encoders | None) -> None:
+        self._gmap, self._encoders = gmap, encoders or make_encoder
         self._lock = threading.RLock()
         self._made: Ranker | InputError | None = None
-        self._ranked: OrderedDict[str, Answer] = OrderedDict()
-
-    @property
-    def problem(self) -> str | None:
-        """Why prompts cannot be ranked (no embeddings, no encoder), one line; None when they can."""
-        try:
-            _ = self.ranker
-        except InputError as error:
-            return str(error)
-        return None
+        self._remembered = lru_cache(REMEMBERED)(self._ranked)
 
     def rank(self, text: str) -> Answer:
         """The ranking of `perception.language.ranking`. Without embeddings or encoder, the instances with this label.
 
         Raises InputError when the map has no embeddings or encoder and no instance has the label `text`.
         """
-        key = " ".join(text.split())
-        with self._lock:
-            if key in self._ranked:
-                self._ranked.move_to_end(key)
-                return self._ranked[key]
         try:
-            ranker = self.ranker
+            _ = self.ranker
         except InputError:
             if (answer := self._by_label(text)) is not None:
                 return answer
             raise
+        return self._remembered(" ".join(text.split()))
+
+    def _ranked(self, text: str) -> Answer:
         with one_thread():
             named = self._by_label(text) is not None
-            answer = ranker.rank(text) if named else ranked(ranker, self.places, text)
-        with self._lock:
-            self._ranked[key] = answer
-            if len(self._ranked) > REMEMBERED:
-                self._ranked.popitem(last=False)
-        return answer
+            return self.ranker.rank(text) if named else ranked(self.ranker, self.places, text)
 
     def _by_label(self, text: str) -> Answer | None:
         """The instances that the user labelled `text`, None without any. Needs no embeddings and no encoder."""
@@ -104,7 +85,7 @@ class TextRanking:
         check_encoder(identity, encoder.identity)
         labels = [entry.get("label") for entry in self._gmap.instances]
         sizes = extents(self._gmap) if self._gmap.metric else None
-        return Ranker(descriptions, encoder, labels, self._shapes, printed_on(self._gmap, self._texts), sizes)
+        return Ranker(descriptions, encoder, labels, self._shapes, printed_on(self._gmap), sizes)
 
     @cached_property
     def places(self) -> Places | None:
@@ -140,9 +121,9 @@ def extents(gmap: Map) -> np.ndarray:
     return sides
 
 
-def printed_on(gmap: Map, use: bool = True) -> Printed | None:
-    """The texts printed on the map's instances; None if the map was made without reading texts, or `use` is false."""
-    read = use and gmap.info.get("instances", {}).get("texts") is not None
+def printed_on(gmap: Map) -> Printed | None:
+    """The texts printed on the map's instances; None if the map was made without reading texts."""
+    read = gmap.info.get("instances", {}).get("texts") is not None
     return Printed([entry.get("texts", []) for entry in gmap.instances]) if read else None
 
 

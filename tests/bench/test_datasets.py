@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception.bench import instances, queries, scannetpp
-from perception.bench.datasets import by_words
-from perception.bench.lerf import LerfMask, LerfOvs
-from perception.bench.scannetpp import ScanNetPP
-from perception.cli import main
+from bench import run, scannetpp
+from bench.datasets import by_words
+from bench.lerf import LerfMask, LerfOvs
+from bench.scannetpp import ScanNetPP
 from perception.errors import InputError
 from perception.io.cloud import read_cloud, write_cloud
 from perception.io.map_files import read_info
@@ -23,6 +22,7 @@ from perception.io.store import read_map
 from perception.language.ranking import Ranker
 from perception.query import load_map
 from perception.types import PointCloud
+from score import instances, queries
 from support.demo_truth import labels_of, load_truth, things
 
 pytestmark = pytest.mark.slow
@@ -145,7 +145,7 @@ def test_published_rules_apply_to_cosines(
 
 
 def test_a_made_scene_is_a_truth_scene(ovs_run: Path, small_scene: Path, tmp_path: Path) -> None:
-    """bench instances and bench queries on the generator's truth and a map in its frame."""
+    """tests/score on the generator's truth and a map in its frame."""
     scene, gmap = str(small_scene / "truth"), str(ovs_run / "maps" / "table.gsmap")
     instances.main([scene, gmap, "-o", str(tmp_path)])
     found = json.loads((tmp_path / "instances.json").read_text())
@@ -170,7 +170,7 @@ def test_lerf_mask_from_download_to_table(
     path = tmp_path / "maps" / "table.gsmap" / "instances.json"
     path.write_text(path.read_text().replace('"label": "ball"', f'"label": "{ball}"'))
     maps = ["--maps", str(tmp_path / "maps")]
-    assert main(["bench", "lerf-mask", str(downloads / "lerf_mask"), "-o", str(tmp_path), *maps]) == 0
+    assert run.main(["lerf-mask", str(downloads / "lerf_mask"), "-o", str(tmp_path), *maps]) == 0
     facts = json.loads((tmp_path / "lerf_mask.json").read_text())
     table = facts["result"]["scenes"]["table"]
     assert table["prompts"][ball]["miou"] > 0.5

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from perception.bench.queries import read_queries
 from perception.io.cloud import read_cloud
 from perception.pipeline.demo import SCENE, DemoTruth
+from score.queries import read_queries
 from worlds import make, make_photos, tabletop
 from worlds.render import cast
 

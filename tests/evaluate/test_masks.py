@@ -9,15 +9,18 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
-from perception.errors import InputError
-from perception.evaluate.layouts import read_lerf_polygons, read_mask_folder, run_scannet, scenes_result
-from perception.evaluate.masks import (
+from bench.masks import (
     boundary_iou,
     evaluate_lerf_mask,
     evaluate_lerf_ovs,
     mask_boundary,
     mask_iou,
+    read_lerf_polygons,
+    read_mask_folder,
+    scenes_result,
 )
+from perception.errors import InputError
+from perception.evaluate.layouts import run_scannet
 from perception.export.transfer import write_scannet
 from support.ap import evaluate_masks
 

@@ -10,9 +10,9 @@ import pytest
 from perception.errors import InputError
 from perception.export.depth_views import DepthView
 from perception.export.volume import FREE, OCCUPIED, centres, closed_body, grid_shape, occupancy, signed_distance
-from perception.geometry import look_at
 from perception.io.open3d import fuse_depth, write_glb
 from support import box_rooms
+from support.aimed import look_at
 from support.box_rooms import FURNISHED
 
 RADIUS = 0.5

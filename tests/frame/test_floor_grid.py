@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from perception.errors import InputError
 from perception.frame.floor_grid import FREE, OCCUPIED, UNKNOWN, floor_grid
-from perception.geometry import look_at
 from perception.io.map import Map
 from perception.types import View
+from support.aimed import look_at
 
 CELL, TABLE, LAMP = 0.1, ((1.0, 0.5), (2.0, 1.2)), ((2.5, 0.5), (2.8, 0.8))
 WIDE, DEEP = 4.0, 3.0

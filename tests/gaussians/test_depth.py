@@ -16,7 +16,7 @@ from perception.gaussians.losses import depth_loss
 from perception.gaussians.model import from_points
 from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView, depth_image
-from perception.geometry import look_at
+from support.aimed import look_at
 
 LOW, HIGH = np.array([-0.5, -0.5, 0.0]), np.array([0.5, 0.5, 0.6])
 FLOOR = 3.0

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from perception.errors import InputError
-from perception.geometry import inverse_se3, look_at
+from perception.geometry import inverse_se3
 from perception.io.cloud import write_cloud
 from perception.io.ignore_masks import load_weight, read_mask
 from perception.io.inputs import load_saved_scene, load_scene, save_scene
 from perception.io.lens import load_pycolmap
 from perception.io.reading import Reading
 from perception.types import PointCloud
+from support.aimed import look_at
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from perception.errors import InputError
-from perception.geometry import align_similarity, inverse_se3, look_at
+from perception.geometry import align_similarity, inverse_se3
 from perception.io import atomic, pairs, triangulate
 from perception.io.atomic import atomic_directory, atomic_file, recover
 from perception.io.camera_file import read_camera
@@ -20,6 +20,7 @@ from perception.io.reading import Reading, make_view
 from perception.io.transforms import read_frames
 from perception.progress import Progress
 from perception.types import Lens, View
+from support.aimed import look_at
 from support.rotations import rotation_from_quaternion
 
 DISTORTED = Lens("OPENCV", (90.0, 91.0, 49.0, 41.0, 0.06, -0.05, 0.001, -0.002), 100, 80)

@@ -15,7 +15,6 @@ import pytest
 from PIL import Image
 
 from perception.errors import InputError
-from perception.geometry import look_at
 from perception.io import photos as photos_module
 from perception.io.documents import safe_name
 from perception.io.features import build_features
@@ -25,6 +24,7 @@ from perception.io.photo_folder import choose_photos, list_photos, view_name
 from perception.io.photos import photo_size, read_photo, why_left_out
 from perception.io.reading import Reading, fit_lens
 from perception.types import Lens
+from support.aimed import look_at
 from support.progress import Told
 
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception.geometry import align_similarity, look_at
+from perception.geometry import align_similarity
 from perception.io.bundle_adjustment import Poses, _linearised, _Problem, starting_points
 from perception.io.pose_refinement import checked_poses, match_errors, moved_back, poses_of, refine
 from perception.io.tracks import Features, Tracks, tracks_of
 from perception.types import View
+from support.aimed import look_at
 
 FOCAL, NOISE, VIEWS, POINTS = 500.0, 0.3, 12, 240
 

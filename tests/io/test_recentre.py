@@ -13,12 +13,12 @@ import pytest
 from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
-from perception.geometry import look_at
 from perception.io.cloud import read_cloud, write_cloud
 from perception.io.recentre import FAR, map_from_input, moved_scene, recentred
 from perception.io.store import read_map
 from perception.pipeline.mapping import build_map
 from perception.types import DepthImage, Scene, View
+from support.aimed import look_at
 
 pytestmark = pytest.mark.slow
 

@@ -12,13 +12,14 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from perception.geometry import align_similarity, inverse_se3, look_at
+from perception.geometry import align_similarity, inverse_se3
 from perception.io import features, incremental_sfm
 from perception.io.features import build_features
 from perception.io.incremental_sfm import Pair
 from perception.io.inputs import load_scene
 from perception.io.lens import load_pycolmap
 from perception.io.reading import Reading
+from support.aimed import look_at
 from support.progress import Told
 
 pytestmark = pytest.mark.slow

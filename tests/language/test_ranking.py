@@ -14,10 +14,10 @@ from scipy.stats import norm
 from perception.errors import InputError
 from perception.language.base import Part, Reading
 from perception.language.colors import (
-    color_match,
     color_share,
     color_words,
     lab_of,
+    match_of_shares,
     palette,
     without_color_words,
 )
@@ -205,8 +205,8 @@ def test_shares_follow_the_painted_fraction() -> None:
     mixed = np.stack([palette(np.array([red] * n + [white] * (10 - n), np.uint8)) for n in (0, 3, 10)])
     share = color_share(mixed, "red")
     assert share[0] < 0.02 and share[1] == pytest.approx(0.3, abs=0.02) and share[2] == pytest.approx(1, abs=0.01)
-    assert np.argmax(color_match(mixed, ["red", "white"])) == 1
-    assert np.argmax(color_match(mixed, ["white"])) == 0
+    assert np.argmax(match_of_shares([share, color_share(mixed, "white")])) == 1
+    assert np.argmax(match_of_shares([color_share(mixed, "white")])) == 0
 
 
 def test_stored_form_round_trips(scene: tuple[Table, list[InstanceDescription]]) -> None:

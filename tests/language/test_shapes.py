@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from perception.geometry import look_at
 from perception.instances.shapes import boxiness, covered_area, roundness, shape_scores, up_from_cameras
 from perception.language.shape_words import KINDS, head_noun, shape_kind
+from support.aimed import look_at
 
 
 def box(size: tuple[float, float, float], rng: np.random.Generator, count: int = 800) -> np.ndarray:

@@ -16,7 +16,6 @@ import torch
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.gaussians.model import from_points
-from perception.geometry import look_at
 from perception.io.engine import Engine
 from perception.io.store import Map
 from perception.io.tasks import TASK, versions
@@ -27,6 +26,7 @@ from perception.pipeline.mapping import build_map
 from perception.pipeline.optimise import Run
 from perception.progress import Progress
 from perception.types import Scene, View
+from support.aimed import look_at
 from support.interrupts import interrupt_at
 from support.row_scene import centres, write_row
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from perception.errors import InputError
-from perception.geometry import look_at
 from perception.io.map import Map
-from perception.query.scene_graph import scene_graph, to_spark_dsg, write_graph
+from perception.query.scene_graph import scene_graph, write_graph
 from perception.types import View
+from support.aimed import look_at
 
 STEP = 0.02
 
@@ -137,21 +137,12 @@ def test_rooms_are_parted_by_a_door() -> None:
     assert graph.nodes[2]["room"] == graph.nodes[3]["room"] == "room 0"
 
 
-def test_the_graph_is_written_as_json_and_for_spark_dsg(tmp_path: Path) -> None:
+def test_the_graph_is_written_as_json(tmp_path: Path) -> None:
     gmap = made(THINGS)
     facts, line = write_graph(gmap, tmp_path / "graph.json")
     read = networkx.node_link_graph(json.loads((tmp_path / "graph.json").read_text()), edges="edges")
     assert networkx.utils.graphs_equal(read, scene_graph(gmap)) and facts["edges"]["on"] == 6 and "6 on" in line
     assert read.graph["metric"] is True and read.nodes[3]["label"] == "book"
-    dsg_module = pytest.importorskip("spark_dsg")
-    write_graph(gmap, tmp_path / "graph.dsg.json")
-    loaded = dsg_module.DynamicSceneGraph.load(str(tmp_path / "graph.dsg.json"))
-    assert loaded.num_nodes() == len(read) and loaded.num_edges() >= len(EXPECTED)
-    names = {node.attributes.name: node for node in loaded.get_layer(dsg_module.DsgLayers.OBJECTS).nodes}
-    mug = names["mug"].attributes
-    np.testing.assert_allclose(mug.position, THINGS["mug"].mean(axis=0), atol=1e-3)
-    assert {k: mug.metadata.get()["relations"][0][k] for k in ("relation", "to")} == {"relation": "on", "to": 3}
-    assert to_spark_dsg(scene_graph(gmap)).num_nodes() == loaded.num_nodes()
 
 
 def test_without_up_there_is_no_graph() -> None:

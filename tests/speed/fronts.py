@@ -25,11 +25,13 @@ from typing import Any
 import numpy as np
 
 import perception
-from perception.bench.instances import score_map
 from perception.bench.output import Column, bench_parser, finish, table
 from perception.config import load_config
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
+
+sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
+from score.instances import score_map  # noqa: E402
 
 COLUMNS: tuple[Column, ...] = (
     ("PSNR", "psnr", ".2f"),

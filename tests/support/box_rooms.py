@@ -9,9 +9,9 @@ import numpy as np
 
 from perception.boxes import oriented_box
 from perception.export.depth_views import DepthView
-from perception.geometry import look_at
 from perception.query import QueryMap
 from perception.types import View
+from support.aimed import look_at
 
 Boxes = list[tuple[list[float], list[float]]]
 """Lowest and highest corner of each; the first is the room, seen from inside."""

@@ -19,7 +19,7 @@ import numpy as np
 
 HOMES = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(HOMES))
-from perception.geometry import look_at  # noqa: E402
+from support.aimed import look_at  # noqa: E402
 from worlds import room, scene  # noqa: E402
 from worlds.cameras import UP, Camera, intrinsics, walk  # noqa: E402
 from worlds.light import Body, Part, Scene, corners  # noqa: E402

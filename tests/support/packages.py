@@ -2,8 +2,8 @@
 
 A table with packages, tins and books that bear words: across, downwards, around a tin, on a spine, partly hidden. Seeds
 select places and turns. The folder then holds what tests/worlds/make.py writes; scene.json has 20 prompts
-with a word in capitals, and as `absent` six whose words are on nothing. `perception bench queries MAP FOLDER` scores
-them on a map of FOLDER/transforms.json.
+with a word in capitals, and as `absent` six whose words are on nothing. `python tests/score/queries.py MAP FOLDER`
+scores them on a map of FOLDER/transforms.json.
 """
 
 from __future__ import annotations

@@ -11,10 +11,10 @@ from PIL import Image
 
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.render import render
-from perception.geometry import look_at
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.cloud import write_cloud
 from perception.types import PointCloud
+from support.aimed import look_at
 
 SPACING, DISTANCE, FOCAL, SIZE = 1.0, 2.4, 60.0, (64, 48)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perception.geometry import look_at
+from support.aimed import look_at
 
 UP = np.array([0, 0, 1.0])
 

@@ -1,14 +1,21 @@
-"""2D mask metrics: IoU, boundary IoU, and the results of LERF-mask and LERF-OVS."""
+"""2D mask metrics: IoU, boundary IoU, and the results of LERF-mask and LERF-OVS, whose folders are read here.
+
+LERF-mask (Gaussian Grouping): <scene>/test_mask/<view>/<prompt>.png|jpg; predictions alike. LERF-OVS:
+label/<scene>/frame_*.json with polygons.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
 from perception.errors import InputError
+from perception.evaluate.images import pictures
 
 Masks = Mapping[tuple[str, str], np.ndarray]  # (view, prompt) -> mask [H, W]
 
@@ -114,3 +121,46 @@ def _paired(
             size = (true.shape[1], true.shape[0])
             found = cv2.resize(found.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
         yield view, prompt, found, true
+
+
+def read_mask_folder(folder: str | Path) -> dict[tuple[str, str], np.ndarray]:
+    """{(view, prompt): grey mask [H, W] uint8} of <folder>/<view>/<prompt>.png|jpg."""
+    masks = {}
+    for stem, path in pictures(folder).items():
+        view, _, prompt = stem.rpartition("/")
+        image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise InputError(f"{path}: is not a readable picture")
+        masks[view, prompt.replace("_", " ")] = image
+    return masks
+
+
+def read_lerf_polygons(folder: str | Path) -> dict[tuple[str, str], np.ndarray]:
+    """{(view, category): mask [H, W] bool} of LERF-OVS label files frame_*.json. Polygons are united."""
+    masks: dict[tuple[str, str], np.ndarray] = {}
+    files = sorted(Path(folder).glob("*.json"))
+    if not files:
+        raise InputError(f"{folder}: holds no label files frame_*.json")
+    for path in files:
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+            size = (int(data["info"]["height"]), int(data["info"]["width"]))
+            for thing in data["objects"]:
+                mask = masks.setdefault((path.stem, thing["category"]), np.zeros(size, bool))
+                polygon = np.asarray(thing["segmentation"], np.float64).reshape(-1, 2).round().astype(np.int32)
+                mask |= cv2.fillPoly(np.zeros(size, np.uint8), [polygon], (1,)).astype(bool)
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path}: is no LERF-OVS label file ({error!r})") from error
+    return masks
+
+
+def scenes_result(scenes: dict[str, dict[str, Any]], keys: Sequence[str]) -> tuple[dict[str, Any], str]:
+    """(result, table) of the results of a LERF evaluation by scene: the figures `keys` by scene, and their means."""
+    mean = {key: float(np.mean([scene[key] for scene in scenes.values()])) for key in sorted(keys)}
+    width = max(len(name) for name in [*scenes, "mean"]) + 2
+    lines = [" " * width + "".join(f"{key:>10}" for key in keys)]
+    lines += [f"{name:<{width}}" + "".join(f"{s[key]:>10.4f}" for key in keys) for name, s in scenes.items()]
+    lines.append(f"{'mean':<{width}}" + "".join(f"{mean[key]:>10.4f}" for key in keys))
+    protocol = next(iter(scenes.values()))["protocol"]
+    lines.append("protocol " + "; ".join(f"{key}: {value}" for key, value in protocol.items()))
+    return {"mean": mean, "scenes": scenes, "protocol": protocol}, "\n".join(lines)

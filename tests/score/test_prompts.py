@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from perception.bench.queries import ABSENT, HOUSEHOLD, accuracy, returned, singular
 from perception.language.ranking import probes
+from score.queries import ABSENT, HOUSEHOLD, accuracy, returned, singular
 
 
 def test_accuracy_counts_first_and_first_three() -> None:

@@ -1,4 +1,4 @@
-"""ScanNet++ instance segmentation of mesh vertices: `perception bench scannetpp DIR -o WORK`."""
+"""ScanNet++ instance segmentation of mesh vertices: `python tests/bench/run.py scannetpp DIR -o WORK`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from perception.bench.datasets import DatasetBench, link
+from bench.datasets import DatasetBench, link
 from perception.errors import InputError
 from perception.evaluate.layouts import instances_table, run_scannet
 from perception.export.transfer import ExportOptions, export_labels, write_scannet

@@ -1,4 +1,4 @@
-"""Maps' instances against their scenes' truth: `perception bench instances SCENE MAP …`.
+"""Maps' instances against their scenes' truth: `python tests/score/instances.py SCENE MAP …`.
 
 AP with the map's scores and with constant ones, things and stuff together and apart, and mIoU of rendered masks.
 Reliability: of all instances with 100 points or more, the score, and whether the IoU with a true one exceeds 0.5.
@@ -6,16 +6,20 @@ Reliability: of all instances with 100 points or more, the score, and whether th
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from perception.bench.output import SCORED, Column, bench_parser, finish_reliability, parse_pairs, table
+from perception.bench.output import Column, bench_parser, table
 from perception.errors import InputError
 from perception.io.documents import read_json
 from perception.types import PointCloud
+
+sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
+from score.reliability import SCORED, finish_reliability, parse_pairs  # noqa: E402
 
 
 def read_scene(scene: Path) -> dict[str, Any]:
@@ -96,3 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"{result['noise_share']:.1%} of the Gaussians noise, rendered mIoU {result['rendered_miou']:.3f}",
         ]
     finish_reliability("instances", options, results, lines, "scores")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,5 +1,5 @@
-"""LERF-mask (Gaussian Grouping) and LERF-OVS, 3D selection by OpenGaussian's protocol: `perception bench lerf-mask` and
-`lerf-ovs DIR -o WORK`."""
+"""LERF-mask (Gaussian Grouping) and LERF-OVS, 3D selection by OpenGaussian's protocol: `python tests/bench/run.py
+lerf-mask` and `lerf-ovs DIR -o WORK`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from perception.bench.datasets import HELD_OUT, DatasetBench, InstanceViews, by_words
+from bench.datasets import HELD_OUT, DatasetBench, InstanceViews, by_words
+from bench.masks import evaluate_lerf_mask, evaluate_lerf_ovs, read_lerf_polygons, read_mask_folder, scenes_result
 from perception.errors import InputError
-from perception.evaluate.layouts import read_lerf_polygons, read_mask_folder, scenes_result
-from perception.evaluate.masks import evaluate_lerf_mask, evaluate_lerf_ovs
 
 RENDERED = 0.2  # Gaussian Grouping: rendered mask > 0.2
 

@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from bench.masks import Masks, read_mask_folder
 from perception.bench.output import bench_parser, finish
 from perception.config import MapConfig, load_config
 from perception.errors import InputError
-from perception.evaluate.layouts import read_mask_folder
-from perception.evaluate.masks import Masks
 from perception.io.atomic import atomic_directory, atomic_file
 from perception.io.map_files import read_info
 from perception.io.store import Map, read_map
@@ -29,7 +28,7 @@ HELD_OUT = "held out of training, unless the map was brought along"
 
 
 class DatasetBench(ABC):
-    """One dataset benchmark, `perception bench NAME DIR -o WORK`: a subclass says how the download is read.
+    """One dataset benchmark, `python tests/bench/run.py NAME DIR -o WORK`: a subclass says how the download is read.
 
     What is finished is kept in WORK, so that a second run goes on. args: the parsed arguments.
     """
@@ -68,6 +67,7 @@ class DatasetBench(ABC):
     def main(cls, arguments: Sequence[str] | None = None) -> None:
         """Command line entry point; prints the table or JSON, and writes WORK/NAME.json."""
         parser = bench_parser(cls.name, cls.__doc__)
+        parser.prog = f"python tests/bench/run.py {cls.name}"
         parser.add_argument("dataset", type=Path, metavar="DIR", help="the dataset as downloaded")
         parser.add_argument("--maps", type=Path, metavar="DIR", help="finished maps <scene>.gsmap (default WORK/maps)")
         parser.add_argument("--scenes", type=lambda text: text.split(","), metavar="A,B", help="only these")

@@ -1,4 +1,4 @@
-"""How well finished maps answer text on scenes with exact truth: `perception bench queries MAP SCENE …`.
+"""How well finished maps answer text on scenes with exact truth: `python tests/score/queries.py MAP SCENE …`.
 
 A hit is right when the true object under most of the instance's exported points answers the prompt. Prompts
 are those of scene.json whose objects some photo shows. Absent prompts: 30 things of street, farm, sea and
@@ -11,6 +11,7 @@ nothing. They are also scored apart, with the texts read on the instances and wi
 from __future__ import annotations
 
 import re
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,13 +19,16 @@ from typing import Any
 
 import numpy as np
 
-from perception.bench.instances import read_scene, read_truth_cloud
-from perception.bench.output import SCORED, bench_parser, finish_reliability, parse_pairs
+from perception.bench.output import bench_parser
 from perception.errors import InputError
 from perception.language.ranking import Answer, Ranker, answering
 from perception.language.shape_words import singular
 from perception.query import QueryMap, load_map
 from perception.query.text_ranking import TextRanking
+
+sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
+from score.instances import read_scene, read_truth_cloud  # noqa: E402
+from score.reliability import SCORED, finish_reliability, parse_pairs  # noqa: E402
 
 PRINTED = re.compile(r"\b[A-Z]{2,}\b")
 PRINTED_FIGURES = "top1", "top3", "returned_precision", "returned_recall", "false_positive_prompts", "failed_prompts"
@@ -68,8 +72,9 @@ def measure(map_path: Path, scene: Path) -> dict[str, Any]:
     printed = [query for query in queries if PRINTED.search(query[0])]
     nowhere = [text for text in read_scene(scene).get("absent", []) if PRINTED.search(text)]
     report |= {"printed_prompts": len(printed), "printed_absent_prompts": len(nowhere)} if printed else {}
-    for name, texts in (("printed", True), ("printed_without_texts", False)) if printed else ():
-        found = _figures(TextRanking(opened, opened.encoders, texts).rank, owners, printed, nowhere)
+    unread = QueryMap.of(opened, info={**opened.info, "instances": {}})  # as mapped without reading texts
+    for name, gmap in (("printed", opened), ("printed_without_texts", unread)) if printed else ():
+        found = _figures(TextRanking(gmap, opened.encoders).rank, owners, printed, nowhere)
         report |= {f"{name}_{key}": found[key] for key in PRINTED_FIGURES}
     return report | latency(opened.ranker, [text for text, _ in queries])
 
@@ -162,3 +167,7 @@ def accuracy(ranked: list[list[int]], right: list[set[int]]) -> tuple[float, flo
     pairs = list(zip(ranked, right, strict=True))
     top1, top3 = (float(np.mean([bool(answers & set(order[:k])) for order, answers in pairs])) for k in (1, 3))
     return round(top1, 3), round(top3, 3)
+
+
+if __name__ == "__main__":
+    main()

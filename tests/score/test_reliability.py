@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perception.bench.output import reliability
+from score.reliability import reliability
 
 
 def test_calibration_error_by_hand() -> None:
