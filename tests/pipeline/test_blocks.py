@@ -132,7 +132,9 @@ def test_each_thing_of_a_row_is_one_instance_also_on_seams(row: Path, whole: Map
     solid = whole.opacities > 0.3
     ball = np.argmin(np.linalg.norm(whole.means[:, None] - centres(BALLS), axis=2), axis=1)
     owners = [np.bincount(whole.instance_ids[solid & (ball == n)] + 1) for n in range(BALLS)]
-    assert len({int(own[1:].argmax()) for own in owners}) == BALLS == len(whole.instances)
+    # Gaussians of the black background, which no mask shows, may be an instance too, with a score of about .3.
+    things = sum(entry["score"] > 0.5 for entry in whole.instances)
+    assert len({int(own[1:].argmax()) for own in owners}) == BALLS == things
     assert all(own[1:].max() > 0.75 * own.sum() for own in owners)
     piece = build_map(row, tmp_path / "piece.gsmap", settings(row, "train.block_photos=0"))
     assert whole.info["quality"]["psnr"] > piece.info["quality"]["psnr"] - 1.0  # both are about 28 dB
