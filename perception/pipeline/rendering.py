@@ -67,9 +67,14 @@ def rendered_crop(gmap: QueryMap, instance_id: int, side: int) -> np.ndarray | N
 
 
 def map_views(gmap: Map, held_out: bool = True) -> list[View]:
-    """The undistorted views of a map: the held-out ones, or all when none were (or `held_out` is False)."""
-    chosen = [view for view in gmap.views if view.held_out or not held_out] or gmap.views
-    return [replace(view, lens=None) for view in chosen]
+    """`scored_views` without the lens of their photos, for undistorted pictures."""
+    return [replace(view, lens=None) for view in scored_views(gmap, held_out)]
+
+
+def scored_views(gmap: Map, held_out: bool = True) -> list[View]:
+    """The views of a map that are compared with a truth in the shape of their photos: the held-out ones, or all when
+    none were (or `held_out` is False)."""
+    return [*([view for view in gmap.views if view.held_out or not held_out] or gmap.views)]
 
 
 def _cameras(path: Path) -> list[View]:
@@ -157,7 +162,7 @@ def score_masks(map_path: Path, truth_dir: Path, all_views: bool = False) -> tup
     truth_dir: one PNG per view, see `evaluate_rendered`. Returns (JSON-able result, table).
     """
     gmap = read_map(map_path)
-    views = map_views(gmap, held_out=not all_views)
+    views = scored_views(gmap, held_out=not all_views)
     result = evaluate_rendered(as_gaussians(gmap), gmap.instance_ids, views, truth_dir)
     lines = [f"{'truth':>6}{'map':>6}{'views':>7}{'mIoU':>8}{'pooled':>8}"]
     for row in result["instances"]:

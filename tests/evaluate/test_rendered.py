@@ -14,7 +14,10 @@ pytest.importorskip("perception._core")
 from perception.errors import InputError
 from perception.evaluate.rendered import evaluate_rendered, mask_miou
 from perception.gaussians.model import from_points
-from perception.types import View
+from perception.io.map_views import stored_view
+from perception.io.store import Map, write_map
+from perception.pipeline.rendering import score_masks
+from perception.types import Lens, View
 
 
 def image(*columns: int) -> np.ndarray:
@@ -83,3 +86,22 @@ def test_a_view_without_truth_is_told(tmp_path: Path) -> None:
     gaussians, ids, view = discs(tmp_path)
     with pytest.raises(InputError, match="no label image for photo other"):
         evaluate_rendered(gaussians, ids, [replace(view, name="other.jpg")], tmp_path)
+
+
+def test_true_masks_have_the_shape_of_distorted_photos(tmp_path: Path) -> None:
+    """A map from photos alone undistorts them, to another size than its photos and their true masks have."""
+    gaussians, ids, view = discs(tmp_path)
+    truth = np.repeat(np.array([1, 2], np.uint8), 31)[None].repeat(41, axis=0)
+    cv2.imwrite(str(tmp_path / "a.png"), truth)
+    lens = Lens("SIMPLE_RADIAL", (40.0, 31.0, 20.5, -0.001), 62, 41)
+    arrays = {name: tensor.numpy() for name, tensor in vars(gaussians).items()}
+    shown = stored_view(replace(view, lens=lens), tmp_path, held_out=True)
+    box = {"centroid": [0, 0, 4], "aabb": {"min": [0, 0, 0], "max": [1, 1, 1]}, "num_gaussians": 4000, "views": 1}
+    box |= {"obb": {"center": [0, 0, 4], "rotation": np.eye(3).tolist(), "extent": [1, 1, 1]}}
+    entries = [{"id": i, "label": None, "score": 1.0, **box} for i in (0, 1)]
+    info = {"frame": "map", "metric": True}
+    gmap = Map(
+        **arrays, instance_ids=ids, membership=np.ones(8000, np.float32), instances=entries, info=info, views=[shown]
+    )
+    write_map(tmp_path / "a.gsmap", gmap)
+    assert score_masks(tmp_path / "a.gsmap", tmp_path)[0]["miou"] > 0.95

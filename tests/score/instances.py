@@ -15,7 +15,9 @@ import numpy as np
 
 from perception.bench.output import Column, bench_parser, table
 from perception.errors import InputError
+from perception.geometry import align_similarity, camera_centres
 from perception.io.documents import read_json
+from perception.io.map import Map
 from perception.types import PointCloud
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
@@ -29,15 +31,24 @@ def read_scene(scene: Path) -> dict[str, Any]:
     return dict(read_json(scene / "scene.json"))
 
 
-def read_truth_cloud(scene: Path, means: np.ndarray) -> PointCloud:
-    """gt_points.ply. Raises InputError without the label `instance_id`, or with most points off `means` [N, 3]."""
+def read_truth_cloud(scene: Path, gmap: Map) -> PointCloud:
+    """gt_points.ply in the map's frame, which for a map from photos alone is found from the true camera centres. Raises
+    InputError without the label `instance_id`, or with most points off the map."""
     from perception.export.transfer import check_overlap
     from perception.io.cloud import read_cloud
 
     cloud = read_cloud(scene / "gt_points.ply")
     if "instance_id" not in cloud.labels:
         raise InputError(f"{scene / 'gt_points.ply'}: expected a property instance_id, found none")
-    if check_overlap(means, cloud.points) < 0.5:
+    if gmap.info.get("scene", {}).get("input") == "photos":
+        frames = read_json(scene / "transforms.json")["frames"]
+        centres = {Path(f["file_path"]).name: np.array(f["transform_matrix"])[:3, 3] for f in frames}
+        true = np.stack([centres[view.name] for view in gmap.views])
+        scale, turn, shift = align_similarity(camera_centres(gmap.poses), true)
+        cloud.points[:] = scale * cloud.points.astype(np.float64) @ turn.T + shift
+        if cloud.normals is not None:
+            cloud.normals[:] = cloud.normals.astype(np.float64) @ turn.T
+    if check_overlap(gmap.means, cloud.points) < 0.5:
         raise InputError(f"{scene}: most of its points lie outside the map; map the scene with its transforms.json")
     return cloud
 
@@ -53,16 +64,16 @@ def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
     from perception.evaluate.rendered import evaluate_rendered
     from perception.export.transfer import export_labels
     from perception.io.store import read_map
-    from perception.pipeline.rendering import as_gaussians, map_views
+    from perception.pipeline.rendering import as_gaussians, scored_views
 
     gmap = read_map(map_path)
-    cloud = read_truth_cloud(scene, gmap.means)
+    cloud = read_truth_cloud(scene, gmap)
     truth = cloud.labels["instance_id"]
     about = read_scene(scene)["instances"]
     stuff = np.isin(truth, [entry["id"] for entry in about if entry["is_stuff"]])
     labels = export_labels(gmap.means, gmap.instance_ids, cloud)
     confidence = {entry["id"]: float(entry["score"]) for entry in gmap.instances}
-    rendered = evaluate_rendered(as_gaussians(gmap), gmap.instance_ids, map_views(gmap), scene / "masks_gt")
+    rendered = evaluate_rendered(as_gaussians(gmap), gmap.instance_ids, scored_views(gmap), scene / "masks_gt")
     rows = {}
     for name, ignore in (("all", None), ("things", stuff), ("stuff", ~stuff)):
         for kind, scores in (("calibrated", confidence), ("constant", None)):
