@@ -1,8 +1,9 @@
 """Large places: cut into overlapping blocks by what the cameras see, optimised block by block, joined to one model.
 
-A block owns a box of space; the boxes tile the space. It is trained on all photos that see enough of its box, from
-nothing but these, so it comes out the same wherever it runs. The joined model takes from each block the Gaussians in
-its box. Instances are found afterwards, from the masks of all photos, so a thing on a seam is one instance.
+A block owns a box of space; the boxes tile the space. It is trained on all photos that see enough of its box or were
+taken in it, from nothing but these, so it comes out the same wherever it runs. The joined model takes from each block
+the Gaussians in its box. Instances are found afterwards, from the masks of all photos, so a thing on a seam is one
+instance.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ SAMPLE = 20_000
 GRID, HIDDEN = 16, 1.3
 """A point is hidden from a photo if it is HIDDEN times as far as the nearest point in its cell of GRID × GRID."""
 SEEN = 0.15
-"""Least share of a photo's points in a block's box for which the block is trained on the photo."""
+"""Least share of a photo's points in a block's box for which the block is trained on a photo from outside."""
 LEAST_GAIN = 0.85
 """Largest share of a block's photos that either half may have after a cut; a place that all photos see stays whole."""
 APART = 4.0
@@ -121,20 +122,18 @@ def _halved(block: Block, points: np.ndarray, seen: sparse.csr_matrix, centres: 
 def _divided(
     block: Block, axis: int, place: float, points: np.ndarray, seen: sparse.csr_matrix, centres: np.ndarray
 ) -> list[Block]:
-    """The block's halves below and above `place`. A photo that sees too little of both is with the one it stands in."""
+    """The block's halves below and above `place`, with the photos that see enough of them or stand in them: these look
+    through the space before them, where Gaussians would float that no other photo sees."""
     sides, own = [], seen[block.views]
     counts = np.maximum(own.getnnz(axis=1), 1)
     middle = np.where(np.arange(3) == axis, place, np.nan)
-    for low, high in ((block.low, np.fmin(block.high, middle)), (np.fmax(block.low, middle), block.high)):
+    below = centres[block.views, axis] < place
+    low_side, high_side = (block.low, np.fmin(block.high, middle)), (np.fmax(block.low, middle), block.high)
+    for (low, high), stands in ((low_side, below), (high_side, ~below)):
         half = replace(block, low=low, high=high)
         share = own @ half.owns(points).astype(np.float32) / counts
-        sides.append((half, share >= SEEN))
-    neither = ~(sides[0][1] | sides[1][1])
-    below = centres[block.views, axis] < place
-    return [
-        replace(half, views=block.views[sees | (neither & stands)])
-        for (half, sees), stands in zip(sides, (below, ~below), strict=True)
-    ]
+        sides.append(replace(half, views=block.views[(share >= SEEN) | stands]))
+    return sides
 
 
 def optimise_blocks(
