@@ -54,8 +54,8 @@ class PhotoConfig(Settings):
         None,
         pattern=r"^[1-9][0-9]*[MG]$",
         title="a size such as 500M or 8G",
-        description="that photos, labels and depth may fill, and votes of masks beside them; others are on disk; none: a "
-        "quarter of the machine's",
+        description="that photos, labels and depth may fill, and beside them votes of masks; others are on disk; "
+        "none: a quarter of the machine's",
     )
 
     @property
