@@ -43,7 +43,6 @@ def register(commands: Any) -> None:
     p.add_argument("--instance", type=int, metavar="ID", help="--mesh: the closed body of this one instead")
     p.add_argument("--voxels", type=Path, metavar="OUT.npz", help="free, occupied and unknown space; distances")
     p.add_argument("--voxel-size", type=float, metavar="S", help="of --mesh and --voxels, in map units")
-    p.add_argument("--scannet", type=Path, metavar="DIR", help="ScanNet submission layout")
     p.add_argument("--graph", type=Path, metavar="OUT.json", help="rooms, supports, things, parts and their relations")
 
     p = map_command(commands, "render", _render, "pictures of the map from given cameras")
@@ -183,7 +182,7 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if args.output is None:
         return facts, "\n".join(lines)
     options = ExportOptions(max_distance=args.max_distance, smooth=args.smooth, segments=args.segments)
-    how = (options, args.color, args.scannet, args.transform or args.align, args.granularity)
+    how = (options, args.color, args.transform or args.align, args.granularity)
     result, table = export_map(args.map, args.output, args.points, *how)
     return {**facts, **result}, "\n".join([*lines, table])
 

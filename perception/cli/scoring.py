@@ -20,11 +20,11 @@ def register(commands: Any) -> None:
     p.add_argument("prediction", type=Path, metavar="PRED.ply")
     p.add_argument("truth", type=Path, metavar="GT.ply")
     p.add_argument("--scores", type=Path, metavar="X.json", help="confidences; default: PRED.json where it lies there")
-    _add_rules(p)
-    p = command(kinds, "scannet", _eval_scannet, "AP over the scenes of a ScanNet or ScanNet++ submission")
-    p.add_argument("prediction", type=Path, metavar="PRED_DIR", help="<scene>.txt, which name mask files")
-    p.add_argument("truth", type=Path, metavar="GT_DIR", help="<scene>.txt, 1000 * class + instance a vertex")
-    _add_rules(p)
+    p.add_argument("--protocol", default="scannet", choices=("scannet", "mask3d", "segment3d", "scannetpp"))
+    p.add_argument("--by-class", action="store_true", help="match within semantic classes and average over them")
+    p.add_argument("--classes", type=_numbers, metavar="N,N,...", help="classes that count; others are void")
+    p.add_argument("--void", type=_numbers, metavar="N,N,...", help="truth ids that are void (default 0; 'none')")
+    p.add_argument("--min-region", type=int, metavar="N", help="least points of an instance (default 100)")
     p = command(kinds, "images", _eval_images, "PSNR and SSIM per view and mean")
     p.add_argument("prediction", type=Path, metavar="PRED_DIR")
     p.add_argument("truth", type=Path, metavar="GT_DIR")
@@ -37,35 +37,16 @@ def register(commands: Any) -> None:
     p.add_argument("rest", nargs=argparse.REMAINDER, metavar="...")
 
 
-def _add_rules(p: argparse.ArgumentParser) -> None:
-    """Adds the options of an AP protocol."""
-    p.add_argument("--protocol", default="scannet", choices=("scannet", "mask3d", "segment3d", "scannetpp"))
-    p.add_argument("--by-class", action="store_true", help="match within semantic classes and average over them")
-    p.add_argument("--classes", type=_numbers, metavar="N,N,...", help="classes that count; others are void")
-    p.add_argument("--void", type=_numbers, metavar="N,N,...", help="truth ids that are void (default 0; 'none')")
-    p.add_argument("--min-region", type=int, metavar="N", help="least points of an instance (default 100)")
-
-
 def _numbers(text: str) -> tuple[int, ...]:
     return () if text == "none" else tuple(int(word) for word in text.split(","))
-
-
-def _rules(args: argparse.Namespace) -> dict[str, Any]:
-    """The options of the protocol that were given."""
-    given = {"valid_classes": args.classes, "void_ids": args.void, "min_region": args.min_region}
-    return {"by_class": args.by_class} | {name: value for name, value in given.items() if value is not None}
 
 
 def _eval_instances(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.evaluate.layouts import run_instances
 
-    return run_instances(args.prediction, args.truth, args.protocol, scores=args.scores, **_rules(args))
-
-
-def _eval_scannet(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.evaluate.layouts import run_scannet
-
-    return run_scannet(args.prediction, args.truth, args.protocol, **_rules(args))
+    given = {"valid_classes": args.classes, "void_ids": args.void, "min_region": args.min_region}
+    rules = {"by_class": args.by_class} | {name: value for name, value in given.items() if value is not None}
+    return run_instances(args.prediction, args.truth, args.protocol, scores=args.scores, **rules)
 
 
 def _eval_images(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

@@ -1,4 +1,4 @@
-"""Instance AP of point labels and of masks: ScanNet's rules and common variants, pooled over scenes.
+"""Instance AP of point labels: ScanNet's rules and common variants, pooled over scenes.
 
 Rules (ScanNet benchmark, 3D semantic instance evaluation): IoU must be strictly above the threshold. True instances are
 visited in order, predictions in input order. The first match uses the prediction. Each further match is a false
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.evaluate.overlap import Overlap, Truth, mode_by_group, overlap_of_ids, overlap_of_masks, read_truth
+from perception.evaluate.overlap import Overlap, Truth, mode_by_group, overlap_of_ids, read_truth
 
 
 @dataclass
@@ -158,7 +158,7 @@ def evaluate(
         raise InputError(
             f"prediction has {len(pred_ids)} points, truth has {len(gt_ids)}; they must be the same points"
         )
-    keep, truth = _truth(rules, gt_ids, gt_semantics, ignore)
+    keep, truth = evaluated_truth(rules, gt_ids, gt_semantics, ignore)
     pred_ids = pred_ids[keep]
     classes = None
     if rules.by_class:
@@ -171,28 +171,7 @@ def evaluate(
     return evaluate_overlaps([overlap_of_ids(pred_ids, scores, truth, classes)], rules)
 
 
-def mask_overlap(
-    rules: Protocol,
-    masks: Sequence[np.ndarray],
-    scores: Sequence[float],
-    gt_ids: np.ndarray,
-    classes: Sequence[int] | None,
-    gt_semantics: np.ndarray | None,
-) -> Overlap:
-    """Overlap of one scene's masks (each bool [N]; they may overlap) with its true ids [N] under a protocol.
-
-    The order of the masks is the input order of the matching rules.
-    """
-    keep, truth = _truth(rules, np.asarray(gt_ids), gt_semantics, None)
-    kept = [np.asarray(mask, bool)[keep] for mask in masks]
-    if rules.by_class and classes is None:
-        raise InputError("evaluation by class needs a class for each predicted mask; there are none")
-    return overlap_of_masks(
-        kept, [1.0] * len(kept) if rules.constant_score else scores, truth, classes if rules.by_class else None
-    )
-
-
-def _truth(
+def evaluated_truth(
     rules: Protocol, gt_ids: np.ndarray, gt_semantics: np.ndarray | None, ignore: np.ndarray | None
 ) -> tuple[np.ndarray | slice, Truth]:
     """Selection of the evaluated points, and the ground truth of these points."""

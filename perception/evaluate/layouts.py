@@ -1,9 +1,4 @@
-"""Evaluation of predictions in files: `perception eval instances`, and directory layouts of public datasets, as
-downloaded.
-
-ScanNet and ScanNet++: <scene>.txt with true ids (1000 · class + instance, one per vertex); predictions are submission
-files <scene>.txt that name mask files.
-"""
+"""`perception eval instances`: AP of a labelled cloud against a cloud with true ids."""
 
 from __future__ import annotations
 
@@ -11,10 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from perception.errors import InputError
-from perception.evaluate.instances import Protocol, evaluate, evaluate_overlaps, get_protocol, mask_overlap
+from perception.evaluate.instances import evaluate, get_protocol
 from perception.io.cloud import read_cloud
 from perception.types import PointCloud
 
@@ -104,61 +97,3 @@ def instances_table(result: dict[str, Any]) -> str:
 def _row(name: str, row: dict[str, Any]) -> str:
     cells = ["-" if row[key] is None else f"{row[key]:.4f}" for key in ("ap", "ap50", "ap25")]
     return f"{name:<12}" + "".join(f"{cell:>8}" for cell in cells)
-
-
-def run_scannet(
-    prediction: str | Path, truth: str | Path, protocol: str | Protocol = "scannet", **changes: Any
-) -> tuple[dict[str, Any], str]:
-    """Instance AP over all scenes of a ScanNet or ScanNet++ layout: (result, table).
-
-    truth: <scene>.txt, one id per vertex (1000 · class + instance, 0 = void); prediction: <scene>.txt naming mask
-    files. For a scene without prediction all true instances count as missed.
-    """
-    rules = get_protocol(protocol, **changes)
-    files = sorted(Path(truth).glob("*.txt"))
-    if not files:
-        raise InputError(f"{truth}: holds no truth files <scene>.txt")
-    overlaps, missing = [], []
-    for path in files:
-        ids = _read_ids(path)
-        ids = np.where(ids >= 1000, ids, np.minimum(ids, 0))  # class 0 means no class; below -1: ignored
-        found = _read_prediction(Path(prediction), path.stem, len(ids))
-        if found is None:
-            missing.append(path.stem)
-            found = ([], [], [])
-        masks, classes, scores = found
-        overlaps.append(mask_overlap(rules, masks, scores, ids, classes, ids // 1000))
-    result = evaluate_overlaps(overlaps, rules)
-    result |= {"scenes": [p.stem for p in files], "missing": missing}
-    return result, instances_table(result)
-
-
-def _read_ids(path: Path) -> np.ndarray:
-    try:
-        values = np.fromstring(path.read_text(encoding="ascii"), dtype=np.float64, sep=" ")
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: expected one whole number a line ({error})") from error
-    return values.astype(np.int64)
-
-
-_Prediction = tuple[list[np.ndarray], list[int], list[float]]
-
-
-def _read_prediction(folder: Path, scene: str, points: int) -> _Prediction | None:
-    text = folder / f"{scene}.txt"
-    if not text.is_file():
-        return None
-    masks, classes, scores = [], [], []
-    for number, line in enumerate(text.read_text(encoding="utf-8").splitlines(), 1):
-        words = line.split()
-        try:
-            name, label, score = words
-            classes.append(int(label))
-            scores.append(float(score))
-        except ValueError as error:
-            raise InputError(f"{text}: line {number} is '{line}'; expected: mask file, class, confidence") from error
-        mask = _read_ids(folder / name)
-        if len(mask) != points:
-            raise InputError(f"{folder / name}: has {len(mask)} rows, the truth has {points}")
-        masks.append(mask != 0)
-    return masks, classes, scores

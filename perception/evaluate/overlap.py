@@ -103,7 +103,6 @@ def overlap_of_ids(
 
     pred_scores, pred_classes: by id. None means score 1 and class OBJECT for every prediction.
     """
-    _same_length(len(pred_ids), len(truth.index))
     index, ids = compact(pred_ids)
     g = len(truth.ids)
     both = np.where(index >= 0, index * (g + 1) + np.where(truth.index >= 0, truth.index, g), -1)
@@ -113,41 +112,12 @@ def overlap_of_ids(
         raise InputError(f"prediction: no score for instance {missing[0]} ({len(missing)} such); give one for each")
     scores = [1.0 if pred_scores is None else pred_scores[i] for i in ids.tolist()]
     classes = [OBJECT if pred_classes is None else pred_classes[i] for i in ids.tolist()]
-    return _overlap(ids, scores, classes, table, truth)
-
-
-def overlap_of_masks(
-    masks: Sequence[np.ndarray], scores: Sequence[float], truth: Truth, classes: Sequence[int] | None = None
-) -> Overlap:
-    """Overlap of P masks, each bool [N]. Masks may overlap; their order is kept."""
-    if len(scores) != len(masks) or (classes is not None and len(classes) != len(masks)):
-        raise InputError(
-            f"prediction: {len(masks)} masks, {len(scores)} scores; one score (and class) per mask is needed"
-        )
-    g = len(truth.ids)
-    target = np.where(truth.index >= 0, truth.index, g)
-    table = np.zeros((len(masks), g + 1), np.int64)
-    for row, mask in zip(table, masks, strict=True):
-        _same_length(len(mask), len(truth.index))
-        row += np.bincount(target[mask], minlength=g + 1)
-    ids = np.arange(len(masks))
-    return _overlap(ids, scores, [OBJECT] * len(masks) if classes is None else classes, table, truth)
-
-
-def _same_length(predicted: int, true: int) -> None:
-    if predicted != true:
-        raise InputError(f"prediction has {predicted} points, truth has {true}; both must be the same points in order")
-
-
-def _overlap(
-    ids: np.ndarray, scores: Sequence[float], classes: Sequence[int], table: np.ndarray, truth: Truth
-) -> Overlap:
-    confidence = np.asarray(scores, np.float64).reshape(len(ids))
+    confidence = np.asarray(scores, np.float64)
     if not np.isfinite(confidence).all():
         raise InputError(f"prediction: score of instance {ids[~np.isfinite(confidence)][0]} is not a finite number")
     return Overlap(
         pred_scores=confidence,
-        pred_classes=np.asarray(classes, np.int64).reshape(len(ids)),
+        pred_classes=np.asarray(classes, np.int64),
         pred_sizes=table.sum(axis=1),
         pred_void=table[:, -1],
         gt_classes=truth.classes,

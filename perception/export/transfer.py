@@ -1,5 +1,5 @@
 """Transfers instance ids of a map to the points of a cloud: nearest Gaussian, then superpoint vote. Writes labelled
-clouds: cloud and sidecar, and the submission format of ScanNet.
+clouds with their sidecars.
 """
 
 from __future__ import annotations
@@ -123,31 +123,3 @@ def sidecar_of(labels: np.ndarray, instances: Instances) -> dict[str, Any]:
         more = {key: known[key] for key in ("parent", "instances") if key in known}
         rows[str(i)] = {"score": score, "label": known.get("label"), "num_points": n, **more}
     return {"instances": rows}
-
-
-def write_scannet(
-    folder: str | Path, scene: str, labels: np.ndarray, instances: Instances, classes: Mapping[int, int] | None = None
-) -> Path:
-    """ScanNet's 3D instance submission: <scene>.txt with "predicted_masks/<scene>_<nnn>.txt <class> <confidence>" rows.
-
-    Each mask file has one 0 or 1 for each vertex. classes: class by instance id; None writes 1 for all. Best
-    score first.
-    """
-    folder = Path(folder)
-    masks = folder / "predicted_masks"
-    try:
-        masks.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{masks}: cannot be written ({error.strerror}); choose a place you may write to") from error
-    ids = np.unique(labels[labels >= 0]).tolist()
-    score = {i: float(instances.get(i, {}).get("score", 1.0)) for i in ids}
-    rows = []
-    for number, i in enumerate(sorted(ids, key=lambda i: (-score[i], i))):
-        name = f"{scene}_{number:03d}.txt"
-        digits = np.where(labels == i, ord("1"), ord("0")).astype(np.uint8)
-        with replacing(masks / name) as file:
-            file.write(np.stack([digits, np.full_like(digits, ord("\n"))], axis=1).tobytes())
-        rows.append(f"predicted_masks/{name} {1 if classes is None else classes.get(i, 0)} {score[i]:.6f}\n")
-    with replacing(folder / f"{scene}.txt") as file:
-        file.write("".join(rows).encode())
-    return folder / f"{scene}.txt"

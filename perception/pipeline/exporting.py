@@ -18,7 +18,7 @@ from perception.export.align import align
 from perception.export.depth_views import DepthView, depth_views
 from perception.export.sog import write_sog
 from perception.export.spz import write_spz
-from perception.export.transfer import ExportOptions, check_overlap, export_labels, write_export, write_scannet
+from perception.export.transfer import ExportOptions, check_overlap, export_labels, write_export
 from perception.geometry import check_similarity, move_points, scale_of
 from perception.io.cloud import read_cloud
 from perception.io.recentre import map_from_input
@@ -86,7 +86,6 @@ def export_map(
     points: Path | None,
     options: ExportOptions,
     color: str = "original",
-    scannet: Path | None = None,
     place: Path | bool = False,
     granularity: str = "default",
 ) -> tuple[dict[str, Any], str]:
@@ -96,10 +95,9 @@ def export_map(
     result are in the coordinates of the map's input (`map_from_input`). Without `points` they are the map's, or the
     input's if that was only shifted.
 
-    color: of the written points, "original" or "instance". scannet: folder of a submission, too (scene = the output's
-    stem). place: `points` lie in a frame of their own: True registers them (`export.align`), a path names a file with
-    map_from_scan [4, 4]. The result keeps that frame; the sidecar and the facts hold `map_from_scan`. granularity: see
-    `at_granularity`.
+    color: of the written points, "original" or "instance". place: `points` lie in a frame of their own: True registers
+    them (`export.align`), a path names a file with map_from_scan [4, 4]. The result keeps that frame; the sidecar and
+    the facts hold `map_from_scan`. granularity: see `at_granularity`.
     """
     if output.suffix.lower() in COMPRESSED:
         return _export_compressed(map_path, output, points)
@@ -134,8 +132,6 @@ def export_map(
     labels = export_labels(means, ids, cloud, options)
     if color == "instance":
         cloud = replace(cloud, colors=instance_palette(labels))
-    if scannet is not None:
-        write_scannet(scannet, output.stem, labels, instances)
     sidecar = write_export(output, cloud, labels, instances, facts)  # last: where it is, everything was written
     result = {
         "points": len(labels),

@@ -19,9 +19,8 @@ from bench.masks import (
     read_mask_folder,
     scenes_result,
 )
+from bench.scannet import run_scannet, write_scannet
 from perception.errors import InputError
-from perception.evaluate.layouts import run_scannet
-from perception.export.transfer import write_scannet
 from support.ap import evaluate_masks
 
 

@@ -164,7 +164,7 @@ class Exporting(Case):
         """One export into the folder `out`; the exit code."""
         out = place / "out"
         words = ["export", place / "m.gsmap", "--points", self.cloud, "-o", out / "cloud.ply", "--color", "instance"]
-        return command(*words, "--scannet", out / "scannet", *more)
+        return command(*words, *more)
 
     def after_kill(self, place: Path, trial: int) -> str:
         assert tree(place / "m.gsmap") == tree(self.gmap), "the exported map changed"

@@ -22,13 +22,13 @@ def test_all_that_was_asked_for_is_written(tmp_path: Path) -> None:
     gmap.instances[2]["label"] = "blue ball"
     write_map(path, gmap)
     folder.mkdir()
-    facts, table = export_map(path, folder / "out.ply", None, ExportOptions(), "instance", folder / "submission")
+    facts, table = export_map(path, folder / "out.ply", None, ExportOptions(), "instance")
     solid = gmap.opacities >= 0.5
     back = read_cloud(folder / "out.ply")
     np.testing.assert_array_equal(back.labels["instance_id"], gmap.instance_ids[solid])
     np.testing.assert_array_equal(back.colors, instance_palette(gmap.instance_ids[solid]))
     assert facts["points"] == solid.sum() and facts["labelled"] == (solid & (gmap.instance_ids >= 0)).sum()
     assert "blue ball" in table and json.loads(json.dumps(facts))["instances"]["2"]["label"] == "blue ball"
-    assert {p.name for p in folder.iterdir()} == {"out.ply", "out.json", "submission"}
+    assert {p.name for p in folder.iterdir()} == {"out.ply", "out.json"}
     with pytest.raises(InputError, match=r"expected one of \.ply"):
         export_map(path, folder / "m.rrd", None, ExportOptions())

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from perception.evaluate.instances import evaluate_overlaps, get_protocol, mask_overlap
+from bench.scannet import mask_overlap
+from perception.evaluate.instances import evaluate_overlaps, get_protocol
 
 
 def evaluate_masks(

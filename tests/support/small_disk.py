@@ -42,7 +42,7 @@ def writers(disk: Path) -> dict[str, Callable[[], Any]]:
         "write_map": lambda: write_map(path, gmap),
         "labels": lambda: set_labels(path, {gmap.instances[0]["id"]: "a name"}),
         "editor": edited.save,
-        "export": lambda: export_map(path, disk / "out.ply", None, ExportOptions(), scannet=disk / "scannet"),
+        "export": lambda: export_map(path, disk / "out.ply", None, ExportOptions()),
         "checkpoint": lambda: save_checkpoint(disk / "checkpoint.pt", state, "mark"),
         "scene": lambda: save_scene(disk / "scene", scene),
         "masks": lambda: write_labels(disk / "m.png", np.random.default_rng(0).integers(0, 9, (200, 200))),
