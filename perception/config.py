@@ -78,7 +78,6 @@ class SamConfig(Settings):
     skip_covered: bool = Field(
         True, description="leave out prompts that lie in the smallest good mask of an earlier one; false: as published"
     )
-    crop_layers: int = Field(0, ge=0, le=3, description="layer i prompts 4^i overlapping crops of the photo as well")
     pred_iou: float = Field(0.88, ge=0, le=1, description="smallest IoU of a mask as the model predicts it")
     stability: float = Field(0.95, ge=0, le=1, description="smallest IoU of the masks cut at logits of -1 and 1")
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,11 +26,8 @@ POINTS_PER_BATCH = 64
 COVERING_BATCH = 8  # prompts of one call with `skip_covered`: those of a call do not see each other's masks
 STABILITY_OFFSET = 1.0  # added to and subtracted from the logit threshold
 BOX_NMS = 0.7  # box IoU above which two masks are duplicates
-CROP_OVERLAP = 512 / 1500  # of the shorter side
-EDGE = 20  # pixels: a mask so near to the edge of its crop is cut off
 AT_ONCE = 4  # photos, at most: each needs the encoder's working memory
 _BATCH_BYTES = 512 << 20  # masks of one batch; some graphs return them at full size
-Box = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
@@ -74,34 +71,7 @@ class SamSource:
 
 
 def automatic_masks(model: SamModel, photo: np.ndarray, settings: SamConfig) -> list[SamMask]:
-    """Masks of photo [h, w, 3] uint8 RGB, sorted by falling predicted IoU; with crops, masks of small crops first."""
-    height, width = photo.shape[:2]
-    found: list[SamMask] = []
-    areas: list[int] = []
-    for crop in crop_boxes(height, width, settings.crop_layers):
-        x0, y0, x1, y1 = crop
-        masks = _prompted(model, np.ascontiguousarray(photo[y0:y1, x0:x1]), settings)
-        if settings.crop_layers:
-            masks = [_placed(mask, crop, (height, width)) for mask in masks if not _cut(mask, crop, (height, width))]
-        found += masks
-        areas += [(x1 - x0) * (y1 - y0)] * len(masks)
-    return _without_duplicates(found, -np.array(areas, float)) if settings.crop_layers else found
-
-
-def crop_boxes(height: int, width: int, layers: int) -> list[Box]:
-    """(x0, y0, x1, y1) of the photo and of the 2^i × 2^i overlapping crops of each layer i, as published."""
-    boxes = [(0, 0, width, height)]
-    for layer in range(1, layers + 1):
-        side = 2**layer
-        overlap = int(CROP_OVERLAP * min(height, width) * 2 / side)
-        w, h = (math.ceil((overlap * (side - 1) + length) / side) for length in (width, height))
-        corners = [((w - overlap) * i, (h - overlap) * j) for i in range(side) for j in range(side)]
-        boxes += [(x, y, min(x + w, width), min(y + h, height)) for x, y in corners]
-    return boxes
-
-
-def _prompted(model: SamModel, photo: np.ndarray, settings: SamConfig) -> list[SamMask]:
-    """The masks of one grid of prompts, sorted by falling predicted IoU."""
+    """Masks of photo [h, w, 3] uint8 RGB from one grid of prompts, sorted by falling predicted IoU."""
     height, width = photo.shape[:2]
     embedding = model.encode(photo)
     side = settings.points_per_side
@@ -122,27 +92,8 @@ def _prompted(model: SamModel, photo: np.ndarray, settings: SamConfig) -> list[S
             for masks in filter(None, good):
                 covered |= min(masks, key=lambda mask: mask.area).pixels()
             points = points[~covered[points[:, 1].astype(int), points[:, 0].astype(int)]]
-    return _without_duplicates(found, np.array([mask.pred_iou for mask in found]))
-
-
-def _without_duplicates(masks: list[SamMask], scores: np.ndarray) -> list[SamMask]:
-    boxes = np.array([mask.box for mask in masks]).reshape(-1, 4)
-    return [masks[row] for row in box_nms(boxes, scores, BOX_NMS)]
-
-
-def _cut(mask: SamMask, crop: Box, shape: tuple[int, int]) -> bool:
-    """Whether the mask of a crop ends at an edge of the crop that is none of the photo [h, w]."""
-    box = mask.box + np.array([*crop[:2], *crop[:2]])
-    near, end = (np.abs(box - np.array(edges)) <= EDGE for edges in (crop, (0, 0, shape[1], shape[0])))
-    return bool((near & ~end).any())
-
-
-def _placed(mask: SamMask, crop: Box, shape: tuple[int, int]) -> SamMask:
-    """The mask of a crop in the photo [h, w]."""
-    whole = np.zeros(shape, bool)
-    whole[crop[1] : crop[3], crop[0] : crop[2]] = mask.pixels()
-    place = {"box": mask_box(whole), "point": mask.point + np.array(crop[:2])}
-    return replace(mask, packed=_pack(whole), shape=shape, **place)
+    boxes = np.array([mask.box for mask in found]).reshape(-1, 4)
+    return [found[row] for row in box_nms(boxes, np.array([mask.pred_iou for mask in found]), BOX_NMS)]
 
 
 def paint(masks: list[SamMask], shape: tuple[int, int]) -> np.ndarray:

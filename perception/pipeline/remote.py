@@ -71,5 +71,8 @@ def _reported(source: Path | str, output: Path, resume: bool, progress: Progress
 
 def _same(found: dict[str, Any], source: Path | str, config: MapConfig) -> bool:
     """Whether the map with `found` in its map.json is of this input and these settings."""
-    theirs = MapConfig.model_validate(found["config"])
+    try:
+        theirs = MapConfig.model_validate(found["config"])
+    except ValueError:  # settings of another version
+        return False
     return found["source"] == str(source) and fingerprint(Path(), theirs) == fingerprint(Path(), config)

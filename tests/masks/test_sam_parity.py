@@ -46,7 +46,6 @@ CASES = [
     ({}, (96, 128), 7),
     ({}, (131, 87), 7),
     ({"stability": 0.8, "pred_iou": 0.5}, (96, 128), 6),
-    ({"crop_layers": 1}, (131, 187), 6),
 ]
 
 
@@ -59,7 +58,6 @@ def test_same_masks_in_the_same_order(segment_anything, sam, exported, changes, 
         points_per_side=side,
         pred_iou_thresh=settings.pred_iou,
         stability_score_thresh=settings.stability,
-        crop_n_layers=settings.crop_layers,
     ).generate(image)
     ours = automatic_masks(open_sam(str(exported)), image, settings)
     print(f"{len(theirs)} masks")

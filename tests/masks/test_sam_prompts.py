@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from perception.config import SamConfig
-from perception.masks.sam import SamMask, automatic_masks, crop_boxes, paint
+from perception.masks.sam import SamMask, automatic_masks, paint
 
 SIZE, SIDE = (300, 400), 16  # of the photo, of the grid of prompts
 
@@ -103,12 +103,3 @@ def test_ragged_masks_agree_too(seed: int) -> None:
     labels = [paint(masks, SIZE) for masks in (full, fewer)]
     same = sum(np.bincount(labels[0][labels[1] == n]).max() for n in np.unique(labels[1]))
     assert same > 0.97 * labels[0].size
-
-
-def test_crops_cover_the_photo_and_overlap() -> None:
-    boxes = crop_boxes(300, 400, 2)
-    assert len(boxes) == 1 + 4 + 16 and boxes[0] == (0, 0, 400, 300)
-    hits = np.zeros(SIZE, int)
-    for x0, y0, x1, y1 in boxes[1:5]:
-        hits[y0:y1, x0:x1] += 1
-    assert hits.min() == 1 and hits.max() == 4
