@@ -24,7 +24,6 @@ from perception.io.model_store import (
     find_model,
     known_names,
     models_folder,
-    set_default,
 )
 from perception.io.onnx_sessions import model_graphs, model_root, side_files
 from perception.progress import Progress
@@ -131,20 +130,14 @@ def judge(found: Sequence[dict[str, Any]]) -> tuple[str | None, str | None, str]
     return family, purpose, f"the {' and '.join(sorted(lacking))} is missing; both are needed" if lacking else ""
 
 
-def add_model(name: str, sources: Sequence[str], *, default: bool = False) -> StoredModel:
-    """Adds files (or all files of a folder) to the store under `name`, all or none.
-
-    default: `--masks auto` uses this model from now on.
-    """
+def add_model(name: str, sources: Sequence[str]) -> StoredModel:
+    """Adds files (or all files of a folder) to the store under `name`, all or none."""
     if not NAME.fullmatch(name):
         raise InputError(f"model name '{name}': expected letters, digits, '.', '_' or '-', as in mobile-sam")
-    known = _install(name, [file for source in sources for file in _local(source)])
-    if default:
-        set_default(known)
-    return known
+    return _install(name, [file for source in sources for file in _local(source)])
 
 
-def get_model(name: str, *, default: bool = False, progress: Progress | None = None) -> StoredModel:
+def get_model(name: str, progress: Progress | None = None) -> StoredModel:
     """Fetches an entry of the catalogue from the Hugging Face hub into the store under its name, unless it is there.
 
     What is fetched is told before. HF_ENDPOINT names a mirror of the hub. Files are verified by their known digests.
@@ -162,8 +155,6 @@ def get_model(name: str, *, default: bool = False, progress: Progress | None = N
         parts = models_folder() / ".parts" / name
         known = _install(name, [_fetched(entry, path, parts) for path in entry.files])
         shutil.rmtree(parts)
-    if default:
-        set_default(known)
     return known
 
 

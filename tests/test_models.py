@@ -100,9 +100,10 @@ def sam(tmp_path: Path) -> tuple[Path, Path]:
 # ----------------------------------------------------------------------- the store
 
 
-def test_a_stored_default_is_what_auto_means(sam: tuple[Path, Path]) -> None:
+def test_auto_takes_a_stored_model_by_its_name(sam: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     assert make_source("auto").name.startswith("built")
-    add_model("tiny", [str(sam[0]), str(sam[1])], default=True)
+    add_model("tiny", [str(sam[0]), str(sam[1])])
+    monkeypatch.setenv("PERCEPTION_SAM", "tiny")
     assert make_source("auto").name.startswith("sam (SAM")
 
 
@@ -141,10 +142,10 @@ def test_get_fetches_an_entry_of_the_catalogue(
     server: Server, hub: dict[str, tuple[int, str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     megabytes = sum(size for size, _ in hub.values()) / 1e6
-    assert main(["models", "get", "tiny", "--default"]) == 0
+    assert main(["models", "get", "tiny"]) == 0
     said = capsys.readouterr()
     assert f"tiny: 3 files, {megabytes:.1f} MB, of org/tiny-ONNX at abc123, licence MIT, to " in said.err
-    assert "use it with --masks sam:tiny" in said.out and make_source("auto").name.startswith("sam (SAM")
+    assert "use it with --masks sam:tiny" in said.out and make_source("sam:tiny").name.startswith("sam (SAM")
     asked = len(server.asked)
     assert main(["models", "get", "tiny"]) == 0 and len(server.asked) == asked  # it is there
     assert main(["models", "get"]) == 0

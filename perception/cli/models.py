@@ -19,10 +19,8 @@ def register(commands: Any) -> None:
     p = command(kinds, "add", _add, "put a model into the store, from files")
     p.add_argument("name", metavar="NAME", help="use it as --masks sam:NAME or language.encoder=clip:NAME")
     p.add_argument("source", nargs="+", metavar="FILE", help="encoder and decoder, or a folder")
-    p.add_argument("--default", action="store_true", help="--masks auto takes this model from now on")
     p = command(kinds, "get", _get, "fetch a model of the catalogue from the Hugging Face hub, or list the catalogue")
     p.add_argument("name", metavar="NAME", nargs="?", help="an entry of the catalogue; none: list it")
-    p.add_argument("--default", action="store_true", help="--masks auto takes this model from now on")
 
 
 def _list(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -61,7 +59,7 @@ def _get(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.progress import Progress
 
     if args.name is not None:
-        return _told(get_model(args.name, default=args.default, progress=Progress()))
+        return _told(get_model(args.name, Progress()))
     lines = [f"{n:16} {e.purpose:5} {e.licence:12} {e.repository} at {e.revision[:12]}" for n, e in catalogue().items()]
     return {"catalogue": list(catalogue())}, "\n".join(lines)
 
@@ -69,14 +67,15 @@ def _get(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 def _add(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.models import add_model
 
-    return _told(add_model(args.name, args.source, default=args.default))
+    return _told(add_model(args.name, args.source))
 
 
 def _told(model: Any) -> tuple[dict[str, Any], str]:
     from perception.models import check_file
 
     warnings = check_file(str(model.folder))["warnings"]
-    use = {"sam": f"--masks sam:{model.name}", "clip": f"--set language.encoder=clip:{model.name}"}
+    sam = f"--masks sam:{model.name}, or PERCEPTION_SAM={model.name} in the environment"
+    use = {"sam": sam, "clip": f"--set language.encoder=clip:{model.name}"}
     lines = [f"{model.folder}: {model.family or 'unknown family'}"]
     lines += [f"  {entry['sha256']}  {entry['name']}" for entry in model.files]
     lines += [f"warning: {text}" for text in warnings]

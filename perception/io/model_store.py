@@ -12,12 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_file
 from perception.io.documents import read_json
 
 RECORD = "perception.json"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-_DEFAULTS = "defaults.json"
 
 
 @dataclass(frozen=True)
@@ -93,28 +91,3 @@ def known_names() -> str:
     """Names of the stored models, for messages."""
     names = ", ".join(model.name for model in stored_models())
     return f"the store holds {names}" if names else "the store is empty (see perception models add)"
-
-
-def default_model(purpose: str) -> str | None:
-    """Folder of the model that the user chose for a purpose ("sam"), or None."""
-    name = _defaults().get(purpose)
-    if name is None:
-        return None
-    model = find_model(name)
-    if model is None:
-        raise InputError(f"the default {purpose} model '{name}' is not in the store any more; {known_names()}")
-    return str(model.folder)
-
-
-def set_default(model: StoredModel) -> None:
-    """Makes a model the default for its purpose, as used by `--masks auto`."""
-    if model.purpose is None:
-        raise InputError(f"{model.name}: its family is unknown, so nothing can be done with it by default")
-    with atomic_file(models_folder() / _DEFAULTS) as file:
-        file.write_text(json.dumps({**_defaults(), model.purpose: model.name}) + "\n", encoding="utf-8")
-
-
-def _defaults() -> dict[str, str]:
-    file = models_folder() / _DEFAULTS
-    known = read_json(file) if file.is_file() else {}
-    return known if isinstance(known, dict) else {}

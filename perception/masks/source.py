@@ -10,7 +10,6 @@ import numpy as np
 
 from perception.config import SamConfig
 from perception.errors import InputError
-from perception.io.model_store import default_model
 from perception.types import View
 
 
@@ -34,14 +33,14 @@ class MaskSource(Protocol):
 def make_source(spec: str, sam: SamConfig | None = None) -> MaskSource:
     """Parses `auto`, `builtin`, `labels:DIR`, or `sam:PATH` (folder, encoder file, or `ENCODER,DECODER`).
 
-    `auto` uses the SAM that the environment variable PERCEPTION_SAM names, else the default set by `perception models
-    add --default`; without one it is `builtin`. Files, model signatures and packages are checked here, before any work.
-    InputError names what is missing or wrong. sam: settings of SAM's mask generation; None: the defaults.
+    `auto` uses the SAM that the environment variable PERCEPTION_SAM names; without one it is `builtin`. Files, model
+    signatures and packages are checked here, before any work. InputError names what is missing or wrong. sam: settings
+    of SAM's mask generation; None: the defaults.
     """
     kind, _, argument = spec.partition(":")
     if kind == "auto" and not argument:
-        configured = os.environ.get("PERCEPTION_SAM", "").strip() or default_model("sam")
-        kind, argument = ("builtin", "") if configured is None else ("sam", configured)
+        argument = os.environ.get("PERCEPTION_SAM", "").strip()
+        kind = "sam" if argument else "builtin"
     if kind == "builtin" and not argument:
         from perception.masks.builtin import BuiltinSegmentation
 
