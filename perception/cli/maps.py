@@ -97,21 +97,16 @@ def _index(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    if args.text is not None and args.clear:
-        raise InputError("label: give a NAME or --clear, only one of them")
-    if args.id is not None:
-        return _set(args)
-    if args.clear:
-        raise InputError("label: --clear needs the ID whose name is taken away")
     from perception.io.map import Map
-
-    named = {entry["id"]: entry["label"] for entry in Map.open(args.map).instances if entry.get("label")}
-    return {"labels": named}, "\n".join(f"{i:>5}  {name}" for i, name in named.items()) or "no instance has a name"
-
-
-def _set(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.io.store import set_labels
 
+    if args.text is not None and args.clear:
+        raise InputError("label: give a NAME or --clear, only one of them")
+    if args.id is None and args.clear:
+        raise InputError("label: --clear needs the ID whose name is taken away")
+    if args.id is None:
+        named = {entry["id"]: entry["label"] for entry in Map.open(args.map).instances if entry.get("label")}
+        return {"labels": named}, "\n".join(f"{i:>5}  {name}" for i, name in named.items()) or "no instance has a name"
     if args.text is None and not args.clear:
         raise InputError("label: no NAME given; write one, or --clear to take it away")
     label = set_labels(args.map, {args.id: args.text})[args.id]
