@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.export.spz import check_finite
+from perception.instances.segments import nearest_centres
 from perception.io.atomic import replacing
 from perception.io.map import Map
 
@@ -22,7 +23,6 @@ CODES, WIDE = 256, 64
 """Numbers of a codebook; centroids in a row of the palette's image."""
 PALETTE, SHARE, FITTED, ROUNDS = 8192, 8, 100_000, 6
 """Of the harmonics: most centroids, Gaussians of each where that gives fewer, Gaussians they are fitted to, rounds."""
-_BATCH = 2048
 
 
 def write_sog(path: Path, gmap: Map) -> None:
@@ -114,17 +114,11 @@ def palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     fitted = rows[np.unique(np.linspace(0, len(rows) - 1, FITTED).astype(int))].astype(np.float32)
     centroids = fitted[np.linspace(0, len(fitted) - 1, count).astype(int)]
     for _ in range(ROUNDS):
-        labels = _nearest(fitted, centroids)
+        labels = nearest_centres(fitted, centroids)
         sizes = np.bincount(labels, minlength=count)
         sums = np.stack([np.bincount(labels, fitted[:, d], count) for d in range(fitted.shape[1])], axis=1)
         centroids = np.where(sizes[:, None] > 0, sums / np.maximum(sizes, 1)[:, None], centroids).astype(np.float32)
-    return centroids, _nearest(rows.astype(np.float32), centroids)
-
-
-def _nearest(rows: np.ndarray, centroids: np.ndarray) -> np.ndarray:
-    half = (centroids**2).sum(axis=1) / 2
-    parts = [rows[start : start + _BATCH] for start in range(0, len(rows), _BATCH)]
-    return np.concatenate([np.argmax(part @ centroids.T - half, axis=1) for part in parts])
+    return centroids, nearest_centres(rows.astype(np.float32), centroids)
 
 
 def _packed(quats: np.ndarray) -> np.ndarray:

@@ -33,14 +33,15 @@ def over_segment(means: np.ndarray, features: np.ndarray, count: int, seed: int 
     sample = rows if len(rows) <= SAMPLE else rows[np.sort(rng.choice(len(rows), SAMPLE, replace=False))]
     centres = sample[np.sort(rng.choice(len(sample), min(count, len(sample)), replace=False))]
     for _ in range(ROUNDS):
-        owner = _nearest(sample, centres)
+        owner = nearest_centres(sample, centres)
         sizes = np.bincount(owner, minlength=len(centres))
         sums = np.stack([np.bincount(owner, column, minlength=len(centres)) for column in sample.T], axis=1)
         centres = (sums[sizes > 0] / sizes[sizes > 0, None]).astype(np.float32)
-    return np.unique(_nearest(rows, centres), return_inverse=True)[1].reshape(-1)
+    return np.unique(nearest_centres(rows, centres), return_inverse=True)[1].reshape(-1)
 
 
-def _nearest(rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
+def nearest_centres(rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """[N] int64: the nearest of centres [K, D] to each of rows [N, D], the first of equals."""
     half = 0.5 * (centres**2).sum(axis=1)
     owner = np.zeros(len(rows), np.int64)
     for begin in range(0, len(rows), CHUNK):

@@ -14,6 +14,7 @@ from perception.cli import main
 from perception.errors import InputError
 from perception.export import sog
 from perception.export.sog import codebook, palette, sog_bytes, spatial_order, write_sog
+from perception.instances import segments
 from perception.io.store import read_map
 from support.compressed import read_sog
 from support.query_maps import write_map_of
@@ -65,7 +66,7 @@ def test_a_codebook_holds_few_values_as_they_are_and_others_as_another_k_means_d
 
 
 def test_a_palette_finds_groups(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sog, "_BATCH", 50)
+    monkeypatch.setattr(segments, "CHUNK", 50)
     rng = np.random.default_rng(3)
     kinds = rng.normal(size=(9, 24))
     member = rng.integers(0, 9, 800)
