@@ -10,11 +10,11 @@ the maxima over the reads r in view v that agree with t, d the edit distance, an
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from perception.language.ocr import Line
+from perception.language.ocr import TextReader
 from perception.language.printed import edit_distance
 from perception.progress import Progress
 
@@ -30,17 +30,8 @@ COVER = 0.5  # share of a line's rectangle that its instance must cover
 Read = tuple[int, str, float]  # view, text, score
 
 
-class Reader(Protocol):
-    """What `ocr.TextReader` is."""
-
-    @property
-    def identity(self) -> str: ...
-
-    def read(self, photo: np.ndarray) -> list[Line]: ...
-
-
 def read_texts(
-    reader: Reader,
+    reader: TextReader,
     choices: Sequence[np.ndarray],
     load: Callable[[int], tuple[np.ndarray, np.ndarray]],
     progress: Progress | None = None,

@@ -21,12 +21,13 @@ from perception.instances.describe import describe_instances
 from perception.instances.group import Grouping, group
 from perception.instances.levels import with_levels
 from perception.instances.silhouettes import Silhouettes, render_silhouettes
-from perception.instances.texts import Reader, read_texts, store_texts
+from perception.instances.texts import read_texts, store_texts
 from perception.instances.votes import mask_votes
 from perception.io.map import prefixed
 from perception.io.memory import Keep, return_free_memory
 from perception.language.base import Encoder, reading_of
 from perception.language.description import to_arrays
+from perception.language.ocr import TextReader
 from perception.masks.merging import Segmentation
 from perception.progress import Progress
 
@@ -86,7 +87,7 @@ def describe(
     words: LanguageConfig,
     encoder: Encoder | None,
     progress: Progress,
-    reader: Reader | None = None,
+    reader: TextReader | None = None,
 ) -> FoundInstances:
     """Geometry, score and views of each instance; with an encoder its language embeddings (§3.2.2), with a reader its
     printed texts."""

@@ -12,7 +12,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.instances.describe import Load, describe_instances
 from perception.instances.silhouettes import render_silhouettes
-from perception.instances.texts import Reader, read_texts, store_texts
+from perception.instances.texts import read_texts, store_texts
 from perception.io.atomic import writing
 from perception.io.map import Map, language_in, prefixed
 from perception.io.map_files import read_info
@@ -21,7 +21,7 @@ from perception.io.store import FORMAT_VERSION, read_map, write_map
 from perception.language.base import Encoder, reading_of
 from perception.language.description import from_arrays, to_arrays
 from perception.language.encoders import make_encoder
-from perception.language.ocr import make_reader
+from perception.language.ocr import TextReader, make_reader
 from perception.pipeline.photos import training_view
 from perception.pipeline.rendering import as_gaussians
 from perception.progress import Progress
@@ -82,7 +82,7 @@ def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:
         gmap.groups = gmap.groups | prefixed(_described(gmap, encoder, stored, gmap.group_ids, known, 1, progress))
 
 
-def _read_again(gmap: Map, reader: Reader | None, progress: Progress) -> None:
+def _read_again(gmap: Map, reader: TextReader | None, progress: Progress) -> None:
     """Replaces `texts` of the instances if another reader, or none, has looked for them."""
     report = gmap.info.get("instances", {})
     if reader is None or not gmap.language or report.get("texts") == reader.identity:
