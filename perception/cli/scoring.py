@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from perception.bench import BENCHES
-from perception.cli.parser import Parser, command, map_command
+from perception.cli.parser import Parser, command
 from perception.errors import InputError
 
 
@@ -28,9 +28,6 @@ def register(commands: Any) -> None:
     p = command(kinds, "images", _eval_images, "PSNR and SSIM per view and mean")
     p.add_argument("prediction", type=Path, metavar="PRED_DIR")
     p.add_argument("truth", type=Path, metavar="GT_DIR")
-    p = map_command(kinds, "masks", _eval_masks, "mIoU of a map's rendered instance masks in its held-out views")
-    p.add_argument("truth", type=Path, metavar="MASKS_DIR", help="one PNG a view: instance ids alike in all, 0 = void")
-    p.add_argument("--all-views", action="store_true", help="score the training views too")
 
     p = command(commands, "bench", _bench, "measure speed against error on this machine")
     p.add_argument("name", metavar="NAME", help=", ".join(BENCHES))
@@ -53,12 +50,6 @@ def _eval_images(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.evaluate.images import run_images
 
     return run_images(args.prediction, args.truth)
-
-
-def _eval_masks(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.pipeline.rendering import score_masks
-
-    return score_masks(args.map, args.truth, args.all_views)
 
 
 def _bench(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

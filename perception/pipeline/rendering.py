@@ -1,4 +1,4 @@
-"""`perception render` and `perception eval masks`: images of a map from cameras, and how right its masks are."""
+"""`perception render`: images of a map from cameras."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from perception.errors import InputError
-from perception.evaluate.rendered import evaluate_rendered
 from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
 from perception.gaussians.views import depth_image
@@ -67,14 +66,10 @@ def rendered_crop(gmap: QueryMap, instance_id: int, side: int) -> np.ndarray | N
 
 
 def map_views(gmap: Map, held_out: bool = True) -> list[View]:
-    """`scored_views` without the lens of their photos, for undistorted pictures."""
-    return [replace(view, lens=None) for view in scored_views(gmap, held_out)]
-
-
-def scored_views(gmap: Map, held_out: bool = True) -> list[View]:
-    """The views of a map that are compared with a truth in the shape of their photos: the held-out ones, or all when
-    none were (or `held_out` is False)."""
-    return [*([view for view in gmap.views if view.held_out or not held_out] or gmap.views)]
+    """The held-out views of a map, or all when none were (or `held_out` is False), for undistorted pictures: without
+    the lens of their photos."""
+    views = [view for view in gmap.views if view.held_out or not held_out] or gmap.views
+    return [replace(view, lens=None) for view in views]
 
 
 def _cameras(path: Path) -> list[View]:
@@ -154,19 +149,3 @@ def write_picture(path: Path, image: np.ndarray) -> None:
         image = np.ascontiguousarray(image[..., ::-1])
     if not cv2.imwrite(str(path), image):
         raise InputError(f"{path}: cannot be written; choose a writable -o")
-
-
-def score_masks(map_path: Path, truth_dir: Path, all_views: bool = False) -> tuple[dict[str, Any], str]:
-    """mIoU of the map's rendered masks in its held-out views; in all its views with all_views or if none was held out.
-
-    truth_dir: one PNG per view, see `evaluate_rendered`. Returns (JSON-able result, table).
-    """
-    gmap = read_map(map_path)
-    views = scored_views(gmap, held_out=not all_views)
-    result = evaluate_rendered(as_gaussians(gmap), gmap.instance_ids, views, truth_dir)
-    lines = [f"{'truth':>6}{'map':>6}{'views':>7}{'mIoU':>8}{'pooled':>8}"]
-    for row in result["instances"]:
-        name = "-" if row["pred"] is None else row["pred"]
-        lines.append(f"{row['gt']:>6}{name:>6}{row['views']:>7}{row['miou']:>8.3f}{row['pooled_iou']:>8.3f}")
-    lines.append(f"mIoU {result['miou']:.4f} over {len(result['instances'])} instances in {result['views']} views")
-    return result, "\n".join(lines)

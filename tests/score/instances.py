@@ -21,6 +21,7 @@ from perception.io.map import Map
 from perception.types import PointCloud
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
+from score.masks import evaluate_rendered  # noqa: E402
 from score.reliability import SCORED, finish_reliability, parse_pairs  # noqa: E402
 
 
@@ -61,10 +62,9 @@ def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
     """
     from perception.evaluate.instances import evaluate
     from perception.evaluate.overlap import overlap_of_ids, read_truth
-    from perception.evaluate.rendered import evaluate_rendered
     from perception.export.transfer import export_labels
     from perception.io.store import read_map
-    from perception.pipeline.rendering import as_gaussians, scored_views
+    from perception.pipeline.rendering import as_gaussians
 
     gmap = read_map(map_path)
     cloud = read_truth_cloud(scene, gmap)
@@ -73,7 +73,8 @@ def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
     stuff = np.isin(truth, [entry["id"] for entry in about if entry["is_stuff"]])
     labels = export_labels(gmap.means, gmap.instance_ids, cloud)
     confidence = {entry["id"]: float(entry["score"]) for entry in gmap.instances}
-    rendered = evaluate_rendered(as_gaussians(gmap), gmap.instance_ids, scored_views(gmap), scene / "masks_gt")
+    unseen = [view for view in gmap.views if view.held_out] or gmap.views
+    rendered = evaluate_rendered(as_gaussians(gmap), gmap.instance_ids, unseen, scene / "masks_gt")
     rows = {}
     for name, ignore in (("all", None), ("things", stuff), ("stuff", ~stuff)):
         for kind, scores in (("calibrated", confidence), ("constant", None)):

@@ -12,12 +12,12 @@ import torch
 
 pytest.importorskip("perception._core")
 from perception.errors import InputError
-from perception.evaluate.rendered import evaluate_rendered, mask_miou
 from perception.gaussians.model import from_points
 from perception.io.map_views import stored_view
-from perception.io.store import Map, write_map
-from perception.pipeline.rendering import score_masks
+from perception.io.store import Map, read_map, write_map
+from perception.pipeline.rendering import as_gaussians
 from perception.types import Lens, View
+from score.masks import evaluate_rendered, mask_miou
 
 
 def image(*columns: int) -> np.ndarray:
@@ -104,4 +104,5 @@ def test_true_masks_have_the_shape_of_distorted_photos(tmp_path: Path) -> None:
         **arrays, instance_ids=ids, membership=np.ones(8000, np.float32), instances=entries, info=info, views=[shown]
     )
     write_map(tmp_path / "a.gsmap", gmap)
-    assert score_masks(tmp_path / "a.gsmap", tmp_path)[0]["miou"] > 0.95
+    read = read_map(tmp_path / "a.gsmap")
+    assert evaluate_rendered(as_gaussians(read), read.instance_ids, read.views, tmp_path)["miou"] > 0.95
