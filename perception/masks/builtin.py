@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from perception.errors import InputError
+from perception.geometry import move_points
 from perception.io.memory import Keep
 from perception.masks.boundaries import WEIGHTS, boundaries, read_layers
 from perception.masks.merging import Segmentation, segmentation
 from perception.masks.stereo import StereoView, make_stereo_view, measure_depths
-from perception.masks.surface import FOOTPRINTS, Surface, SurfaceBuilder, to_world
+from perception.masks.surface import FOOTPRINTS, Surface, SurfaceBuilder
 from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
 from perception.progress import Progress
 from perception.types import View
@@ -100,7 +101,7 @@ def surface_graph(views: list[StereoView], surface: Surface) -> SurfaceGraph:
     graph = SurfaceGraph(surface, patches(surface, edges), edges)
     for view in views:
         photo, depth = view.cues()
-        view.voxel = view.keep(surface.voxel_of(to_world(depth.points, view.world_from_camera)))
+        view.voxel = view.keep(surface.voxel_of(move_points(view.world_from_camera, depth.points.astype(np.float64))))
         regions = np.where(view.voxel >= 0, graph.patch[view.voxel], -1)
         graph.add(regions, photo, depth, np.asarray(view.learned, np.float32))
     graph.link()

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from perception.geometry import move_points
 from perception.masks.cues import DepthCues, PhotoCues
 
 FOOTPRINTS = 4.0  # voxel side in pixel footprints at the median depth; above the noise of the depth
@@ -51,7 +52,7 @@ class SurfaceBuilder:
     ) -> None:
         """Adds one photo. border: [h, w] probability; known: [h, w] bool, pixels with reliable depth;
         world_from_camera: [4, 4]."""
-        points = to_world(depth.points[known], world_from_camera)
+        points = move_points(world_from_camera, depth.points[known].astype(np.float64))
         normals = depth.normals[known] @ world_from_camera[:3, :3].T
         values = np.concatenate(
             [np.ones((len(points), 1)), points, normals, photo.lab[known], border[known][:, None]], axis=1
@@ -80,11 +81,6 @@ class SurfaceBuilder:
             (sums[:, k] / count).astype(np.float32) for k in (slice(1, 4), slice(7, 10), slice(10, 11))
         )
         return Surface(self.size, self._keys[rows], sums[:, 0], points, normals.astype(np.float32), lab, border[:, 0])
-
-
-def to_world(points: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
-    """Transforms points [..., 3] from the camera frame to the world frame, float64."""
-    return points.astype(np.float64) @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
 
 
 def voxel_keys(points: np.ndarray, size: float) -> np.ndarray:

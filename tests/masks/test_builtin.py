@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from perception.errors import InputError
+from perception.geometry import move_points
 from perception.masks import compute_masks, load_labels, make_source
 from perception.masks.builtin import BuiltinSegmentation, fuse, surface_graph
 from perception.masks.cues import depth_cues
@@ -31,7 +32,7 @@ from perception.masks.stereo import (
     measure_depths,
     plane_depths,
 )
-from perception.masks.surface import pack_voxels, to_world, unpack_voxels, voxel_keys
+from perception.masks.surface import pack_voxels, unpack_voxels, voxel_keys
 from perception.masks.surface_graph import SurfaceGraph, voxel_edges
 from perception.types import DepthImage, View
 from support.mask_scores import best_ious, leaf_sums
@@ -210,7 +211,7 @@ def test_merging_patches_keeps_the_evidence_exact():
         graph = SurfaceGraph(surface, patch, edges)
         for shown in seen:
             photo, depth = shown.cues()
-            voxel = surface.voxel_of(to_world(depth.points, shown.world_from_camera))
+            voxel = surface.voxel_of(move_points(shown.world_from_camera, depth.points.astype(float)))
             graph.add(np.where(voxel >= 0, patch[voxel], -1), photo, depth, shown.learned.astype(np.float32))
         graph.link()
         return graph
@@ -454,7 +455,7 @@ def test_segments_do_not_depend_on_the_order_of_patches():
     second = SurfaceGraph(surface, order[first.patch], voxel_edges(surface))
     for shown in seen:
         photo, depth = shown.cues()
-        voxel = surface.voxel_of(to_world(depth.points, shown.world_from_camera))
+        voxel = surface.voxel_of(move_points(shown.world_from_camera, depth.points.astype(float)))
         second.add(np.where(voxel >= 0, second.patch[voxel], -1), photo, depth, shown.learned.astype(np.float32))
     second.link()
     (labels, probability), (others, _) = (divided(g, tree_by(read_model(), g), read_model()) for g in (first, second))
