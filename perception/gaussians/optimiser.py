@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,15 +14,6 @@ from perception.gaussians.device import training_kernels
 
 Rate = float | Tensor
 BETAS, EPS = (0.9, 0.999), 1e-15
-
-
-@dataclass(frozen=True)
-class StepReport:
-    """Rows of each tensor that were updated, and rows skipped because their gradient held NaN or infinity; tensors of
-    one element where the parameters are not on the CPU."""
-
-    updated: dict[str, int]
-    skipped: dict[str, int]
 
 
 class SparseAdam:
@@ -58,29 +48,30 @@ class SparseAdam:
         """N, the number of rows."""
         return len(next(iter(self.params.values()))) if self.params else 0
 
-    def step(self, visible: Tensor | None = None, grads: Mapping[str, Tensor] | None = None) -> StepReport:
+    def step(self, visible: Tensor | None = None, grads: Mapping[str, Tensor] | None = None) -> dict[str, int]:
         """One step. visible: [N] bool or uint8, None for all. grads: name -> [N, ...], by default each .grad.
 
-        Tensors without a gradient are not updated; the global step count increases by one for all.
+        Tensors without a gradient are not updated; the global step count increases by one for all. Returns how many
+        rows of each other one were skipped for a gradient with NaN or infinity, as a tensor where it is not on the CPU.
         """
         if visible is not None:
             if visible.shape != (len(self),):
                 raise InputError(f"SparseAdam: visible has shape {list(visible.shape)}, expected [{len(self)}]")
             visible = visible.detach().to(torch.uint8).contiguous()
         self.steps += 1
-        updated, skipped = {}, {}
+        skipped = {}
         for name, param in self.params.items():
             grad = param.grad if grads is None else grads.get(name)
             if grad is not None:
-                updated[name], skipped[name] = self._step_one(name, param, grad, visible)
-        return StepReport(updated, skipped)
+                skipped[name] = self._step_one(name, param, grad, visible)
+        return skipped
 
-    def _step_one(self, name: str, param: Tensor, grad: Tensor, visible: Tensor | None) -> tuple[int, int]:
+    def _step_one(self, name: str, param: Tensor, grad: Tensor, visible: Tensor | None) -> int:
         if grad.shape != param.shape or grad.dtype != param.dtype:
             found = f"{list(grad.shape)} {grad.dtype}"
             raise InputError(f"SparseAdam: gradient of {name} is {found}, expected {list(param.shape)} {param.dtype}")
         if not param.numel():
-            return 0, 0
+            return 0
         rows = (len(param), -1)
         tensors = (param, grad.contiguous(), self._first[name], self._second[name])
         matrices = [t.detach().view(rows) for t in tensors]
@@ -90,8 +81,8 @@ class SparseAdam:
             raise InputError(f"SparseAdam: rates of {name} are {rate.size}, expected 1 or {width}")
         rate = np.ascontiguousarray(np.broadcast_to(rate, width))
         adam = training_kernels(param.device).adam
-        updated, skipped = adam(*matrices, visible, rate, self.steps, *BETAS, EPS)
-        return updated, skipped
+        _, skipped = adam(*matrices, visible, rate, self.steps, *BETAS, EPS)
+        return skipped
 
     def keep(self, index: Tensor) -> None:
         """Keeps the rows `index` selects, in its order: [N] bool, or int64 row numbers (repeats allowed)."""

@@ -178,7 +178,7 @@ class Schedule:
         if (reason := stopping.plateau(progress)) is not None:
             stopping.finished, stopping.growing = True, False
             left = 1.0 - COOLDOWN - progress
-            trainer.skip(left)
+            trainer.skipped += left
             self._tell(f"{reason}; {left:.0%} of the course left out")
 
     def _may_stop(self, progress: float) -> bool:

@@ -212,7 +212,7 @@ class Trainer:
             self._backward(inputs, background, settings, out, cotangents, (), stored)
         with self.record.timed("Adam"):
             self.optimiser.rates = self._rates(progress)
-            self.record.skipped_gradients += int(sum(self.optimiser.step(out.visible[0], gradients).skipped.values()))
+            self.record.skipped_gradients += int(sum(self.optimiser.step(out.visible[0], gradients).values()))
         if self.schedule.grows_at(progress):
             with self.record.timed("densification"):
                 mean2d, long_side = self._gradients["mean2d"][0], max(height, width)
@@ -277,10 +277,6 @@ class Trainer:
         if self.progress > share:  # the time limit determines progress
             return max(self.iteration, round(self.iteration / max(self.progress, 1e-6)))
         return round(self.iteration + (1 - self.progress) * self.config.train.iterations)
-
-    def skip(self, share: float) -> None:
-        """Skips `share` of training progress."""
-        self.skipped += share
 
     # ------------------------------------------------------------------- model
 
