@@ -1,6 +1,1 @@
-"""Benchmarks: `perception bench NAME`."""
-
-BENCHES = {
-    "rasterizer": "rasterizer:main",
-}
-"""Name on the command line -> module of this package and function in it, which takes the arguments."""
+"""Benchmarks: `perception bench rasterizer`, and what it and those of a checkout share."""
