@@ -37,7 +37,7 @@ from perception.gaussians.rasterize import Forward, Settings, passes, torch_on_o
 from perception.gaussians.rates import learning_rates
 from perception.gaussians.schedule import Schedule
 from perception.gaussians.size import sized
-from perception.gaussians.views import TrainingView, scene_extent, surface_depth, target_photo
+from perception.gaussians.views import TrainingView, scene_extent, target_photo
 from perception.interrupts import uninterrupted
 from perception.progress import timed
 
@@ -55,14 +55,13 @@ INSTANCE_WEIGHT = 0.1
 class TrainRecord:
     """JSON-able. profile: wall-clock seconds by part.
 
-    pairs, evaluated_pairs: (Gaussian, pixel) pairs of all training steps that contributed, that were computed.
+    pairs: (Gaussian, pixel) pairs of all training steps that contributed.
     """
 
     curve: list[dict[str, float]] = field(default_factory=list)
     decisions: list[str] = field(default_factory=list)
     profile: dict[str, float] = field(default_factory=dict)
     pairs: int = 0
-    evaluated_pairs: int = 0
     seconds: float = 0.0
     iterations: int = 0
     skipped_gradients: int = 0
@@ -74,7 +73,7 @@ class TrainRecord:
         for number, record in enumerate(records, start=1):
             whole.decisions += [f"block {number}: {told}" for told in record.decisions]
             whole.profile = {part: whole.profile.get(part, 0.0) + s for part, s in record.profile.items()}
-            for name in ("pairs", "evaluated_pairs", "seconds", "iterations", "skipped_gradients"):
+            for name in ("pairs", "seconds", "iterations", "skipped_gradients"):
                 setattr(whole, name, getattr(whole, name) + getattr(record, name))
         return whole
 
@@ -218,7 +217,6 @@ class Trainer:
                 mean2d, long_side = self._gradients["mean2d"][0], max(height, width)
                 self.statistics.add(mean2d, out.radii[0], out.visible[0], long_side)
         self.record.pairs += out.frames.contributing
-        self.record.evaluated_pairs += out.frames.evaluated
         self.iteration += 1
         return float(loss)
 
@@ -294,10 +292,6 @@ class Trainer:
         """Truncates the spherical harmonics to `degree`, or adds zero coefficients up to it."""
         self.optimiser.resize("sh", (degree + 1) ** 2)
         self._sync()
-
-    def depth(self, view: TrainingView) -> np.ndarray:
-        """`surface_depth` of the Gaussians as they are now."""
-        return surface_depth(self.gaussians, view)
 
     def _sync(self) -> None:
         """Makes `gaussians` share the optimiser's tensors, which are replaced when rows are added or removed.

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from perception.errors import InputError
 from perception.frame.place import placed_scene
 from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians
-from perception.gaussians.nearby import Nearby
 from perception.gaussians.views import TrainingView, psnr, render_view, surface_depth
 from perception.io.engine import Engine
 from perception.io.inputs import load_saved_scene, load_scene, save_scene
@@ -101,8 +99,9 @@ def build_map(
         else:
             nearby, trained, of_blocks = optimise_blocks(run, scene, blocks, held_out, from_geometry, where)
             photos = Photos.load(run, training, held_out)
-            depth = partial(_depth_nearby, nearby)
-            mask_report = label_photos(run, photos, mask_source, depth)
+            mask_report = label_photos(
+                run, photos, mask_source, lambda view: surface_depth(nearby.of(view.name)[0], view)
+            )
         del mask_source  # with the views of stereo
 
         # Group the Gaussians by their features into instances (§3.2.1), describe these from their best views (§3.2.2).
@@ -172,10 +171,6 @@ def _scene(source: Path, output: Path, run: Run, engine: Engine) -> Scene:
     if config.losses.depth_weight == 0:
         return replace(scene, views=[replace(view, depth=None) for view in scene.views])
     return scene
-
-
-def _depth_nearby(nearby: Nearby, view: TrainingView) -> np.ndarray:
-    return surface_depth(nearby.of(view.name)[0], view)
 
 
 def score_views(gaussians: Gaussians, views: list[TrainingView], metric: bool = False) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import gc
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.nearby import Nearby
 from perception.gaussians.size import sized
 from perception.gaussians.train import Trainer, TrainingView, TrainRecord
+from perception.gaussians.views import surface_depth
 from perception.io.engine import Engine
 from perception.io.memory import DiskArrays, Keep, return_free_memory
 from perception.io.photos import load_photo
@@ -107,7 +109,7 @@ def optimise(
     if from_geometry and trainer.progress < GEOMETRY_START:
         with run.stage("train"):
             trainer.run(observer, until=GEOMETRY_START)
-    report = label_photos(run, photos, source, trainer.depth)
+    report = label_photos(run, photos, source, partial(surface_depth, trainer.gaussians))
     trainer.show(photos.views)
 
     # Optimise colours and features together: L_RGB + λ_inst2d L_inst2d + λ_var L_var (§3.1 to 3.2.3, eq. 14).

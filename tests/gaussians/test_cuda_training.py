@@ -20,7 +20,7 @@ from perception.gaussians.losses import assign_labels, instance_loss
 from perception.gaussians.model import from_points
 from perception.gaussians.nearby import Nearby
 from perception.gaussians.train import Trainer
-from perception.gaussians.views import TrainingView
+from perception.gaussians.views import TrainingView, surface_depth
 from perception.instances.votes import mask_votes
 from support import pretend_device
 from support.cuda_emulator import emulated
@@ -181,7 +181,7 @@ def test_a_whole_training_runs_there_and_resumes_with_the_same_bits(pretended):
     second.run()
     for name, tensor in vars(whole.gaussians).items():
         assert torch.equal(tensor.cpu(), getattr(second.gaussians, name).cpu()), name
-    assert whole.depth(whole.views[0]).shape == (32, 40)
+    assert surface_depth(whole.gaussians, whole.views[0]).shape == (32, 40)
 
 
 def test_labels_and_votes_of_a_photo_are_those_of_the_cpu(pretended, monkeypatch):
