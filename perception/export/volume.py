@@ -17,9 +17,7 @@ _SLAB = 1 << 19
 
 
 def grid_shape(low: np.ndarray, high: np.ndarray, voxel: float) -> tuple[int, int, int]:
-    """Voxels from corner `low` to beyond `high`; InputError for a size that is not positive or gives too many."""
-    if not (np.isfinite(voxel) and voxel > 0):
-        raise InputError(f"--voxel-size is {voxel:g}; expected a length above 0 in map units")
+    """Voxels of a side above 0 from corner `low` to beyond `high`; InputError when they are too many."""
     shape = np.maximum(np.ceil((high - low) / voxel), 1)
     if shape.prod() > MOST_VOXELS:
         raise InputError(f"--voxel-size {voxel:g} gives {shape.prod():.2g} voxels; at most {MOST_VOXELS:.0e} are held")

@@ -11,6 +11,7 @@ from perception.errors import InputError
 from perception.export.depth_views import DepthView
 from perception.export.volume import FREE, OCCUPIED, centres, closed_body, grid_shape, occupancy, signed_distance
 from perception.io.open3d import fuse_depth, write_glb
+from perception.pipeline.meshing import check_outputs
 from support import box_rooms
 from support.aimed import look_at
 from support.box_rooms import FURNISHED
@@ -105,10 +106,15 @@ def test_space_of_a_room_is_free_occupied_or_unknown_as_it_truly_is() -> None:
     assert np.median(np.abs(distance[probes] - true)) < voxel
 
 
-@pytest.mark.parametrize("voxel", [0.0, -1.0, np.nan, 1e-5])
+@pytest.mark.parametrize("voxel", [0.0, -1.0, np.nan, np.inf])
 def test_sizes_that_no_grid_has_are_refused(voxel: float) -> None:
     with pytest.raises(InputError, match="voxel-size"):
-        grid_shape(np.zeros(3), np.ones(3), voxel)
+        check_outputs(None, None, voxel)
+
+
+def test_more_voxels_than_are_held_are_refused() -> None:
+    with pytest.raises(InputError, match="voxel-size"):
+        grid_shape(np.zeros(3), np.ones(3), 1e-5)
 
 
 def test_glb_holds_the_mesh(tmp_path: Path) -> None:
