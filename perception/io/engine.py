@@ -6,12 +6,15 @@ import logging
 import os
 import socket
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from perception.cores import cores
 from perception.errors import InputError, missing_extra
 from perception.progress import Progress
 
@@ -44,20 +47,27 @@ class Engine:
     kind: str = "local"
     address: str | None = None
 
-    def run(self, task: Callable[..., Any], items: Sequence[str], what: str, progress: Progress) -> list[Any]:
+    def run(
+        self, task: Callable[..., Any], items: Sequence[str], what: str, progress: Progress, each_core: bool = False
+    ) -> list[Any]:
         """task(item) of each item, in order; the first error is raised. what: a task's name in messages.
 
-        A task must take up what an interrupted call has left.
+        A task must take up what an interrupted call has left. each_core: a task uses one core and shows its progress
+        at least every few seconds, by which it is stopped here when the call is interrupted.
         """
         if self.kind == "ray":
-            return self._on_ray(task, items, what, progress)
+            return self._on_ray(task, items, what, progress, each_core)
+        if each_core:
+            return _on_cores(task, items, what, progress)
         found = []
         for number, item in enumerate(items, start=1):
             progress.log(f"{what} {number} of {len(items)}")
             found.append(task(item, progress))
         return found
 
-    def _on_ray(self, task: Callable[..., Any], items: Sequence[str], what: str, progress: Progress) -> list[Any]:
+    def _on_ray(
+        self, task: Callable[..., Any], items: Sequence[str], what: str, progress: Progress, each_core: bool
+    ) -> list[Any]:
         try:
             import ray
         except ImportError as error:
@@ -76,9 +86,9 @@ class Engine:
             told = f"--address {self.address}: no Ray cluster there ({str(error).splitlines()[0]})"
             raise InputError(f"{told}; start one: ray start --head, and give its HOST:PORT") from error
         try:
-            # A task uses all cores of its machine, so each machine has one task at a time.
-            cores = min(node["Resources"].get("CPU", 1) for node in ray.nodes() if node["Alive"])
-            remote = ray.remote(task).options(num_cpus=cores, max_retries=RETRIES)
+            # Where a task uses all cores of its machine, each machine has one task at a time.
+            taken = 1 if each_core else min(node["Resources"].get("CPU", 1) for node in ray.nodes() if node["Alive"])
+            remote = ray.remote(task).options(num_cpus=taken, max_retries=RETRIES)
             asked = [remote.remote(item) for item in items]
             waiting = list(asked)
             while waiting:
@@ -94,3 +104,31 @@ class Engine:
         finally:
             if started:
                 ray.shutdown()
+
+
+class _Stoppable(Progress):
+    """Shows nothing. Once `stop` is set, the next update ends the task."""
+
+    def __init__(self, stop: threading.Event) -> None:
+        super().__init__(quiet=True)
+        self.stop = stop
+
+    def update(self, stage: str, done: int, total: int, *words: str) -> None:
+        if self.stop.is_set():
+            raise KeyboardInterrupt
+
+
+def _on_cores(task: Callable[..., Any], items: Sequence[str], what: str, progress: Progress) -> list[Any]:
+    """As many tasks at a time as there are cores, each in a thread of its own."""
+    stop = threading.Event()
+    with ThreadPoolExecutor(cores()) as pool:
+        asked = [pool.submit(task, item, _Stoppable(stop)) for item in items]
+        try:
+            progress.update(f"{what}s", 0, len(items))
+            for done, one in enumerate(as_completed(asked), start=1):
+                one.result()
+                progress.update(f"{what}s", done, len(items))
+            return [one.result() for one in asked]
+        finally:
+            stop.set()
+            pool.shutdown(cancel_futures=True)

@@ -25,6 +25,8 @@ PHOTOS_A_TASK, PAIRS_A_TASK = 64, 2000
 RESULT, DATABASE = "result", "database.db"
 _IMAGES = ("rigs", "rig_sensors", "cameras", "frames", "frame_data", "images")
 _FEATURES, _MATCHES = ("keypoints", "descriptors"), ("matches", "two_view_geometries")
+_PAIR = 2147483647
+"""COLMAP's id of a pair is _PAIR × the smaller image id + the larger."""
 
 
 class FeatureTasks:
@@ -63,7 +65,7 @@ class FeatureTasks:
             homes.append(self.folder / f"pairs-{first}")
             if not has_task(homes[-1]):
                 homes[-1].mkdir(parents=True, exist_ok=True)
-                _part(database, sorted({name for pair in some for name in pair}), homes[-1] / DATABASE)
+                write_part(database, _ids(database, {name for pair in some for name in pair}), homes[-1] / DATABASE)
                 write_task(homes[-1], pairs=some, seed=seed)
         self._run(match_task, homes, "pair set")
         with closing(sqlite3.connect(database)) as own, own:
@@ -118,16 +120,26 @@ def _insert(table: str, columns: int) -> str:
     return f"INSERT INTO {table} VALUES ({', '.join('?' * columns)})"
 
 
-def _part(database: Path, names: list[str], target: Path) -> None:
-    """Writes the database of some photos, with their features, under the same ids."""
+def _ids(database: Path, names: set[str]) -> list[int]:
+    with closing(sqlite3.connect(database)) as tables:
+        return [image for image, name in tables.execute("SELECT image_id, name FROM images") if name in names]
+
+
+def write_part(
+    database: Path, images: Sequence[int], target: Path, tables: Sequence[str] = _FEATURES, matched: bool = False
+) -> None:
+    """Writes the database of some photos, under the same ids, with their rows of `tables`; matched: and the verified
+    matches between them."""
     target.unlink(missing_ok=True)
     load_pycolmap().Database.open(target).close()  # creates its tables
     with closing(sqlite3.connect(target)) as part, part:
         part.execute("ATTACH DATABASE ? AS whole", (str(database),))
         for table in _IMAGES:
             part.execute(f"INSERT INTO {table} SELECT * FROM whole.{table}")
-        part.execute("CREATE TEMP TABLE wanted (name TEXT)")
-        part.executemany("INSERT INTO wanted VALUES (?)", [(name,) for name in names])
-        chosen = "SELECT image_id FROM whole.images WHERE name IN (SELECT name FROM wanted)"
-        for table in _FEATURES:
-            part.execute(f"INSERT INTO {table} SELECT * FROM whole.{table} WHERE image_id IN ({chosen})")
+        part.execute("CREATE TEMP TABLE wanted (id INTEGER PRIMARY KEY)")
+        part.executemany("INSERT INTO wanted VALUES (?)", [(image,) for image in images])
+        for table in tables:
+            part.execute(f"INSERT INTO {table} SELECT * FROM whole.{table} WHERE image_id IN wanted")
+        if matched:
+            both = " AND ".join(f"{image} IN wanted" for image in (f"pair_id / {_PAIR}", f"pair_id % {_PAIR}"))
+            part.execute(f"INSERT INTO two_view_geometries SELECT * FROM whole.two_view_geometries WHERE {both}")

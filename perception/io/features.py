@@ -40,8 +40,8 @@ class FeatureStore:
     """A folder with the COLMAP `database.db` and `photos/`, which holds the photos under numbered names (see staging).
     names[i] is the name of the i-th photo in both."""
 
-    def __init__(self, folder: Path, names: list[str], facts: dict[str, Any]) -> None:
-        self.folder, self.image_root, self.names, self.facts = folder, folder / "photos", names, facts
+    def __init__(self, folder: Path, names: list[str], facts: dict[str, Any], photos: Path | None = None) -> None:
+        self.folder, self.image_root, self.names, self.facts = folder, photos or folder / "photos", names, facts
 
     @property
     def database(self) -> Path:

@@ -164,6 +164,22 @@ LEVELS = (MIN_INLIERS, 2 * MIN_INLIERS, 4 * MIN_INLIERS, 8 * MIN_INLIERS)
 """Least verified matches of a pair, tried in turn until the model contradicts no pair stronger than those it uses."""
 
 
+def pipeline_options(fixed: bool, seed: int, one_thread: bool) -> Any:
+    """pycolmap.IncrementalPipelineOptions. fixed: the intrinsics are not refined. With one thread, results repeat."""
+    options = load_pycolmap().IncrementalPipelineOptions()
+    options.random_seed = seed
+    if one_thread:
+        options.num_threads = 1
+    options.min_num_matches = MIN_INLIERS
+    options.min_model_size = MIN_MODEL_SIZE
+    options.structure_less_registration_fallback = False
+    # Global bundle adjustment at every 40 % of growth, not 10 %, as it takes most of the mapping time.
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
+    options.ba_global_max_refinements = 3
+    options.ba_refine_focal_length = options.ba_refine_extra_params = not fixed
+    return options
+
+
 def map_photos(store: FeatureStore, fixed: bool, seed: int, count: int, progress: Progress) -> Found:
     """All models, largest first (pycolmap does not sort them), and names of photos left out as contradicted.
     fixed: the intrinsics in the database are not refined."""
@@ -232,7 +248,7 @@ class _Mapping:
         wrong = outvoted_photos(pairs)
         if not wrong or len(wrong) > best.num_reg_images() / 4:
             return models, set()
-        _take_out(best, wrong)
+        take_out(best, wrong)
         source = self.folder / f"kept-{self.runs}"
         source.mkdir()
         best.write(source)
@@ -242,23 +258,14 @@ class _Mapping:
         still = outvoted_photos(verified_pairs(best, self.store.database))
         still |= wrong - set(best.reg_image_ids())
         names = {best.images[image].name for image in still}
-        _take_out(best, still & set(best.reg_image_ids()))
+        take_out(best, still & set(best.reg_image_ids()))
         return [best, *models[1:]], names
 
     def _map(self, database: Path, min_inliers: int, source: Path | None = None) -> list[Any]:
         pycolmap = load_pycolmap()
-        options = pycolmap.IncrementalPipelineOptions()
-        options.random_seed = self.seed
-        if self.count <= REPEATABLE_PHOTOS:
-            options.num_threads = 1
+        options = pipeline_options(self.fixed, self.seed, one_thread=self.count <= REPEATABLE_PHOTOS)
         options.min_num_matches = min_inliers
-        options.min_model_size = MIN_MODEL_SIZE
         options.multiple_models = source is None
-        options.structure_less_registration_fallback = False
-        # Global bundle adjustment at every 40 % of growth, not 10 %, as it takes most of the mapping time.
-        options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
-        options.ba_global_max_refinements = 3
-        options.ba_refine_focal_length = options.ba_refine_extra_params = not self.fixed
         self.runs += 1
         began = time.monotonic()
         out = self.folder / f"run-{self.runs}"
@@ -281,6 +288,7 @@ class _Mapping:
         return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
-def _take_out(model: Any, images: set[int]) -> None:
+def take_out(model: Any, images: set[int]) -> None:
+    """Takes photos out of a model."""
     for image in sorted(images):
         model.deregister_frame(model.images[image].frame_id)

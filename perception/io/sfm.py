@@ -1,7 +1,7 @@
-"""Structure from motion from a folder of photos: features, matches, incremental model (pycolmap), checks, report.
+"""Structure from motion from a folder of photos: features, matches, a model (pycolmap), checks, report.
 
-The seed fixes every random choice: up to incremental_sfm.REPEATABLE_PHOTOS photos the same machine gives the same
-poses bit for bit. Larger sets are mapped by several threads; poses, unit and origin then differ between runs.
+The seed fixes every random choice: the same machine gives the same poses bit for bit, unless more than
+incremental_sfm.REPEATABLE_PHOTOS photos had to be mapped in one piece, which is done by several threads.
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ from typing import Any
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory, recover
 from perception.io.colmap import views_of_model
+from perception.io.engine import Engine
 from perception.io.features import FeatureStore, build_features, verified_matches
 from perception.io.ignore_masks import mask_of
-from perception.io.incremental_sfm import map_photos, model_warnings
+from perception.io.incremental_sfm import REPEATABLE_PHOTOS, map_photos, model_warnings
 from perception.io.lens import lens_from_camera, lens_text, load_pycolmap
 from perception.io.photo_folder import PhotoSet, choose_photos
 from perception.io.photos import photo_size
+from perception.io.places import map_places
 from perception.io.reading import Reading
 from perception.io.triangulate import cloud_of
 from perception.types import Lens, Scene
@@ -71,7 +73,10 @@ def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, fixed: bool, how: 
     recover(done)
     if not done.is_dir():
         started = time.perf_counter()
-        models, contradicted = map_photos(store, fixed, how.seed, len(chosen.photos), how.progress)
+        found = None
+        if len(chosen.photos) > REPEATABLE_PHOTOS:
+            found = map_places(store, fixed, how.seed, how.engine or Engine(), how.progress)
+        models, contradicted = found or map_photos(store, fixed, how.seed, len(chosen.photos), how.progress)
         if not models:
             advice = "take sharp, overlapping photos of a textured scene from different places"
             raise InputError(f"{folder}: none of the {len(chosen.photos)} photos could be registered; {advice}")

@@ -2,8 +2,8 @@
 
 python tests/kills/ray_cluster.py
 
-A row of things with given poses is mapped in blocks, a tabletop from photos alone, with features and matches by tasks.
-Every map must be that of the local engine. Nodes are processes of one machine, with one core each.
+A row of things with given poses is mapped in blocks, a tabletop from photos alone, with features, matches and places by
+tasks. Every map must be that of the local engine. Nodes are processes of one machine, with one core each.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from worlds import make_photos  # noqa: E402
 
 SETTINGS = ["train.iterations=400", "train.budget=1200", "densify.every=20", "language.encoder=none"]
 OF_ROW = ["photos.poses=keep", "frame.keep_world=true", "train.block_photos=14"]
-TASKS = ("extract_task", "match_task", "optimise_block")
+TASKS = ("extract_task", "match_task", "place_task", "optimise_block")
 
 
 def command(scene: Path, out: Path, *more: str) -> list[str]:
@@ -43,8 +43,8 @@ def workers() -> list[int]:
 
 
 def write_tabletop(folder: Path) -> Path:
-    """80 photos, more than one task of features."""
-    make_photos(folder / "photos", views=80, width=320, height=240, light_samples=2)
+    """160 photos: several tasks of features, and poses place by place."""
+    make_photos(folder / "photos", views=160, width=320, height=240, light_samples=2)
     shutil.copytree(folder / "truth" / "labels", folder / "labels")
     return folder / "photos"
 

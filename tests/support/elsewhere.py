@@ -17,7 +17,7 @@ class Elsewhere(Engine):
 
     asked: list[int]
 
-    def run(self, task: Any, items: Any, what: str, progress: Progress) -> list[Any]:
+    def run(self, task: Any, items: Any, what: str, progress: Progress, each_core: bool = False) -> list[Any]:
         self.asked.append(len(items))
         for item in [*reversed(items), *items]:
             task(item)
