@@ -180,14 +180,16 @@ def pipeline_options(fixed: bool, seed: int, one_thread: bool) -> Any:
     return options
 
 
-def map_photos(store: FeatureStore, fixed: bool, seed: int, count: int, progress: Progress) -> Found:
+def map_photos(
+    store: FeatureStore, fixed: bool, seed: int, count: int, progress: Progress, one_thread: bool = False
+) -> Found:
     """All models, largest first (pycolmap does not sort them), and names of photos left out as contradicted.
-    fixed: the intrinsics in the database are not refined."""
+    fixed: the intrinsics in the database are not refined. one_thread: also for more than REPEATABLE_PHOTOS photos."""
     folder = store.folder / "mapping"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     try:
-        return _Mapping(store, folder, fixed, seed, count, progress).run()
+        return _Mapping(store, folder, fixed, seed, count, progress, one_thread or count <= REPEATABLE_PHOTOS).run()
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -202,6 +204,7 @@ class _Mapping:
     seed: int
     count: int
     progress: Progress
+    one_thread: bool
     shown: float = 0.0
     runs: int = 0
 
@@ -263,7 +266,7 @@ class _Mapping:
 
     def _map(self, database: Path, min_inliers: int, source: Path | None = None) -> list[Any]:
         pycolmap = load_pycolmap()
-        options = pipeline_options(self.fixed, self.seed, one_thread=self.count <= REPEATABLE_PHOTOS)
+        options = pipeline_options(self.fixed, self.seed, self.one_thread)
         options.min_num_matches = min_inliers
         options.multiple_models = source is None
         self.runs += 1

@@ -58,27 +58,28 @@ Matches = dict[tuple[int, int], int]
 def map_places(store: FeatureStore, fixed: bool, seed: int, engine: Engine, progress: Progress) -> Found | None:
     """As `map_photos`, place by place; None where the photos' matches contradict the welded model."""
     counts = {pair: len(found) for pair, found in verified_matches(store.database).items() if len(found)}
+    if not counts:
+        return None
     places = with_border(divide(counts, LARGEST), counts)
     homes = [_task(store, photos, number, fixed, seed) for number, photos in enumerate(places)]
     engine.run(place_task, [str(home.resolve()) for home in homes], "poses: place", progress, each_core=True)
     groups = weld(needed([part for home in homes for part in _parts(home)]), seed)
     if not groups:
         return None
-    options = pipeline_options(fixed, seed, one_thread=True)
-    models: list[Any] = []
-    for group in groups:
-        progress.update("poses: adjusting", len(models), len(groups))
-        models.append(_adjusted(_joined(group), store, options))
-    pairs = verified_pairs(models[0], store.database)
-    progress.update("poses: adjusting", len(models), len(groups))
+    progress.update("poses: adjusting", 0, 1)
+    best, *others = map(_joined, groups)
+    best = _adjusted(best, store, pipeline_options(fixed, seed, one_thread=True))
+    pairs = verified_pairs(best, store.database)
+    progress.update("poses: adjusting", 1, 1)
     if is_contradicted(pairs):
         progress.log("poses: matches contradict the model welded from places; all photos are mapped in one piece")
         return None
     wrong = outvoted_photos(pairs)
-    left_out = {models[0].images[image].name for image in wrong}
-    take_out(models[0], wrong)
+    left_out = {best.images[image].name for image in wrong}
+    others = needed([best, *others])[1:]  # photos of the others may have been added
+    take_out(best, wrong)
     shutil.rmtree(store.folder / "places")
-    return models, left_out
+    return [best, *others], left_out
 
 
 # ----------------------------------------------------------------------- division
@@ -186,7 +187,7 @@ def place_task(folder: str, progress: Progress | None = None) -> None:
         return
     store = FeatureStore(home, [], {}, Path(facts["photos"]))
     told = progress or Progress(quiet=True)
-    models, left_out = map_photos(store, facts["fixed"], facts["seed"], facts["count"], told)
+    models, left_out = map_photos(store, facts["fixed"], facts["seed"], facts["count"], told, one_thread=True)
     with atomic_directory(home / RESULT) as new:
         for number, model in enumerate(models):
             (new / str(number)).mkdir()
@@ -206,8 +207,8 @@ def _parts(home: Path) -> list[Any]:
 
 
 def needed(parts: Sequence[Any]) -> list[Any]:
-    """The models, largest first, that have at least MIN_MODEL_SIZE photos that no larger one has. A small one that
-    repeats photos of others is what did not fit into its place."""
+    """The models, largest first, with at least MIN_MODEL_SIZE photos that no larger one has. Small ones that repeat
+    photos of others are what did not fit into their place."""
     found, had = [], set[int]()
     for part in sorted(parts, key=lambda part: (-part.num_reg_images(), min(part.reg_image_ids()))):
         if len(set(part.reg_image_ids()) - had) >= MIN_MODEL_SIZE:
@@ -283,19 +284,24 @@ def _adjusted(model: Any, store: FeatureStore, options: Any) -> Any:
     adjustment.ceres.max_num_images_direct_sparse_cpu_solver = DIRECT
     limits = options.ba_global_max_refinements, options.ba_global_max_refinement_change
     mapper.iterative_global_refinement(*limits, options.get_mapper(), adjustment, triangulation)
-    if _complete(mapper, options):
+    added = False
+    # Photos that no place has: `any` ends at the first that is registered, after which others may be.
+    while any(_register(mapper, image, options) for image in mapper.find_next_images(options.get_mapper(), False)):
+        added = True
+    if added:
         mapper.iterative_global_refinement(*limits, options.get_mapper(), adjustment, triangulation)
     mapper.end_reconstruction(False)
     model.extract_colors_for_all_images(store.image_root)
     return model
 
 
-def _complete(mapper: Any, options: Any) -> int:
-    """Registers photos that the model lacks, each tried once; their number."""
-    tried, registered = set[int](), 0
-    while new := [i for i in mapper.find_next_images(options.get_mapper(), structure_less=False) if i not in tried]:
-        tried.add(new[0])
-        if mapper.register_next_image(options.get_mapper(), new[0]):
-            mapper.triangulate_image(options.get_triangulation(), new[0])
-            registered += 1
-    return registered
+def _register(mapper: Any, image: int, options: Any) -> bool:
+    """Adds a photo to the model, with its points, and adjusts its surroundings; False where no pose is found."""
+    if not mapper.register_next_image(options.get_mapper(), image):
+        return False
+    triangulation = options.get_triangulation()
+    mapper.triangulate_image(triangulation, image)
+    limits = options.ba_local_max_refinements, options.ba_local_max_refinement_change
+    local = options.get_local_bundle_adjustment()
+    mapper.iterative_local_refinement(*limits, options.get_mapper(), local, triangulation, image)
+    return True
