@@ -2,12 +2,11 @@
 
 The photos are divided where few of them match; each place is mapped by one thread, in a frame of its own, as a task of
 the engine. Places next to each other share some photos, by which their models are welded; then one bundle adjustment
-goes over all. So time grows in proportion to the photos, and the result is repeatable.
+goes over all. So time grows little faster than the number of photos, and the result is repeatable.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
 from heapq import heapify, heappop, heappush
@@ -49,7 +48,7 @@ SHARED = 3
 TOLERANCE, DIRECT = 1e-6, 20_000
 """Of the last bundle adjustment: the relative gain at which it ends (the distance between rooms is known by few photos,
 so 1e-5 is too early), and photos up to which its normal equations are solved by factorisation, which is then faster."""
-RESULT, REPORT = "result", "report.json"
+RESULT = "result"
 
 Matches = dict[tuple[int, int], int]
 """Number of verified matches of each pair of image ids."""
@@ -76,7 +75,8 @@ def map_places(store: FeatureStore, fixed: bool, seed: int, engine: Engine, prog
         return None
     wrong = outvoted_photos(pairs)
     left_out = {best.images[image].name for image in wrong}
-    others = needed([best, *others])[1:]  # photos of the others may have been added
+    had = set(best.reg_image_ids())  # photos of the others may have been added
+    others = [model for model in others if len(set(model.reg_image_ids()) - had) >= MIN_MODEL_SIZE]
     take_out(best, wrong)
     shutil.rmtree(store.folder / "places")
     return [best, *others], left_out
@@ -187,20 +187,18 @@ def place_task(folder: str, progress: Progress | None = None) -> None:
         return
     store = FeatureStore(home, [], {}, Path(facts["photos"]))
     told = progress or Progress(quiet=True)
-    models, left_out = map_photos(store, facts["fixed"], facts["seed"], facts["count"], told, one_thread=True)
+    models, _ = map_photos(store, facts["fixed"], facts["seed"], facts["count"], told, one_thread=True)
     with atomic_directory(home / RESULT) as new:
         for number, model in enumerate(models):
             (new / str(number)).mkdir()
             model.write(new / str(number))
-        (new / REPORT).write_text(json.dumps({"models": len(models), "left_out": sorted(left_out)}))
 
 
 def _parts(home: Path) -> list[Any]:
     """The models of a place, each in a frame of its own."""
     if not (home / RESULT).is_dir():
         raise InputError(f"{home}: has no {RESULT} after its task; workers must share the output's folder")
-    count = json.loads((home / RESULT / REPORT).read_text())["models"]
-    return [load_pycolmap().Reconstruction(home / RESULT / str(number)) for number in range(count)]
+    return [load_pycolmap().Reconstruction(folder) for folder in sorted((home / RESULT).iterdir())]
 
 
 # ----------------------------------------------------------------------- welding
@@ -210,10 +208,10 @@ def needed(parts: Sequence[Any]) -> list[Any]:
     """The models, largest first, with at least MIN_MODEL_SIZE photos that no larger one has. Small ones that repeat
     photos of others are what did not fit into their place."""
     found, had = [], set[int]()
-    for part in sorted(parts, key=lambda part: (-part.num_reg_images(), min(part.reg_image_ids()))):
-        if len(set(part.reg_image_ids()) - had) >= MIN_MODEL_SIZE:
+    for part in sorted(parts, key=lambda part: (-part.num_reg_images(), sorted(part.reg_image_ids()))):
+        if len(new := set(part.reg_image_ids()) - had) >= MIN_MODEL_SIZE:
             found.append(part)
-            had |= set(part.reg_image_ids())
+            had |= new
     return found
 
 
