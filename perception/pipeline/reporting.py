@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import io
-import shlex
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 import torch
 
 from perception.colors import instance_palette
-from perception.config import MapConfig, flat
+from perception.config import flat
 from perception.errors import InputError
 from perception.gaussians.render import render
 from perception.gaussians.views import TrainingView, render_view
@@ -64,7 +63,6 @@ def write_map_report(opened: QueryMap, path: Path, queries: list[str]) -> Path:
         "queries": [_query_row(opened, text, album) for text in queries],
         "warnings": _warnings(info),
         "settings": dict(flat(info["config"])),
-        "command": rerun_command(info, opened.path or Path("MAP")),
     }
     try:
         return write_page(path, data)
@@ -123,18 +121,6 @@ def clock(seconds: float) -> str:
         return f"{seconds:.1f} s"
     whole = round(seconds)
     return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60:02d} s"
-
-
-def rerun_command(info: dict[str, Any], path: Path) -> str:
-    """The command that builds the map again: its input, and all settings that differ from the defaults."""
-    usual = dict(flat(MapConfig().to_json()))
-    words = ["perception", "map", str(info["source"]), "-o", str(path), "--seed", str(info["seed"])]
-    for key, value in flat(info["config"]):
-        if key == "seed" or key not in usual or usual[key] == value:  # older maps have settings that no longer exist
-            continue
-        text = "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
-        words += ["--masks", text] if key == "masks" else ["--set", f"{key}={text}"]
-    return shlex.join(words)
 
 
 def _warnings(info: dict[str, Any]) -> list[str]:

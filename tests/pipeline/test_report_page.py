@@ -45,7 +45,6 @@ def _full(side: int = 64) -> dict[str, Any]:
         ],
         "warnings": [NASTY],
         "settings": {NASTY: NASTY},
-        "command": NASTY,
     }
 
 
