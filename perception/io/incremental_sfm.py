@@ -7,7 +7,6 @@ verified pair satisfy one epipolar geometry, which the model either agrees with 
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +22,6 @@ from perception.progress import Progress
 MAX_UNREGISTERED, MAX_SECOND_MODEL, MAX_CONTRADICTED, MAX_UNMATCHED = 0.15, 0.30, 0.005, 0.30
 MOST_CONTRADICTED = 4
 """Pairs. Right models of up to 1,200 photos had none, two wrong ones of 1,200 photos 14 and 35 of 18,887."""
-GROWTH = 1.4
-"""Seconds of mapping grow with this power of the photos: from 24, 64 and 87 % of the 1,200 of a made building."""
 EPIPOLAR_TOLERANCE, TOLERANCE_PIXELS = 4.0 / 1000, 4.0
 """Largest Sampson distance of a match that agrees, in normalised image coordinates; TOLERANCE_PIXELS (the error that
 verification allows) divided by the focal length where that is larger."""
@@ -270,7 +267,6 @@ class _Mapping:
         options.min_num_matches = min_inliers
         options.multiple_models = source is None
         self.runs += 1
-        began = time.monotonic()
         out = self.folder / f"run-{self.runs}"
         out.mkdir()
         registered = 2
@@ -278,11 +274,8 @@ class _Mapping:
         def next_image() -> None:
             nonlocal registered
             registered += 1
-            share = min(1.0, registered / self.count)
-            left = (time.monotonic() - began) * (share**-GROWTH - 1)
-            self.shown = max(self.shown, share)
-            words = [f"about {left:.0f} s left"] if share > 0.1 and self.shown == share else []
-            self.progress.update("poses: mapping", round(100 * self.shown), 100, *words)
+            self.shown = max(self.shown, min(1.0, registered / self.count))
+            self.progress.update("poses: mapping", round(100 * self.shown), 100)
 
         found = pycolmap.incremental_mapping(
             database, self.store.image_root, out, options, input_path=source or "", next_image_callback=next_image
