@@ -9,6 +9,7 @@ dimmed backgrounds, and blurred backgrounds.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from scipy import sparse
 
@@ -37,10 +38,8 @@ def choose_views(scores: np.ndarray | sparse.coo_matrix, k: int = 5) -> list[np.
 
 def mask_box(mask: np.ndarray) -> Box | None:
     """Bounding box (x0, y0, x1, y1) in pixels, x1 and y1 exclusive, of a boolean mask [H, W]; None if it is empty."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not len(rows):
-        return None
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    return (x, y, x + width, y + height) if width else None
 
 
 def expand_box(box: Box, ratio: float, width: int, height: int) -> Box:
@@ -54,10 +53,9 @@ def letterbox(image: np.ndarray, fill: int = FILL) -> np.ndarray:
     """Pads an image [H, W, 3] to a square of side max(H, W), centred, without scaling."""
     height, width = image.shape[:2]
     side = max(height, width)
-    square = np.full((side, side, 3), fill, image.dtype)
     top, left = (side - height) // 2, (side - width) // 2
-    square[top : top + height, left : left + width] = image
-    return square
+    bottom, right = side - height - top, side - width - left
+    return cv2.copyMakeBorder(image, top, bottom, left, right, cv2.BORDER_CONSTANT, value=(fill,) * 3)
 
 
 def crop_levels(photo: np.ndarray, mask: np.ndarray, levels: int = 3) -> list[np.ndarray]:

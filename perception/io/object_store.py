@@ -65,7 +65,8 @@ def publish(folder: Path, url: str, progress: Progress) -> None:
 
     InputError where that is not possible, for example in a full store; what was copied is then removed.
     """
-    files = sorted((path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()), key=_last)
+    files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    files.sort(key=lambda name: name == FACTS)
     with _errors(url, "written"):
         store, root = _opened(url)
         try:
@@ -125,10 +126,6 @@ def _batches(names: list[str]) -> Iterator[tuple[list[str], int]]:
     for start in range(0, len(names), AT_ONCE):
         some = names[start : start + AT_ONCE]
         yield some, start + len(some)
-
-
-def _last(name: str) -> tuple[bool, str]:
-    return name == FACTS, name
 
 
 @contextmanager

@@ -148,10 +148,6 @@ def _good_masks(model: SamModel, embedding: Any, points: np.ndarray, settings: S
         if stable >= np.float32(settings.stability):  # compared in float32, as published; false for NaN
             mask = logits > 0
             shape, area = (mask.shape[0], mask.shape[1]), int(np.count_nonzero(mask))
-            scores = pred_iou[point, which], stable
-            good[point].append(SamMask(_pack(mask), shape, area, mask_box(mask), *scores, points[point]))
+            scores, packed = (pred_iou[point, which], stable), zlib.compress(np.packbits(mask).tobytes(), 1)
+            good[point].append(SamMask(packed, shape, area, mask_box(mask), *scores, points[point]))
     return good
-
-
-def _pack(mask: np.ndarray) -> bytes:
-    return zlib.compress(np.packbits(mask).tobytes(), 1)
