@@ -79,9 +79,8 @@ class Engine:
                 host, _, port = str(self.address).rpartition(":")
                 socket.create_connection((host, int(port)), timeout=CONNECT).close()
             with _elsewhere():
-                ray.init(
-                    address=self.address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR
-                )
+                address = self.address or "local"  # without one, Ray takes up what another run left
+                ray.init(address=address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR)
         except (OSError, ValueError) as error:
             told = f"--address {self.address}: no Ray cluster there ({str(error).splitlines()[0]})"
             raise InputError(f"{told}; start one: ray start --head, and give its HOST:PORT") from error
