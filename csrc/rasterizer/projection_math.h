@@ -3,7 +3,9 @@
 //
 // camera frame: p = R m + t; mean: x = fx p0/p2 + cx. Covariance (EWA splatting, 3DGS eq. 5): J R Q S S Qᵀ Rᵀ Jᵀ +
 // eps2d I, with p0/p2 and p1/p2 in J clamped to 1.3 times the field of view (the gradient through a clamped value is
-// zero).
+// zero). J is a good approximation near the mean only: a large Gaussian far beside the field of view and close to the
+// camera's plane would lie before the whole image as haze. Those outside the guard band (Kerbl et al. 2023, section 6) are
+// not drawn.
 #pragma once
 #include <cmath>
 
@@ -14,6 +16,11 @@
 #endif
 
 namespace perception {
+
+// Width of the guard band: a mean outside the clamped field of view and this many times as far from the optical axis as
+// from the camera's plane is not drawn.
+template <class T>
+constexpr T kGuardBand = T(5);
 
 template <class T>
 struct Camera {
@@ -68,7 +75,7 @@ struct UnitQuaternion {
 // whose terms never cancel, however thin the ellipse.
 template <class T>
 struct Projected {
-  T x, y, z;          // px, px, depth
+  T x, y, z;          // px, px, depth (0 outside the guard band)
   T var_x, k, var_y;  // px², -, px²   (var_y = c)
   T cov_xx, cov_xy;   // px²
 };
@@ -98,7 +105,8 @@ PERCEPTION_HD Projected<T> project(const Camera<T> &cam, const T *m, const T *q,
   const T n0 = (u[1] * w[2] - u[2] * w[1]) * scale, n1 = (u[2] * w[0] - u[0] * w[2]) * scale,
           n2 = (u[0] * w[1] - u[1] * w[0]) * scale;
   Projected<T> o;
-  o.x = cam.fx * ux + cam.cx, o.y = cam.fy * uy + cam.cy, o.z = p2;
+  const bool outside = ((tx != ux) | (ty != uy)) & (ux * ux + uy * uy > kGuardBand<T> * kGuardBand<T>);
+  o.x = cam.fx * ux + cam.cx, o.y = cam.fy * uy + cam.cy, o.z = outside ? T(0) : p2;
   o.cov_xx = a + cam.eps2d;
   o.cov_xy = u[0] * w[0] + u[1] * w[1] + u[2] * w[2];
   o.var_y = vc;

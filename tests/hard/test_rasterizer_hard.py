@@ -73,6 +73,24 @@ def test_near_plane_and_behind(dtype):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
+def test_a_large_gaussian_beside_the_camera_is_no_haze_before_the_picture(dtype):
+    """A wall before the camera, and a long Gaussian on each side along the line of sight: they enter the field of view
+    at twice the wall's distance, so the picture is that of the wall alone. By their means they lie before it."""
+    inputs = cast(scene(n=3, cameras=1), dtype)
+    inputs["viewmats"][0] = torch.eye(4)
+    inputs["means"][:] = torch.tensor([[0.0, 0.0, 4.0], [5.5, 0.0, 0.6], [0.0, -5.5, 0.6]])
+    inputs["scales"][:] = torch.tensor([[50.0, 50.0, 0.01], [0.3, 0.3, 4.0], [0.3, 0.3, 4.0]])
+    inputs["quats"][:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    inputs["opacities"][:] = 0.9
+    out = perception.rasterize(**inputs)
+    wall = {name: inputs[name][:1] for name in ("means", "quats", "scales", "opacities", "colors", "features")}
+    torch.testing.assert_close(out.colors, perception.rasterize(**{**inputs, **wall}).colors, rtol=0, atol=0)
+    assert out.visible[0].tolist() == [True, False, False]
+    inputs["Ks"][0, 0, 0] = inputs["Ks"][0, 1, 1] = 1.0  # all means are in the picture of a camera that sees this wide
+    assert perception.rasterize(**inputs).visible[0].tolist() == [True, True, True]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize(
     ("focal", "cx", "cy"), [(1.0, 16.0, 17.0), (1e5, 16.0, 17.0), (30.0, -200.0, 17.0), (30.0, 16.0, 900.0)]
 )

@@ -52,15 +52,21 @@ def sh_colors(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
 def _camera(means, quats, scales, opacities, colors, viewmat, k, width, height, features, near_plane, eps2d):  # type: ignore[no-untyped-def]
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     p = means @ rotation.T + translation
+    fx, fy, cx, cy = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
+    mx, my = 0.3 * 0.5 * width / fx, 0.3 * 0.5 * height / fy
+
+    def clamped(u, v):  # type: ignore[no-untyped-def]
+        return u.clamp(-cx / fx - mx, (width - cx) / fx + mx), v.clamp(-cy / fy - my, (height - cy) / fy + my)
+
     keep = p[:, 2] > near_plane
+    u, v = p[:, 0] / p[:, 2], p[:, 1] / p[:, 2]
+    tx, ty = clamped(u, v)
+    keep &= ((tx == u) & (ty == v)) | (u**2 + v**2 <= 25)  # the guard band
     index = torch.nonzero(keep)[:, 0]
     index = index[torch.argsort(p[index, 2].detach(), stable=True)]
     p, z = p[index], p[index, 2]
-    fx, fy, cx, cy = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
     u, v = p[:, 0] / z, p[:, 1] / z
-    mx, my = 0.3 * 0.5 * width / fx, 0.3 * 0.5 * height / fy
-    tx = u.clamp(-cx / fx - mx, (width - cx) / fx + mx)
-    ty = v.clamp(-cy / fy - my, (height - cy) / fy + my)
+    tx, ty = clamped(u, v)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         [torch.stack([fx / z, zero, -fx * tx / z], -1), torch.stack([zero, fy / z, -fy * ty / z], -1)], -2
