@@ -96,12 +96,10 @@ def mode_by_group(group: np.ndarray, values: np.ndarray, count: int) -> np.ndarr
     return distinct[table.argmax(axis=1)].astype(np.int64)
 
 
-def overlap_of_ids(
-    pred_ids: np.ndarray, pred_scores: dict[int, float] | None, truth: Truth, pred_classes: dict[int, int] | None = None
-) -> Overlap:
+def overlap_of_ids(pred_ids: np.ndarray, pred_scores: dict[int, float] | None, truth: Truth) -> Overlap:
     """Overlap of point labels pred_ids [N] int, negative = none. Predictions are ordered by ascending id.
 
-    pred_scores, pred_classes: by id. None means score 1 and class OBJECT for every prediction.
+    pred_scores: by id; None: 1 for every prediction.
     """
     index, ids = compact(pred_ids)
     g = len(truth.ids)
@@ -111,13 +109,12 @@ def overlap_of_ids(
     if missing:
         raise InputError(f"prediction: no score for instance {missing[0]} ({len(missing)} such); give one for each")
     scores = [1.0 if pred_scores is None else pred_scores[i] for i in ids.tolist()]
-    classes = [OBJECT if pred_classes is None else pred_classes[i] for i in ids.tolist()]
     confidence = np.asarray(scores, np.float64)
     if not np.isfinite(confidence).all():
         raise InputError(f"prediction: score of instance {ids[~np.isfinite(confidence)][0]} is not a finite number")
     return Overlap(
         pred_scores=confidence,
-        pred_classes=np.asarray(classes, np.int64),
+        pred_classes=np.full(len(ids), OBJECT, np.int64),
         pred_sizes=table.sum(axis=1),
         pred_void=table[:, -1],
         gt_classes=truth.classes,
