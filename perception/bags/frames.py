@@ -27,17 +27,15 @@ from perception.types import Lens
 class FrameOptions:
     """topic: of the images (None: the only one in the bag). camera_info: its topic (None: the one next to the images).
 
-    camera: file that replaces camera_info. poses: use tf and odometry if available. fixed_frame: the world frame
-    (None: map, odom, world, or the root of the tree). odometry: topic (None: all). depth: topic, or
-    "none" (None: the one registered to the images, else the only one). max_frames, spacing: see Chooser.
+    camera: file that replaces camera_info. fixed_frame: the world frame (None: map, odom, world, or the root of the
+    tree). depth: topic, or "none" (None: the one registered to the images, else the only one). max_frames, spacing: see
+    Chooser.
     """
 
     topic: str | None = None
     camera_info: str | None = None
     camera: Path | None = None
-    poses: bool = True
     fixed_frame: str | None = None
-    odometry: str | None = None
     depth: str | None = None
     max_frames: int = 200
     spacing: float = 0.08
@@ -67,12 +65,12 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         if size is None:
             raise InputError(f"{source}: {topic} holds no images")
         chosen = chooser.chosen(options.max_frames)
-        poses = read_poses(bag, options.odometry)
+        poses = read_poses(bag)
         with atomic_directory(output) as aside:
             lens = _write_camera(aside / "camera.yaml", options.camera, info, topic, size, source)
             stamps, frame = _write_images(bag, topic, chosen, aside / "images")
             depth, told = _depth(bag, depths, options.depth, stamps, lens, frame, poses, aside / "depth")
-            known, fixed = _place(poses if options.poses else Poses(), stamps, frame, options.fixed_frame)
+            known, fixed = _place(poses, stamps, frame, options.fixed_frame)
             down = None if fixed is None else gravity(bag, poses, fixed)
             if fixed is not None:
                 _write_transforms(aside / "transforms.json", known, stamps, fixed, lens, depth, down)
