@@ -26,13 +26,11 @@ SCANNET = Path("scannet")
 class ExportOptions:
     """How labels are transferred; the defaults are the paper's.
 
-    drop_noise: Gaussians without an instance are ignored, so every point gets a label (as in the released code).
     max_distance: in map units, beyond which points stay unlabelled; None = no limit.
     smooth: superpoint vote, on or off. segments: a ScanNet *.segs.json to use instead of our own segmentation, or
     SCANNET for the one that ScanNet's segmentator makes of a mesh.
     """
 
-    drop_noise: bool = True
     max_distance: float | None = None
     smooth: bool = True
     segments: Path | None = None
@@ -42,12 +40,12 @@ def export_labels(
     means: np.ndarray, instance_ids: np.ndarray, cloud: PointCloud, options: ExportOptions | None = None
 ) -> np.ndarray:
     """Instance of each point [P] int32, −1 = none: that of the nearest mean (OpenSplat3D, point cloud transfer).
-    means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise)."""
+    means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise, ignored as in the released code)."""
     options = options or ExportOptions()
     limit = options.max_distance
     if limit is not None and not limit >= 0:
         raise InputError(f"max_distance is {limit}; expected a length that is not negative")
-    used = np.isfinite(means).all(axis=1) & ((instance_ids >= 0) | (not options.drop_noise))
+    used = np.isfinite(means).all(axis=1) & (instance_ids >= 0)
     nearest = nearest_gaussian(cloud.points, means[used], max_distance=limit)
     labels = np.append(instance_ids[used], -1).astype(np.int32)[nearest]
     if not options.smooth or not (labels >= 0).any():
