@@ -94,7 +94,8 @@ class Protocol:
 
     thresholds: IoU thresholds averaged into AP; extra_thresholds are reported separately (AP25).
     constant_score: all confidences are 1.0 (Segment3D). remove_ignored: ignored points (truth ids below −1, or a mask)
-    are removed from truth and prediction before counting (ScanNet++); without it they are void.
+    are removed from truth and prediction before counting (ScanNet++); without it they are void. by_class,
+    valid_classes: for callers that set the classes of an `Overlap`.
     """
 
     name: str
@@ -153,13 +154,13 @@ def evaluate(
         raise InputError(
             f"prediction has {len(pred_ids)} points, truth has {len(gt_ids)}; they must be the same points"
         )
-    keep, truth = evaluated_truth(rules, gt_ids, None, ignore)
+    keep, truth = evaluated_truth(rules, gt_ids, ignore)
     scores = None if rules.constant_score or pred_scores is None else {int(k): v for k, v in pred_scores.items()}
     return evaluate_overlaps([overlap_of_ids(pred_ids[keep], scores, truth)], rules)
 
 
 def evaluated_truth(
-    rules: Protocol, gt_ids: np.ndarray, gt_semantics: np.ndarray | None, ignore: np.ndarray | None
+    rules: Protocol, gt_ids: np.ndarray, ignore: np.ndarray | None = None
 ) -> tuple[np.ndarray | slice, Truth]:
     """Selection of the evaluated points, and the ground truth of these points."""
     keep: np.ndarray | slice = slice(None)
@@ -169,11 +170,7 @@ def evaluated_truth(
             keep &= ~np.asarray(ignore, bool)
     elif ignore is not None:
         gt_ids = np.where(np.asarray(ignore, bool), -1, gt_ids)
-    semantics = None if gt_semantics is None else np.asarray(gt_semantics)[keep]
-    truth = read_truth(
-        gt_ids[keep], semantics, void_ids=rules.void_ids, valid_classes=rules.valid_classes, by_class=rules.by_class
-    )
-    return keep, truth
+    return keep, read_truth(gt_ids[keep], rules.void_ids)
 
 
 def evaluate_overlaps(scenes: Sequence[Overlap], rules: Protocol) -> dict[str, Any]:
