@@ -99,25 +99,18 @@ def write_export(
     """Writes the cloud with `instance_id` and its sidecar JSON (same stem); returns the sidecar.
 
     labels [P] int32, −1 = none; points and order are the cloud's own. instances: {id: {"score", "label"}} of the map.
+    Entries have "score", "label", "num_points"; those of parts also their `parent`, of groups the `instances` in them.
     facts: further keys of the sidecar.
     """
-    path = Path(path)
-    sidecar = {**(facts or {}), **sidecar_of(labels, instances)}
+    path, rows = Path(path), {}
+    ids, counts = np.unique(labels[labels >= 0], return_counts=True)
+    for i, n in zip(ids.tolist(), counts.tolist(), strict=True):
+        known = instances.get(i, {})
+        row = {"score": float(known.get("score", 1.0)), "label": known.get("label"), "num_points": n}
+        rows[str(i)] = row | {key: known[key] for key in ("parent", "instances") if key in known}
+    sidecar = {**(facts or {}), "instances": rows}
     with replacing(path.with_suffix(".json")) as file:
         file.write(json.dumps(sidecar, indent=1).encode())
     labelled = {"instance_id": labels.astype(np.int32)}
     write_cloud(path, PointCloud(cloud.points, cloud.colors, cloud.normals, cloud.faces, labelled))
     return sidecar
-
-
-def sidecar_of(labels: np.ndarray, instances: Instances) -> dict[str, Any]:
-    """{"instances": {"<id>": {"score", "label", "num_points"}}} of the instances that labels [P] name; parts also have
-    their `parent`, groups the `instances` in them."""
-    ids, counts = np.unique(labels[labels >= 0], return_counts=True)
-    rows = {}
-    for i, n in zip(ids.tolist(), counts.tolist(), strict=True):
-        known = instances.get(i, {})
-        score = float(known.get("score", 1.0))
-        more = {key: known[key] for key in ("parent", "instances") if key in known}
-        rows[str(i)] = {"score": score, "label": known.get("label"), "num_points": n, **more}
-    return {"instances": rows}
