@@ -69,7 +69,16 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         with atomic_directory(output) as aside:
             lens = _write_camera(aside / "camera.yaml", options.camera, info, topic, size, source)
             stamps, frame = _write_images(bag, topic, chosen, aside / "images")
-            depth, told = _depth(bag, depths, options.depth, stamps, lens, frame, poses, aside / "depth")
+            depth, told = dict[str, str](), None
+            try:
+                measured = choose_depth(bag, depths, options.depth, frame)
+                if measured is not None:
+                    depth, told = write_depth(bag, measured, stamps, lens, frame, poses, aside / "depth")
+            except InputError as error:  # depth that was not asked for and cannot be used is left out
+                if options.depth is not None:
+                    raise
+                shutil.rmtree(aside / "depth", ignore_errors=True)
+                told = f"left out: {error}"
             known, fixed = _place(poses, stamps, frame, options.fixed_frame)
             down = None if fixed is None else gravity(bag, poses, fixed)
             if fixed is not None:
@@ -131,27 +140,6 @@ def _write_images(bag: Bag, topic: str, chosen: list[int], folder: Path) -> tupl
         stamps[name] = stamp_of(message) or recorded
         frame = str(message.header.frame_id)
     return stamps, frame
-
-
-def _depth(
-    bag: Bag,
-    topics: list[str],
-    wanted: str | None,
-    stamps: dict[str, int],
-    lens: Lens,
-    frame: str,
-    poses: Poses,
-    folder: Path,
-) -> tuple[dict[str, str], str | None]:
-    """Depth file by photo, and one line for the user; depth that was not asked for and cannot be used is left out."""
-    try:
-        topic = choose_depth(bag, topics, wanted, frame)
-        return ({}, None) if topic is None else write_depth(bag, topic, stamps, lens, frame, poses, folder)
-    except InputError as error:
-        if wanted is not None:
-            raise
-        shutil.rmtree(folder, ignore_errors=True)
-        return {}, f"left out: {error}"
 
 
 def _place(
