@@ -177,12 +177,11 @@ def pose(box: OrientedBox) -> dict[str, Any]:
 
 
 def detection(
-    box: OrientedBox, class_id: str, score: float, identity: str, head: dict[str, Any], spread: np.ndarray | None = None
+    box: OrientedBox, class_id: str, score: float, identity: str, head: dict[str, Any], spread: np.ndarray
 ) -> dict[str, Any]:
     """vision_msgs/Detection3D. spread [3, 3]: covariance of the points, used as that of the position."""
     covariance = np.zeros((6, 6))
-    if spread is not None:
-        covariance[:3, :3] = spread
+    covariance[:3, :3] = spread
     at = pose(box)
     hypothesis = {"class_id": class_id, "score": float(score)}
     return {
