@@ -33,7 +33,11 @@ def oriented_box(points: np.ndarray, trim: float = 0.0) -> OrientedBox:
     # A floor of a thousandth of the longest side, so that flat instances compare by their area.
     volume = np.maximum(extent, np.maximum(extent.max(axis=1, keepdims=True) * 1e-3, 1e-12)).prod(axis=1)
     best = int(np.argmax(volume <= 1.001 * volume.min()))  # the first of equals: the world axes if they qualify
-    rotation = _in_order(axes[best], extent[best])
+    rotation = axes[best][np.argsort(-extent[best], kind="stable")]
+    for row in rotation[:2]:
+        if row[np.abs(row).argmax()] < 0:
+            row *= -1
+    rotation[2] = np.cross(rotation[0], rotation[1])
     low, high = _sides(rotation[None], points if trim else outline, trim)
     return OrientedBox(rotation.T @ ((low[0] + high[0]) / 2), rotation, high[0] - low[0])
 
@@ -45,16 +49,6 @@ def _sides(axes: np.ndarray, points: np.ndarray, trim: float) -> tuple[np.ndarra
         low, high = np.quantile(local, [trim, 1 - trim], axis=1)
         return low, high
     return local.min(axis=1), local.max(axis=1)
-
-
-def _in_order(axes: np.ndarray, extent: np.ndarray) -> np.ndarray:
-    """The same axes, longest side first, signs fixed, right-handed."""
-    rotation = axes[np.argsort(-extent, kind="stable")].copy()
-    for row in rotation[:2]:
-        if row[np.abs(row).argmax()] < 0:
-            row *= -1
-    rotation[2] = np.cross(rotation[0], rotation[1])
-    return rotation
 
 
 def _hull(points: np.ndarray) -> np.ndarray:

@@ -58,11 +58,6 @@ class PhotoConfig(Settings):
         "none: a quarter of the machine's",
     )
 
-    @property
-    def memory_bytes(self) -> int | None:
-        """`memory` in bytes."""
-        return None if self.memory is None else int(self.memory[:-1]) << {"M": 20, "G": 30}[self.memory[-1]]
-
 
 class FrameConfig(Settings):
     keep_world: bool | None = Field(None, description="keep the input's frame and unit; none: if the input has poses")

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from perception.boxes import instance_entry
 from perception.config import FrameConfig, InstanceConfig
@@ -131,8 +132,13 @@ class Editor:
             return parts
         known = [part["id"] for entry in self._now.instances for part in entry.get("parts", [])]
         alive = np.isin(np.unique(parts["ids"][parts["ids"] >= 0]), known)
-        ids = np.where(np.isin(parts["ids"], known), parts["ids"], -1).astype(np.int32)
-        return _described({**parts, "ids": ids}, alive)
+        parts = {**parts, "ids": self.part_ids.astype(np.int32)}
+        language = language_in(parts)
+        if not language or alive.all():
+            return parts
+        descriptions, encoder = from_arrays(language)
+        left = [description for description, lives in zip(descriptions, alive, strict=True) if lives]
+        return {"ids": parts["ids"], **prefixed(to_arrays(left, encoder))}
 
     # ------------------------------------------------------------------ editing
 
@@ -192,7 +198,8 @@ class Editor:
             raise InputError(f"instance {instance}: its Gaussians are all alike, there is nothing to split")
         first = self._next_id()
         ids = self.ids.copy()
-        ids[rows] = _nearest_filled(gmap.means[rows], found) + first
+        known, means = found >= 0, gmap.means[rows]
+        ids[rows] = np.where(known, found, found[known][cKDTree(means[known]).query(means)[1]]) + first
         news = list(range(first, first + int(found.max()) + 1))
         entry = self.instances[place]
         parts = [self._entry(new, ids, entry["score"], entry.get("views", 0)) for new in news]
@@ -305,15 +312,6 @@ class Editor:
         self._push(what, ids=ids, instances=tuple(entries), descriptions=tuple(descriptions))
 
 
-def _nearest_filled(means: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    """ids [N] with −1 replaced by the id of the nearest point that has one."""
-    from scipy.spatial import cKDTree
-
-    known = ids >= 0
-    _, nearest = cKDTree(means[known]).query(means)
-    return np.asarray(np.where(known, ids, ids[known][nearest]))
-
-
 def _joined(descriptions: list[InstanceDescription]) -> InstanceDescription:
     """One description of several instances: all views, their mean embedding, the palette of the one with most views."""
     best = max(descriptions, key=lambda d: len(d.views))
@@ -326,13 +324,3 @@ def _joined(descriptions: list[InstanceDescription]) -> InstanceDescription:
         [name for d in descriptions for name in d.views],
         [box for d in descriptions for box in d.boxes],
     )
-
-
-def _described(parts: dict[str, np.ndarray], alive: np.ndarray) -> dict[str, np.ndarray]:
-    """The arrays of parts.npz with language rows only for parts that are alive [P] bool, in ascending id."""
-    language = language_in(parts)
-    if not language or alive.all():
-        return parts
-    descriptions, encoder = from_arrays(language)
-    left = [description for description, lives in zip(descriptions, alive, strict=True) if lives]
-    return {"ids": parts["ids"], **prefixed(to_arrays(left, encoder))}

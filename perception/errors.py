@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import unicodedata
 from pathlib import Path
+from unicodedata import category
 
 
 class InputError(ValueError):
@@ -13,11 +13,8 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: object = ""):
-        super().__init__("".join(c if _visible(c) else ascii(c)[1:-1] for c in str(message)))
-
-
-def _visible(character: str) -> bool:
-    return unicodedata.category(character) not in ("Cc", "Cs", "Zl", "Zp")
+        hidden = ("Cc", "Cs", "Zl", "Zp")
+        super().__init__("".join(ascii(c)[1:-1] if category(c) in hidden else c for c in str(message)))
 
 
 def missing_extra(package: str, extra: str) -> InputError:

@@ -66,21 +66,29 @@ def align_similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, n
     return scale, rotation, mean_a - scale * rotation @ mean_b
 
 
-def check_similarity(a_from_b: Any, name: str = "a_from_b") -> np.ndarray:
-    """`a_from_b` as float64 [4, 4]; InputError unless it is a rotation times a positive scale, and a translation."""
+def numbers(value: Any, name: str, expected: str = "numbers") -> np.ndarray:
+    """`value` as a float64 array; InputError unless it holds finite numbers."""
     try:
-        matrix = np.asarray(a_from_b, np.float64)
+        array = np.asarray(value, np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected 4 × 4 numbers, found {str(a_from_b)[:60]!r}") from error
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise InputError(f"{name}: expected {expected}, found {str(value)[:60]!r}") from error
+    if not np.isfinite(array).all():
+        raise InputError(f"{name}: expected finite numbers, found {str(value)[:60]!r}")
+    return array
+
+
+def check_similarity(a_from_b: Any, name: str = "a_from_b") -> np.ndarray:
+    """`a_from_b` as float64 [4, 4]; InputError unless it is a rotation times a scale, and a translation."""
+    matrix = numbers(a_from_b, name, "4 × 4 numbers")
+    if matrix.shape != (4, 4):
         raise InputError(f"{name}: expected a finite [4, 4] transform, found shape {list(matrix.shape)}")
     scale = scale_of(matrix)
     linear = matrix[:3, :3] / scale if scale > 0 else matrix[:3, :3]
     straight = np.abs(linear @ linear.T - np.eye(3)).max() <= _TOLERANCE
-    if scale <= 0 or not straight or not np.array_equal(matrix[3], [0, 0, 0, 1]):
+    if not 1e-9 < scale < 1e9 or not straight or not np.array_equal(matrix[3], [0, 0, 0, 1]):
         raise InputError(
-            f"{name}: expected a rotation, a positive scale and a translation with last row 0 0 0 1; "
-            "found a shear, a mirror or another last row"
+            f"{name}: expected a rotation, a scale from 1e-9 to 1e9 and a translation with last row 0 0 0 1; "
+            "found a shear, a mirror, another scale or another last row"
         )
     return matrix
 

@@ -26,7 +26,7 @@ from perception.io.model_store import (
     models_folder,
 )
 from perception.io.onnx_sessions import model_graphs, model_root, side_files
-from perception.progress import Progress
+from perception.progress import QUIET, Progress
 
 _KEPT = (".json", ".txt")  # of a folder, beside graphs and their weights: configurations and tokenizers
 _PURPOSES = {"encoder": "sam", "decoder": "sam", "image tower": "clip", "text tower": "clip", "both towers": "clip"}
@@ -43,8 +43,6 @@ def check_file(file: str) -> dict[str, Any]:
     left_out: list[Path] = []
     if path.is_dir():
         graphs, left_out = model_graphs(path)
-        if not graphs:
-            raise InputError(f"{path}: no .onnx file in this folder; expected ONNX models")
     elif path.is_file():
         graphs = [path]
     else:
@@ -137,7 +135,7 @@ def add_model(name: str, sources: Sequence[str]) -> StoredModel:
     return _install(name, [file for source in sources for file in _local(source)])
 
 
-def get_model(name: str, progress: Progress | None = None) -> StoredModel:
+def get_model(name: str, progress: Progress = QUIET) -> StoredModel:
     """Fetches an entry of the catalogue from the Hugging Face hub into the store under its name, unless it is there.
 
     What is fetched is told before. HF_ENDPOINT names a mirror of the hub. Files are verified by their known digests.
@@ -145,11 +143,10 @@ def get_model(name: str, progress: Progress | None = None) -> StoredModel:
     entry = catalogue().get(name)
     if entry is None:
         raise InputError(f"models get {name}: not in the catalogue; it holds {', '.join(catalogue())}")
-    if progress is not None:
-        sizes = [size for size, _ in entry.files.values()]
-        size = f", {sum(sizes) / 1e6:.1f} MB" if None not in sizes else ""
-        told = f"{len(sizes)} files{size}, of {entry.repository} at {entry.revision[:12]}"
-        progress.log(f"{name}: {told}, licence {entry.licence}, to {models_folder() / name}")
+    sizes = [size for size, _ in entry.files.values()]
+    size = f", {sum(sizes) / 1e6:.1f} MB" if None not in sizes else ""
+    told = f"{len(sizes)} files{size}, of {entry.repository} at {entry.revision[:12]}"
+    progress.log(f"{name}: {told}, licence {entry.licence}, to {models_folder() / name}")
     known = find_model(name)
     if known is None or not _holds(known, entry):
         parts = models_folder() / ".parts" / name

@@ -10,47 +10,28 @@ import numpy as np
 from perception.colors import instance_palette
 
 
-def colorize_instances(ids: np.ndarray) -> np.ndarray:
-    """Instance ids [H, W] (-1 = none) as an image in instance colours."""
-    present, inverse = np.unique(ids, return_inverse=True)
-    return instance_palette(present)[inverse.reshape(ids.shape)]
-
-
-def error_map(a: np.ndarray, b: np.ndarray, full: float = 0.25) -> np.ndarray:
-    """Difference of two images (uint8, or float in [0, 1]): black = equal, brightest = `full` or more (of 1)."""
-    if a.shape != b.shape:
-        raise ValueError(f"error_map: pictures of shapes {a.shape} and {b.shape}; they must agree")
-    difference = np.abs(_unit(a) - _unit(b)).mean(-1)
-    level = np.round(255 * np.clip(difference / full, 0, 1)).astype(np.uint8)
+def error_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Difference of two images of one shape: black = equal, brightest = a quarter of the range or more."""
+    difference = np.abs(a.astype(np.float32) / 255 - b.astype(np.float32) / 255).mean(-1)
+    level = np.round(255 * np.clip(difference / 0.25, 0, 1)).astype(np.uint8)
     return cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1].copy()
-
-
-def _unit(picture: np.ndarray) -> np.ndarray:
-    return picture.astype(np.float32) / 255 if picture.dtype == np.uint8 else picture.astype(np.float32)
 
 
 def overlay(photo: np.ndarray, ids: np.ndarray, alpha: float = 0.55) -> np.ndarray:
     """A photo overlaid with instance colours and thin borders between instances; at -1 the photo is unchanged."""
-    tinted = (1 - alpha) * photo + alpha * colorize_instances(ids)
+    present, inverse = np.unique(ids, return_inverse=True)
+    tinted = (1 - alpha) * photo + alpha * instance_palette(present)[inverse.reshape(ids.shape)]
     out = np.where((ids >= 0)[..., None], tinted, photo)
-    out[_borders(ids)] = 255
+    out[:, 1:][ids[:, 1:] != ids[:, :-1]] = 255
+    out[1:][ids[1:] != ids[:-1]] = 255
     return np.round(out).astype(np.uint8)
 
 
-def _borders(ids: np.ndarray) -> np.ndarray:
-    edge = np.zeros(ids.shape, bool)
-    edge[:, 1:] |= ids[:, 1:] != ids[:, :-1]
-    edge[1:] |= ids[1:] != ids[:-1]
-    return edge
-
-
-def outline(
-    photo: np.ndarray, mask: np.ndarray, color: tuple[int, int, int] = (255, 64, 160), thickness: int = 2
-) -> np.ndarray:
+def outline(photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """A copy of the photo with the boundary of mask [H, W] bool drawn, everything outside it dimmed."""
     out = np.where(mask[..., None], photo, np.round(photo * 0.55)).astype(np.uint8)
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return cv2.drawContours(np.ascontiguousarray(out), contours, -1, color, thickness, cv2.LINE_AA)
+    return cv2.drawContours(np.ascontiguousarray(out), contours, -1, (255, 64, 160), 2, cv2.LINE_AA)
 
 
 def features_to_rgb(features: np.ndarray) -> np.ndarray:
@@ -70,11 +51,11 @@ def features_to_rgb(features: np.ndarray) -> np.ndarray:
     return np.round(255 * level).astype(np.uint8).reshape(*features.shape[:-1], 3)
 
 
-def titled_row(images: Sequence[np.ndarray], titles: Sequence[str], gap: int = 6, head: int = 22) -> np.ndarray:
-    """Images of one size side by side on white, with a title of `head` pixels above each."""
+def titled_row(images: Sequence[np.ndarray], titles: Sequence[str]) -> np.ndarray:
+    """Images of one size side by side on white, with a title above each."""
     from PIL import Image, ImageDraw, ImageFont
 
-    height, width = images[0].shape[:2]
+    (height, width), gap, head = images[0].shape[:2], 6, 22
     sheet = Image.new("RGB", (len(images) * (width + gap) + gap, height + head + 2 * gap), "white")
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=14)
     for k, (image, title) in enumerate(zip(images, titles, strict=True)):

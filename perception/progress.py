@@ -78,3 +78,6 @@ class Progress:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
+
+
+QUIET = Progress(quiet=True)

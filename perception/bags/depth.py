@@ -139,17 +139,13 @@ def write_depth(
                 lacks = "a camera_info" if own is None else f"tf from '{there}' to '{frame}'"
                 raise InputError(f"{bag.path}: {topic} is not registered to the photos and lacks {lacks}")
             depth = registered(depth, own, lens, moved)
+        stored = np.round(depth * MILLIMETRES)
+        data = cv2.imencode(".png", np.where(stored <= LARGEST, stored, 0).astype(np.uint16))[1].tobytes()
         for name in wanted[index]:
-            (folder / f"{Path(name).stem}.png").write_bytes(_png(depth))
+            (folder / f"{Path(name).stem}.png").write_bytes(data)
     written = {name: f"{folder.name}/{Path(name).stem}.png" for names in wanted.values() for name in names}
     most = max(apart[name] for name in written)
     return written, f"{topic}, {len(written)} of {len(stamps)} photos, at most {1000 * most:.0f} ms apart"
-
-
-def _png(depth: np.ndarray) -> bytes:
-    stored = np.round(depth * MILLIMETRES)
-    image = np.where(stored <= LARGEST, stored, 0).astype(np.uint16)
-    return bytes(cv2.imencode(".png", image)[1].tobytes())
 
 
 def _frame_of(message: Any) -> str:

@@ -27,17 +27,15 @@ from perception.types import Lens
 class FrameOptions:
     """topic: of the images (None: the only one in the bag). camera_info: its topic (None: the one next to the images).
 
-    camera: file that replaces camera_info. poses: use tf and odometry if available. fixed_frame: the world frame
-    (None: map, odom, world, or the root of the tree). odometry: topic (None: all). depth: topic, or
-    "none" (None: the one registered to the images, else the only one). max_frames, spacing: see Chooser.
+    camera: file that replaces camera_info. fixed_frame: the world frame (None: map, odom, world, or the root of the
+    tree). depth: topic, or "none" (None: the one registered to the images, else the only one). max_frames, spacing: see
+    Chooser.
     """
 
     topic: str | None = None
     camera_info: str | None = None
     camera: Path | None = None
-    poses: bool = True
     fixed_frame: str | None = None
-    odometry: str | None = None
     depth: str | None = None
     max_frames: int = 200
     spacing: float = 0.08
@@ -67,12 +65,21 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
         if size is None:
             raise InputError(f"{source}: {topic} holds no images")
         chosen = chooser.chosen(options.max_frames)
-        poses = read_poses(bag, options.odometry)
+        poses = read_poses(bag)
         with atomic_directory(output) as aside:
             lens = _write_camera(aside / "camera.yaml", options.camera, info, topic, size, source)
             stamps, frame = _write_images(bag, topic, chosen, aside / "images")
-            depth, told = _depth(bag, depths, options.depth, stamps, lens, frame, poses, aside / "depth")
-            known, fixed = _place(poses if options.poses else Poses(), stamps, frame, options.fixed_frame)
+            depth, told = dict[str, str](), None
+            try:
+                measured = choose_depth(bag, depths, options.depth, frame)
+                if measured is not None:
+                    depth, told = write_depth(bag, measured, stamps, lens, frame, poses, aside / "depth")
+            except InputError as error:  # depth that was not asked for and cannot be used is left out
+                if options.depth is not None:
+                    raise
+                shutil.rmtree(aside / "depth", ignore_errors=True)
+                told = f"left out: {error}"
+            known, fixed = _place(poses, stamps, frame, options.fixed_frame)
             down = None if fixed is None else gravity(bag, poses, fixed)
             if fixed is not None:
                 _write_transforms(aside / "transforms.json", known, stamps, fixed, lens, depth, down)
@@ -133,27 +140,6 @@ def _write_images(bag: Bag, topic: str, chosen: list[int], folder: Path) -> tupl
         stamps[name] = stamp_of(message) or recorded
         frame = str(message.header.frame_id)
     return stamps, frame
-
-
-def _depth(
-    bag: Bag,
-    topics: list[str],
-    wanted: str | None,
-    stamps: dict[str, int],
-    lens: Lens,
-    frame: str,
-    poses: Poses,
-    folder: Path,
-) -> tuple[dict[str, str], str | None]:
-    """Depth file by photo, and one line for the user; depth that was not asked for and cannot be used is left out."""
-    try:
-        topic = choose_depth(bag, topics, wanted, frame)
-        return ({}, None) if topic is None else write_depth(bag, topic, stamps, lens, frame, poses, folder)
-    except InputError as error:
-        if wanted is not None:
-            raise
-        shutil.rmtree(folder, ignore_errors=True)
-        return {}, f"left out: {error}"
 
 
 def _place(

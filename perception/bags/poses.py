@@ -78,16 +78,15 @@ class Poses:
         return interpolated_pose(times, matrices, time, MAX_GAP * 1e9)
 
 
-def read_poses(bag: Bag, odometry: str | None = None) -> Poses:
-    """All transforms of a bag. odometry [topic] (default: all odometry) adds frames that tf does not define."""
+def read_poses(bag: Bag) -> Poses:
+    """All transforms of a bag; odometry adds frames that tf does not define."""
     poses = Poses()
     for topic, _, message in bag.messages(bag.of_type(*TRANSFORMS)):
         for entry in message.transforms:
             t, q = entry.transform.translation, entry.transform.rotation
             static = topic.rstrip("/").endswith("static")
             poses.add(entry.header.frame_id, entry.child_frame_id, stamp_of(entry), _matrix(t, q), static)
-    topics = [odometry] if odometry else bag.of_type(ODOMETRY)
-    for _, _, message in bag.messages(topics):
+    for _, _, message in bag.messages(bag.of_type(ODOMETRY)):
         pose = message.pose.pose
         child = message.child_frame_id or "base_link"
         poses.add(message.header.frame_id, child, stamp_of(message), _matrix(pose.position, pose.orientation))

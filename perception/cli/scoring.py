@@ -16,12 +16,7 @@ def register(commands: Any) -> None:
     p = command(kinds, "instances", _eval_instances, "AP, AP50, AP25 of labelled clouds")
     p.add_argument("prediction", type=Path, metavar="PRED.ply")
     p.add_argument("truth", type=Path, metavar="GT.ply")
-    p.add_argument("--scores", type=Path, metavar="X.json", help="confidences; default: PRED.json where it lies there")
     p.add_argument("--protocol", default="scannet", choices=("scannet", "mask3d", "segment3d", "scannetpp"))
-    p.add_argument("--by-class", action="store_true", help="match within semantic classes and average over them")
-    p.add_argument("--classes", type=_numbers, metavar="N,N,...", help="classes that count; others are void")
-    p.add_argument("--void", type=_numbers, metavar="N,N,...", help="truth ids that are void (default 0; 'none')")
-    p.add_argument("--min-region", type=int, metavar="N", help="least points of an instance (default 100)")
     p = command(kinds, "images", _eval_images, "PSNR and SSIM per view and mean")
     p.add_argument("prediction", type=Path, metavar="PRED_DIR")
     p.add_argument("truth", type=Path, metavar="GT_DIR")
@@ -31,16 +26,10 @@ def register(commands: Any) -> None:
     p.add_argument("rest", nargs=argparse.REMAINDER, metavar="...")
 
 
-def _numbers(text: str) -> tuple[int, ...]:
-    return () if text == "none" else tuple(int(word) for word in text.split(","))
-
-
 def _eval_instances(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.evaluate.layouts import run_instances
 
-    given = {"valid_classes": args.classes, "void_ids": args.void, "min_region": args.min_region}
-    rules = {"by_class": args.by_class} | {name: value for name, value in given.items() if value is not None}
-    return run_instances(args.prediction, args.truth, args.protocol, scores=args.scores, **rules)
+    return run_instances(args.prediction, args.truth, args.protocol)
 
 
 def _eval_images(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

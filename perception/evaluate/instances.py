@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.evaluate.overlap import Overlap, Truth, mode_by_group, overlap_of_ids, read_truth
+from perception.evaluate.overlap import Overlap, Truth, overlap_of_ids, read_truth
 
 
 @dataclass
@@ -94,7 +94,8 @@ class Protocol:
 
     thresholds: IoU thresholds averaged into AP; extra_thresholds are reported separately (AP25).
     constant_score: all confidences are 1.0 (Segment3D). remove_ignored: ignored points (truth ids below −1, or a mask)
-    are removed from truth and prediction before counting (ScanNet++); without it they are void.
+    are removed from truth and prediction before counting (ScanNet++); without it they are void. by_class,
+    valid_classes: for callers that set the classes of an `Overlap`.
     """
 
     name: str
@@ -141,38 +142,25 @@ def evaluate(
     pred_scores: Mapping[int, float] | None,
     gt_ids: np.ndarray,
     protocol: str | Protocol = "scannet",
-    *,
-    pred_semantics: np.ndarray | None = None,
-    gt_semantics: np.ndarray | None = None,
     ignore: np.ndarray | None = None,
-    **changes: Any,
 ) -> dict[str, Any]:
     """AP of predicted labels against true labels, both [N] int over the same points; negative prediction = none.
 
-    pred_scores: confidence by id (None: all 1). *_semantics [N] int are required for by_class and valid_classes. The
-    class of a prediction is the most frequent semantic id of its points. ignore: [N] bool. changes: fields of Protocol.
+    pred_scores: confidence by id (None: all 1). ignore: [N] bool.
     """
-    rules = get_protocol(protocol, **changes)
+    rules = get_protocol(protocol)
     pred_ids, gt_ids = np.asarray(pred_ids), np.asarray(gt_ids)
     if len(pred_ids) != len(gt_ids):
         raise InputError(
             f"prediction has {len(pred_ids)} points, truth has {len(gt_ids)}; they must be the same points"
         )
-    keep, truth = evaluated_truth(rules, gt_ids, gt_semantics, ignore)
-    pred_ids = pred_ids[keep]
-    classes = None
-    if rules.by_class:
-        if pred_semantics is None:
-            raise InputError("evaluation by class needs semantic ids in the prediction; there are none")
-        values, index = np.unique(pred_ids, return_inverse=True)
-        modes = mode_by_group(index, np.asarray(pred_semantics)[keep], len(values))
-        classes = dict(zip(values.tolist(), modes.tolist(), strict=True))
+    keep, truth = evaluated_truth(rules, gt_ids, ignore)
     scores = None if rules.constant_score or pred_scores is None else {int(k): v for k, v in pred_scores.items()}
-    return evaluate_overlaps([overlap_of_ids(pred_ids, scores, truth, classes)], rules)
+    return evaluate_overlaps([overlap_of_ids(pred_ids[keep], scores, truth)], rules)
 
 
 def evaluated_truth(
-    rules: Protocol, gt_ids: np.ndarray, gt_semantics: np.ndarray | None, ignore: np.ndarray | None
+    rules: Protocol, gt_ids: np.ndarray, ignore: np.ndarray | None = None
 ) -> tuple[np.ndarray | slice, Truth]:
     """Selection of the evaluated points, and the ground truth of these points."""
     keep: np.ndarray | slice = slice(None)
@@ -182,11 +170,7 @@ def evaluated_truth(
             keep &= ~np.asarray(ignore, bool)
     elif ignore is not None:
         gt_ids = np.where(np.asarray(ignore, bool), -1, gt_ids)
-    semantics = None if gt_semantics is None else np.asarray(gt_semantics)[keep]
-    truth = read_truth(
-        gt_ids[keep], semantics, void_ids=rules.void_ids, valid_classes=rules.valid_classes, by_class=rules.by_class
-    )
-    return keep, truth
+    return keep, read_truth(gt_ids[keep], rules.void_ids)
 
 
 def evaluate_overlaps(scenes: Sequence[Overlap], rules: Protocol) -> dict[str, Any]:

@@ -14,19 +14,11 @@ from perception.types import PointCloud
 _ID_NAMES = ("instance_id", "instance", "inst_id", "label")
 
 
-def run_instances(
-    prediction: str | Path,
-    truth: str | Path,
-    protocol: str = "scannet",
-    *,
-    by_class: bool = False,
-    scores: str | Path | None = None,
-    **changes: Any,
-) -> tuple[dict[str, Any], str]:
+def run_instances(prediction: str | Path, truth: str | Path, protocol: str = "scannet") -> tuple[dict[str, Any], str]:
     """Instance AP of a labelled cloud against ground truth: (result, table).
 
-    Confidences come from `scores`, else from the sidecar JSON next to the prediction. Without either they are all 1,
-    and the result says so. Points with a non-zero property `ignore` in the ground truth are ignored.
+    Confidences come from the sidecar JSON next to the prediction. Without it they are all 1, and the result says so.
+    Points with a non-zero property `ignore` in the ground truth are ignored.
     """
     pred, gt = read_cloud(prediction), read_cloud(truth)
     pred_ids, gt_ids = _ids(pred, prediction), _ids(gt, truth)
@@ -35,19 +27,10 @@ def run_instances(
             f"{prediction}: has {len(pred_ids)} points, the truth {truth} has {len(gt_ids)}; "
             "both must be the same points in the same order"
         )
-    rules = get_protocol(protocol, by_class=by_class, **changes)
-    source = Path(scores) if scores is not None else Path(prediction).with_suffix(".json")
-    confidence = read_scores(source) if scores is not None or source.is_file() else None
+    rules, source = get_protocol(protocol), Path(prediction).with_suffix(".json")
+    confidence = read_scores(source) if source.is_file() else None
     ignore = gt.labels.get("ignore")
-    result = evaluate(
-        pred_ids,
-        confidence,
-        gt_ids,
-        rules,
-        pred_semantics=pred.labels.get("semantic_id"),
-        gt_semantics=gt.labels.get("semantic_id"),
-        ignore=None if ignore is None else ignore != 0,
-    )
+    result = evaluate(pred_ids, confidence, gt_ids, rules, None if ignore is None else ignore != 0)
     result["void_points"] = {"negative": int((gt_ids < 0).sum())}
     result["void_points"] |= {str(i): n for i in rules.void_ids if (n := int((gt_ids == i).sum()))}
     constant = rules.constant_score or confidence is None

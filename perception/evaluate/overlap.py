@@ -45,33 +45,11 @@ class Truth:
     sizes: np.ndarray
 
 
-def read_truth(
-    gt_ids: np.ndarray,
-    gt_semantics: np.ndarray | None = None,
-    *,
-    void_ids: Sequence[int] = (0,),
-    valid_classes: Sequence[int] | None = None,
-    by_class: bool = False,
-) -> Truth:
-    """Compacts the true ids [N] int. Void: negative ids, `void_ids`, and points with a class not in `valid_classes`.
-
-    by_class: the class of an instance is the most frequent semantic id of its points; otherwise it is OBJECT.
-    """
+def read_truth(gt_ids: np.ndarray, void_ids: Sequence[int] = (0,)) -> Truth:
+    """Compacts the true ids [N] int. Void: negative ids and `void_ids`. The class of every instance is OBJECT."""
     index, ids = compact(gt_ids, void_ids)
-    semantics = None if gt_semantics is None else np.asarray(gt_semantics, np.int64)
-    if valid_classes is not None:
-        if semantics is None:
-            raise InputError("valid classes are given, but the truth carries no semantic ids")
-        index = np.where(np.isin(semantics, list(valid_classes)), index, -1)
     sizes = np.bincount(index[index >= 0], minlength=len(ids))
-    classes = np.full(len(ids), OBJECT, np.int64)
-    if by_class:
-        if semantics is None:
-            raise InputError("evaluation by class needs semantic ids in the truth; there are none")
-        classes = mode_by_group(index, semantics, len(ids))
-    kept = sizes > 0
-    renumber = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
-    return Truth(renumber[index], ids[kept], classes[kept], sizes[kept])
+    return Truth(index, ids, np.full(len(ids), OBJECT, np.int64), sizes)
 
 
 def compact(ids: np.ndarray, void_ids: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
@@ -85,23 +63,10 @@ def compact(ids: np.ndarray, void_ids: Sequence[int] = ()) -> tuple[np.ndarray, 
     return np.where(valid, np.cumsum(valid) - 1, -1)[index], values[valid]
 
 
-def mode_by_group(group: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """Most frequent value of each group 0..count−1 [count]; ties: the smallest value; group −1 is ignored."""
-    inside = group >= 0
-    distinct, index = np.unique(values[inside], return_inverse=True)
-    if len(distinct) == 0:
-        return np.zeros(count, np.int64)
-    table = np.zeros((count, len(distinct)), np.int64)
-    np.add.at(table, (group[inside], index), 1)
-    return distinct[table.argmax(axis=1)].astype(np.int64)
-
-
-def overlap_of_ids(
-    pred_ids: np.ndarray, pred_scores: dict[int, float] | None, truth: Truth, pred_classes: dict[int, int] | None = None
-) -> Overlap:
+def overlap_of_ids(pred_ids: np.ndarray, pred_scores: dict[int, float] | None, truth: Truth) -> Overlap:
     """Overlap of point labels pred_ids [N] int, negative = none. Predictions are ordered by ascending id.
 
-    pred_scores, pred_classes: by id. None means score 1 and class OBJECT for every prediction.
+    pred_scores: by id; None: 1 for every prediction.
     """
     index, ids = compact(pred_ids)
     g = len(truth.ids)
@@ -111,13 +76,12 @@ def overlap_of_ids(
     if missing:
         raise InputError(f"prediction: no score for instance {missing[0]} ({len(missing)} such); give one for each")
     scores = [1.0 if pred_scores is None else pred_scores[i] for i in ids.tolist()]
-    classes = [OBJECT if pred_classes is None else pred_classes[i] for i in ids.tolist()]
     confidence = np.asarray(scores, np.float64)
     if not np.isfinite(confidence).all():
         raise InputError(f"prediction: score of instance {ids[~np.isfinite(confidence)][0]} is not a finite number")
     return Overlap(
         pred_scores=confidence,
-        pred_classes=np.asarray(classes, np.int64),
+        pred_classes=np.full(len(ids), OBJECT, np.int64),
         pred_sizes=table.sum(axis=1),
         pred_void=table[:, -1],
         gt_classes=truth.classes,

@@ -20,10 +20,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import fft
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, map_coordinates
 
 from perception.errors import InputError
-from perception.export.align_steps import Place, gray_images, likely_rotations, photometric_step, plane_step
+from perception.export.align_steps import Images, Place, gray_images, jacobian, likely_rotations, robust_gain
 from perception.export.depth_views import DepthView, cell_means, fused_surface, grid_cells, observe
 from perception.export.neighbors import Neighbors, list_normals, neighbor_lists
 from perception.types import PointCloud
@@ -43,6 +43,10 @@ ELSEWHERE = 0.1
 """Root mean square distance in extents of the scan's points in one place to those in another place."""
 LEAST_AGREEMENT, LEAST_COVER, MOST_RIVAL, LEAST_STIFFNESS = 0.95, 0.05, 0.85, 1e-3
 LEAST_LIKENESS = 0.5
+FACING = 0.7
+"""Least cosine of the normals of points that are matched."""
+LEAST_GAIN = 0.2
+"""Views whose brightness goes less than this with the scan's are left out of a step."""
 
 
 @dataclass(frozen=True)
@@ -121,17 +125,34 @@ class Registration:
         self.rows = np.arange(0, len(self.scan), max(len(self.scan) // ROWS, 1))
 
     def candidates(self) -> list[Place]:
-        """Places by the correlation, best first."""
+        """Places by the correlation, best first: the best two shifts of each rotation and scale, by the sum of the grid
+        over the N cells that the scan occupies, over √N. The sum alone grows with the scale: of a cropped scan, right
+        places came after 200 larger ones."""
         step = self.extent / GRID
         low = self.points.min(axis=0) - 2 * step
         grid = self._evidence(low, step)
-        spectra: dict[tuple[int, ...], np.ndarray] = {}
+        spectra: dict[tuple[int, ...], np.ndarray] = {}  # of the grid, by padded shape
         rows = self.scan[:: max(len(self.scan) // FINE_ROWS, 1)]
         found: list[Place] = []
         for rotation in likely_rotations(self.scan_normals, self.normals):
             turned = rows @ rotation.T
             for scale in self.scales:
-                found += _correlated(grid, spectra, low, step, np.asfortranarray(turned * scale), scale * rotation)
+                points = np.asfortranarray(turned * scale)
+                first = points.min(axis=0)
+                cells = ((points - first) / step).astype(np.int64)
+                shape = tuple(4 * (-int(n) // -4) for n in np.array(grid.shape) + cells.max(axis=0) + 1)
+                if shape not in spectra:
+                    spectra[shape] = fft.rfftn(grid, shape)
+                held = np.zeros(shape, np.float32)
+                held[tuple(cells.T)] = 1
+                scores = fft.irfftn(spectra[shape] * np.conj(fft.rfftn(held)), shape) / np.sqrt(held.sum())
+                for _ in range(2):
+                    best = np.array(np.unravel_index(int(np.argmax(scores)), shape))
+                    value = float(scores[tuple(best)])
+                    around = [(best[axis] + np.arange(-2, 3)) % shape[axis] for axis in range(3)]
+                    scores[np.ix_(*around)] = -np.inf
+                    offset = np.where(best >= grid.shape, best - shape, best)  # shifts are circular
+                    found.append(Place(scale * rotation, low + offset * step - first, value))
         return sorted(found, key=lambda place: -place.score)
 
     def _evidence(self, low: np.ndarray, step: float) -> np.ndarray:
@@ -230,6 +251,11 @@ class Registration:
         return max(0.0, float((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-12)))
 
     def _icp(self, place: Place, rows: np.ndarray, widths: Sequence[float]) -> tuple[Place, float, np.ndarray]:
+        """The place after a step for each width, the weighted rms before the last, and its information matrix over Σ w.
+
+        Each step lowers Σ w r², r = n·(s R p + t − q), w = (1 − r²/width²)² for |r| < width, else 0 (Tukey), of the
+        points p and the map's points q nearest to them, with normals n.
+        """
         rms, information = np.inf, np.zeros((7, 7))
         for width in widths:
             index, _ = self.tree.query(place(self.scan[rows]), 1, 3 * width)
@@ -237,8 +263,19 @@ class Registration:
             if len(near) < 30:
                 break
             own, at = rows[near], index[near, 0]
-            pairs = (self.scan[own], self.scan_normals[own], self.points[at], self.normals[at])
-            place, rms, information = plane_step(place, *pairs, width, self.extent, self.similar)
+            moved, facing = place(self.scan[own]), self.normals[at]
+            r = np.einsum("ij,ij->i", facing, moved - self.points[at])
+            turned = np.einsum("nj,ij->ni", self.scan_normals[own], place.linear / place.scale)
+            alike = np.abs(np.einsum("ij,ij->i", facing, turned)) > FACING
+            w = np.maximum(1 - (r / width) ** 2, 0) ** 2 * alike
+            total = max(float(w.sum()), 1e-12)
+            middle = np.einsum("i,ij->j", w, moved) / total
+            J = jacobian(moved, facing, middle, self.extent, self.similar)
+            information = np.einsum("i,ij,ik->jk", w, J, J) / total
+            b = np.einsum("i,ij,i->j", w, J, r) / total
+            delta = -np.linalg.solve(information + 1e-6 * np.eye(len(information)), b)
+            place = place.stepped(delta, middle, self.extent)
+            rms = float(np.sqrt(np.einsum("i,i,i->", w, r, r) / total))
         return place, rms, information
 
     def _photometric(self, place: Place, rows: np.ndarray) -> Place:
@@ -249,12 +286,38 @@ class Registration:
         for blur in (8.0, 8.0, 4.0, 2.0, 1.0):
             images = gray_images(chosen, blur)
             for _ in range(5):
-                found = photometric_step(
-                    found, self.scan[rows], self.brightness[rows], images, self.tolerance, self.extent, self.similar
-                )
+                found = self._photometric_step(found, self.scan[rows], self.brightness[rows], images)
         # With the fewer points of `judged`, noise turned down refinements from 1.2 to 0.3 cm.
         before, after = (self._alike(p(self.scan[rows]), self.brightness[rows], self.views) for p in (place, found))
         return found if after > before and self.apart(found, place) < 2 * self.tolerance else place
+
+    def _photometric_step(self, place: Place, points: np.ndarray, brightness: np.ndarray, images: Images) -> Place:
+        """A step that lowers Σ w (a_v I_v(π_v(s R p + t)) + b_v − g_p)² over views v and the points p on their depth.
+
+        points [P, 3] with brightness g [P]; I_v: rendered brightness; a_v, b_v: gain and offset of each view; w:
+        Tukey's weights by the spread of the view's residuals.
+        """
+        moved = place(points)
+        middle, size = moved.mean(axis=0), 7 if self.similar else 6
+        A, b = np.zeros((size, size)), np.zeros(size)
+        for view, *layers in images:
+            rows, u, v, own = view.seen(moved, self.tolerance)
+            if len(rows) < 50:
+                continue
+            I, Iu, Iv = (map_coordinates(layer, [v - 0.5, u - 0.5], order=1, mode="nearest") for layer in layers)
+            gain, r, w = robust_gain(I.astype(np.float64), brightness[rows])
+            if gain < LEAST_GAIN:
+                continue
+            x, y, z = own.T
+            fx, fy = view.K[0, 0], view.K[1, 1]
+            slopes = np.stack([Iu * fx / z, Iv * fy / z, -(Iu * fx * x + Iv * fy * y) / z**2], axis=1)
+            slopes = gain * np.einsum("nj,ji->ni", slopes, view.camera_from_world[:3, :3])
+            J = jacobian(moved[rows], slopes, middle, self.extent, self.similar)
+            A += np.einsum("i,ij,ik->jk", w, J, J)
+            b += np.einsum("i,ij,i->j", w, J, r)
+        if not np.trace(A) > 0:
+            return place
+        return place.stepped(-np.linalg.solve(A + 1e-6 * np.trace(A) * np.eye(size), b), middle, self.extent)
 
 
 def _extent(points: np.ndarray) -> float:
@@ -269,36 +332,3 @@ def _thinned(points: np.ndarray, colors: np.ndarray | None, width: float) -> tup
     if colors is None or colors.min() == colors.max():
         return mean, None
     return mean, np.bincount(cell, colors.mean(axis=1) / 255) / count
-
-
-def _correlated(
-    grid: np.ndarray,
-    spectra: dict[tuple[int, ...], np.ndarray],
-    low: np.ndarray,
-    step: float,
-    points: np.ndarray,
-    linear: np.ndarray,
-) -> list[Place]:
-    """The best two shifts of points [S, 3] in the grid, by the sum over the N cells that they occupy, over √N.
-
-    The sum alone grows with the scale: of a cropped scan, right places came after 200 larger ones.
-
-    spectra: transforms of the grid by padded shape, kept between calls.
-    """
-    first = points.min(axis=0)
-    cells = ((points - first) / step).astype(np.int64)
-    shape = tuple(4 * (-int(n) // -4) for n in np.array(grid.shape) + cells.max(axis=0) + 1)
-    if shape not in spectra:
-        spectra[shape] = fft.rfftn(grid, shape)
-    held = np.zeros(shape, np.float32)
-    held[tuple(cells.T)] = 1
-    scores = fft.irfftn(spectra[shape] * np.conj(fft.rfftn(held)), shape) / np.sqrt(held.sum())
-    found = []
-    for _ in range(2):
-        best = np.array(np.unravel_index(int(np.argmax(scores)), shape))
-        value = float(scores[tuple(best)])
-        around = [(best[axis] + np.arange(-2, 3)) % shape[axis] for axis in range(3)]
-        scores[np.ix_(*around)] = -np.inf
-        offset = np.where(best >= grid.shape, best - shape, best)  # shifts are circular
-        found.append(Place(linear, low + offset * step - first, value))
-    return found

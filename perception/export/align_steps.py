@@ -1,4 +1,4 @@
-"""Steps of an alignment: likely rotations (extended Gaussian images), and Gauss-Newton on planes and on brightness."""
+"""Parts of an alignment: likely rotations (extended Gaussian images), and the steps of Gauss-Newton on a place."""
 
 from __future__ import annotations
 
@@ -7,16 +7,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from perception.export.depth_views import DepthView
 from perception.geometry import nearest_rotation
 
-FACING = 0.7
-"""Least cosine of the normals of points that are matched."""
-LEAST_GAIN = 0.2
-"""Views whose brightness goes less than this with the scan's are left out of a step."""
 COUNT, KEPT, APART = 12_000, 64, 12.0
 """Rotations tried, which leave none farther than about 8° away; kept, at least APART degrees from one another."""
 SHARPNESS = 25.0
@@ -47,39 +42,11 @@ class Place:
         return Place(grow * self.scale * rotation, grow * turn @ (self.shift - middle) + middle + delta[3:6])
 
 
-def _jacobian(points: np.ndarray, slopes: np.ndarray, middle: np.ndarray, extent: float, similar: bool) -> np.ndarray:
+def jacobian(points: np.ndarray, slopes: np.ndarray, middle: np.ndarray, extent: float, similar: bool) -> np.ndarray:
     """[P, 6 or 7] derivative of f by `Place.stepped`, given its slopes [P, 3] at points [P, 3]."""
     arm = (points - middle) / extent
     parts = [np.cross(arm, slopes), slopes]
     return np.concatenate([*parts, np.einsum("ij,ij->i", arm, slopes)[:, None]] if similar else parts, axis=1)
-
-
-def plane_step(
-    place: Place,
-    points: np.ndarray,
-    normals: np.ndarray,
-    targets: np.ndarray,
-    target_normals: np.ndarray,
-    width: float,
-    extent: float,
-    similar: bool,
-) -> tuple[Place, float, np.ndarray]:
-    """A step that lowers Σ w r², r = n·(s R p + t − q), w = (1 − r²/width²)² for |r| < width, else 0 (Tukey).
-
-    Points p and targets q [P, 3], with normals, are matched by row. Returns the new place, the weighted rms before the
-    step, and the information matrix divided by Σ w.
-    """
-    moved = place(points)
-    r = np.einsum("ij,ij->i", target_normals, moved - targets)
-    facing = np.abs(np.einsum("ij,ij->i", target_normals, np.einsum("nj,ij->ni", normals, place.linear / place.scale)))
-    w = np.maximum(1 - (r / width) ** 2, 0) ** 2 * (facing > FACING)
-    total = max(float(w.sum()), 1e-12)
-    middle = np.einsum("i,ij->j", w, moved) / total
-    J = _jacobian(moved, target_normals, middle, extent, similar)
-    A = np.einsum("i,ij,ik->jk", w, J, J) / total
-    b = np.einsum("i,ij,i->j", w, J, r) / total
-    delta = -np.linalg.solve(A + 1e-6 * np.eye(len(A)), b)
-    return place.stepped(delta, middle, extent), float(np.sqrt(np.einsum("i,i,i->", w, r, r) / total)), A
 
 
 Images = list[tuple[DepthView, np.ndarray, np.ndarray, np.ndarray]]
@@ -95,44 +62,7 @@ def gray_images(views: Sequence[DepthView], blur: float) -> Images:
     return found
 
 
-def photometric_step(
-    place: Place,
-    points: np.ndarray,
-    brightness: np.ndarray,
-    images: Images,
-    tolerance: float,
-    extent: float,
-    similar: bool,
-) -> Place:
-    """A step that lowers Σ w (a_v I_v(π_v(s R p + t)) + b_v − g_p)² over views v and the points p on their depth.
-
-    points [P, 3] with brightness g [P]; I_v: rendered brightness; a_v, b_v: gain and offset of each view; w: Tukey's
-    weights by the spread of the view's residuals.
-    """
-    moved = place(points)
-    middle, size = moved.mean(axis=0), 7 if similar else 6
-    A, b = np.zeros((size, size)), np.zeros(size)
-    for view, *layers in images:
-        rows, u, v, own = view.seen(moved, tolerance)
-        if len(rows) < 50:
-            continue
-        I, Iu, Iv = (map_coordinates(layer, [v - 0.5, u - 0.5], order=1, mode="nearest") for layer in layers)
-        gain, r, w = _robust_gain(I.astype(np.float64), brightness[rows])
-        if gain < LEAST_GAIN:
-            continue
-        x, y, z = own.T
-        fx, fy = view.K[0, 0], view.K[1, 1]
-        slopes = np.stack([Iu * fx / z, Iv * fy / z, -(Iu * fx * x + Iv * fy * y) / z**2], axis=1)
-        slopes = gain * np.einsum("nj,ji->ni", slopes, view.camera_from_world[:3, :3])
-        J = _jacobian(moved[rows], slopes, middle, extent, similar)
-        A += np.einsum("i,ij,ik->jk", w, J, J)
-        b += np.einsum("i,ij,i->j", w, J, r)
-    if not np.trace(A) > 0:
-        return place
-    return place.stepped(-np.linalg.solve(A + 1e-6 * np.trace(A) * np.eye(size), b), middle, extent)
-
-
-def _robust_gain(I: np.ndarray, g: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+def robust_gain(I: np.ndarray, g: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Gain a, residuals a I + b − g [P] and weights [P] of the line through (I, g), three rounds of reweighting."""
     gain, r, w = 0.0, I, np.ones(len(I))
     for _ in range(3):

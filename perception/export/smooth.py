@@ -106,15 +106,15 @@ def felzenszwalb(
     return labels
 
 
-def segment_cloud(cloud: PointCloud, color_weight: float | None = None, scannet: bool = False) -> np.ndarray:
+def segment_cloud(cloud: PointCloud, scannet: bool = False) -> np.ndarray:
     """Superpoints [P] int32 of a cloud or mesh. Points that are not finite become segments of their own.
 
     scannet: those of ScanNet's segmentator, for meshes alone; it leaves open how equal weights are ordered, here by
     vertex. By default its short normals are scaled to length 1 except at a CREASE, which keeps curved things whole:
     exported to meshes of tabletop_a with cells of 1 and 2 cm, AP is .509 and .589, with ScanNet's rule .493 and .548.
 
-    The graph is the mesh's edges, or the NEIGHBORS nearest neighbours where there are no faces. color_weight: added to
-    an edge's weight per unit of RGB distance in [0, √3] beyond 0.3; None: 0 on meshes, as ScanNet, else COLOR_WEIGHT.
+    The graph is the mesh's edges, or the NEIGHBORS nearest neighbours where there are no faces. There, COLOR_WEIGHT is
+    added to an edge's weight per unit of RGB distance in [0, √3] beyond 0.3; not on meshes, as ScanNet.
     """
     points, meshed = cloud.points, cloud.faces is not None and len(cloud.faces) > 0
     if scannet and not meshed:
@@ -134,24 +134,16 @@ def segment_cloud(cloud: PointCloud, color_weight: float | None = None, scannet:
     weights = scannet_weights(points, normals, edges, oriented=meshed or cloud.normals is not None)
     if not meshed and cloud.normals is not None:  # meshes have no edges across gaps; estimated normals show steps
         weights += _STEP_WEIGHT * step_weights(points, normals, edges)
-    if color_weight is None:
-        color_weight = 0.0 if meshed else COLOR_WEIGHT
-    if color_weight and cloud.colors is not None:
-        near = neighbor_lists(points, _COLOR_NEIGHBORS) if lists is None else lists[:, :_COLOR_NEIGHBORS]
-        colors = _median_colors(cloud.colors, near)
+    if lists is not None and cloud.colors is not None:
+        near = lists[:, :_COLOR_NEIGHBORS]  # a missing neighbour (−1) is the point itself
+        near = cloud.colors[np.where(near >= 0, near, np.arange(len(points), dtype=near.dtype)[:, None])]
+        middle = near.shape[1] // 2  # of the values of each channel
+        colors = np.partition(near, middle, axis=1)[:, middle].astype(np.float32)
         difference = colors[edges[:, 0]] - colors[edges[:, 1]]
         distance = np.sqrt(np.einsum("ei,ei->e", difference, difference)) / np.float32(255)
-        weights += color_weight * np.maximum(distance - _COLOR_EDGE, 0)
+        weights += COLOR_WEIGHT * np.maximum(distance - _COLOR_EDGE, 0)
     weights = np.nan_to_num(weights, nan=2.0).astype(np.float32)
     return felzenszwalb(edges, weights, len(points))
-
-
-def _median_colors(colors: np.ndarray, lists: np.ndarray) -> np.ndarray:
-    """Colours [P, 3] float32, each the median, channel by channel, of colors [P, 3] uint8 over its neighbour list
-    [P, k]; a missing neighbour (−1) is the point itself."""
-    own = np.arange(len(colors), dtype=lists.dtype)[:, None]
-    near = colors[np.where(lists >= 0, lists, own)]
-    return np.partition(near, lists.shape[1] // 2, axis=1)[:, lists.shape[1] // 2].astype(np.float32)
 
 
 def vote(labels: np.ndarray, segments: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from perception.export.spz import check_finite
 from perception.instances.segments import nearest_centres
@@ -67,14 +68,17 @@ def sog_bytes(gmap: Map, order: np.ndarray) -> bytes:
     if bands and count:
         centroids, labels = palette(gmap.sh[order, 1:].reshape(count, -1))
         rest_codes, rest = codebook(centroids)
-        images["shN_centroids"] = _palette_image(rest.reshape(len(centroids), -1, 3))
+        full = np.pad(rest, ((0, -len(rest) % WIDE), (0, 0)))
+        images["shN_centroids"] = full.reshape(-1, WIDE * rest.shape[1] // 3, 3)
         images["shN_labels"] = _image(labels.astype("<u2")[:, None].view(np.uint8))
         named = ["shN_centroids.webp", "shN_labels.webp"]
         meta["shN"] = {"count": len(centroids), "bands": bands, "codebook": rest_codes, "files": named}
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
         for name, pixels in images.items():
-            archive.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(pixels))
+            file = io.BytesIO()
+            Image.fromarray(pixels).save(file, "WEBP", lossless=True, exact=True, quality=100, method=4)
+            archive.writestr(zipfile.ZipInfo(f"{name}.webp"), file.getvalue())
         archive.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
     return packed.getvalue()
 
@@ -140,19 +144,3 @@ def _image(values: np.ndarray) -> np.ndarray:
     image = np.zeros((height * width, 4 if channels == 4 else 3), np.uint8)
     image[:count, :channels] = values
     return image.reshape(height, width, -1)
-
-
-def _palette_image(codes: np.ndarray) -> np.ndarray:
-    """[K, C, 3] bytes as an image of WIDE centroids a row, each of C pixels."""
-    count, coefficients, _ = codes.shape
-    image = np.zeros((-(-count // WIDE) * WIDE, coefficients, 3), np.uint8)
-    image[:count] = codes
-    return image.reshape(-1, WIDE * coefficients, 3)
-
-
-def _webp(pixels: np.ndarray) -> bytes:
-    from PIL import Image
-
-    found = io.BytesIO()
-    Image.fromarray(pixels).save(found, "WEBP", lossless=True, exact=True, quality=100, method=4)
-    return found.getvalue()

@@ -26,13 +26,11 @@ SCANNET = Path("scannet")
 class ExportOptions:
     """How labels are transferred; the defaults are the paper's.
 
-    drop_noise: Gaussians without an instance are ignored, so every point gets a label (as in the released code).
     max_distance: in map units, beyond which points stay unlabelled; None = no limit.
     smooth: superpoint vote, on or off. segments: a ScanNet *.segs.json to use instead of our own segmentation, or
     SCANNET for the one that ScanNet's segmentator makes of a mesh.
     """
 
-    drop_noise: bool = True
     max_distance: float | None = None
     smooth: bool = True
     segments: Path | None = None
@@ -42,12 +40,12 @@ def export_labels(
     means: np.ndarray, instance_ids: np.ndarray, cloud: PointCloud, options: ExportOptions | None = None
 ) -> np.ndarray:
     """Instance of each point [P] int32, −1 = none: that of the nearest mean (OpenSplat3D, point cloud transfer).
-    means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise)."""
+    means [N, 3] in the cloud's frame, instance_ids [N] int32 (−1 = noise, ignored as in the released code)."""
     options = options or ExportOptions()
     limit = options.max_distance
     if limit is not None and not limit >= 0:
         raise InputError(f"max_distance is {limit}; expected a length that is not negative")
-    used = np.isfinite(means).all(axis=1) & ((instance_ids >= 0) | (not options.drop_noise))
+    used = np.isfinite(means).all(axis=1) & (instance_ids >= 0)
     nearest = nearest_gaussian(cloud.points, means[used], max_distance=limit)
     labels = np.append(instance_ids[used], -1).astype(np.int32)[nearest]
     if not options.smooth or not (labels >= 0).any():
@@ -101,25 +99,18 @@ def write_export(
     """Writes the cloud with `instance_id` and its sidecar JSON (same stem); returns the sidecar.
 
     labels [P] int32, −1 = none; points and order are the cloud's own. instances: {id: {"score", "label"}} of the map.
+    Entries have "score", "label", "num_points"; those of parts also their `parent`, of groups the `instances` in them.
     facts: further keys of the sidecar.
     """
-    path = Path(path)
-    sidecar = {**(facts or {}), **sidecar_of(labels, instances)}
+    path, rows = Path(path), {}
+    ids, counts = np.unique(labels[labels >= 0], return_counts=True)
+    for i, n in zip(ids.tolist(), counts.tolist(), strict=True):
+        known = instances.get(i, {})
+        row = {"score": float(known.get("score", 1.0)), "label": known.get("label"), "num_points": n}
+        rows[str(i)] = row | {key: known[key] for key in ("parent", "instances") if key in known}
+    sidecar = {**(facts or {}), "instances": rows}
     with replacing(path.with_suffix(".json")) as file:
         file.write(json.dumps(sidecar, indent=1).encode())
     labelled = {"instance_id": labels.astype(np.int32)}
     write_cloud(path, PointCloud(cloud.points, cloud.colors, cloud.normals, cloud.faces, labelled))
     return sidecar
-
-
-def sidecar_of(labels: np.ndarray, instances: Instances) -> dict[str, Any]:
-    """{"instances": {"<id>": {"score", "label", "num_points"}}} of the instances that labels [P] name; parts also have
-    their `parent`, groups the `instances` in them."""
-    ids, counts = np.unique(labels[labels >= 0], return_counts=True)
-    rows = {}
-    for i, n in zip(ids.tolist(), counts.tolist(), strict=True):
-        known = instances.get(i, {})
-        score = float(known.get("score", 1.0))
-        more = {key: known[key] for key in ("parent", "instances") if key in known}
-        rows[str(i)] = {"score": score, "label": known.get("label"), "num_points": n, **more}
-    return {"instances": rows}

@@ -34,10 +34,10 @@ class Surface:
     map_from_level: np.ndarray
     path: Path | None
 
-    def grid(self, resolution: float, step: float = STEP, height: float = HEIGHT) -> tuple[np.ndarray, np.ndarray]:
+    def grid(self, resolution: float, step: float = STEP) -> tuple[np.ndarray, np.ndarray]:
         """`floor_grid` of these points."""
         points = self.points
-        points = points[(np.abs(points[:, 2]) <= step) | ((points[:, 2] > 0) & (points[:, 2] <= height))]
+        points = points[(np.abs(points[:, 2]) <= step) | ((points[:, 2] > 0) & (points[:, 2] <= HEIGHT))]
         cells, stands = np.floor(points[:, :2] / resolution).astype(np.int64), points[:, 2] > step
         if stands.all():
             raise InputError(f"{self.path}: has no floor below its cameras")
@@ -73,16 +73,14 @@ def level_surface(gmap: Map) -> Surface:
     return Surface(points, rows, np.r_[np.c_[axes, axes @ [0, 0, floor]], [[0, 0, 0, 1]]], gmap.path)
 
 
-def floor_grid(
-    gmap: Map, resolution: float, step: float = STEP, height: float = HEIGHT
-) -> tuple[np.ndarray, np.ndarray]:
+def floor_grid(gmap: Map, resolution: float, step: float = STEP) -> tuple[np.ndarray, np.ndarray]:
     """cells [H, W] int8, row y, column x, of `resolution` metres; map_from_grid [4, 4], rigid: its origin is the outer
     corner of cell (0, 0) on the floor, z is up, x as near to the map's x as a level axis can be.
 
-    Occupied: cells with something between `step` and `height` metres above the floor; else free: with something
+    Occupied: cells with something between `step` and 1.8 metres above the floor; else free: with something
     within `step` of it; else unknown. What lies deeper is not drawn: a stair down is unknown.
 
     "Something" is a point of `level_surface`; discs with a radius above two cells leave gaps. InputError for a map
     without metric scale, gravity, cameras or floor, or of more than 16 million cells.
     """
-    return level_surface(gmap).grid(resolution, step, height)
+    return level_surface(gmap).grid(resolution, step)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy import sparse
 
-Box = tuple[int, int, int, int]
+from perception.language.description import Box
 
 EXPANSION = 0.3  # margin added per level, relative to the box's sides (OpenMask3D)
 FILL = 127  # grey value of the padding: mid-range, near zero after any encoder's normalisation

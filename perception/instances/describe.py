@@ -14,7 +14,7 @@ from perception.instances.crops import crop_levels, mask_box
 from perception.language.base import Encoder, unit_rows
 from perception.language.colors import palette
 from perception.language.description import InstanceDescription, unseen
-from perception.progress import Progress
+from perception.progress import QUIET, Progress
 
 COLOR_SAMPLES = 2000  # pixels of a mask per view, from which the palette is computed
 AT_ONCE = 24  # crops from which they are encoded together, so that no thread waits at the end of each photo
@@ -27,7 +27,7 @@ def describe_instances(
     load: Load,
     view_names: Sequence[str],
     levels: int = 3,
-    progress: Progress | None = None,
+    progress: Progress = QUIET,
 ) -> list[InstanceDescription]:
     """Descriptions of the I instances whose views `choices` lists (see `crops.choose_views`).
 
@@ -54,8 +54,7 @@ def describe_instances(
             for instance, rank, (name, box, rows, colors) in waiting:
                 seen[instance][rank] = (name, box, embedded[rows], colors)
             crops, waiting = [], []
-        if progress:
-            progress.update("language", done, len(wanted))
+        progress.update("language", done, len(wanted))
     return [_summary(found, encoder.dim) for found in seen]
 
 

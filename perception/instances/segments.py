@@ -50,17 +50,14 @@ def nearest_centres(rows: np.ndarray, centres: np.ndarray) -> np.ndarray:
     return owner
 
 
-def touching(
-    means: np.ndarray, groups: np.ndarray, count: int, neighbours: int = 7, least: int = 3
-) -> sparse.csr_matrix:
-    """[S, S] bool, sparse: whether at least `least` pairs of nearby Gaussians connect the two groups.
+def touching(means: np.ndarray, groups: np.ndarray, count: int) -> sparse.csr_matrix:
+    """[S, S] bool, sparse: whether at least three pairs of nearby Gaussians connect the two groups.
 
-    Nearby: among the `neighbours` nearest, and within 3 × max(nearest-neighbour distance of the Gaussian, its median
-    over all Gaussians).
+    Nearby: among the 7 nearest, and within 3 × max(nearest-neighbour distance of the Gaussian, its median over all).
     """
     from scipy.spatial import cKDTree
 
-    k = min(neighbours + 1, len(means))
+    k = min(8, len(means))
     if k < 2:
         return sparse.csr_matrix((count, count), dtype=bool)
     distance, neighbour = cKDTree(means).query(means, k=k, workers=-1)
@@ -68,4 +65,4 @@ def touching(
     row, column = np.nonzero(distance[:, 1:] <= reach)
     a, b = groups[row], groups[neighbour[row, column + 1]]
     pairs = sparse.csr_matrix((np.ones((a != b).sum(), np.int64), (a[a != b], b[a != b])), shape=(count, count))
-    return (pairs + pairs.T >= least).tocsr()
+    return (pairs + pairs.T >= 3).tocsr()

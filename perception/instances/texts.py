@@ -16,7 +16,7 @@ import numpy as np
 
 from perception.language.ocr import TextReader
 from perception.language.printed import edit_distance
-from perception.progress import Progress
+from perception.progress import QUIET, Progress
 
 MOST_VIEWS = 120  # most photos read for a map, those that are best for an instance first: bounds the time
 MOST_TEXTS = 20  # kept per instance, best supported first
@@ -34,7 +34,7 @@ def read_texts(
     reader: TextReader,
     choices: Sequence[np.ndarray],
     load: Callable[[int], tuple[np.ndarray, np.ndarray]],
-    progress: Progress | None = None,
+    progress: Progress = QUIET,
 ) -> list[list[dict[str, Any]]]:
     """Texts of the I instances, best supported first: entries {"text": str, "score": in [0, 1]}.
 
@@ -52,8 +52,7 @@ def read_texts(
             owner = owner_of(line.corners, ids)
             if owner is not None and line.score >= LEAST and sum(c.isalnum() for c in line.text) > 1:
                 reads[owner].append((view, line.text, line.score))
-        if progress:
-            progress.update("texts", done, len(wanted))
+        progress.update("texts", done, len(wanted))
     return [fuse(found) for found in reads]
 
 

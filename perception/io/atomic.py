@@ -54,19 +54,29 @@ def atomic_directory(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _aside(path: Path, make: Callable[[Path], Any], put: Callable[[Path, Path], Any]) -> Iterator[Path]:
-    """Yields a locked temporary sibling of `path`. make: creates it. put: renames it to `path` once it is synced."""
+    """Yields a locked temporary sibling of `path`. make: creates it. put: renames it to `path` once it is synced.
+    An InputError that names the sibling names `path` instead."""
     temporary = _sibling(path, "new")
     try:
-        with contextlib.ExitStack() as held, _disk_errors(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            recover(path)
-            held.enter_context(_locked(temporary, lambda: make(temporary)))
-            with _errors_naming(path, temporary):
-                yield temporary
+        path.parent.mkdir(parents=True, exist_ok=True)
+        recover(path)
+        with _locked(temporary, lambda: make(temporary)):
+            yield temporary
             for file in (*temporary.rglob("*"), temporary):
                 _sync(file)
             put(temporary, path)
             _sync(path.parent)
+    except InputError as error:
+        if str(temporary) not in str(error):
+            raise
+        raise InputError(str(error).replace(str(temporary), str(path))) from error
+    except OSError as error:
+        short = error.errno is None and str(error).endswith(" written")  # numpy's only sign of a full disk
+        if error.errno in _FULL or short:
+            raise InputError(f"{path}: the disk is full, nothing was written; free some space") from error
+        if error.errno in _REFUSED:
+            raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+        raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         with contextlib.suppress(OSError):  # it was a folder, took its place, or was never created
@@ -183,30 +193,6 @@ def _sync(path: Path) -> None:
             raise
     finally:
         os.close(descriptor)
-
-
-@contextmanager
-def _errors_naming(path: Path, temporary: Path) -> Iterator[None]:
-    """Replaces the temporary folder by `path` in InputError messages."""
-    try:
-        yield
-    except InputError as error:
-        if str(temporary) not in str(error):
-            raise
-        raise InputError(str(error).replace(str(temporary), str(path))) from error
-
-
-@contextmanager
-def _disk_errors(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        short = error.errno is None and str(error).endswith(" written")  # numpy's only sign of a full disk
-        if error.errno in _FULL or short:
-            raise InputError(f"{path}: the disk is full, nothing was written; free some space") from error
-        if error.errno in _REFUSED:
-            raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
-        raise
 
 
 def lock(descriptor: int) -> bool:

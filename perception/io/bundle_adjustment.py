@@ -82,7 +82,12 @@ def adjust(tracks: Tracks, given: Poses, poses: Poses, prior: tuple[float, float
     """
     points = starting_points(tracks, poses)
     for _ in range(ROUNDS):
-        problem = _Problem(tracks, given, prior, *_noise(tracks, poses, points))
+        error, depth, _ = residuals(tracks, poses, points)
+        known = np.abs(depth[tracks.depth > 0])
+        # Standard errors from the medians of normal residuals in 2D (1.18 σ) and 1D (0.67 σ).
+        sigma = max(float(np.median(np.hypot(*error.T))) / 1.1774, LEAST_PIXELS)
+        depth_sigma = max(float(np.median(known)) / 0.6745 if len(known) else 0.0, LEAST_DEPTH)
+        problem = _Problem(tracks, given, prior, sigma, depth_sigma)
         poses, points = _round(problem, poses, points)
     return poses, points
 
@@ -96,14 +101,6 @@ class _Problem:
     prior: tuple[float, float]
     sigma: float
     depth_sigma: float
-
-
-def _noise(tracks: Tracks, poses: Poses, points: np.ndarray) -> tuple[float, float]:
-    """Standard errors of features and of depth, from the medians of normal residuals in 2D (1.18 σ) and 1D (0.67 σ)."""
-    error, depth, _ = residuals(tracks, poses, points)
-    known = np.abs(depth[tracks.depth > 0])
-    pixels = float(np.median(np.hypot(*error.T))) / 1.1774
-    return max(pixels, LEAST_PIXELS), max(float(np.median(known)) / 0.6745 if len(known) else 0.0, LEAST_DEPTH)
 
 
 def _round(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[Poses, np.ndarray]:

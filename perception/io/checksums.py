@@ -22,18 +22,13 @@ def damaged(file: Path, what: str) -> InputError:
     return InputError(f"{file}: {what}; the map is damaged, build it again or copy it anew")
 
 
-def file_facts(folder: Path) -> dict[str, dict[str, Any]]:
-    """{name: {"bytes", "sha256"}} of every file in `folder` except the report and map.json, which holds this table."""
-    return {file.name: facts_of(file) for file in _files(folder)}
-
-
 def facts_of(file: Path) -> dict[str, Any]:
     """{"bytes", "sha256"} of one file."""
     return {"bytes": file.stat().st_size, "sha256": sha256(file)}
 
 
-def _files(folder: Path) -> list[Path]:
-    """The map's files except map.json and the report; hidden files, such as temporary ones, are skipped."""
+def listed_files(folder: Path) -> list[Path]:
+    """The files that map.json lists: all but itself, the report, and hidden ones, such as temporary files."""
     files = (file for file in folder.iterdir() if file.is_file() and file.name not in (FACTS, REPORT))
     return sorted(file for file in files if not file.name.startswith("."))
 
@@ -84,7 +79,7 @@ def verify(folder: Path, info: dict[str, Any]) -> dict[str, str]:
     if "sha256" in info and seal(info)["sha256"] != info["sha256"]:
         raise InputError(f"{folder / FACTS}: its own checksum differs; it was edited or is damaged")
     states = {FACTS: "ok" if "sha256" in info else "no checksum"}
-    for file in _files(folder):
+    for file in listed_files(folder):
         if file.name not in known:
             states[file.name] = "no checksum"
         elif file.name == EDITABLE:

@@ -18,7 +18,7 @@ from perception.io.ignore_masks import stage_masks
 from perception.io.lens import load_pycolmap
 from perception.io.staging import stage_photos
 from perception.io.tasks import has_task, read_facts, write_task
-from perception.progress import Progress
+from perception.progress import QUIET, Progress
 
 PHOTOS_A_TASK, PAIRS_A_TASK = 64, 2000
 """About half a minute on two cores each."""
@@ -82,13 +82,11 @@ class FeatureTasks:
                 raise InputError(f"{home}: has no {RESULT} after its task; workers must share the output's folder")
 
 
-def extract_task(folder: str, progress: Progress | None = None) -> None:
-    """Extracts the features of the photos whose task lies in `folder`."""
-    home = Path(folder)
-    facts = read_facts(home)
+def extract_task(folder: str, progress: Progress = QUIET) -> None:
+    """Extracts the features of the photos whose task lies in `folder`, unless it is done."""
+    home, facts = Path(folder), read_facts(Path(folder))
     if (home / RESULT).is_dir():
         return
-    progress = progress or Progress(quiet=True)
     photos, masks = [Path(photo) for photo in facts["photos"]], facts["masks"]
     with atomic_directory(home / RESULT) as new:
         names = stage_photos(new / "photos", photos, progress)
@@ -98,17 +96,16 @@ def extract_task(folder: str, progress: Progress | None = None) -> None:
         extract(new / DATABASE, new / "photos", groups, progress)
 
 
-def match_task(folder: str, progress: Progress | None = None) -> None:
-    """Matches the pairs whose task and database lie in `folder`."""
-    home = Path(folder)
-    facts = read_facts(home)
+def match_task(folder: str, progress: Progress = QUIET) -> None:
+    """Matches the pairs whose task and database lie in `folder`, unless it is done."""
+    home, facts = Path(folder), read_facts(Path(folder))
     if (home / RESULT).is_dir():
         return
     with atomic_directory(home / RESULT) as new:
         with closing(sqlite3.connect(home / DATABASE)) as given, closing(sqlite3.connect(new / DATABASE)) as copy:
             given.backup(copy)
         chosen = [(one, other) for one, other in facts["pairs"]]
-        match(new / DATABASE, chosen, facts["seed"], progress or Progress(quiet=True))
+        match(new / DATABASE, chosen, facts["seed"], progress)
 
 
 def _ids_by_name(database: sqlite3.Connection) -> list[int]:

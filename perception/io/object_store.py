@@ -46,7 +46,8 @@ def fetch(url: str, folder: Path, progress: Progress) -> Path:
         files = {_below(name, root): about for name, about in listed.items()}
         if not files:
             raise InputError(f"{url}: nothing lies there; give the URL of photos or of a transforms.json")
-        marks = {name: _mark(about) for name, about in files.items()}
+        told = {name: json.dumps(about, sort_keys=True, default=str) for name, about in files.items()}
+        marks = {name: hashlib.sha256(about.encode()).hexdigest()[:16] for name, about in told.items()}
         folder.mkdir(parents=True, exist_ok=True)
         kept = _kept(folder)
         missing = [name for name in sorted(files) if kept.get(name) != marks[name] or not (folder / name).is_file()]
@@ -108,11 +109,6 @@ def _below(name: str, root: str) -> str:
     if ".." in path.parts or not path.parts:
         raise InputError(f"{name}: is no name of a file below {root}")
     return path.as_posix()
-
-
-def _mark(about: dict[str, Any]) -> str:
-    """Digest of all that a store tells of a file: size, times, checksum. It changes with the file."""
-    return hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
 def _kept(folder: Path) -> dict[str, str]:

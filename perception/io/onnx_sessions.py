@@ -38,10 +38,12 @@ def model_graphs(folder: Path) -> tuple[list[Path], list[Path]]:
     """The ONNX files of a model folder and its subfolders (`onnx/`, `visual/`), and those left out.
 
     Of files that differ only in precision (`model.onnx`, `model_fp16.onnx`, `model_quantized.onnx`) the most precise
-    one is the model's.
+    one is the model's. InputError where there is none.
     """
     root, best = model_root(folder), dict[tuple[Path, str], Path]()
     found = sorted([*root.glob("*.onnx"), *root.glob("*/*.onnx")], key=lambda path: _PRECISIONS.index(_precision(path)))
+    if not found:
+        raise InputError(f"{folder}: no .onnx file in this folder; expected ONNX models")
     for path in found:
         best.setdefault((path.parent, graph_name(path)), path)
     return sorted(best.values()), [path for path in found if path not in best.values()]

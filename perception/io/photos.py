@@ -196,9 +196,13 @@ _HEADER = 1 << 16
 
 
 def open_photo(path: Path) -> Image.Image:
-    """The photo opened by Pillow, not decoded. Raises InputError if it is missing or not readable by Pillow."""
+    """The photo opened by Pillow, not decoded. InputError if it is missing or Pillow cannot read it."""
     if path.suffix.lower() in HEIF_SUFFIXES:
-        register_heif()
+        try:
+            import pillow_heif
+        except ImportError as error:
+            raise missing_extra("pillow-heif", "heic") from error
+        pillow_heif.register_heif_opener(thumbnails=False)
     try:
         if not S_ISREG(path.stat().st_mode):
             raise ValueError("no file")  # to open a FIFO would mean to wait for its writer
@@ -214,15 +218,6 @@ def open_photo(path: Path) -> Image.Image:
         raise InputError(f"{path}: no such photo") from error
     except (UnidentifiedImageError, *DECODE_ERRORS) as error:
         raise InputError(f"{path}: not a readable image; replace or remove it") from error
-
-
-def register_heif() -> None:
-    """Enables HEIC in Pillow. Raises InputError with the install command if pillow-heif is missing."""
-    try:
-        import pillow_heif
-    except ImportError as error:
-        raise missing_extra("pillow-heif", "heic") from error
-    pillow_heif.register_heif_opener(thumbnails=False)
 
 
 def decode(image: Image.Image, path: Path) -> None:

@@ -14,7 +14,7 @@ from perception.io.cloud import read_cloud
 from perception.io.engine import Engine
 from perception.io.lens import is_pinhole, pinhole_from_lens, rescale_lens
 from perception.io.photos import photo_size, reduced_size, stored_size
-from perception.progress import Progress
+from perception.progress import QUIET, Progress
 from perception.types import Lens, Scene, View
 
 Cloud = tuple[np.ndarray, np.ndarray]
@@ -41,7 +41,7 @@ class Reading:
 
     workdir: Path
     seed: int = 0
-    progress: Progress = field(default_factory=lambda: Progress(quiet=True))
+    progress: Progress = QUIET
     strict: bool = False
     masks: Path | None = None
     camera: Path | None = None

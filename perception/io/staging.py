@@ -32,30 +32,22 @@ def stage_photos(folder: Path, photos: list[Path], progress: Progress) -> list[s
     folder.mkdir()
     names, converted = [], []
     for index, photo in enumerate(photos):
-        suffix = _plain_suffix(photo)
+        with open_photo(photo) as image:
+            plain = exif_of(image, photo).get(0x0112, 1) == 1 and image.mode in ("RGB", "L")
+            small = image.width * image.height <= LARGE_PIXELS
+            suffix = _PLAIN.get(image.format or "") if plain and small else None
         names.append(f"{index:06d}{suffix or '.png'}")
         if suffix is None:
             converted.append((photo, folder / names[-1]))
         else:
-            _link(photo.resolve(), folder / names[-1])
+            try:
+                (folder / names[-1]).symlink_to(photo.resolve())
+            except OSError:  # a file system without symbolic links
+                shutil.copyfile(photo, folder / names[-1])
     with ThreadPoolExecutor(min(4, cores())) as pool:
         for done, _ in enumerate(pool.map(_convert, *zip(*converted, strict=True)) if converted else (), start=1):
             progress.update("poses: turning and converting photos", done, len(converted))
     return names
-
-
-def _plain_suffix(photo: Path) -> str | None:
-    with open_photo(photo) as image:
-        plain = exif_of(image, photo).get(0x0112, 1) == 1 and image.mode in ("RGB", "L")
-        small = image.width * image.height <= LARGE_PIXELS
-        return _PLAIN.get(image.format or "") if plain and small else None
-
-
-def _link(photo: Path, target: Path) -> None:
-    try:
-        target.symlink_to(photo)
-    except OSError:  # a file system without symbolic links
-        shutil.copyfile(photo, target)
 
 
 def _convert(photo: Path, target: Path) -> None:

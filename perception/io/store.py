@@ -1,17 +1,11 @@
-"""The map on disk (`name.gsmap/`): a standard 3DGS PLY, JSON facts, and arrays beside them.
+"""The map on disk (`name.gsmap/`): a standard 3DGS PLY, JSON facts, and arrays; docs/formats.md lists its files.
 
-map.json        format_version, frame, metric, counts, config, seed, versions, times, quality, run record, and `views`:
-                the photos with their cameras (see map_views)
-gaussians.ply   the standard 3DGS properties, readable by other viewers
-instances.json  per instance: id, label, score, num_gaussians, centroid, obb, aabb, views, and maybe parts: a list of
-                entries with the same keys and `parent`, the id of the whole. Ids of parts follow those of the wholes.
-features.npy    [N, D] float32      instance_ids.npy  [N] int32 (−1 = none)   membership.npy [N] float32
-language.npz    embeddings of each instance, with the identity of the encoder (absent without an encoder)
+instances.json may hold `parts` of an instance: entries with the same keys and `parent`, the id of the whole. Ids of
+parts follow those of the wholes. language.npz: see `language.description.to_arrays`.
 parts.npz       ids [N] int32: the part each Gaussian belongs to (−1 = none; absent without parts). With an encoder also
                 language_*: as language.npz, one row per part in ascending id
 groups.npz      instances that may be one thing: of [I] int32, group of each instance in the order of instances.json,
                 −1 = none; scores [G] float32; language_* as in parts.npz (absent without groups)
-map.json also lists size and SHA-256 of the other files (`files`) and its own (`sha256`); see checksums.
 """
 
 from __future__ import annotations
@@ -28,7 +22,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory, atomic_file, writing
-from perception.io.checksums import EDITABLE, FACTS, REPORT, facts_of, file_facts, seal, verify
+from perception.io.checksums import EDITABLE, FACTS, REPORT, facts_of, listed_files, seal, verify
 from perception.io.documents import safe_name
 from perception.io.map import Map
 from perception.io.map_files import FORMAT_VERSION, MapFiles
@@ -64,7 +58,7 @@ def write_map(path: Path, gmap: Map, keep_report: bool = False) -> None:
         if keep_report and (path / REPORT).is_file():
             shutil.copy2(path / REPORT, folder / REPORT)
         facts = json.loads(json.dumps(info, allow_nan=False, default=_plain))  # as it will be read
-        _dump(folder / FACTS, seal({**facts, "files": file_facts(folder)}))
+        _dump(folder / FACTS, seal({**facts, "files": {file.name: facts_of(file) for file in listed_files(folder)}}))
 
 
 def _recorded(view: View, path: Path, before: Path | None) -> StoredView:
@@ -100,7 +94,12 @@ def set_labels(path: Path, labels: dict[int, str | None]) -> dict[int, str | Non
             if instance_id not in places:
                 raise InputError(f"{path}: has no instance {instance_id}; it has {len(places)}")
             files.instances[places[instance_id]]["label"] = label
-        _write_instances(path, files)
+        with contextlib.ExitStack() as both:  # both are written completely before the first rename
+            facts = both.enter_context(atomic_file(path / FACTS)) if "files" in files.facts else None
+            aside = both.enter_context(atomic_file(path / EDITABLE))
+            _dump(aside, {"instances": files.instances})
+            if facts is not None:  # other checksums are kept, so damage stays detectable
+                _dump(facts, seal({**files.facts, "files": {**files.facts["files"], EDITABLE: facts_of(aside)}}))
     return tidied
 
 
@@ -112,16 +111,6 @@ def tidy_label(label: str) -> str:
     if len(tidy) > LONGEST_LABEL:
         raise InputError(f"label: {len(tidy)} characters, at most {LONGEST_LABEL} are kept; choose a shorter name")
     return tidy
-
-
-def _write_instances(path: Path, files: MapFiles) -> None:
-    """Writes instances.json, and its checksum in map.json; other checksums are kept, so damage stays detectable."""
-    with contextlib.ExitStack() as both:  # both are written completely before the first rename
-        facts = both.enter_context(atomic_file(path / FACTS)) if "files" in files.facts else None
-        aside = both.enter_context(atomic_file(path / EDITABLE))
-        _dump(aside, {"instances": files.instances})
-        if facts is not None:
-            _dump(facts, seal({**files.facts, "files": {**files.facts["files"], EDITABLE: facts_of(aside)}}))
 
 
 def relink(path: Path, folder: Path) -> dict[str, Any]:

@@ -128,14 +128,8 @@ def _photos(file: Path, frames: list[dict[str, Any]], strict: bool) -> tuple[dic
 def _find(folder: Path, listed: str) -> Path | None:
     plain = folder / listed
     others = (plain.with_name(plain.name + suffix) for suffix in sorted(SUFFIXES) if plain.name)
-    return next((path for path in (plain, *others) if _is_file(path)), None)
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # for example a name too long for the file system
-        return False
+    # Path.is_file raises for a name that is too long for the file system.
+    return next((path for path in (plain, *others) if os.path.isfile(path)), None)  # noqa: PTH113
 
 
 def _pose(file: Path, frame: dict[str, Any]) -> np.ndarray:

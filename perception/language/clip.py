@@ -138,7 +138,7 @@ class ClipEncoder:
             if shape_of(self._pixels)[-1] == 3:  # channels last
                 batch = batch.transpose(0, 2, 3, 1)
             feed: dict[str, np.ndarray] = {self._pixels.name: _padded(batch, fixed)}
-            rows.append(self._run(self._image, self._image_output, feed)[: len(batch)])
+            rows.append(self._answers(self._image, [self._image_output.name], feed)[0][: len(batch)])
         return unit_rows(np.concatenate(rows))
 
     def encode_texts(self, texts: Sequence[str]) -> np.ndarray:
@@ -155,11 +155,7 @@ class ClipEncoder:
         for value in self._text.get_inputs():
             if "mask" in value.name:
                 feed[value.name] = _padded(mask, fixed)
-        return self._run(self._text, self._text_output, feed)[: len(texts)]
-
-    def _run(self, session: Any, output: Any, feed: dict[str, np.ndarray]) -> np.ndarray:
-        """One output [n, dim] float32."""
-        return self._answers(session, [output.name], feed)[0]
+        return self._answers(self._text, [self._text_output.name], feed)[0][: len(texts)]
 
     def _answers(self, session: Any, outputs: list[str], feed: dict[str, np.ndarray]) -> list[np.ndarray]:
         """Outputs as float32. If both towers share a file, the inputs of the other tower get placeholders."""

@@ -111,8 +111,10 @@ def lab_of(pixels: np.ndarray) -> np.ndarray:
 def color_share(palettes: np.ndarray, word: str) -> np.ndarray:
     """Fraction of each instance that a colour word covers: palettes [I, P, 4] → [I] in [0, 1]."""
     weights = palettes[..., 3]
-    if word == "many":
-        return _variety(palettes)
+    if word == "many":  # share-weighted standard deviation in the a*b* plane, 1 at 40 CIELAB units
+        mean = (palettes[..., 3:] * palettes[..., 1:3]).sum(axis=1, keepdims=True)
+        spread = (weights * ((palettes[..., 1:3] - mean) ** 2).sum(axis=-1)).sum(axis=1)
+        return np.minimum(1.0, np.sqrt(spread) / 40.0)
     examples = lab_of(np.array(_EXAMPLES[word], np.uint8))
     apart = palettes[..., None, :3] - examples
     squared = (LIGHTNESS * apart[..., 0]) ** 2 + apart[..., 1] ** 2 + apart[..., 2] ** 2
@@ -127,11 +129,3 @@ def match_of_shares(shares: Sequence[np.ndarray]) -> np.ndarray:
     for share in shares:
         match *= np.minimum(1.0, share / (0.5 / len(shares)))
     return match ** (1.0 / len(shares))
-
-
-def _variety(palettes: np.ndarray) -> np.ndarray:
-    """Share-weighted standard deviation in the a*b* plane, scaled to 1 at 40 CIELAB units."""
-    weights = palettes[..., 3:]
-    mean = (weights * palettes[..., 1:3]).sum(axis=1, keepdims=True)
-    spread = (weights[..., 0] * ((palettes[..., 1:3] - mean) ** 2).sum(axis=-1)).sum(axis=1)
-    return np.minimum(1.0, np.sqrt(spread) / 40.0)

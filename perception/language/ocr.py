@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -63,9 +62,10 @@ class TextReader:
     def __init__(self) -> None:
         try:
             self._paths = [packaged_file(PACKAGE, f"ppocrv5_{part}.onnx") for part in ("det", "rec")]
-            self._keys_path = packaged_file(PACKAGE, "ppocr_keys_v5.txt")
+            keys = packaged_file(PACKAGE, "ppocr_keys_v5.txt").read_text(encoding="utf-8")
         except InputError as error:
             raise missing_extra(PACKAGE.replace("_", "-"), EXTRA) from error
+        self._characters = keys.removesuffix("\n").split("\n")
 
     @property
     def identity(self) -> str:
@@ -96,7 +96,7 @@ class TextReader:
         size = [max(32, round(side * scale / 32) * 32) for side in (width, height)]
         resized = cv2.resize(photo, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
         pixels = (resized[..., ::-1] / np.float32(255) - _MEAN) / _STD
-        inside = self._run(self._detector, pixels.transpose(2, 0, 1)[None])[0, 0]
+        inside = self._run(self._networks[0], pixels.transpose(2, 0, 1)[None])[0, 0]
         factor = np.array([width / size[0], height / size[1]], np.float32)
         contours, _ = cv2.findContours((inside > THRESHOLD).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
         found = []
@@ -122,7 +122,7 @@ class TextReader:
             photo, warp, (width, HEIGHT), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
         )
         pixels = strip[..., ::-1].astype(np.float32) / 127.5 - 1.0
-        chances = self._run(self._recogniser, pixels.transpose(2, 0, 1)[None])[0]  # [T, characters]
+        chances = self._run(self._networks[1], pixels.transpose(2, 0, 1)[None])[0]  # [T, characters]
         best = chances.argmax(axis=1)
         kept = (best > 0) & (best != np.concatenate([[0], best[:-1]]))  # 0: CTC's blank
         text = "".join(self._characters[n] for n in best[kept]).strip()
@@ -134,16 +134,9 @@ class TextReader:
         return np.asarray(session.run(None, feed)[0])
 
     @cached_property
-    def _detector(self) -> Any:
-        return open_session(self._paths[0])
-
-    @cached_property
-    def _recogniser(self) -> Any:
-        return open_session(self._paths[1])
-
-    @cached_property
-    def _characters(self) -> list[str]:
-        return Path(self._keys_path).read_text(encoding="utf-8").removesuffix("\n").split("\n")
+    def _networks(self) -> tuple[Any, Any]:
+        """Of detection and recognition."""
+        return open_session(self._paths[0]), open_session(self._paths[1])
 
 
 def _mean_inside(inside: np.ndarray, contour: np.ndarray) -> float:

@@ -66,7 +66,8 @@ def find_tokenizer(model: Path, length: int | None) -> Tokenizer:
         raise InputError(f"{file}: not a tokenizer ({error})") from error
     family = family_of(model)
     canonical = family is not None and family.canonical
-    length = length or _configured_length(model) or (64 if canonical else 77)
+    stated = read_config(model, "config.json").get("text_config", {}).get("max_position_embeddings")
+    length = length or int(stated or _text_config(model).get("context_length") or (64 if canonical else 77))
     wanted = _text_config(model).get("tokenizer_kwargs", {}).get("clean")
     usual = "" if not canonical else "lower" if backend.get_vocab_size() > _GEMMA else "canonicalize"
     left = read_config(model, "tokenizer_config.json").get("padding_side") == "left"
@@ -80,12 +81,6 @@ def _padding_id(backend: Any, model: Path) -> int:
         name = name.get("content")
     found = backend.token_to_id(name) if isinstance(name, str) else None
     return int((backend.padding or {}).get("pad_id") or 0) if found is None else int(found)
-
-
-def _configured_length(model: Path) -> int | None:
-    text = read_config(model, "config.json").get("text_config", {})
-    found = text.get("max_position_embeddings") or _text_config(model).get("context_length")
-    return int(found) if found else None
 
 
 def _text_config(model: Path) -> dict[str, Any]:

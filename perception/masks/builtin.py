@@ -18,7 +18,7 @@ from perception.masks.merging import Segmentation, segmentation
 from perception.masks.stereo import StereoView, make_stereo_view, measure_depths
 from perception.masks.surface import FOOTPRINTS, Surface, SurfaceBuilder
 from perception.masks.surface_graph import SurfaceGraph, patches, voxel_edges
-from perception.progress import Progress
+from perception.progress import QUIET, Progress
 from perception.types import View
 
 VERSION = 14  # increased whenever the label images change, so that cached ones are recomputed
@@ -60,7 +60,7 @@ class BuiltinSegmentation:
         found = [view for view in made if view is not None]
         if len(found) < 2:
             return None
-        measure_depths(found, progress)
+        measure_depths(found, progress or QUIET)
         surface = fuse(found)
         if len(surface) < _LEAST_VOXELS:
             return None
@@ -73,10 +73,15 @@ class BuiltinSegmentation:
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
         """[H, W] int32 labels of `photo` [H, W, 3], after `survey`. All 0 if the photo does not show the surface."""
         import cv2
+        from scipy.ndimage import distance_transform_edt
 
         if view.name not in self._views:
             return np.zeros(photo.shape[:2], np.int32)
-        labels = label_view(self._views[view.name], self._segment)
+        voxel = self._views[view.name].voxel
+        labels = np.where(voxel >= 0, self._segment[voxel], 0)
+        if labels.any():  # pixels off the surface take the nearest segment in the image
+            nearest = distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
+            labels = labels[tuple(nearest)]
         return cv2.resize(labels, photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
 
 
@@ -106,14 +111,3 @@ def surface_graph(views: list[StereoView], surface: Surface) -> SurfaceGraph:
         graph.add(regions, photo, depth, np.asarray(view.learned, np.float32))
     graph.link()
     return graph
-
-
-def label_view(view: StereoView, segment: np.ndarray) -> np.ndarray:
-    """[h, w] int32 segment of each pixel. Pixels off the surface take the nearest segment in the image."""
-    from scipy.ndimage import distance_transform_edt
-
-    labels = np.where(view.voxel >= 0, segment[view.voxel], 0)
-    if not labels.any():
-        return labels
-    nearest = distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
-    return labels[tuple(nearest)]

@@ -24,9 +24,11 @@ class LabelFolder:
             raise InputError(f"labels:{folder}: no such folder; expected one PNG per photo in it")
         if not _pngs(folder):
             raise InputError(f"labels:{folder}: holds no PNG; expected a label image for each photo")
-        self.name = "labels"
-        self.folder = folder
-        self.identity = f"labels {_fingerprint(folder)}"
+        digest = hashlib.sha256()
+        for file in _pngs(folder):
+            status = file.stat()
+            digest.update(f"{file.relative_to(folder)} {status.st_size} {status.st_mtime_ns}\n".encode())
+        self.name, self.folder, self.identity = "labels", folder, f"labels {digest.hexdigest()[:16]}"
         self._files: dict[str, Path] = {}
 
     def check(self, views: list[View]) -> list[str]:
@@ -80,14 +82,6 @@ def _check_header(file: Path, width: int, height: int) -> None:
 
 def _pngs(folder: Path) -> list[Path]:
     return sorted(file for file in folder.rglob("*") if file.suffix.lower() == ".png")
-
-
-def _fingerprint(folder: Path) -> str:
-    digest = hashlib.sha256()
-    for file in _pngs(folder):
-        status = file.stat()
-        digest.update(f"{file.relative_to(folder)} {status.st_size} {status.st_mtime_ns}\n".encode())
-    return digest.hexdigest()[:16]
 
 
 def _some(names: list[str]) -> str:

@@ -15,6 +15,7 @@ import zlib
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 
 from perception.config import SamConfig
@@ -113,10 +114,8 @@ def stability(logits: np.ndarray) -> np.float32:
 
 def mask_box(mask: np.ndarray) -> np.ndarray:
     """mask: [h, w] bool. [4] int64 (x0, y0, x1, y1) in pixels, ends inclusive; all zero for an empty mask."""
-    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
-    if not len(rows):
-        return np.zeros(4, np.int64)
-    return np.array([columns[0], rows[0], columns[-1], rows[-1]], np.int64)
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    return np.array([x, y, x + width - 1, y + height - 1] if width else [0] * 4, np.int64)
 
 
 def box_nms(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> np.ndarray:

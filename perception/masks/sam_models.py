@@ -292,10 +292,7 @@ def _outputs(names: list[str]) -> dict[str, str]:
 
 def _candidates(path: Path) -> list[Path]:
     if path.is_dir():
-        files, _ = model_graphs(path)
-        if not files:
-            raise InputError(f"sam:{path}: no .onnx file in this folder; expected an encoder and a decoder")
-        return files
+        return model_graphs(path)[0]
     if not path.is_file():
         found = "no such file or folder, nor a stored model; expected a SAM encoder and decoder as ONNX"
         raise InputError(f"sam:{path}: {found}; {known_names()}")

@@ -15,7 +15,7 @@ import numpy as np
 from perception import _core
 from perception.io.memory import Keep
 from perception.masks.cues import DepthCues, PhotoCues, depth_cues, filled_depth, photo_cues
-from perception.progress import Progress
+from perception.progress import QUIET, Progress
 from perception.types import View
 
 PLANES = 96
@@ -90,7 +90,7 @@ def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray, keep: Kee
     return made
 
 
-def measure_depths(views: list[StereoView], progress: Progress | None = None) -> None:
+def measure_depths(views: list[StereoView], progress: Progress = QUIET) -> None:
     """Replaces the depths of all views by stereo depths, and marks the pixels confirmed by other views.
     Depths that a sensor measured are kept, averaged with those of the views that agree."""
     chosen = choose_neighbours(views)
@@ -98,8 +98,7 @@ def measure_depths(views: list[StereoView], progress: Progress | None = None) ->
     for i, (view, near) in enumerate(zip(views, chosen, strict=True), start=1):
         swept = near and not view.measured
         depths.append(view.keep(sweep(view, [views[j] for j in near])) if swept else view.depth)
-        if progress is not None:
-            progress.update("masks (stereo)", i, len(views))
+        progress.update("masks (stereo)", i, len(views))
     for view, depth, near in zip(views, depths, chosen, strict=True):
         if near:
             agreeing, mean = confirmed(depth, view, [views[j] for j in near], [depths[j] for j in near])

@@ -53,6 +53,7 @@ Stamp = tuple[int, int]
 _FIELD_KINDS = {"<i4": 5, "<u4": 6, "<f4": 7}  # sensor_msgs/PointField
 _CUBE, _TEXT, _DELETE_ALL = 1, 9, 3  # visualization_msgs/Marker
 _STRING, _DOUBLE_ARRAY = 4, 8  # rcl_interfaces/ParameterType
+LEAST_SIDE = 1e-3
 _OK, _WARN, _ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
 
 
@@ -114,9 +115,9 @@ def points_value(reply: Reply) -> dict[str, Any]:
 def map_cloud(gmap: QueryMap, most: int, stamp: Stamp) -> dict[str, Any]:
     """PointCloud2 of the map, every k-th Gaussian, at most `most`: x y z, rgb, instance_id (−1 = none)."""
     rows = slice(None, None, max(1, -(-len(gmap) // most)))
-    colors = rgb8_from_sh(gmap.sh[rows, 0])
+    r, g, b = rgb8_from_sh(gmap.sh[rows, 0]).astype(np.uint32).T
     columns = {axis: np.asarray(gmap.means[rows, i], np.float32) for i, axis in enumerate("xyz")}
-    columns["rgb"] = packed_rgb(colors)
+    columns["rgb"] = (r << 16) | (g << 8) | b  # as PCL packs colours
     columns["instance_id"] = np.asarray(gmap.instance_ids[rows], np.int32)
     return point_cloud2(columns, gmap.frame, stamp)
 
@@ -143,12 +144,6 @@ def diagnostics(name: str, facts: Mapping[str, Any], warnings: Sequence[str], st
 def header(frame: str, stamp: Stamp) -> dict[str, Any]:
     """std_msgs/Header."""
     return {"stamp": {"sec": stamp[0], "nanosec": stamp[1]}, "frame_id": frame}
-
-
-def packed_rgb(colors: np.ndarray) -> np.ndarray:
-    """PCL's packing of colors [P, 3] uint8 into [P] uint32."""
-    r, g, b = colors.astype(np.uint32).T
-    return (r << 16) | (g << 8) | b
 
 
 def point_cloud2(columns: Mapping[str, np.ndarray], frame: str, stamp: Stamp) -> dict[str, Any]:
@@ -182,12 +177,11 @@ def pose(box: OrientedBox) -> dict[str, Any]:
 
 
 def detection(
-    box: OrientedBox, class_id: str, score: float, identity: str, head: dict[str, Any], spread: np.ndarray | None = None
+    box: OrientedBox, class_id: str, score: float, identity: str, head: dict[str, Any], spread: np.ndarray
 ) -> dict[str, Any]:
     """vision_msgs/Detection3D. spread [3, 3]: covariance of the points, used as that of the position."""
     covariance = np.zeros((6, 6))
-    if spread is not None:
-        covariance[:3, :3] = spread
+    covariance[:3, :3] = spread
     at = pose(box)
     hypothesis = {"class_id": class_id, "score": float(score)}
     return {
@@ -198,16 +192,14 @@ def detection(
     }
 
 
-def box_markers(
-    boxes: Iterable[tuple[int, OrientedBox, str]], namespace: str, head: dict[str, Any], least: float = 1e-3
-) -> dict[str, Any]:
+def box_markers(boxes: Iterable[tuple[int, OrientedBox, str]], namespace: str, head: dict[str, Any]) -> dict[str, Any]:
     """visualization_msgs/MarkerArray: one marker that deletes the markers before it, then for each of `boxes`
     (instance id, box, text) a transparent box in the instance's colour and its text. Viewers reject sides
-    of length 0, so sides are at least `least`."""
+    of length 0, so sides are at least LEAST_SIDE."""
     markers: list[dict[str, Any]] = [{"header": head, "action": _DELETE_ALL}]
     for i, (instance, box, words) in enumerate(boxes):
         at, common = pose(box), {"header": head, "ns": namespace}
-        size = {axis: max(side, least) for axis, side in _xyz(box.extent).items()}
+        size = {axis: max(side, LEAST_SIDE) for axis, side in _xyz(box.extent).items()}
         tint = dict(zip("rgb", (instance_palette([instance])[0] / 255).tolist(), strict=True)) | {"a": 0.4}
         markers.append({**common, "id": 2 * i, "type": _CUBE, "pose": at, "scale": size, "color": tint})
         upright = {"position": at["position"], "orientation": {"w": 1.0}}

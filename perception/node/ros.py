@@ -87,13 +87,12 @@ class RosTransport:
             _qos(False),
             callback_group=MutuallyExclusiveCallbackGroup(),
         )
-        for service, answer in ((answers.QUERY, self._query), (answers.RELOAD, self._reload)):
-            node.create_service(
-                message_class(service.kind),
-                service.name,
-                lambda request, response, answer=answer: answer(core, request, response),  # type: ignore[misc]
-                callback_group=calls,
-            )
+        asked: dict[Channel, Callable[[Any, Any], Any]] = {
+            answers.QUERY: lambda request, response: self._query(core, request, response),
+            answers.RELOAD: lambda _, response: fill(response, core.reload()),
+        }
+        for service, answer in asked.items():
+            node.create_service(message_class(service.kind), service.name, answer, callback_group=calls)
         node.create_timer(self.config.health_seconds, core.send_health, callback_group=MutuallyExclusiveCallbackGroup())
 
     def _query(self, core: Core, request: Any, response: Any) -> Any:
@@ -106,10 +105,6 @@ class RosTransport:
         core.query(list(request.names), finish)
         done.wait(self.config.timeout + _EXTRA_SECONDS)
         return fill(response, answered[0]) if answered else response
-
-    def _reload(self, core: Core, request: Any, response: Any) -> Any:
-        del request
-        return fill(response, core.reload())
 
 
 def spin(node: Any, config: NodeConfig, stop: threading.Event) -> None:

@@ -56,9 +56,8 @@ class DemoTruth:
         return cls(facts["asked"], dict(facts["queries"]), names, facts["centres"], points, ids)
 
 
-def run_demo(output: Path, progress: Progress | None = None) -> tuple[dict[str, Any], str]:
+def run_demo(output: Path, progress: Progress) -> tuple[dict[str, Any], str]:
     """Photos → SfM → masks → map → export → queries, all in `output`; returns figures and a text."""
-    progress = progress or Progress()
     started = time.monotonic()
     if output.exists() and any(output.iterdir()):
         raise InputError(f"{output}: is not empty; choose another folder or remove it first")

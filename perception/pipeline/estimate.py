@@ -24,7 +24,9 @@ STEP_BYTES_PER_PIXEL, DECODE_BYTES_PER_PIXEL, READERS = 200, 12, 4
 
 def image_memory(config: MapConfig, limit: int | None) -> int:
     """Bytes that the photos, labels and depth of a run may fill: as set, or a quarter of the `limit` of the process."""
-    return config.photos.memory_bytes or (1 << 62 if limit is None else limit // 4)
+    if (size := config.photos.memory) is not None:
+        return int(size[:-1]) << {"M": 20, "G": 30}[size[-1]]
+    return 1 << 62 if limit is None else limit // 4
 
 
 def needed_bytes(photos: PhotoSizes, max_side: int, budget: int, memory: int = 1 << 62) -> int:
@@ -41,33 +43,27 @@ def largest_budget(limit: int | None) -> int | None:
     return None if limit is None else max(0, limit // 2 - BASE_BYTES) // BYTES_PER_GAUSSIAN
 
 
-def _sized(photos: PhotoSizes, config: MapConfig, limit: int | None) -> MapConfig:
-    """The settings with the budget of the run, of one block in a large place."""
-    count, block = len(photos.sizes), config.train.block_photos
-    return sized(config, min(count, block) if block else count, largest_budget(limit))
-
-
 def log_estimate(source: Path, config: MapConfig, log: Callable[[str], None]) -> None:
     """Passes the estimate for the input `source` to `log` as one line; InputError if memory is not sufficient."""
     photos = photo_sizes(source)
     if photos.sizes:
-        check_memory(photos, config)
-        memory, budget = image_memory(config, memory_limit()), _sized(photos, config, memory_limit()).train.budget
-        needed = needed_bytes(photos, config.photos.max_side, budget, memory)
+        needed = check_memory(photos, config)
         log(f"{photos.what}, trained at up to {config.photos.max_side} pixels: about {needed / 2**30:.1f} GiB")
 
 
-def check_memory(photos: PhotoSizes, config: MapConfig, limit: int | None = None) -> None:
-    """InputError that suggests smaller settings if the run needs more than `limit` bytes.
+def check_memory(photos: PhotoSizes, config: MapConfig, limit: int | None = None) -> int:
+    """The bytes that the run needs; InputError that suggests smaller settings if they are more than `limit`.
 
     limit None: the memory available to this process; nothing is checked if that is unknown.
     """
     limit = memory_limit() if limit is None else limit
-    side, budget = config.photos.max_side, _sized(photos, config, limit).train.budget
+    count, block = len(photos.sizes), config.train.block_photos  # a block at a time, in a large place
+    budget = sized(config, min(count, block) if block else count, largest_budget(limit)).train.budget
+    side = config.photos.max_side
     memory = image_memory(config, limit)
     needed = needed_bytes(photos, side, budget, memory)
     if limit is None or needed <= limit:
-        return
+        return needed
     smaller = [(max(64, int(side * share)), max(1000, int(budget * share))) for share in (0.75, 0.5, 0.35, 0.2, 0.1)]
     fitting = next((pair for pair in smaller if needed_bytes(photos, *pair, memory) <= limit), None)
     advice = "give fewer or smaller photos, or use a machine with more memory"

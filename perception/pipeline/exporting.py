@@ -68,10 +68,7 @@ def read_transform(path: Path) -> np.ndarray:
             ]
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{path}: expected a 4 × 4 matrix as text or JSON ({error})") from error
-    matrix = check_similarity(rows, str(path))
-    if not 1e-9 < scale_of(matrix) < 1e9:
-        raise InputError(f"{path}: its scale is {scale_of(matrix):g}, expected 1e-9 to 1e9")
-    return matrix
+    return check_similarity(rows, str(path))
 
 
 COMPRESSED = {".spz": write_spz, ".sog": write_sog}
@@ -122,14 +119,13 @@ def export_map(
     moved = not np.array_equal(placed, np.eye(4))
     means = move_points(np.linalg.inv(placed), gmap.means.astype(np.float64)) if moved else gmap.means
     began = time.perf_counter()
-    if given is None:  # every point is its own nearest Gaussian
-        rows = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY)
-        cloud = PointCloud(means[rows], rgb8_from_sh(gmap.sh[rows, 0]))
-        options = ExportOptions(drop_noise=False, smooth=False)
+    if given is None:
+        rows, options = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY), ExportOptions(smooth=False)
+        given = PointCloud(means[rows], rgb8_from_sh(gmap.sh[rows, 0]))
+        labels = ids[rows].astype(np.int32)
     else:
-        cloud = given
-    inside = check_overlap(means, cloud.points)
-    labels = export_labels(means, ids, cloud, options)
+        labels = export_labels(means, ids, given, options)
+    cloud, inside = given, check_overlap(means, given.points)
     if color == "instance":
         cloud = replace(cloud, colors=instance_palette(labels))
     sidecar = write_export(output, cloud, labels, instances, facts)  # last: where it is, everything was written

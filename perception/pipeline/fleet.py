@@ -13,7 +13,7 @@ from perception.io.engine import Engine
 from perception.io.object_store import is_url, place
 from perception.pipeline.mapping import build_map
 from perception.pipeline.remote import local_places
-from perception.progress import Progress
+from perception.progress import QUIET, Progress
 
 
 class Job(Settings):
@@ -70,9 +70,9 @@ def _place(text: str, folder: Path) -> str:
     return text if is_url(text) else str((folder / text).resolve())
 
 
-def map_one(task: str, progress: Progress | None = None) -> dict[str, Any]:
+def map_one(task: str, progress: Progress = QUIET) -> dict[str, Any]:
     """Makes the map of one job. An InputError is in its result, so that the other maps are made."""
-    job, progress = json.loads(task), progress or Progress(quiet=True)
+    job = json.loads(task)
     told = {"input": job["input"], "output": job["output"]}
     try:
         config = MapConfig.model_validate(job["settings"])

@@ -12,7 +12,6 @@ from scipy import sparse
 
 from perception import _core
 from perception.boxes import instance_entry
-from perception.config import LanguageConfig, MapConfig
 from perception.gaussians.model import Gaussians
 from perception.gaussians.nearby import Nearby
 from perception.gaussians.train import TrainingView
@@ -24,11 +23,12 @@ from perception.instances.silhouettes import Silhouettes, render_silhouettes
 from perception.instances.texts import read_texts, store_texts
 from perception.instances.votes import mask_votes
 from perception.io.map import prefixed
-from perception.io.memory import Keep, return_free_memory
+from perception.io.memory import return_free_memory
 from perception.language.base import Encoder, reading_of
 from perception.language.description import to_arrays
 from perception.language.ocr import TextReader
 from perception.masks.merging import Segmentation
+from perception.pipeline.optimise import Run
 from perception.progress import Progress
 
 HALVED_FROM = 480
@@ -49,23 +49,16 @@ class FoundInstances:
     groups: dict[str, np.ndarray] = field(default_factory=dict)
 
 
-def group_gaussians(
-    nearby: Nearby,
-    views: list[TrainingView],
-    config: MapConfig,
-    progress: Progress,
-    cuts: Segmentation | None = None,
-    keep: Keep = np.asarray,
-) -> Grouping | None:
+def group_gaussians(nearby: Nearby, views: list[TrainingView], run: Run, cuts: Segmentation | None) -> Grouping | None:
     """Groups Gaussians into instances by features and votes of all masks (§3.2.1); None if no photo has masks.
-
-    cuts: of the surface, if the masks come from one. keep: for the votes."""
+    cuts: of the surface, if the masks come from one."""
     if not any(view.labels is not None and bool((view.labels > 0).any()) for view in views):
         return None
-    progress.log(f"grouping {len(nearby.gaussians)} Gaussians")
+    config = run.config
+    run.progress.log(f"grouping {len(nearby.gaussians)} Gaussians")
     return_free_memory()
     half = config.losses.half_resolution
-    votes = mask_votes(nearby, views, half_resolution=half, progress=progress, keep=keep)
+    votes = mask_votes(nearby, views, half_resolution=half, progress=run.progress, keep=run.new_keep())
     gaussians = nearby.gaussians.to("cpu")
     found = group(
         gaussians.means.detach().numpy(),
@@ -84,14 +77,13 @@ def describe(
     nearby: Nearby,
     grouped: Grouping | None,
     views: list[TrainingView],
-    words: LanguageConfig,
+    run: Run,
     encoder: Encoder | None,
-    progress: Progress,
-    reader: TextReader | None = None,
+    reader: TextReader | None,
 ) -> FoundInstances:
     """Geometry, score and views of each instance; with an encoder its language embeddings (§3.2.2), with a reader its
     printed texts."""
-    count = len(nearby.gaussians)
+    count, words, progress = len(nearby.gaussians), run.config.language, run.progress
     if grouped is None:
         report = {"warnings": ["no photo has masks"]}
         return FoundInstances(np.full(count, -1, np.int32), np.zeros(count, np.float32), report=report)
@@ -105,18 +97,22 @@ def describe(
         # The networks of the copy are freed with it, before the encoder needs as much memory.
         texts = read_texts(copy(reader), choices, lambda n: _shown(views[n], seen[n]), progress)
         store_texts(found.instances, texts)
-    if encoder is not None and grouped.count:
-        found.language = _embed(encoder, grouped.ids, seen, views, words.views, words.zooms, progress)
 
-    def language_of(ids: np.ndarray, seen: list[Silhouettes]) -> dict[str, np.ndarray]:
+    def embedded(ids: np.ndarray, seen: list[Silhouettes], best: int, zooms: int) -> dict[str, np.ndarray]:
+        """Language arrays of all instances (eq. 11) from their `best` views (eq. 10), `zooms` crops of each."""
         if encoder is None:
             return {}
-        return prefixed(_embed(encoder, ids, seen, views, 1, 1, progress))  # a crop of the best view
+        choices, names = _best_views(ids, seen, best), [view.name for view in views]
+        zooms = zooms or reading_of(encoder).zooms
+        shown = describe_instances(encoder, choices, lambda n: _shown(views[n], seen[n]), names, zooms, progress)
+        return to_arrays(shown, encoder.identity)
 
-    if grouped.parents:
-        found.parts = {"ids": grouped.part_ids, **language_of(local, parts_seen)}
+    if grouped.count:
+        found.language = embedded(grouped.ids, seen, words.views, words.zooms)
+    if grouped.parents:  # a crop of the best view of each
+        found.parts = {"ids": grouped.part_ids, **prefixed(embedded(local, parts_seen, 1, 1))}
     if len(grouped.group_scores):
-        language = language_of(levels[2], groups_seen)
+        language = prefixed(embedded(levels[2], groups_seen, 1, 1))
         found.groups = {"of": together[:-1], "scores": grouped.group_scores, **language}
     found.report = {
         "count": grouped.count,
@@ -173,30 +169,6 @@ def _entries(grouped: Grouping, gaussians: Gaussians, seen: list[Silhouettes]) -
         part = entry(grouped.count + number, grouped.part_ids, score, shown)
         entries[parent].setdefault("parts", []).append({**part, "parent": parent})
     return entries
-
-
-def _embed(
-    encoder: Encoder,
-    ids: np.ndarray,
-    seen: list[Silhouettes],
-    views: list[TrainingView],
-    best: int,
-    zooms: int,
-    progress: Progress,
-) -> dict[str, np.ndarray]:
-    """Language arrays of all instances (eq. 11) from their `best` views (eq. 10), `zooms` crops of each.
-
-    zooms 0: the default number of the encoder.
-    """
-    descriptions = describe_instances(
-        encoder,
-        _best_views(ids, seen, best),
-        lambda index: _shown(views[index], seen[index]),
-        [view.name for view in views],
-        levels=zooms or reading_of(encoder).zooms,
-        progress=progress,
-    )
-    return to_arrays(descriptions, encoder.identity)
 
 
 def _best_views(ids: np.ndarray, seen: list[Silhouettes], best: int) -> list[np.ndarray]:

@@ -39,7 +39,7 @@ from perception.pipeline.optimise import Photos, Run, label_by_tasks, label_phot
 from perception.pipeline.photos import exposed_as_neighbours, split_views
 from perception.pipeline.record import depth_errors, depth_used, finite, peak_memory_mib
 from perception.pipeline.summary import depth_text, frame_lines
-from perception.progress import Progress
+from perception.progress import QUIET, Progress
 from perception.types import Scene, View
 
 FRAME_FACTS = ("map_from_input", "scale", "gravity")
@@ -52,7 +52,7 @@ def build_map(
     config: MapConfig,
     *,
     resume: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = QUIET,
     engine: Engine | None = None,
     origin: str | None = None,
 ) -> Map:
@@ -63,7 +63,7 @@ def build_map(
     before training leaves no files. Resuming a finished run returns its map. engine: where features, masks and the
     blocks of a large place are made; None: here. origin: the input's name in map.json, where `source` is a copy of it.
     """
-    progress, started = progress or Progress(quiet=True), time.monotonic()
+    started = time.monotonic()
     if resume and output.exists() and read_info(output).get("fingerprint") == fingerprint(source, config):
         progress.log(f"{output}: this run is finished")
         clear_work(output)
@@ -107,8 +107,8 @@ def build_map(
         # Group the Gaussians by their features into instances (§3.2.1), describe these from their best views (§3.2.2).
         with run.stage("instances"):
             cuts = load_segmentation(run.masks) if from_geometry else None
-            grouped = group_gaussians(nearby, photos.views, config, progress, cuts, run.new_keep())
-            found = describe(nearby, grouped, photos.views, config.language, encoder, progress, reader)
+            grouped = group_gaussians(nearby, photos.views, run, cuts)
+            found = describe(nearby, grouped, photos.views, run, encoder, reader)
         gaussians = nearby.gaussians.to("cpu")
 
         with run.stage("score"):
@@ -225,17 +225,14 @@ def _tell_scene(scene: Scene, progress: Progress) -> None:
     report = scene.report
     with_depth = sum(view.depth is not None for view in scene.views)
     depth = f", {with_depth} with depth" if with_depth else ""
-    progress.log(f"{len(scene.views)} posed photos{depth}, {len(scene.points)} points")
-    for line in frame_lines({"metric": scene.metric, **report}):
-        progress.log(line)
+    lines = [f"{len(scene.views)} posed photos{depth}, {len(scene.points)} points"]
+    lines += frame_lines({"metric": scene.metric, **report})
     if report.get("exposure", {}).get("varies"):
-        progress.log(f"exposure varies by {report['exposure']['spread']:.0%} between photos: each has its gains")
-    for note in report.get("notes", []):
-        progress.log(note)
-    for entry in report.get("left_out", []):
-        progress.log(f"left out: {entry['name']} ({entry['why']})")
-    for warning in report.get("warnings", []):
-        progress.log(f"warning: {warning}")
+        lines.append(f"exposure varies by {report['exposure']['spread']:.0%} between photos: each has its gains")
+    lines += report.get("notes", [])
+    lines += [f"left out: {entry['name']} ({entry['why']})" for entry in report.get("left_out", [])]
+    lines += [f"warning: {warning}" for warning in report.get("warnings", [])]
+    progress.log("\n".join(lines))
 
 
 def _tell_result(gmap: Map, output: Path, progress: Progress) -> None:

@@ -18,7 +18,7 @@ from perception.instances.silhouettes import render_silhouettes
 from perception.io.documents import safe_name
 from perception.io.recentre import map_from_input, moved
 from perception.io.store import Map, read_map
-from perception.query.crops import best_box, cut_out
+from perception.query.crops import cut_out
 from perception.query.query_map import QueryMap
 from perception.types import View
 
@@ -61,7 +61,7 @@ def as_gaussians(gmap: Map) -> Gaussians:
 
 def rendered_crop(gmap: QueryMap, instance_id: int, side: int) -> np.ndarray | None:
     """`query.crops.best_crop` of the map's own picture in place of the photo."""
-    found = best_box(gmap, instance_id)
+    found = gmap.best_view(instance_id)
     return None if found is None else cut_out(_picture("rgb", as_gaussians(gmap), gmap, found[0]), found[1], side)
 
 

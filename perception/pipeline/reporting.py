@@ -83,17 +83,13 @@ def write_page(path: Path, data: Mapping[str, Any]) -> Path:
     page = b""
     for side, quality in SIZES:
         image = partial(_image, side=side, quality=quality)
-        text = template.render(data=data, image=image, sides=sides, clock=clock, color=_color)
+        text = template.render(data=data, image=image, sides=sides, clock=clock, palette=instance_palette)
         page = text.encode(errors="replace")  # an unpaired surrogate in a file name cannot be encoded as UTF-8
         if len(page) < LIMIT:
             break
     with atomic_file(path) as aside:
         aside.write_bytes(page)
     return path
-
-
-def _color(instance: int) -> list[int]:
-    return [int(value) for value in instance_palette([instance])[0]]
 
 
 def _image(picture: np.ndarray, side: int, quality: int) -> tuple[int, int, str]:

@@ -24,7 +24,7 @@ from perception.language.encoders import make_encoder
 from perception.language.ocr import TextReader, make_reader
 from perception.pipeline.photos import training_view
 from perception.pipeline.rendering import as_gaussians
-from perception.progress import Progress
+from perception.progress import QUIET, Progress
 
 
 def upgrade_map(
@@ -32,7 +32,7 @@ def upgrade_map(
     output: Path | None = None,
     *,
     encoders: Callable[[str], Encoder | None] = make_encoder,
-    progress: Progress | None = None,
+    progress: Progress = QUIET,
 ) -> dict[str, Any]:
     """Writes the map at `path` in the newest format, to `output` or in place; Gaussians, instances, labels are kept.
 
@@ -41,14 +41,15 @@ def upgrade_map(
     read if the extra ocr is installed, the map has none from this reader, and its photos are there.
     Returns {"map", "format_version": [before, after], "encoder": [before, after]}.
     """
-    target, progress = output or path, progress or Progress(quiet=True)
+    target = output or path
     if output is not None and output.exists():
         raise InputError(f"{output}: exists already; choose another -o or remove it first")
     with writing(target):
         before = int(read_info(path)["format_version"])
         gmap = read_map(path)
         old = str(gmap.language["encoder"]) if gmap.language else None
-        encoder = _encoder(gmap, encoders) if gmap.language else None
+        spec = gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
+        encoder = encoders("conse" if spec == "auto" else spec) if gmap.language else None
         if encoder is not None and encoder.identity != old:
             _embed_again(gmap, encoder, progress)
         _read_again(gmap, make_reader(gmap.info.get("config", {}).get("language", {}).get("texts", "auto")), progress)
@@ -63,23 +64,25 @@ def upgrade_map(
     return {"map": str(target), "format_version": [before, FORMAT_VERSION], "encoder": [old, new]}
 
 
-def _encoder(gmap: Map, encoders: Callable[[str], Encoder | None]) -> Encoder | None:
-    spec = gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
-    return encoders("conse" if spec == "auto" else spec)
-
-
 def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:
     """Replaces `language` and, if present, that of the parts and groups."""
+    names = [view.name for view in gmap.views]
+
+    def described(
+        stored: dict[str, np.ndarray], owners: np.ndarray, ids: list[int], zooms: int = 1
+    ) -> dict[str, np.ndarray]:
+        """Language arrays of the instances `ids`; see `_shown`."""
+        choices, load = _shown(gmap, stored, owners, ids)
+        return to_arrays(describe_instances(encoder, choices, load, names, zooms, progress), encoder.identity)
+
     zooms = int(gmap.info.get("config", {}).get("language", {}).get("zooms") or reading_of(encoder).zooms)
-    ids = [entry["id"] for entry in gmap.instances]
-    gmap.language = _described(gmap, encoder, gmap.language, gmap.instance_ids, ids, zooms, progress)
+    gmap.language = described(gmap.language, gmap.instance_ids, [entry["id"] for entry in gmap.instances], zooms)
     if stored := language_in(gmap.parts):
         owners = gmap.parts["ids"]
-        known = np.unique(owners[owners >= 0]).tolist()
-        gmap.parts = gmap.parts | prefixed(_described(gmap, encoder, stored, owners, known, 1, progress))
+        gmap.parts = gmap.parts | prefixed(described(stored, owners, np.unique(owners[owners >= 0]).tolist()))
     if stored := language_in(gmap.groups):
         known = list(range(len(gmap.groups["scores"])))
-        gmap.groups = gmap.groups | prefixed(_described(gmap, encoder, stored, gmap.group_ids, known, 1, progress))
+        gmap.groups = gmap.groups | prefixed(described(stored, gmap.group_ids, known))
 
 
 def _read_again(gmap: Map, reader: TextReader | None, progress: Progress) -> None:
@@ -94,21 +97,6 @@ def _read_again(gmap: Map, reader: TextReader | None, progress: Progress) -> Non
         return
     store_texts(gmap.instances, read_texts(reader, choices, load, progress))
     gmap.info["instances"] = {**report, "texts": reader.identity}
-
-
-def _described(
-    gmap: Map,
-    encoder: Encoder,
-    stored: dict[str, np.ndarray],
-    owners: np.ndarray,
-    ids: list[int],
-    zooms: int,
-    progress: Progress,
-) -> dict[str, np.ndarray]:
-    """Language arrays of the instances `ids`; see `_shown`."""
-    choices, load = _shown(gmap, stored, owners, ids)
-    names = [view.name for view in gmap.views]
-    return to_arrays(describe_instances(encoder, choices, load, names, zooms, progress), encoder.identity)
 
 
 def _shown(

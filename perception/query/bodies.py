@@ -13,15 +13,12 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
 
 from perception.errors import InputError
-from perception.geometry import scale_of
 from perception.query.requests import MAX_TEXT, MAX_TEXTS, MAX_TOP, TOP, Request
 from perception.query.where import Frame, Where, axis_box
 from perception.types import OrientedBox
 
 MAX_NUMBER = 1e12
 """Largest absolute value of a number; it exceeds every coordinate on the earth in millimetres."""
-MAX_SCALE = 1e9
-"""Largest scale of a frame relative to the map; the smallest is 1 / MAX_SCALE."""
 
 Number = Annotated[float, Field(ge=-MAX_NUMBER, le=MAX_NUMBER)]
 Length = Annotated[float, Field(ge=0, le=MAX_NUMBER)]
@@ -108,10 +105,7 @@ class FrameBody(Body):
     from_map: Matrix
 
     def frame(self) -> Frame:
-        frame = Frame(self.name, np.array(self.from_map))
-        if not 1 / MAX_SCALE <= scale_of(frame.from_map) <= MAX_SCALE:
-            raise InputError(f"frame: its scale is {scale_of(frame.from_map):g}, expected 1e-9 to 1e9")
-        return frame
+        return Frame(self.name, np.array(self.from_map))
 
 
 class FramedBody(Body):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from perception.errors import InputError
@@ -26,7 +27,7 @@ def best_crop(gmap: QueryMap, instance_id: int, side: int = 320, inside: Path | 
     """
     from perception.io.photos import load_photo
 
-    found = best_box(gmap, instance_id)
+    found = gmap.best_view(instance_id)
     if found is None:
         return None
     try:
@@ -38,20 +39,18 @@ def best_crop(gmap: QueryMap, instance_id: int, side: int = 320, inside: Path | 
     return cut_out(photo, found[1], side)
 
 
-def best_box(gmap: QueryMap, instance_id: int) -> tuple[View, tuple[int, int, int, int]] | None:
-    """The view that shows an instance best, and its box there (`QueryMap.best_view`); None when there is none."""
-    name, box = gmap.best_view(gmap.position(instance_id)) or (None, (0, 0, 0, 0))
-    view = next((view for view in gmap.views if view.name == name), None)
-    return None if view is None else (view, box)
-
-
 def cut_out(picture: np.ndarray, box: tuple[int, int, int, int], side: int) -> np.ndarray | None:
     """The box (x0, y0, x1, y1) of a picture [H, W, 3] with a margin, longer side at most `side`; None outside of it."""
     x0, y0, x1, y1 = box
     margin = 2 + round(MARGIN * max(x1 - x0, y1 - y0))
     top, left = max(0, y0 - margin), max(0, x0 - margin)
     cut = picture[top : y1 + margin, left : x1 + margin]
-    return _shrunk(cut, side) if cut.size else None
+    if not cut.size:
+        return None
+    height, width = cut.shape[:2]
+    scale = min(1.0, side / max(height, width))
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return cut if scale == 1 else np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA))
 
 
 def readable_view(gmap: Map, view: View, inside: Path | None) -> View:
@@ -68,12 +67,3 @@ def readable_view(gmap: Map, view: View, inside: Path | None) -> View:
     if not known:
         raise UnknownInstance(f"{view.name}: this photo is not in the map's folder")
     return replace(located, photo=real)
-
-
-def _shrunk(picture: np.ndarray, side: int) -> np.ndarray:
-    import cv2
-
-    height, width = picture.shape[:2]
-    scale = min(1.0, side / max(height, width))
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    return picture if scale == 1 else np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))

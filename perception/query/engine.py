@@ -95,8 +95,14 @@ class QueryEngine:
         future raises OtherMap when `map_id` is given and is not the id of the map."""
         if self._closed.is_set():
             raise EngineClosed(f"{self.path}: the engine has been closed")
+
+        def checked(gmap: QueryMap) -> T:
+            if map_id is not None and map_id != gmap.map_id:
+                raise OtherMap(f"the map is now {gmap.map_id}, not {map_id[:40]}; ask again")
+            return work(gmap)
+
         now = time.monotonic()
-        job = Job(partial(_checked, work, map_id), Future(), now, now + (self.timeout if timeout is None else timeout))
+        job = Job(checked, Future(), now, now + (self.timeout if timeout is None else timeout))
         if not self._queue.put(job):
             if self._closed.is_set():
                 raise EngineClosed(f"{self.path}: the engine has been closed")
@@ -116,16 +122,15 @@ class QueryEngine:
             self._counters.count("timed_out")
             raise AnswerTimeout(f"no answer within {seconds:g} s") from None
 
-    async def awaited(self, future: Future[T], timeout: float | None = None) -> T:
+    async def awaited(self, future: Future[T]) -> T:
         """`wait` as a coroutine, for servers with an event loop."""
-        seconds = self.timeout if timeout is None else timeout
         try:
-            return await asyncio.wait_for(asyncio.wrap_future(future), seconds)  # cancels what has not begun
+            return await asyncio.wait_for(asyncio.wrap_future(future), self.timeout)  # cancels what has not begun
         except (TimeoutError, asyncio.TimeoutError) as error:
             if isinstance(error, AnswerTimeout):
                 raise
             self._counters.count("timed_out")
-            raise AnswerTimeout(f"no answer within {seconds:g} s") from None
+            raise AnswerTimeout(f"no answer within {self.timeout:g} s") from None
 
     # --------------------------------------------------------------- reloading
 
@@ -189,7 +194,10 @@ class QueryEngine:
         is missing or unreadable, prompts cannot be answered, or answers are overdue. Further: the map's identity and
         counts, the queue, totals since the start, and the latency of the last thousand answers in ms."""
         gmap = self._map
-        problem = self._problem or gmap.problem or self._overdue()
+        now = time.monotonic()
+        late = sum(now - since > self.timeout for since in list(self._busy_since.values()))
+        overdue = f"{late} answers take longer than {self.timeout:g} s" if late else None
+        problem = self._problem or gmap.problem or overdue
         return {
             "status": "closed" if self._closed.is_set() else "degraded" if problem else "ok",
             "problem": problem,
@@ -202,11 +210,6 @@ class QueryEngine:
             "queue_size": self._queue.most,
             **self._counters.to_json(),
         }
-
-    def _overdue(self) -> str | None:
-        now = time.monotonic()
-        late = sum(now - since > self.timeout for since in list(self._busy_since.values()))
-        return f"{late} answers take longer than {self.timeout:g} s" if late else None
 
     def close(self) -> None:
         """Finishes running requests, ends waiting ones with EngineClosed, and joins the threads."""
@@ -256,12 +259,6 @@ class QueryEngine:
         else:
             self._counters.answered(time.monotonic() - job.asked)
             job.future.set_result(result)
-
-
-def _checked(work: Callable[[QueryMap], T], wanted: str | None, gmap: QueryMap) -> T:
-    if wanted is not None and wanted != gmap.map_id:
-        raise OtherMap(f"the map is now {gmap.map_id}, not {wanted[:40]}; ask again")
-    return work(gmap)
 
 
 @dataclass(eq=False)

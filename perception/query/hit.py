@@ -12,8 +12,6 @@ from perception.boxes import move_box
 from perception.geometry import check_similarity, move_points
 from perception.types import OrientedBox
 
-_NO_SPREAD = np.zeros((3, 3))
-
 
 class _Points:
     """The field `points`: an array, or a function that is called when they are first read."""
@@ -50,7 +48,7 @@ class Hit:
     obb: OrientedBox
     label: str | None = None
     views: tuple[str, ...] = ()
-    covariance: np.ndarray = field(default_factory=lambda: _NO_SPREAD)
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     frame: str = "map"
     distance: float | None = None
     part: int | None = None

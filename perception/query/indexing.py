@@ -16,7 +16,7 @@ from perception.errors import InputError
 from perception.io.atomic import atomic_file, writing
 from perception.io.checksums import FACTS, STORE
 from perception.language.encoders import make_encoder
-from perception.progress import Progress
+from perception.progress import QUIET, Progress
 from perception.query.map_store import FORMAT_VERSION, TOLD, read_store
 from perception.query.query_map import QueryMap, load_map
 from perception.query.relations import Places
@@ -28,7 +28,7 @@ def index_maps(
     maps: Sequence[Path],
     remove: Sequence[Path] = (),
     encoders: Encoders | None = None,
-    progress: Progress | None = None,
+    progress: Progress = QUIET,
 ) -> dict[str, Any]:
     """Brings `maps` into the store at `store`, made if there is none, and takes those of `remove` out of it.
 
@@ -38,7 +38,7 @@ def index_maps(
     without embeddings or of another encoder than the store's, a path to remove that the store does not hold, a folder
     that is no store, and while another process writes the store.
     """
-    encoders, progress = lru_cache(encoders or make_encoder), progress or Progress(quiet=True)
+    encoders = lru_cache(encoders or make_encoder)
     with writing(store):
         facts = _facts(store)
         entries = {entry["map"]: entry for entry in facts["maps"]}

@@ -1,11 +1,6 @@
 """A store: the instances of many maps in one folder, which answers prompts with the scores of the instances' own maps.
-
-STORE/store.json   format_version, encoder (`name`, `identity`), and `maps`: of each map its path (`map`), `map_id`,
-                   `frame`, `metric`, when it was written (`written`), count of `instances`, and its `file`
-STORE/maps/*.npz   one per map, named by a digest of path and map_id. Arrays of `Ranker.prepared`; told [I] of `TOLD`;
-                   places [I, 2, 3], poses [C, 4, 4] of `Places` (absent where up is not known); names, views: JSON in
-                   UTF-8. Records are kept as rows of bytes
-A new file has a new name and store.json is replaced last, so that a reader sees the store of before or after.
+docs/formats.md lists its files; a file of maps/ holds the arrays of `Ranker.prepared`, told [I] of `TOLD`, and places
+[I, 2, 3] and poses [C, 4, 4] of `Places` (absent where up is not known). It is named by a digest of path and map_id.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from perception.query.requests import TOP, Request, UnknownInstance
 from perception.query.spatial_index import SpatialIndex
 from perception.query.text_ranking import Encoders, TextRanking
 from perception.query.where import Frame, Where, place, tidy
-from perception.types import OrientedBox
+from perception.types import OrientedBox, View
 
 if TYPE_CHECKING:
     from perception.query.standing import FreeSpace
@@ -189,15 +189,17 @@ class QueryMap(Map):
             raise UnknownInstance(f"instance {instance_id}: the map has none such; it has {len(self.instances)}")
         return place
 
-    def best_view(self, position: int) -> tuple[str, tuple[int, int, int, int]] | None:
-        """The photo that shows the instance best and the tight box (x0, y0, x1, y1) in it, in pixels of the size used
-        for training; None when no photo shows it."""
+    def best_view(self, instance_id: int) -> tuple[View, tuple[int, int, int, int]] | None:
+        """The view that shows the instance best and the tight box (x0, y0, x1, y1) in it, in pixels of the size used
+        for training; None when none shows it. InputError for an unknown id."""
+        position = self.position(instance_id)
         names = self._views(position)
-        if not names:
+        view = next((view for view in self.views if view.name in names[:1]), None)
+        if view is None:
             return None
         start = int(self._view_stops[position]) - len(names)
         x0, y0, x1, y1 = (int(value) for value in self.language["view_boxes"][start])
-        return names[0], (x0, y0, x1, y1)
+        return view, (x0, y0, x1, y1)
 
     # --------------------------------------------------------------- internals
 

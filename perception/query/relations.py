@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from perception.language.printed import quoted_text
 from perception.language.ranking import PRESENT
 
 if TYPE_CHECKING:
@@ -66,8 +67,6 @@ def parse(prompt: str) -> Relation | None:
 
 def ranked(ranker: Ranker, places: Places | None, text: str) -> Answer:
     """The ranking of the instances for a prompt, by the relation in it if there is one and z is known."""
-    from perception.language.printed import quoted_text
-
     relation = parse(text)
     if relation is None or places is None or quoted_text(text) is not None:
         return ranker.rank(text)

@@ -99,7 +99,7 @@ def holders(points: list[np.ndarray], places: Places) -> list[Holder | None]:
     """What holds each instance; None where nothing does. points: of the instances, [P, 3] each, z up."""
     shell, sizes, inside = _shells(places), places.highs - places.lows, places.match("in")
     typical = float(np.median(sizes[~shell].max(axis=1))) if (~shell).any() else 0.0
-    trees = [cKDTree(cloud) if len(cloud) else None for cloud in points]
+    trees = {j: cKDTree(cloud) for j, cloud in enumerate(points) if len(cloud)}
     found: list[Holder | None] = []
     for n, mine in enumerate(points):
         slack = 0.02 * typical + min(0.25 * sizes[n, 2], 0.1 * typical)
@@ -114,7 +114,7 @@ def holders(points: list[np.ndarray], places: Places) -> list[Holder | None]:
 def _holder(
     n: int,
     points: list[np.ndarray],
-    trees: list[cKDTree | None],
+    trees: dict[int, cKDTree],
     places: Places,
     shell: np.ndarray,
     inside: np.ndarray,
@@ -139,7 +139,8 @@ def _holder(
             return Holder(int(j), "in", float(inside[j]))
     reach = 2 * slack + float(size.min())
     away = np.maximum(places.lows - places.highs[n], places.lows[n] - places.highs).max(axis=1)
-    touches = {j: 0.0 if away[j] > 2 * reach else _touching(mine, trees[j], reach) for j in others}
+    near = {j: trees[j].query(mine, distance_upper_bound=reach)[0] for j in others if away[j] <= 2 * reach}
+    touches = {j: float(np.isfinite(near[j]).mean()) if j in near else 0.0 for j in others}
     flat = size[:2].min() < FLAT * size.max()
     upright = [j for j in others if shell[j] and places.highs[j, 2] - places.lows[j, 2] > size[2]]
     wall = max(upright, key=lambda j: touches[j], default=None)
@@ -170,11 +171,6 @@ def _holder(
         return Holder(best, "attached to", touches[best])
     flats = [j for j in under if floors[j] and low[2] - size[2] <= places.highs[j, 2] <= low[2] + slack]
     return Holder(max(flats, key=lambda j: places.highs[j, 2]), "on", 1 / SECTORS) if flats else None
-
-
-def _touching(points: np.ndarray, tree: cKDTree | None, reach: float) -> float:
-    """Share of the points that are no farther than `reach` from one of the tree."""
-    return 0.0 if tree is None else float(np.isfinite(tree.query(points, distance_upper_bound=reach)[0]).mean())
 
 
 def _thinned(points: np.ndarray) -> np.ndarray:

@@ -42,10 +42,10 @@ class SpatialIndex:
 
     def share_inside(self, instance_id: int, region: OrientedBox) -> float:
         """The share of the instance's points that lies in `region`, in [0, 1]; 0 without points."""
-        points = self.index.of(instance_id)
-        if not len(points) or self._apart(instance_id, region):
-            return 0.0
-        return float(inside(region, points).mean())
+        points, corners = self.index.of(instance_id), region.center + (CORNERS * region.extent) @ region.rotation
+        low, high = self.aabb(instance_id)
+        apart = (corners.max(axis=0) < low - 1e-9).any() or (corners.min(axis=0) > high + 1e-9).any()
+        return float(inside(region, points).mean()) if len(points) and not apart else 0.0
 
     def reaches(self, instance_id: int, point: np.ndarray) -> bool:
         """Whether `point` [3] lies on the instance: its distance to the instance's nearest point p is at most the
@@ -74,12 +74,6 @@ class SpatialIndex:
             return float(tree.query(self.index.of(other), distance_upper_bound=max(most * (1 + 1e-9), 1e-30))[0].min())
 
         return [entry for entry in _closest(others, apart, count, gap) if np.isfinite(entry[0])]
-
-    def _apart(self, instance_id: int, region: OrientedBox) -> bool:
-        """True when the bounding boxes alone show that no point is inside."""
-        corners = region.center + (CORNERS * region.extent) @ region.rotation
-        low, high = self.aabb(instance_id)
-        return bool((corners.max(axis=0) < low - 1e-9).any() or (corners.min(axis=0) > high + 1e-9).any())
 
 
 def _squared(points: np.ndarray, point: np.ndarray) -> np.ndarray:

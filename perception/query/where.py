@@ -10,7 +10,7 @@ import numpy as np
 
 from perception.boxes import move_box
 from perception.errors import InputError
-from perception.geometry import check_similarity, move_points, scale_of
+from perception.geometry import check_similarity, move_points, numbers, scale_of
 from perception.types import OrientedBox
 
 
@@ -91,13 +91,10 @@ class Where:
 
 def place(point_or_pose: Any) -> np.ndarray:
     """[3] float64: a point as it is, or the origin of a pose [4, 4] (map_from_robot); InputError for other input."""
-    try:
-        array = np.asarray(point_or_pose, np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"near: expected a point [3] or a pose [4, 4], found {str(point_or_pose)[:60]!r}") from error
+    array = numbers(point_or_pose, "near", "a point [3] or a pose [4, 4]")
     if array.shape == (4, 4):
         return check_similarity(array, "near")[:3, 3]
-    if array.shape != (3,) or not np.isfinite(array).all():
+    if array.shape != (3,):
         raise InputError(f"near: expected a finite point [3] or pose [4, 4], found shape {list(array.shape)}")
     return array
 
@@ -109,7 +106,7 @@ def tidy(text: str) -> str:
 
 def axis_box(low: Sequence[float] | np.ndarray, high: Sequence[float] | np.ndarray) -> OrientedBox:
     """The box along the axes between two corners [3]; InputError unless low <= high."""
-    a, b = _numbers(low, "region: low corner"), _numbers(high, "region: high corner")
+    a, b = numbers(low, "region: low corner"), numbers(high, "region: high corner")
     if a.shape != (3,) or b.shape != (3,) or (a > b).any():
         raise InputError(f"region: corners {a.tolist()} and {b.tolist()}, expected two [3] points with low <= high")
     return OrientedBox((a + b) / 2, np.eye(3), b - a)
@@ -125,8 +122,8 @@ def check_box(box: Any) -> OrientedBox:
     """The box with float64 arrays; InputError unless its rotation is a rotation matrix and its extent is >= 0."""
     if not isinstance(box, OrientedBox):
         raise InputError(f"region: found {type(box).__name__}, expected an OrientedBox or axis_box(low, high)")
-    center, extent = _numbers(box.center, "region: center"), _numbers(box.extent, "region: extent")
-    rotation = _numbers(box.rotation, "region: rotation")
+    center, extent = numbers(box.center, "region: center"), numbers(box.extent, "region: extent")
+    rotation = numbers(box.rotation, "region: rotation")
     if center.shape != (3,) or extent.shape != (3,) or rotation.shape != (3, 3) or (extent < 0).any():
         raise InputError("region: expected a center [3], an extent [3] >= 0 and a rotation [3, 3]")
     pose = np.eye(4)
@@ -135,13 +132,3 @@ def check_box(box: Any) -> OrientedBox:
     if abs(np.linalg.det(rotation) - 1) > 1e-3:
         raise InputError("region: rotation is scaled, expected rows of length 1")
     return OrientedBox(center, rotation, extent)
-
-
-def _numbers(value: Any, name: str) -> np.ndarray:
-    try:
-        array = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected numbers, found {str(value)[:60]!r}") from error
-    if not np.isfinite(array).all():
-        raise InputError(f"{name}: expected finite numbers, found {str(value)[:60]!r}")
-    return array

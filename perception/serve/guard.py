@@ -93,7 +93,11 @@ class Guard:
             await self.app(scope, receive, send)
             return
         headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
-        scope.setdefault("state", {})["trusted"] = trusted = self._has_token(headers)
+        kind, _, given = headers.get("authorization", "").partition(" ")
+        trusted = (token := self.settings.token) is None or (
+            kind.lower() == "bearer" and hmac.compare_digest(given.strip().encode(), token.encode())
+        )
+        scope.setdefault("state", {})["trusted"] = trusted
         refusal = self._refusal(scope, headers, trusted)
         if refusal is None and scope["method"] in ("POST", "PUT", "PATCH"):
             refusal, receive = await self._body(receive)
@@ -116,12 +120,6 @@ class Guard:
             found = headers.get("content-type", "none")[:80]
             return problem(415, f"Content-Type is '{found}', expected application/json")
         return None
-
-    def _has_token(self, headers: dict[str, str]) -> bool:
-        if self.settings.token is None:
-            return True
-        kind, _, given = headers.get("authorization", "").partition(" ")
-        return kind.lower() == "bearer" and hmac.compare_digest(given.strip().encode(), self.settings.token.encode())
 
     async def _body(self, receive: Any) -> tuple[Any, Any]:
         """Reads the body within its limits; (rejection, receive) or (None, a receive that returns the body again).

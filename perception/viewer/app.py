@@ -176,7 +176,7 @@ class Viewer:
                         self.redraw()
                 except InputError as error:  # missing; for an instant also between the two renames of a save
                     problem = str(error)
-                self.panel.offer_renewal(bool(problem) and editor.dirty)
+                self.panel.renew.visible = bool(problem) and editor.dirty
             if problem and problem != self._problem:
                 self.panel.notify(None, problem)
             self._problem = problem

@@ -104,8 +104,8 @@ class Panel:
             save = self.gui.add_button("Save into the map")
             save.on_click(lambda event: self.viewer.guarded(editor.save, event.client, edited=True))
             why = "another program replaced the map"
-            self._renew = self.gui.add_button("Drop them, open the new map", visible=False, hint=why)
-            self._renew.on_click(lambda event: self.viewer.guarded(session.reopen, event.client, edited=True))
+            self.renew = self.gui.add_button("Drop them, open the new map", visible=False, hint=why)
+            self.renew.on_click(lambda event: self.viewer.guarded(session.reopen, event.client, edited=True))
             self._history = self.gui.add_markdown("")
 
     def _build_measure(self) -> None:
@@ -123,10 +123,6 @@ class Panel:
         receivers = [client] if client is not None else list(self.viewer.server.get_clients().values())
         for receiver in receivers:
             receiver.add_notification("perception", text, auto_close_seconds=8, color="orange")
-
-    def offer_renewal(self, offered: bool) -> None:
-        """Shows or hides the button that drops the corrections and opens the map of another program."""
-        self._renew.visible = offered
 
     def refresh(self) -> None:
         """Updates all texts of the panel from the session's state."""

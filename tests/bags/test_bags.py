@@ -103,7 +103,7 @@ def test_poses_are_those_recorded(tmp_path: Path) -> None:
         assert lens.model == "OPENCV_FISHEYE" and lens == read_camera(tmp_path / "out" / "camera.yaml")
         kept = (tmp_path / "out" / name).read_bytes()
         assert kept == cv2.imencode(".jpg", photo(number))[1].tobytes()  # compressed images are not touched
-    plain, text = run_frames(tmp_path / "drive", tmp_path / "plain", FrameOptions(poses=False))
+    plain, text = run_frames(tmp_path / "drive", tmp_path / "plain", FrameOptions(fixed_frame="nowhere"))
     assert plain["with_pose"] == 0 and "--camera" in text and not (tmp_path / "plain" / "transforms.json").exists()
 
 
@@ -115,7 +115,7 @@ def test_rectified_images_take_the_camera_of_rectified_images(tmp_path: Path, to
     for i, time in enumerate(TIMES[:3]):
         bag.jpeg(topic, time, cv2.imencode(".jpg", photo(i))[1].tobytes())
     bag.close()
-    run_frames(tmp_path / "drive", tmp_path / "out", FrameOptions(poses=False))
+    run_frames(tmp_path / "drive", tmp_path / "out")
     params = np.array(read_camera(tmp_path / "out" / "camera.yaml").params)
     if "rect" in topic:  # the recorder writes P = .9 K
         np.testing.assert_allclose(

@@ -5,6 +5,7 @@ predictions are submission files <scene>.txt that name mask files.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,17 @@ def _read_prediction(folder: Path, scene: str, points: int) -> _Prediction | Non
     return masks, classes, scores
 
 
+def mode_by_group(group: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Most frequent value of each group 0..count−1 [count]; ties: the smallest value; group −1 is ignored."""
+    inside = group >= 0
+    distinct, index = np.unique(values[inside], return_inverse=True)
+    if len(distinct) == 0:
+        return np.zeros(count, np.int64)
+    table = np.zeros((count, len(distinct)), np.int64)
+    np.add.at(table, (group[inside], index), 1)
+    return distinct[table.argmax(axis=1)].astype(np.int64)
+
+
 def mask_overlap(
     rules: Protocol,
     masks: Sequence[np.ndarray],
@@ -116,7 +128,14 @@ def mask_overlap(
 
     The order of the masks is the input order of the matching rules.
     """
-    keep, truth = evaluated_truth(rules, np.asarray(gt_ids), gt_semantics, None)
+    gt_ids, kinds = np.asarray(gt_ids), None if gt_semantics is None else np.asarray(gt_semantics)
+    if kinds is None and (rules.by_class or rules.valid_classes is not None):
+        raise InputError("evaluation by class needs semantic ids in the truth; there are none")
+    if kinds is not None and rules.valid_classes is not None:
+        gt_ids = np.where(np.isin(kinds, list(rules.valid_classes)), gt_ids, np.minimum(gt_ids, -1))  # void
+    keep, truth = evaluated_truth(rules, gt_ids)
+    if kinds is not None and rules.by_class:
+        truth = replace(truth, classes=mode_by_group(truth.index, kinds[keep], len(truth.ids)))
     kept = [np.asarray(mask, bool)[keep] for mask in masks]
     if rules.by_class and classes is None:
         raise InputError("evaluation by class needs a class for each predicted mask; there are none")

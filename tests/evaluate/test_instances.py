@@ -188,7 +188,6 @@ def test_confidence_order_matters_and_segment3d_drops_it():
         (np.zeros(10), None, {}, "whole numbers"),
         (np.zeros(10, int), {1: 0.5}, {}, "no score for instance 0"),
         (np.zeros(10, int), {0: float("nan")}, {}, "not a finite number"),
-        (np.zeros(10, int), None, {"by_class": True}, "semantic ids"),
         (np.zeros(10, int), None, {"protocol": "coco"}, "scannet, mask3d"),
     ],
 )

@@ -262,7 +262,7 @@ def test_colour_keeps_a_poster_from_its_wall():
     poster = (np.abs(points[:, :2] - 0.5) < 0.2).all(axis=1)
     colors = np.where(poster[:, None], [200, 30, 30], [220, 220, 210]).astype(np.uint8)
     normals = np.tile(np.float32([0, 0, 1]), (4000, 1))
-    assert segment_cloud(PointCloud(points, colors, normals), color_weight=0).max() == 0
+    assert segment_cloud(PointCloud(points, None, normals)).max() == 0
     segments = segment_cloud(PointCloud(points, colors, normals))
     assert segments.max() == 1
     own = np.bincount(segments[poster]).argmax()
