@@ -86,7 +86,9 @@ class Engine:
             raise InputError(f"{told}; start one: ray start --head, and give its HOST:PORT") from error
         try:
             # Where a task uses all cores of its machine, each machine has one task at a time.
-            taken = 1 if each_core else min(node["Resources"].get("CPU", 1) for node in ray.nodes() if node["Alive"])
+            # A head of a cluster often has no CPU to give, and no entry then.
+            offered = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
+            taken = 1 if each_core else min(filter(None, offered), default=1)
             remote = ray.remote(task).options(num_cpus=taken, max_retries=RETRIES)
             asked = [remote.remote(item) for item in items]
             waiting = list(asked)
