@@ -234,7 +234,7 @@ class KilledOnce(Engine):
 def test_ray_gives_the_same_map_although_a_worker_is_killed(
     row: Path, whole: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")  # of a cluster that is gone: without --address a new one is started
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")  # a cluster that is gone: without --address a new one is started
     made = build_map(row, tmp_path / "m.gsmap", settings(row), engine=KilledOnce("ray"))
     assert (tmp_path / "killed").exists()
     same(made, whole)
