@@ -105,6 +105,7 @@ def describe(
         # The networks of the copy are freed with it, before the encoder needs as much memory.
         texts = read_texts(copy(reader), choices, lambda n: _shown(views[n], seen[n]), progress)
         store_texts(found.instances, texts)
+        return_free_memory()
     if encoder is not None and grouped.count:
         found.language = _embed(encoder, grouped.ids, seen, views, words.views, words.zooms, progress)
 
