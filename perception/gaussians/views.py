@@ -62,15 +62,18 @@ class TrainingView:
         # In numpy: torch's aligned temporary arrays do not fit where they were freed, which took 6 MB a view.
         blocks = self.photo.numpy()[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3)
         photo = torch.from_numpy(((blocks.sum(axis=(1, 3), dtype=np.uint16) + 2) // 4).astype(np.uint8))
-        labels = None if self.labels is None else self.labels[: 2 * height : 2, : 2 * width : 2].contiguous()
+        labels = self.labels
+        if labels is not None:
+            labels = torch.from_numpy(labels.numpy()[: 2 * height : 2, : 2 * width : 2].copy())
 
-        def four(image: torch.Tensor) -> torch.Tensor:
-            return image[: 2 * height, : 2 * width].reshape(height, 2, width, 2)
+        def four(image: torch.Tensor) -> np.ndarray:
+            return image.numpy()[: 2 * height, : 2 * width].reshape(height, 2, width, 2)
 
         depth = self.depth
         if depth is not None:
-            depth = four(depth).sum(dim=(1, 3)) / four(depth > 0).sum(dim=(1, 3)).clamp(min=1)
-        weight = None if self.weight is None else four(self.weight).amin(dim=(1, 3))
+            measured = (four(depth) > 0).sum(axis=(1, 3), dtype=np.float32)
+            depth = torch.from_numpy(four(depth).sum(axis=(1, 3)) / np.maximum(measured, 1))
+        weight = None if self.weight is None else torch.from_numpy(four(self.weight).min(axis=(1, 3)))
         K = self.K * torch.tensor([[0.5], [0.5], [1.0]])
         eps2d = (self.eps2d + 0.25) / 4
         return replace(self, photo=photo, labels=labels, K=K, eps2d=eps2d, weight=weight, depth=depth)

@@ -7,7 +7,7 @@ from scipy import sparse
 
 from perception.instances.votes import MaskVotes, Table
 
-CHUNK, ENTRIES = 20_000, 10_000_000  # Gaussians, and their affinities with all instances, at once
+CHUNK, ENTRIES = 20_000, 10_000_000  # Gaussians, and their affinities with all instances or 4 × weights, at once
 NEIGHBOURS = 8
 LEAST_AGREEMENT = 0.5
 MARGIN = 0.15
@@ -28,12 +28,17 @@ def affinities(votes: MaskVotes, shares: sparse.csr_matrix, rows: np.ndarray) ->
     return (weights @ shares.T).toarray() / np.maximum(pixels, 1e-12)[:, None], pixels
 
 
+def _at_once(votes: MaskVotes, count: int) -> int:
+    """The number of Gaussians whose affinities with `count` instances are computed together."""
+    return min(CHUNK, ENTRIES // max(1, count, 4 * votes.weights.nnz // max(1, votes.weights.shape[0])) + 1)
+
+
 def memberships(ids: np.ndarray, votes: MaskVotes) -> np.ndarray:
     """[N] float32 in [0, 1]: agreement of each Gaussian's masks with its instance (`affinities`); 0 for noise."""
     count = int(ids.max(initial=-1)) + 1
     shares = mask_shares(votes.table(ids, count))
     found = np.zeros(len(ids), np.float32)
-    chunk = min(CHUNK, ENTRIES // max(count, 1) + 1)
+    chunk = _at_once(votes, count)
     for begin in range(0, len(ids), chunk):
         rows = begin + np.flatnonzero(ids[begin : begin + chunk] >= 0)
         if len(rows):
@@ -62,7 +67,7 @@ def reassign(
     tree = cKDTree(means[voters])
     near = min(NEIGHBOURS + 1, len(voters))
     finite = np.flatnonzero(np.isfinite(means).all(axis=1))
-    chunk = min(CHUNK, ENTRIES // count + 1)
+    chunk = _at_once(votes, count)
     for begin in range(0, len(finite), chunk):
         rows = finite[begin : begin + chunk]
         affinity, pixels = affinities(votes, shares, rows)

@@ -41,7 +41,7 @@ SUPPORT = 0.6  # IoU with a mask from which a photo supports a group
 LEAST_PIXELS = 8.0  # pixels under masks from which a view shows a group
 LARGEST_PART = 0.8  # share of the whole's pixels; a larger part is nearly the whole
 PART_VIEWS = 2  # photos that must support a part
-AT_ONCE = 64  # nodes whose tables are held together
+AT_ONCE, ENTRIES = 64, 2_000_000  # nodes whose tables are held together, and their entries: 60 bytes each
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ def merge_tree(table: Table, prototypes: np.ndarray, sizes: np.ndarray, near: sp
     if count == 0:
         return MergeTree(0, np.zeros((0, 2), np.int64), np.zeros(0))
     children, affinity = np.zeros((count - 1, 2), np.int32), np.zeros(count - 1)
-    rows = [(m.indptr.astype(np.int64), m.indices.astype(np.int32)) for m in (table.pixels, table.void, near)]
-    values = [m.data.astype(np.float32) for m in (table.pixels, table.void)]
+    rows = [(m.indptr.astype(np.int64), np.asarray(m.indices, np.int32)) for m in (table.pixels, table.void, near)]
+    values = [np.asarray(m.data, np.float32) for m in (table.pixels, table.void)]
     z, weights = np.ascontiguousarray(prototypes, np.float64), np.ascontiguousarray(sizes, np.float64)
     merges = _core.merge_segments(
         *(*rows[0], values[0], *rows[1], values[1], table.view.astype(np.int32), table.void.shape[1], *rows[2]),
@@ -134,7 +134,8 @@ def node_evidence(tree: MergeTree, table: Table) -> Evidence:
     leaves = [np.array([leaf], np.int32) for leaf in range(tree.leaves)]
     for a, b in tree.children.tolist():
         leaves.append(np.concatenate([leaves[a], leaves[b]]))
-    found = [evidence(table.pooled(leaves[at : at + AT_ONCE])) for at in range(0, len(leaves), AT_ONCE)]
+    some = min(AT_ONCE, ENTRIES // max(1, len(table.area)) + 1)
+    found = [evidence(table.pooled(leaves[at : at + some])) for at in range(0, len(leaves), some)]
     numbers = {name: np.concatenate([vars(part)[name] for part in found]) for name in ("pixels", "matched", "views")}
     return Evidence(**numbers, fit=sparse.vstack([part.fit for part in found], format="csr"))
 

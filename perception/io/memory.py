@@ -18,6 +18,7 @@ import numpy as np
 from perception.errors import InputError
 
 CHUNK = 64 << 20  # bytes of a file; a larger array has a file of its own
+PIECE = 1 << 20  # numbers of an array that are copied between two looks at what is resident
 INTERVAL = 0.05  # seconds between two looks at what is resident
 
 Keep = Callable[[np.ndarray], np.ndarray]
@@ -29,26 +30,30 @@ class DiskArrays:
 
     A thread drops the files' pages from memory when more than `limit` / 2 bytes of them are resident. That is safe at
     any time: the numbers are in the file, and mostly in the system's cache, from which a page returns in less than a
-    microsecond. Files vanish with the last array, or with the process. OSError when the disk is full.
+    microsecond. Files vanish with the last array, or with the process. OSError when the disk is full. beside: others,
+    whose arrays fill the same limit.
 
     Memory is taken in blocks of CHUNK bytes, apart from the allocator's, whose space kept arrays would split.
     """
 
-    def __init__(self, folder: Path, limit: int) -> None:
+    def __init__(self, folder: Path, limit: int, beside: DiskArrays | None = None) -> None:
         self.folder, self.most = folder, limit // 2
-        self._held = 0  # bytes of blocks in memory
+        self._held: int = 0 if beside is None else beside._held  # bytes of blocks in memory
+        self._before: int = mapped_bytes() if beside is None else beside._before
         self._block, self._used = mmap.mmap(-1, 1), 1  # the block that is being filled, and its bytes in use
         self._files: list[mmap.mmap] = []
-        self._before = mapped_bytes()
 
     def keep(self, array: np.ndarray) -> np.ndarray:
-        """A copy of the array."""
+        """A copy of the array. Pages are dropped on the way: the thread may have no turn meanwhile."""
         needed = -(-array.nbytes // 64) * 64  # compiled loops rely on aligned numbers
         if self._used + needed > len(self._block):
             self._block, self._used = self._new_block(max(CHUNK, needed)), 0
         flat = np.frombuffer(self._block, array.dtype, array.size, self._used)
         self._used += needed
-        flat[:] = array.reshape(-1)
+        given = array.reshape(-1)
+        for start in range(0, array.size, PIECE):
+            flat[start : start + PIECE] = given[start : start + PIECE]
+            self.trim()
         return flat.reshape(array.shape)
 
     def _new_block(self, size: int) -> mmap.mmap:
@@ -62,7 +67,7 @@ class DiskArrays:
 
     def trim(self) -> None:
         """Drops the pages of all files if there are too many."""
-        if mapped_bytes() - self._before >= self.most and hasattr(mmap, "MADV_DONTNEED"):
+        if self._files and mapped_bytes() - self._before >= self.most and hasattr(mmap, "MADV_DONTNEED"):
             for file in list(self._files):
                 file.madvise(mmap.MADV_DONTNEED)
 

@@ -8,14 +8,13 @@ instance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from scipy import sparse
 
 from perception.config import MapConfig
 from perception.errors import InputError
@@ -45,6 +44,8 @@ LEAST_GAIN = 0.85
 """Largest share of a block's photos that either half may have after a cut; a place that all photos see stays whole."""
 APART = 4.0
 """Distance between the features of two blocks, which are not comparable: more than the loss's margin of 1."""
+ONES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint8)
+"""How many bits of a byte are 1."""
 RESULT = "result.pt"
 
 
@@ -73,7 +74,7 @@ def cut(scene: Scene, most: int) -> list[Block]:
     if most == 0 or count <= most or len(scene.points) == 0 or scene.report.get("points_from") == "random":
         return [whole]
     points = _sample(scene.points)
-    seen = sparse.csr_matrix(sparse.vstack([_row(visible_points(view, points)) for view in scene.views]))
+    seen = np.stack([np.packbits(visible_points(view, points)) for view in scene.views])
     centres = camera_centres(np.stack([view.camera_from_world for view in scene.views]))
     return _halved(whole, points, seen, centres, most)
 
@@ -98,19 +99,21 @@ def visible_points(view: View, points: np.ndarray) -> np.ndarray:
     return np.asarray(inside)
 
 
-def _row(visible: np.ndarray) -> sparse.csr_matrix:
-    return sparse.csr_matrix(visible[None].astype(np.float32))
-
-
-def _halved(block: Block, points: np.ndarray, seen: sparse.csr_matrix, centres: np.ndarray, most: int) -> list[Block]:
-    """seen [V, P]: 1 where a photo sees a point."""
+def _halved(block: Block, points: np.ndarray, seen: np.ndarray, centres: np.ndarray, most: int) -> list[Block]:
+    """seen [V, P / 8] uint8: a bit for each photo and point, 1 where the photo sees the point."""
     if len(block.views) <= most:
         return [block]
-    inside = points[block.owns(points) & (seen[block.views].getnnz(axis=0) > 0)]
+    own = seen[block.views]
+    inside = points[block.owns(points) & np.unpackbits(np.bitwise_or.reduce(own), count=len(points)).astype(bool)]
+    counts = np.maximum(ONES[own].sum(axis=1), 1)
+
+    def share(half: Block) -> np.ndarray:
+        return np.asarray(ONES[own & np.packbits(half.owns(points))].sum(axis=1) / counts)
+
     best, fewest = None, (np.inf, np.inf)
     for axis in range(3) if len(inside) else ():
         for place in np.quantile(inside[:, axis], np.arange(0.2, 0.81, 0.1)):
-            halves = _divided(block, axis, float(place), points, seen, centres)
+            halves = _divided(block, axis, float(place), share, centres)
             sizes = [len(half.views) for half in halves]
             if min(sizes) > 0 and max(sizes) <= LEAST_GAIN * len(block.views) and (max(sizes), sum(sizes)) < fewest:
                 best, fewest = halves, (max(sizes), sum(sizes))
@@ -120,19 +123,18 @@ def _halved(block: Block, points: np.ndarray, seen: sparse.csr_matrix, centres: 
 
 
 def _divided(
-    block: Block, axis: int, place: float, points: np.ndarray, seen: sparse.csr_matrix, centres: np.ndarray
+    block: Block, axis: int, place: float, share: Callable[[Block], np.ndarray], centres: np.ndarray
 ) -> list[Block]:
     """The block's halves below and above `place`, with the photos that see enough of them or stand in them: these look
-    through the space before them, where Gaussians would float that no other photo sees."""
-    sides, own = [], seen[block.views]
-    counts = np.maximum(own.getnnz(axis=1), 1)
+    through the space before them, where Gaussians would float that no other photo sees. share: of the points that each
+    of the block's photos sees, those in a box."""
+    sides = []
     middle = np.where(np.arange(3) == axis, place, np.nan)
     below = centres[block.views, axis] < place
     low_side, high_side = (block.low, np.fmin(block.high, middle)), (np.fmax(block.low, middle), block.high)
     for (low, high), stands in ((low_side, below), (high_side, ~below)):
         half = replace(block, low=low, high=high)
-        share = own @ half.owns(points).astype(np.float32) / counts
-        sides.append(replace(half, views=block.views[(share >= SEEN) | stands]))
+        sides.append(replace(half, views=block.views[(share(half) >= SEEN) | stands]))
     return sides
 
 
@@ -164,18 +166,18 @@ def optimise_blocks(
     return Nearby(joined(parts).to(run.device), rows), TrainRecord.joined(records), reports
 
 
-def nearby_rows(scene: Scene, blocks: Sequence[Block], counts: Sequence[int]) -> dict[str, np.ndarray]:
-    """By photo, the rows of the joined Gaussians of the blocks that it was used for or of which it sees a point.
-    counts: Gaussians of each block, in order."""
+def nearby_rows(scene: Scene, blocks: Sequence[Block], counts: Sequence[int]) -> dict[str, list[np.ndarray]]:
+    """By photo, the rows of the joined Gaussians of each block that it was used for or of which it sees a point: arrays
+    that all photos share. counts: Gaussians of each block, in order."""
     of_block = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
     points = _sample(scene.points)
     owned = np.stack([block.owns(points) for block in blocks])
     holds = np.stack([owned[:, visible_points(view, points)].any(axis=1) for view in scene.views])
     for number, block in enumerate(blocks):
         holds[block.views, number] = True
-    sets: dict[bytes, np.ndarray] = {}
+    sets: dict[bytes, list[np.ndarray]] = {}
     return {
-        view.name: sets.setdefault(held.tobytes(), np.concatenate([of_block[number] for number in held.nonzero()[0]]))
+        view.name: sets.setdefault(held.tobytes(), [of_block[number] for number in held.nonzero()[0]])
         for view, held in zip(scene.views, holds, strict=True)
     }
 

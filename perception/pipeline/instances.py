@@ -97,6 +97,7 @@ def describe(
         # The networks of the copy are freed with it, before the encoder needs as much memory.
         texts = read_texts(copy(reader), choices, lambda n: _shown(views[n], seen[n]), progress)
         store_texts(found.instances, texts)
+        return_free_memory()
 
     def embedded(ids: np.ndarray, seen: list[Silhouettes], best: int, zooms: int) -> dict[str, np.ndarray]:
         """Language arrays of all instances (eq. 11) from their `best` views (eq. 10), `zooms` crops of each."""

@@ -53,11 +53,12 @@ class Run:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.keep = self.new_keep()
+        self._arrays = DiskArrays(self.work, image_memory(self.config, memory_limit()))
+        self.keep: Keep = self._arrays.keep
 
     def new_keep(self) -> Keep:
-        """A place for arrays whose bytes in memory are bounded by `photos.memory`; it goes with the last of them."""
-        return DiskArrays(self.work, image_memory(self.config, memory_limit())).keep
+        """A place for arrays that fill what those of `keep` leave of `photos.memory`; it goes with the last of them."""
+        return DiskArrays(self.work, 2 * self._arrays.most, self._arrays).keep
 
     def stage(self, name: str) -> AbstractContextManager[None]:
         """Adds the seconds of its block to the stage `name`."""

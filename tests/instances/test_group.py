@@ -57,7 +57,7 @@ def test_a_photo_votes_for_the_gaussians_near_it_as_if_there_were_no_others() ->
     scene = make_scene(row(3), CODES[:3, :8], CAMERAS[:2])
     g, (one, other) = scene.gaussians, scene.views
     near = np.arange(100, 300)
-    votes = mask_votes(Nearby(g, {one.name: near}), [one, other])
+    votes = mask_votes(Nearby(g, {one.name: [near[:50], near[50:]]}), [one, other])
     of_near, of_all = mask_votes(Nearby(g.rows(torch.from_numpy(near))), [one]), mask_votes(Nearby(g), [other])
     for name in ("weights", "void"):
         both = getattr(votes, name).toarray()

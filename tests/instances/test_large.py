@@ -16,6 +16,7 @@ from sklearn.metrics import adjusted_rand_score
 
 pytest.importorskip("perception._core")
 from perception.config import InstanceConfig
+from perception.instances import assign, consensus
 from perception.instances.group import Grouping, group
 from perception.instances.votes import MaskVotes
 
@@ -72,6 +73,27 @@ def test_the_objects_of_a_building_are_found(together: int | None, monkeypatch: 
     found = grouped(means, features, votes)
     known = found.ids >= 0
     assert known.mean() > 0.95 and adjusted_rand_score(truth[known], found.ids[known]) > 0.97
+
+
+def test_tables_of_many_photos_are_made_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The instances are the same, bit for bit, and no part is larger than it may be."""
+    made = building(6_000, 120)[:3]
+    expected, nodes, weights = grouped(*made), list[int](), list[int]()
+    evidence, affinities = consensus.evidence, assign.affinities
+    monkeypatch.setattr(consensus, "evidence", lambda table: nodes.append(table.pixels.nnz) or evidence(table))
+    monkeypatch.setattr(
+        assign,
+        "affinities",
+        lambda votes, shares, rows: weights.append(votes.weights[rows].nnz) or affinities(votes, shares, rows),
+    )
+    monkeypatch.setattr(consensus, "ENTRIES", 5_000)
+    monkeypatch.setattr(assign, "ENTRIES", 100_000)
+    found = grouped(*made)
+    for name, value in vars(expected).items():
+        np.testing.assert_array_equal(getattr(found, name), value)
+    masks = made[2].weights.shape[1]
+    assert len(nodes) > 100 and max(nodes) <= 5_000 + masks
+    assert len(weights) > 10 and max(weights) < 1.5 * 100_000 / 4  # of 60 weights for each Gaussian
 
 
 def main() -> None:

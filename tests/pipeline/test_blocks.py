@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import tracemalloc
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -117,6 +118,25 @@ def test_a_place_that_every_photo_sees_stays_whole() -> None:
     assert len(cut(replace(scene, report={"points_from": "random"}), 10)) == 1
 
 
+def test_a_cut_holds_less_than_a_byte_for_each_photo_and_point() -> None:
+    """What 200 more photos take, each of which sees all points."""
+    scene = corridor()
+    points = np.random.default_rng(4).uniform([5, 1.9, -1], [15, 2.1, 1], (16_000, 3))
+    far = look_at(np.array([10, -40, 0.0]), np.array([10, 2, 0.0]), np.array([0, 0, 1.0]))
+    view = replace(scene.views[0], camera_from_world=far)
+    assert visible_points(view, points).all()
+
+    def peak(count: int) -> int:
+        views = [replace(view, name=str(number)) for number in range(count)]
+        tracemalloc.start()
+        cut(replace(scene, views=views, points=points), 10)
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return most
+
+    assert peak(300) - peak(100) < 200 * len(points)
+
+
 def test_joined_gaussians_keep_their_order_harmonics_and_blocks() -> None:
     a, b = (from_points(np.eye(3) * n, np.full((3, 3), 90, np.uint8), feature_dim=2, seed=0) for n in (1, 2))
     b = replace(b, sh=torch.arange(36.0).reshape(3, 4, 3))
@@ -165,8 +185,9 @@ def test_near_a_photo_are_the_gaussians_of_the_blocks_that_it_sees() -> None:
     for number, view in enumerate(scene.views):
         visible = scene.points[visible_points(view, scene.points)]
         sees = [number in block.views or block.owns(visible).any() for block in blocks]
-        assert rows[view.name].tolist() == [i for i, block in enumerate(owner) if sees[block]]
-    assert len(blocks) > 2 and len({id(array) for array in rows.values()}) < len(scene.views)  # shared
+        assert np.concatenate(rows[view.name]).tolist() == [i for i, block in enumerate(owner) if sees[block]]
+    assert len(blocks) > 2 and len({id(parts) for parts in rows.values()}) < len(scene.views)  # shared
+    assert len({id(part) for parts in rows.values() for part in parts}) == len(blocks)  # a row is held once
 
 
 @pytest.mark.slow

@@ -48,6 +48,30 @@ def test_arrays_beyond_the_limit_lie_on_disk_and_stay_as_they_are(
     assert not list(tmp_path.iterdir())  # unnamed: nothing is left, however the run ends
 
 
+def test_arrays_beside_others_fill_the_same_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "CHUNK", 128)
+    first = DiskArrays(tmp_path, limit=800)  # three blocks in memory
+    held = [first.keep(np.zeros(128, np.uint8)) for _ in range(2)]
+    files: list[int] = []
+    make = memory._new_file
+    monkeypatch.setattr(memory, "_new_file", lambda folder, size: files.append(size) or make(folder, size))
+    second = DiskArrays(tmp_path, 800, first)
+    held += [second.keep(np.zeros(128, np.uint8)) for _ in range(3)]
+    assert files == [128, 128]
+
+
+def test_pages_are_dropped_while_a_large_array_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the thread that looks at them has no turn."""
+    if mapped_bytes() == 1 << 62:
+        pytest.skip("the system does not tell what is resident")
+    monkeypatch.setattr(memory, "_watch", lambda _: None)
+    arrays, before, seen = DiskArrays(tmp_path, limit=4 * MIB), mapped_bytes(), list[int]()
+    monkeypatch.setattr(memory, "mapped_bytes", lambda: seen.append(mapped_bytes()) or seen[-1])
+    numbers = np.arange(24 * MIB, dtype=np.uint8)
+    np.testing.assert_array_equal(arrays.keep(numbers), numbers)
+    assert len(seen) == 24 and max(seen) - before < 5 * MIB
+
+
 def test_pages_of_files_are_dropped_beyond_the_limit(tmp_path: Path) -> None:
     before = mapped_bytes()
     if before == 1 << 62:
