@@ -316,6 +316,9 @@ def rasterize(
     viewmats [C,4,4] camera_from_world, Ks [C,3,3] pixels (pixel centres at +0.5, no skew), features [N,D],
     background [3] or [C,3]. float32 or float64 on the CPU, float32 on CUDA. Gradients flow to all of them except Ks.
 
+    Not drawn are Gaussians behind the near plane, and those outside the guard band (Kerbl et al. 2023, §6): their mean
+    is outside 1.3 times the field of view, and over 5 times as far from the optical axis as from the camera's plane.
+
     eps2d: px² added to the diagonal of every 2D covariance, the variance of the pixel's blur (named as in gsplat).
     variance=False and depth=False save time: `feature_variance` and `depths` are not computed (None).
     threads: 0 takes torch.get_num_threads(). The result is the same, bit for bit, for any number of threads.
