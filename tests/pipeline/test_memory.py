@@ -143,6 +143,8 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draws both against the photos (matplotlib)")
     options = parser.parse_args()
+    if options.plot:
+        import matplotlib  # noqa: F401  before minutes of work
     few = ["train.iterations=40", "train.budget=5000", "language.encoder=none", "photos.poses=keep", *options.pairs]
     more = ["--memory", options.memory] if options.memory else []
     paths = {**os.environ, "PYTHONPATH": str(Path(perception.__file__).resolve().parents[1])}
