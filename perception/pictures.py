@@ -11,7 +11,7 @@ from perception.colors import instance_palette
 
 
 def error_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Difference of two images of one shape: black = equal, brightest = a quarter of the range or more."""
+    """Mean difference of two images [H, W, 3] uint8: black = none, brightest = a quarter of the range or more."""
     difference = np.abs(a.astype(np.float32) / 255 - b.astype(np.float32) / 255).mean(-1)
     level = np.round(255 * np.clip(difference / 0.25, 0, 1)).astype(np.uint8)
     return cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1].copy()
