@@ -13,9 +13,10 @@ from typing import Any
 
 from perception.errors import InputError, missing_extra
 from perception.io.atomic import atomic_directory
-from perception.io.checksums import facts_of, sha256
 from perception.io.documents import brief
-from perception.io.model_store import (
+from perception.map.checksums import facts_of, sha256
+from perception.onnx.sessions import model_graphs, model_root, side_files
+from perception.onnx.store import (
     NAME,
     RECORD,
     Entry,
@@ -25,7 +26,6 @@ from perception.io.model_store import (
     known_names,
     models_folder,
 )
-from perception.io.onnx_sessions import model_graphs, model_root, side_files
 from perception.progress import QUIET, Progress
 
 _KEPT = (".json", ".txt")  # of a folder, beside graphs and their weights: configurations and tokenizers
@@ -76,8 +76,8 @@ def _opened(purpose: str | None, spec: str) -> list[str]:
 
 def describe_graph(path: Path) -> dict[str, Any]:
     """Family, role, inputs, outputs and providers of one ONNX file."""
-    from perception.io.onnx_sessions import provider_warning
     from perception.masks.sam_models import open_graph
+    from perception.onnx.sessions import provider_warning
 
     graph = open_graph(path)
     family, role = recognise(graph)

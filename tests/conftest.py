@@ -12,7 +12,8 @@ import pytest
 import perception
 
 # Child processes import the perception under test, installed or in this tree, and the tests' helpers.
-_HOMES = [Path(perception.__file__).resolve().parents[1], Path(__file__).resolve().parent]
+_TESTS = Path(__file__).resolve().parent
+_HOMES = [Path(perception.__file__).resolve().parents[1], _TESTS, _TESTS.parent / "tools"]
 os.environ["PYTHONPATH"] = os.pathsep.join(map(str, _HOMES))
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")

@@ -14,9 +14,9 @@ import pytest
 
 from perception.cli import main
 from perception.errors import InputError
-from perception.io.model_store import Entry, catalogue, find_model, models_folder
 from perception.masks import make_source
 from perception.models import add_model, check_file, get_model
+from perception.onnx.store import Entry, catalogue, find_model, models_folder
 from support.onnx_files import FLOAT, INT64, SAM_DECODER, write_onnx
 
 IMAGE = ((1, 3, 1024, 1024), FLOAT)

@@ -13,8 +13,8 @@ import numpy as np
 from perception.bags.poses import Poses
 from perception.bags.read import CAMERA_INFO, DEPTH_TRANSPORT, IMAGES, Bag, camera_of, raw_rows, stamp_of
 from perception.errors import InputError
-from perception.io.camera_file import read_camera, write_camera_info
-from perception.io.lens import camera_from_lens, rescale_lens
+from perception.photos.camera_file import read_camera, write_camera_info
+from perception.photos.lens import camera_from_lens, rescale_lens
 from perception.types import Lens
 
 APART = 0.03

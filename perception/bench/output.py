@@ -57,7 +57,7 @@ def machine() -> dict[str, Any]:
 
 def finish(name: str, options: argparse.Namespace, report: dict[str, Any], text: str) -> None:
     """Prints `text`, or JSON with --json. Writes both to the output folder, with machine, versions and arguments."""
-    from perception.io.tasks import versions
+    from perception.tasks.folder import versions
 
     facts = {"bench": name, "arguments": dict(vars(options)), "machine": machine(), "versions": versions(), **report}
     with atomic_file(options.output / f"{name}.json") as aside:

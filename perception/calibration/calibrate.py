@@ -16,9 +16,9 @@ from perception.calibration.board import Board, Detection
 from perception.calibration.solve import NAMES, Solution, solve
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
-from perception.io.camera_file import write_camera
-from perception.io.photos import SUFFIXES, read_grey
-from perception.io.video import frames
+from perception.photos.camera_file import write_camera
+from perception.photos.decode import SUFFIXES, read_grey
+from perception.photos.video import frames
 
 MAX_FRAMES = 240
 """Maximum number of video frames that are read, evenly spaced."""

@@ -119,11 +119,11 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.config import load_config
 
     config = load_config(args.config, settings_given(args), args.preset)
-    from perception.io.engine import Engine
     from perception.pipeline.mapping import build_map
     from perception.pipeline.remote import local_places
-    from perception.pipeline.summary import map_facts
     from perception.progress import Progress
+    from perception.report.text import map_facts
+    from perception.tasks.engine import Engine
 
     engine = Engine(args.engine, args.address)
     with (
@@ -140,9 +140,9 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _fleet(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.engine import Engine
     from perception.pipeline.fleet import run_fleet
     from perception.progress import Progress
+    from perception.tasks.engine import Engine
 
     with _sigterm_as_interrupt(), Progress() as progress:
         made = run_fleet(args.jobs, Engine(args.engine, args.address), progress)
@@ -161,10 +161,10 @@ def _sigterm_as_interrupt() -> AbstractContextManager[None]:
 
 
 def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.map import Map
-    from perception.io.map_files import read_info
-    from perception.io.store import verify_map
-    from perception.pipeline.summary import info_text
+    from perception.map.files import read_info
+    from perception.map.map import Map
+    from perception.map.write import verify_map
+    from perception.report.text import info_text
 
     info = read_info(args.map)
     entries = Map.open(args.map).instances
@@ -179,8 +179,8 @@ def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _report(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.pipeline.reporting import write_map_report
     from perception.query import load_map
+    from perception.report.page import write_map_report
 
     page = write_map_report(load_map(args.map), args.output, args.ask)
     return {"report": str(page)}, str(page)

@@ -70,8 +70,8 @@ def register(commands: Any) -> None:
 
 
 def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.pipeline.summary import query_text, write_hits
     from perception.query import load_map
+    from perception.report.text import query_text, write_hits
 
     opened = load_map(args.map)
     answers = [(text, opened.query(text, args.top, args.min_score)) for text in args.text]
@@ -97,8 +97,8 @@ def _index(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.map import Map
-    from perception.io.store import set_labels
+    from perception.map.map import Map
+    from perception.map.write import set_labels
 
     if args.text is not None and args.clear:
         raise InputError("label: give a NAME or --clear, only one of them")
@@ -116,8 +116,8 @@ def _label(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _scale(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.config import FrameConfig, settings_from
-    from perception.frame.scaled_map import scale_map
-    from perception.pipeline.summary import frame_lines
+    from perception.edit.scale import scale_map
+    from perception.report.text import frame_lines
 
     names = ("known_length", "tag_size", "board")
     given = {n: (getattr(args, n), f"--{n.replace('_', '-')}") for n in names if getattr(args, n) is not None}
@@ -127,7 +127,7 @@ def _scale(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _relink(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.store import relink
+    from perception.map.write import relink
 
     facts = relink(args.map, args.folder)
     lines = [f"{args.map}: {facts['linked']} photos found in {args.folder}"]
@@ -137,7 +137,7 @@ def _relink(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _upgrade(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.pipeline.upgrade import upgrade_map
+    from perception.edit.upgrade import upgrade_map
     from perception.progress import Progress
 
     facts = upgrade_map(args.map, args.output, progress=Progress(quiet=args.json))
@@ -147,10 +147,10 @@ def _upgrade(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.export.export_map import export_map
+    from perception.export.mesh import check_outputs, export_mesh, export_voxels
     from perception.export.transfer import ExportOptions
-    from perception.io.store import read_map
-    from perception.pipeline.exporting import export_map
-    from perception.pipeline.meshing import check_outputs, export_mesh, export_voxels
+    from perception.map.write import read_map
     from perception.query.query_map import load_map
     from perception.query.scene_graph import write_graph
 
@@ -183,6 +183,6 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _render(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.pipeline.rendering import render_map
+    from perception.export.render import render_map
 
     return render_map(args.map, args.output, args.cameras, args.what.split(","))

@@ -24,7 +24,7 @@ def register(commands: Any) -> None:
 
 
 def _list(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.model_store import models_folder, stored_models
+    from perception.onnx.store import models_folder, stored_models
 
     found = [
         {name: getattr(model, name) for name in ("name", "family", "purpose", "files")}
@@ -54,8 +54,8 @@ def _check(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _get(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.model_store import catalogue
     from perception.models import get_model
+    from perception.onnx.store import catalogue
     from perception.progress import Progress
 
     if args.name is not None:

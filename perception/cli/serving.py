@@ -39,7 +39,7 @@ def register(commands: Any) -> None:
 
 def _settings(args: argparse.Namespace, **given: Any) -> Any:
     from perception.config import settings_from
-    from perception.listening import read_token
+    from perception.serve.listening import read_token
     from perception.serve.server import ServeSettings
 
     given["token"] = None if args.token_file is None else read_token(args.token_file)
@@ -55,7 +55,7 @@ def _serve(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _mcp(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.mcp import serve_http, serve_stdio
+    from perception.serve.mcp import serve_http, serve_stdio
 
     if args.http is None:
         serve_stdio(args.map)
@@ -86,7 +86,7 @@ def _view(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     import sys
     import threading
 
-    from perception.listening import read_token
+    from perception.serve.listening import read_token
 
     token = None if args.token_file is None else read_token(args.token_file)
     from perception.viewer import Viewer

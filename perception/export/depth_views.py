@@ -11,8 +11,8 @@ import torch
 
 from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
-from perception.io.depth import without_edges
-from perception.io.photos import scaled_K, scaled_size
+from perception.photos.decode import scaled_K, scaled_size
+from perception.photos.depth import without_edges
 from perception.types import View
 
 

@@ -18,7 +18,7 @@ from PIL import Image
 from perception.export.spz import check_finite
 from perception.instances.segments import nearest_centres
 from perception.io.atomic import replacing
-from perception.io.map import Map
+from perception.map.map import Map
 
 CODES, WIDE = 256, 64
 """Numbers of a codebook; centroids in a row of the palette's image."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.atomic import replacing
-from perception.io.map import Map
+from perception.map.map import Map
 
 MAGIC, VERSION = 0x5053474E, 2
 COLOR_SCALE = 0.15

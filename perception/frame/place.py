@@ -12,10 +12,10 @@ from perception.config import FrameConfig
 from perception.errors import InputError
 from perception.frame.gravity import Gravity, floor_height, gravity_of_scene
 from perception.frame.known_size import scale_of_board, scale_of_pixels, scale_of_tags
+from perception.frame.recentre import moved_scene
 from perception.frame.scale import Measurement, combined, known_length, scale_of_depth, scale_of_gps
 from perception.geometry import camera_centres
-from perception.io.depth import load_depth
-from perception.io.recentre import moved_scene
+from perception.photos.depth import load_depth
 from perception.types import Scene, View
 
 UNIT_IS_METRE, UNIT_OF_DEPTH = 0.03, 0.4

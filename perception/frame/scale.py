@@ -12,9 +12,9 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import align_similarity, camera_centres
-from perception.io.depth import load_depth
-from perception.io.lens import load_pycolmap
-from perception.io.photos import DECODE_ERRORS, exif_of, open_photo
+from perception.photos.decode import DECODE_ERRORS, exif_of, open_photo
+from perception.photos.depth import load_depth
+from perception.photos.lens import load_pycolmap
 from perception.types import View
 
 LARGEST_ERROR = 0.2

@@ -15,7 +15,7 @@ TRIAL = 0.05
 CEILING = 45.0
 """PSNR in dB above which gains are not counted: an RMS error of 1.4 of 255 grey levels, below a photo's noise."""
 COST_EXPONENT = 0.6
-"""The time of an iteration grows with the number of Gaussians to this power (tests/speed/fronts.py)."""
+"""The time of an iteration grows with the number of Gaussians to this power (tools/speed/fronts.py)."""
 HARMONICS_GAIN = 0.05
 """Least gain in held-out PSNR, in dB, for which the highest degree of harmonics is kept."""
 

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from perception.errors import InputError
-from perception.io.checksums import FACTS
+from perception.map.checksums import FACTS
 from perception.progress import Progress
 
 AT_ONCE = 64

@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.model_store import known_names, resolve
-from perception.io.onnx_sessions import (
+from perception.language.base import Reading, check_images, check_texts, unit_rows
+from perception.language.preprocess import CLIP_FAMILY, Family, family_of, find_preprocess
+from perception.language.tokenizer import Tokenizer, find_tokenizer
+from perception.onnx.sessions import (
     dtype_of,
     fingerprint,
     graph_name,
@@ -28,9 +30,7 @@ from perception.io.onnx_sessions import (
     shape_of,
     signature,
 )
-from perception.language.base import Reading, check_images, check_texts, unit_rows
-from perception.language.preprocess import CLIP_FAMILY, Family, family_of, find_preprocess
-from perception.language.tokenizer import Tokenizer, find_tokenizer
+from perception.onnx.store import known_names, resolve
 
 BATCH = 16
 CLIP_SCALE = 100.0  # to which CLIP's trained logit_scale is clipped, and which its models reach (Radford et al. 2021)

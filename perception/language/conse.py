@@ -25,11 +25,11 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
-from perception.io.model_store import cache_folder
 from perception.language import minilm
 from perception.language.base import Part, Reading, check_images, check_texts, packaged_file, unit_rows
 from perception.language.household import household_thing
 from perception.language.minilm import MiniLM
+from perception.onnx.store import cache_folder
 
 TOP = 20  # number of classes T in the sentence-space embedding
 CLASSES = 1000

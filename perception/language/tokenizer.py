@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError, missing_extra
-from perception.io.onnx_sessions import read_config
 from perception.language.preprocess import family_of
+from perception.onnx.sessions import read_config
 
 _GEMMA = 200_000  # words that SigLIP 2's vocabulary exceeds; it is trained on lower case with punctuation
 _PUNCTUATION = str.maketrans("", "", string.punctuation)

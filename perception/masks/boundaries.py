@@ -1,6 +1,6 @@
 """Learned borders of objects: a small convolutional network sees the colours, normals, steps and creases of a photo.
 
-It tells the border of a thing from a shadow or from print by what is around it. `python tests/training/masks.py` makes
+It tells the border of a thing from a shadow or from print by what is around it. `python -m tools training.masks` makes
 its packaged weights from rendered worlds alone, see docs/masks.md.
 """
 
@@ -89,7 +89,7 @@ def forward(layers: Layers, inputs: torch.Tensor) -> torch.Tensor:
 
 @functools.cache
 def read_layers(file: Path = WEIGHTS) -> Layers:
-    """The layers of the package, or of another file of `tests/training/masks.py`."""
+    """The layers of the package, or of another file of `tools/training/masks.py`."""
     import torch
 
     with np.load(file) as stored:

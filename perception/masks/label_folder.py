@@ -52,7 +52,7 @@ class LabelFolder:
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
         """photo: [h, w, 3] undistorted; only its size is used. Returns [h, w] int32."""
-        from perception.io.photos import warp_labels
+        from perception.photos.decode import warp_labels
 
         file = self._files.get(view.name) or self._find(view, [view])
         if file is None:

@@ -146,7 +146,7 @@ def stored_key(file: Path) -> str | None:
     """The key that a label image was written with; None if the file or the key cannot be read."""
     from PIL import Image
 
-    from perception.io.photos import DECODE_ERRORS
+    from perception.photos.decode import DECODE_ERRORS
 
     if not file.is_file():
         return None
@@ -183,7 +183,7 @@ def read_labels(file: Path) -> np.ndarray:
     """[H, W] int32. Pillow keeps palette indices, whereas OpenCV converts them to colours."""
     from PIL import Image
 
-    from perception.io.photos import DECODE_ERRORS
+    from perception.photos.decode import DECODE_ERRORS
 
     try:
         with Image.open(file, formats=["PNG"]) as image:

@@ -2,7 +2,7 @@
 
 The most likely pair of neighbours is merged first, and the evidence is recomputed after every merge (Nunez-Iglesias et
 al. 2013), until nothing is left to merge. The cut maximises Σ (p − cost) over its regions, where p is the learned
-probability that a region is an object. Small neural networks tell the probabilities; `python tests/training/masks.py`
+probability that a region is an object. Small neural networks tell the probabilities; `python -m tools training.masks`
 makes their packaged weights from rendered worlds alone, see docs/masks.md.
 """
 
@@ -62,7 +62,7 @@ class MergeModel:
 
 @functools.cache
 def read_model(file: Path = WEIGHTS) -> MergeModel:
-    """The model of the package, or of another file of `tests/training/masks.py`."""
+    """The model of the package, or of another file of `tools/training/masks.py`."""
     with np.load(file) as stored:
         settings, *parts = (stored[f"arr_{k}"] for k in range(1 + 2 * _PARTS))
     cost, slope, offset = settings.tolist()

@@ -14,8 +14,7 @@ import numpy as np
 from PIL import Image
 
 from perception.errors import InputError
-from perception.io.model_store import known_names, resolve
-from perception.io.onnx_sessions import (
+from perception.onnx.sessions import (
     dtype_of,
     fingerprint,
     model_graphs,
@@ -25,6 +24,7 @@ from perception.io.onnx_sessions import (
     shape_of,
     signature,
 )
+from perception.onnx.store import known_names, resolve
 
 # Role -> names of it in public exporters.
 _ALIASES = {

@@ -15,7 +15,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from perception.colors import instance_palette, rgb8_from_sh
-from perception.query import Hit, QueryMap, Reply
+from perception.query import Hit, QueryMap
+from perception.query.requests import Reply
 from perception.types import OrientedBox
 
 

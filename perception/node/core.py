@@ -18,9 +18,10 @@ from typing import Any, Protocol
 from perception.errors import InputError
 from perception.node import answers
 from perception.node.config import NodeConfig
-from perception.query import EngineBusy, EngineClosed, QueryEngine, QueryMap, Reply, Request
-from perception.query.bodies import QueryBody, parse
-from perception.query.requests import MAX_BYTES, error_kind, error_line
+from perception.query import QueryMap
+from perception.query.requests import MAX_BYTES, EngineBusy, EngineClosed, Reply, Request, error_kind, error_line
+from perception.serve.bodies import QueryBody, parse
+from perception.serve.engine import QueryEngine
 
 _SHOWN = 80
 

@@ -24,7 +24,7 @@ from perception.node import answers
 from perception.node.answers import DEPTH, Channel
 from perception.node.config import NodeConfig
 from perception.node.core import Core, Message
-from perception.query import QueryEngine
+from perception.serve.engine import QueryEngine
 
 _SEQUENCE = re.compile(r"(?:sequence<)?(\w+/\w+)(?:, \d+)?>?(?:\[\d+\])?")
 _EXTRA_SECONDS = 1.0

@@ -16,15 +16,15 @@ from perception.errors import InputError
 from perception.evaluate.instances import evaluate
 from perception.export.transfer import export_labels, write_export
 from perception.geometry import align_similarity, camera_centres
-from perception.io.store import Map
+from perception.map.write import Map
 from perception.pipeline.mapping import build_map
-from perception.pipeline.reporting import map_picture, write_map_report
 from perception.progress import Progress
 from perception.query import QueryMap, load_map
+from perception.report.page import map_picture, write_map_report
 from perception.types import PointCloud
 
 SCENE = Path(__file__).parents[1] / "demo_scene"
-"""40 rendered photos of a table, and their truth (tests/worlds/make.py)."""
+"""40 rendered photos of a table, and their truth (tools/worlds/make.py)."""
 SETTINGS = ["train.iterations=1300", "train.budget=40000"]
 """Settings of the demo, for a small scene in under a minute on two cores."""
 

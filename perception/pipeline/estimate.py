@@ -13,7 +13,7 @@ from pathlib import Path
 from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.size import sized
-from perception.io.inputs import PhotoSizes, photo_sizes
+from perception.inputs.load import PhotoSizes, photo_sizes
 
 BASE_BYTES, BYTES_PER_GAUSSIAN, BYTES_PER_PIXEL, DEPTH_BYTES = 900 << 20, 2400, 7, 5
 """Program and libraries; parameters, gradients and moments of a Gaussian; a decoded photo (3), its

@@ -9,11 +9,11 @@ from typing import Any
 
 from perception.config import MapConfig, Settings, load_config, settings_from
 from perception.errors import InputError, refuse_named_pipe
-from perception.io.engine import Engine
 from perception.io.object_store import is_url, place
 from perception.pipeline.mapping import build_map
 from perception.pipeline.remote import local_places
 from perception.progress import QUIET, Progress
+from perception.tasks.engine import Engine
 
 
 class Job(Settings):

@@ -15,31 +15,31 @@ import numpy as np
 from perception.config import MapConfig
 from perception.errors import InputError
 from perception.frame.place import placed_scene
+from perception.frame.recentre import recentred
 from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians
+from perception.gaussians.photos import exposed_as_neighbours, split_views
 from perception.gaussians.views import TrainingView, psnr, render_view, surface_depth
-from perception.io.engine import Engine
-from perception.io.inputs import load_saved_scene, load_scene, save_scene
-from perception.io.map_files import read_info
-from perception.io.map_views import stored_view
-from perception.io.reading import Reading
-from perception.io.recentre import recentred
-from perception.io.store import Map, read_map, write_map
-from perception.io.tasks import versions
+from perception.inputs.load import load_saved_scene, load_scene, save_scene
 from perception.language.base import Encoder
 from perception.language.ocr import make_reader
+from perception.map.files import read_info
+from perception.map.write import Map, read_map, write_map
 from perception.masks import make_source
 from perception.masks.builtin import BuiltinSegmentation
 from perception.masks.label_images import load_segmentation
+from perception.photos.reading import Reading
+from perception.photos.view_json import stored_view
 from perception.pipeline.blocks import cut, optimise_blocks
 from perception.pipeline.checkpoint import clear_work, fingerprint, frames_folder, poses_mark, working
 from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
 from perception.pipeline.optimise import Photos, Run, label_by_tasks, label_photos, optimise
-from perception.pipeline.photos import exposed_as_neighbours, split_views
 from perception.pipeline.record import depth_errors, depth_used, finite, peak_memory_mib
-from perception.pipeline.summary import depth_text, frame_lines
 from perception.progress import QUIET, Progress
+from perception.report.text import depth_text, frame_lines
+from perception.tasks.engine import Engine
+from perception.tasks.folder import versions
 from perception.types import Scene, View
 
 FRAME_FACTS = ("map_from_input", "scale", "gravity")

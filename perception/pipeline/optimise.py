@@ -17,20 +17,20 @@ from perception.config import MapConfig
 from perception.gaussians.depth_start import start_on_surface
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.nearby import Nearby
+from perception.gaussians.photos import load_all, with_labels
 from perception.gaussians.size import sized
 from perception.gaussians.train import Trainer, TrainingView, TrainRecord
 from perception.gaussians.views import surface_depth
-from perception.io.engine import Engine
 from perception.io.memory import DiskArrays, Keep, return_free_memory
-from perception.io.photos import load_photo
-from perception.io.tasks import has_task, read_task, write_task
 from perception.masks import MaskSource, compute_masks, make_source
 from perception.masks.builtin import BuiltinSegmentation
 from perception.masks.sam import SamSource
+from perception.photos.decode import load_photo
 from perception.pipeline.checkpoint import TrainingObserver, digest, training_mark
 from perception.pipeline.estimate import image_memory, largest_budget, memory_limit
-from perception.pipeline.photos import load_all, with_labels
 from perception.progress import Progress, timed
+from perception.tasks.engine import Engine
+from perception.tasks.folder import has_task, read_task, write_task
 from perception.types import Scene, View
 
 GEOMETRY_START = 0.3

@@ -11,12 +11,12 @@ from typing import Any
 
 from perception.config import MapConfig
 from perception.errors import InputError
-from perception.io.map_files import read_info
-from perception.io.model_store import cache_folder
 from perception.io.object_store import fetch, is_url, publish, published
+from perception.map.files import read_info
+from perception.onnx.store import cache_folder
 from perception.pipeline.checkpoint import digest, fingerprint
-from perception.pipeline.reporting import write_own_report
 from perception.progress import Progress
+from perception.report.page import write_own_report
 
 
 @dataclass

@@ -4,24 +4,16 @@ gmap = load_map("kitchen.gsmap")             a map in one process; thread-safe
 with QueryEngine("kitchen.gsmap") as engine  for servers: bounded request queue, time-outs, reload of a changed map
 """
 
-from perception.query.engine import QueryEngine
 from perception.query.hit import Description, Hit, Neighbor
 from perception.query.query_map import QueryMap, load_map
-from perception.query.requests import AnswerTimeout, EngineBusy, EngineClosed, Reply, Request
 from perception.query.where import Frame, Where, axis_box
 
 __all__ = [
-    "AnswerTimeout",
     "Description",
-    "EngineBusy",
-    "EngineClosed",
     "Frame",
     "Hit",
     "Neighbor",
-    "QueryEngine",
     "QueryMap",
-    "Reply",
-    "Request",
     "Where",
     "axis_box",
     "load_map",

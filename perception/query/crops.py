@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.map import Map
+from perception.map.map import Map
 from perception.query.query_map import QueryMap
 from perception.query.requests import UnknownInstance
 from perception.types import View
@@ -25,7 +25,7 @@ def best_crop(gmap: QueryMap, instance_id: int, side: int = 320, inside: Path | 
     inside: the folder where photos may be read, None = anywhere. An untrusted map may name any file as its photo, so
     UnknownInstance is raised for a photo outside this folder. Symbolic links are resolved first.
     """
-    from perception.io.photos import load_photo
+    from perception.photos.decode import load_photo
 
     found = gmap.best_view(instance_id)
     if found is None:

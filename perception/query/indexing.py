@@ -14,8 +14,8 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_file, writing
-from perception.io.checksums import FACTS, STORE
 from perception.language.encoders import make_encoder
+from perception.map.checksums import FACTS, STORE
 from perception.progress import QUIET, Progress
 from perception.query.map_store import FORMAT_VERSION, TOLD, read_store
 from perception.query.query_map import QueryMap, load_map

@@ -17,14 +17,14 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.arrays import read_npz
-from perception.io.checksums import STORE
-from perception.io.map import Map
 from perception.language.description import check_encoder
 from perception.language.encoders import make_encoder
 from perception.language.printed import Printed, quoted_text
-from perception.language.ranking import THING, Ranker, least_score
+from perception.map.checksums import STORE
+from perception.map.map import Map
 from perception.query.hit import Hit
 from perception.query.query_map import QueryMap
+from perception.query.ranking import THING, Ranker, least_score
 from perception.query.relations import WEIGHT, Places, parse, standing
 from perception.query.requests import MAX_TOP, TOP, Request
 from perception.query.text_ranking import REMEMBERED, one_thread

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from perception.boxes import oriented_box
-from perception.io.map import language_in
 from perception.language.description import from_arrays
 from perception.language.printed import quoted_text
-from perception.language.ranking import PRESENT, Ranker
 from perception.language.shape_words import shape_kind
+from perception.map.map import language_in
+from perception.query.ranking import PRESENT, Ranker
 from perception.query.relations import parse
 
 if TYPE_CHECKING:

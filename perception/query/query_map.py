@@ -11,11 +11,11 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import move_points
-from perception.io.checksums import STORE
-from perception.io.map import Map
-from perception.language.ranking import Ranker, answering
+from perception.map.checksums import STORE
+from perception.map.map import Map
 from perception.query.hit import Description, Hit, Neighbor
 from perception.query.nodes import Nodes
+from perception.query.ranking import Ranker, answering
 from perception.query.requests import TOP, Request, UnknownInstance
 from perception.query.spatial_index import SpatialIndex
 from perception.query.text_ranking import Encoders, TextRanking
@@ -160,7 +160,7 @@ class QueryMap(Map):
 
     def likely_names(self, count: int = 3) -> list[list[str]]:
         """The likeliest names of every instance, best first, in the order of `instances`."""
-        from perception.language.naming import likely_names
+        from perception.query.naming import likely_names
 
         return likely_names(self.ranker, count) if self.instances else []
 

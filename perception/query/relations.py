@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perception.language.printed import quoted_text
-from perception.language.ranking import PRESENT
+from perception.query.ranking import PRESENT
 
 if TYPE_CHECKING:
-    from perception.io.map import Map
-    from perception.language.ranking import Answer, Ranker
+    from perception.map.map import Map
+    from perception.query.ranking import Answer, Ranker
 
 TRIM = 0.02  # share of an instance's points left out of its box at either end of each axis
 WEIGHT = 3.0  # added to z for a full match, in standard deviations of the map's probes
@@ -91,7 +91,7 @@ def standing(ranker: Ranker, maps: Sequence[tuple[slice, Places]], relation: Rel
 def level_from_map(gmap: Map) -> np.ndarray | None:
     """The rotation [3, 3] to a frame with z up: against the map's gravity or, where that is not recorded, up as the
     cameras were held; None if they were not held level."""
-    from perception.instances.shapes import level_frame, up_from_cameras
+    from perception.query.shapes import level_frame, up_from_cameras
 
     down = (gmap.info.get("gravity") or {}).get("direction")
     up = up_from_cameras(gmap.poses) if down is None else -np.asarray(down, np.float64)

@@ -24,7 +24,7 @@ from perception.query.relations import Places, level_from_map
 if TYPE_CHECKING:
     import networkx
 
-    from perception.io.map import Map
+    from perception.map.map import Map
 
 MOST_POINTS = 3000  # of an instance that are looked at
 SECTORS = 8  # of the ring around a thing's foot
@@ -191,7 +191,7 @@ def _rooms(gmap: Map) -> list[int]:
     without what is nearer than DOOR / 2 to something. One room where that is not known."""
     from scipy import ndimage
 
-    from perception.frame.floor_grid import FREE, OCCUPIED, floor_grid
+    from perception.query.floor_grid import FREE, OCCUPIED, floor_grid
 
     cell = 0.1
     try:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from perception.io.map import InstanceIndex
+from perception.map.map import InstanceIndex
 from perception.query.where import inside
 from perception.types import OrientedBox
 

@@ -10,8 +10,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from perception.errors import InputError
-from perception.frame.floor_grid import FREE, HEIGHT, STEP, UNKNOWN, level_surface
 from perception.geometry import move_points, scale_of
+from perception.query.floor_grid import FREE, HEIGHT, STEP, UNKNOWN, level_surface
 from perception.query.query_map import QueryMap
 from perception.query.spatial_index import CORNERS
 from perception.query.where import Frame

@@ -11,11 +11,11 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.map import Map
 from perception.language.base import Encoder
 from perception.language.encoders import make_encoder
 from perception.language.printed import Printed
-from perception.language.ranking import Answer, Ranker
+from perception.map.map import Map
+from perception.query.ranking import Answer, Ranker
 from perception.query.relations import Places, ranked
 from perception.query.where import tidy
 
@@ -35,7 +35,7 @@ class TextRanking:
         self._remembered = lru_cache(REMEMBERED)(self._ranked)
 
     def rank(self, text: str) -> Answer:
-        """The ranking of `perception.language.ranking`. Without embeddings or encoder, the instances with this label.
+        """The ranking of `perception.query.ranking`. Without embeddings or encoder, the instances with this label.
 
         Raises InputError when the map has no embeddings or encoder and no instance has the label `text`.
         """
@@ -94,7 +94,7 @@ class TextRanking:
 
     def _shapes(self) -> np.ndarray:
         from perception.frame.gravity import Gravity
-        from perception.instances.shapes import shape_scores
+        from perception.query.shapes import shape_scores
 
         index = self._gmap.index
         owners = np.repeat(index.ids, np.diff(index.starts))
@@ -108,7 +108,7 @@ def extents(gmap: Map) -> np.ndarray:
     """[I, 3] sides of the instances along the axes of their boxes, or thinner: along the normal of their best plane;
     without the outer TRIM of the points at either end, which stray in a map, and scaled as if spread evenly.
     """
-    from perception.instances.shapes import plane_normal
+    from perception.query.shapes import plane_normal
 
     sides = np.zeros((len(gmap.instances), 3))
     for n, entry in enumerate(gmap.instances):

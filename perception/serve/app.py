@@ -14,11 +14,11 @@ from starlette.concurrency import run_in_threadpool
 
 from perception import __version__
 from perception.io.ply import ply_bytes
-from perception.query.bodies import AtBody, FindBody, NearestBody, QueryBody
-from perception.query.engine import QueryEngine
 from perception.query.query_map import QueryMap
 from perception.query.requests import source
 from perception.query.where import Frame
+from perception.serve.bodies import AtBody, FindBody, NearestBody, QueryBody
+from perception.serve.engine import QueryEngine
 from perception.serve.guard import HANDLERS, Guard
 from perception.serve.server import ServeSettings
 

@@ -16,9 +16,9 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from perception.listening import names_this_machine
-from perception.query.bodies import problem_line
 from perception.query.requests import KINDS, error_kind, error_line
+from perception.serve.bodies import problem_line
+from perception.serve.listening import names_this_machine
 from perception.serve.server import ServeSettings
 
 _log = logging.getLogger("perception.serve")

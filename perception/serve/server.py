@@ -13,9 +13,9 @@ from pydantic import Field
 
 from perception.errors import missing_extra
 from perception.language.base import Encoder
-from perception.listening import check_address, listen, url_host
-from perception.query.engine import QueryEngine
 from perception.query.requests import MAX_BYTES, EngineSettings
+from perception.serve.engine import QueryEngine
+from perception.serve.listening import check_address, listen, url_host
 
 MAX_CONNECTIONS = 256
 MAX_WAITING = MAX_CONNECTIONS // 2

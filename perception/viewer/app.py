@@ -16,7 +16,7 @@ import numpy as np
 
 from perception.colors import instance_palette
 from perception.errors import InputError, missing_extra
-from perception.listening import check_address, is_local, listen, url_host
+from perception.serve.listening import check_address, is_local, listen, url_host
 from perception.viewer.guard import Guard, guarded_server
 from perception.viewer.levels import MOST, Level, level
 from perception.viewer.panel import Panel

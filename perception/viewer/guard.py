@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import parse_qs, quote, unquote
 
 from perception.errors import InputError
-from perception.listening import is_local, names_this_machine
+from perception.serve.listening import is_local, names_this_machine
 
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",

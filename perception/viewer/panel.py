@@ -7,8 +7,8 @@ import string
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from perception.pipeline.summary import frame_lines
 from perception.query.hit import printed_texts
+from perception.report.text import frame_lines
 from perception.viewer.session import MODES
 
 if TYPE_CHECKING:

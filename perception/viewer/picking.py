@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from perception.io.store import Map
+from perception.map.write import Map
 
 PIXEL = 0.0015
 """Angle of a click in radians: about a pixel of a laptop's window."""

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from perception.colors import instance_palette, rgb8_from_sh
-from perception.editing import Editor
+from perception.edit.editor import Editor
 from perception.errors import InputError
-from perception.io.store import Map
+from perception.map.write import Map
 from perception.pictures import features_to_rgb
 from perception.query import Hit, QueryMap
 from perception.query.crops import best_crop

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from perception.bags.frames import FrameOptions, run_frames
 from perception.errors import InputError
 from perception.geometry import inverse_se3
-from perception.io.transforms import read_frames
+from perception.inputs.transforms import read_frames
 
 pytest.importorskip("rosbags")
 from support.bag_recorder import Recorder

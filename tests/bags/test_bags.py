@@ -19,9 +19,9 @@ from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
 from perception.geometry import inverse_se3
-from perception.io.camera_file import read_camera
-from perception.io.transforms import read_frames
-from perception.io.video import Chooser
+from perception.inputs.transforms import read_frames
+from perception.photos.camera_file import read_camera
+from perception.photos.video import Chooser
 from perception.pipeline.mapping import build_map
 
 pytest.importorskip("rosbags")

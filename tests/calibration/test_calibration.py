@@ -14,8 +14,8 @@ from perception.calibration.board import Board, Detection
 from perception.calibration.calibrate import best_model, distinct_views, run_calibration
 from perception.calibration.solve import NAMES, project, solve
 from perception.cli import main
-from perception.io.camera_file import read_camera
-from perception.io.lens import camera_from_lens
+from perception.photos.camera_file import read_camera
+from perception.photos.lens import camera_from_lens
 from support.board_pictures import KnownCamera, board_views, render_board
 
 pytestmark = pytest.mark.slow

@@ -28,7 +28,7 @@ def image(path: Path) -> np.ndarray:
 
 @pytest.fixture(scope="module", params=["tabletop", pytest.param("room", marks=pytest.mark.slow)])
 def scene(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder as tests/worlds/make.py writes it, of small photos; seeds that choose for themselves."""
+    """A folder as tools/worlds/make.py writes it, of small photos; seeds that choose for themselves."""
     folder = tmp_path_factory.mktemp(request.param)
     made = {"scene": request.param, "seed": 5, "views": 10, "width": 160, "height": 120, "light_samples": 1}
     make_photos(folder / "images", truth_folder=folder, **made)

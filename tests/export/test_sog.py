@@ -15,7 +15,7 @@ from perception.errors import InputError
 from perception.export import sog
 from perception.export.sog import codebook, palette, sog_bytes, spatial_order, write_sog
 from perception.instances import segments
-from perception.io.store import read_map
+from perception.map.write import read_map
 from support.compressed import read_sog
 from support.query_maps import write_map_of
 

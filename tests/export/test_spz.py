@@ -13,7 +13,7 @@ from perception.cli import main
 from perception.errors import InputError
 from perception.export.spz import FLIPS, spz_bytes
 from perception.gaussians.rasterize import rasterize
-from perception.io.store import Map, read_map
+from perception.map.write import Map, read_map
 from support.compressed import read_spz
 from support.query_maps import write_map_of
 

@@ -9,9 +9,9 @@ import pytest
 
 from perception.errors import InputError
 from perception.export.depth_views import DepthView
+from perception.export.mesh import check_outputs
 from perception.export.volume import FREE, OCCUPIED, centres, closed_body, grid_shape, occupancy, signed_distance
 from perception.io.open3d import fuse_depth, write_glb
-from perception.pipeline.meshing import check_outputs
 from support import box_rooms
 from support.aimed import look_at
 from support.box_rooms import FURNISHED

@@ -13,10 +13,10 @@ import pytest
 from perception.config import FrameConfig
 from perception.errors import InputError
 from perception.frame.place import placed_scene
+from perception.frame.recentre import moved_scene
 from perception.geometry import camera_centres
-from perception.io.reading import Reading
-from perception.io.recentre import moved_scene
-from perception.io.transforms import read_transforms
+from perception.inputs.transforms import read_transforms
+from perception.photos.reading import Reading
 from perception.types import DepthImage, Scene
 from support.measured_scenes import cameras, random_similarity, room_points
 

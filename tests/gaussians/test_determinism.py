@@ -13,7 +13,7 @@ from perception.cli import main
 from perception.config import load_config
 from perception.gaussians.model import sigmoid
 from perception.io.cloud import read_cloud, write_cloud
-from perception.io.store import read_map
+from perception.map.write import read_map
 from perception.pipeline.mapping import build_map
 from perception.types import PointCloud
 

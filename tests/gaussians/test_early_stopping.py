@@ -25,7 +25,7 @@ from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView
 from perception.io.cloud import read_cloud, write_cloud
 from perception.pipeline.mapping import build_map
-from perception.pipeline.summary import shares
+from perception.report.text import shares
 from perception.types import PointCloud
 
 pytestmark = pytest.mark.slow

@@ -17,16 +17,16 @@ import perception
 from perception import _core
 from perception.config import load_config
 from perception.errors import InputError
+from perception.inputs.colmap import read_workspace
+from perception.inputs.load import load_scene
+from perception.inputs.transforms import read_frames, read_transforms
 from perception.io.arrays import map_npy, read_npz
-from perception.io.camera_file import read_camera
 from perception.io.cloud import read_cloud, write_cloud
-from perception.io.colmap import read_workspace
-from perception.io.inputs import load_scene
-from perception.io.photos import photo_size, read_photo
 from perception.io.ply import read_ply
-from perception.io.reading import Reading, rigid_pose
-from perception.io.transforms import read_frames, read_transforms
 from perception.masks.label_images import load_labels, stored_key
+from perception.photos.camera_file import read_camera
+from perception.photos.decode import photo_size, read_photo
+from perception.photos.reading import Reading, rigid_pose
 from perception.progress import Progress
 from perception.types import PointCloud, View
 

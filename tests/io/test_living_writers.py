@@ -14,8 +14,8 @@ import perception
 from perception.errors import InputError
 from perception.io import atomic
 from perception.io.atomic import atomic_directory, atomic_file, recover
-from perception.io.map_files import map_signature
-from perception.io.store import read_map, write_map
+from perception.map.files import map_signature
+from perception.map.write import read_map, write_map
 from support.paths import SUPPORT
 from support.query_maps import write_map_of
 

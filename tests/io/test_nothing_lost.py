@@ -16,10 +16,10 @@ import pytest
 import perception
 from perception.cli import main
 from perception.config import load_config
-from perception.editing import Editor
+from perception.edit.editor import Editor
 from perception.errors import InputError
 from perception.io.atomic import lock_file, writing
-from perception.io.store import read_map, set_labels, verify_map
+from perception.map.write import read_map, set_labels, verify_map
 from perception.pipeline.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint, work_folder
 from perception.pipeline.mapping import build_map
 from support.paths import SUPPORT
@@ -83,7 +83,7 @@ WITHOUT_EXCHANGE = """
 import os, signal, sys
 from pathlib import Path
 from perception.io import atomic
-from perception.io.store import read_map, write_map
+from perception.map.write import read_map, write_map
 
 path = Path(sys.argv[1])
 atomic._exchange = lambda a, b: False
@@ -171,7 +171,7 @@ TRY = """
 import sys
 from pathlib import Path
 from perception.errors import InputError
-from perception.io.store import set_labels
+from perception.map.write import set_labels
 try:
     set_labels(Path(sys.argv[1]), {0: "x"})
 except InputError as error:

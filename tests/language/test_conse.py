@@ -24,7 +24,7 @@ from perception.language.conse import CLASSIFIER, KNOWN, TAU, TOP, ConseEncoder,
 from perception.language.efficientnet_lite2 import SIDE, EfficientNetLite2  # noqa: E402
 from perception.language.encoders import make_encoder  # noqa: E402
 from perception.language.minilm import WEIGHTS, MiniLM  # noqa: E402
-from perception.language.ranking import Ranker  # noqa: E402
+from perception.query.ranking import Ranker  # noqa: E402
 from support.truth_scenes import TruthScene  # noqa: E402
 
 pytestmark = pytest.mark.slow

@@ -13,7 +13,7 @@ from perception.language import household
 from perception.language.conse import class_names
 from perception.language.description import InstanceDescription
 from perception.language.household import Household, household_thing, size_misfits
-from perception.language.ranking import Ranker
+from perception.query.ranking import Ranker
 from perception.query.text_ranking import extents
 
 

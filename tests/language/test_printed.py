@@ -17,7 +17,7 @@ from perception.language.base import unit_rows
 from perception.language.description import InstanceDescription
 from perception.language.ocr import Line, TextReader, make_reader
 from perception.language.printed import Printed, edit_distance, quoted_text
-from perception.language.ranking import Ranker
+from perception.query.ranking import Ranker
 
 _WORDS = (
     "BIRDS CEREAL MILK BUTTER COFFEE TOMATO PEPPER SUGAR HONEY GARDEN "

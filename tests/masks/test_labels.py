@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from perception.errors import InputError
-from perception.io import photos
 from perception.masks import make_source
 from perception.masks.label_images import compute_masks, label_file, load_labels, write_labels
+from perception.photos import decode as photos
 from perception.types import Lens, View
 from support.progress import Told
 

@@ -18,7 +18,7 @@ from perception.errors import InputError
 from perception.node import answers
 from perception.node.config import NodeConfig, node_config
 from perception.node.core import Core
-from perception.query import QueryEngine
+from perception.serve.engine import QueryEngine
 from support.node_maps import WordEncoder, encoders, write_small_map
 
 LABELS = ["red mug", "laptop", "banana", "Kühlschrank"]

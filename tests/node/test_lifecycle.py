@@ -15,7 +15,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from perception import load_map
-from perception.io.store import write_map
+from perception.map.write import write_map
 from perception.query.standing import where_to_stand
 from support.box_rooms import FURNISHED, map_of
 from support.node_maps import encoders, write_small_map

@@ -18,15 +18,15 @@ from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.gaussians.model import from_points
 from perception.geometry import camera_centres
-from perception.io.engine import Engine
-from perception.io.store import Map
-from perception.io.tasks import TASK, versions
+from perception.map.write import Map
 from perception.pipeline import blocks as module
 from perception.pipeline.blocks import APART, cut, joined, nearby_rows, optimise_block, visible_points
 from perception.pipeline.checkpoint import work_folder
 from perception.pipeline.mapping import build_map
 from perception.pipeline.optimise import Run
 from perception.progress import Progress
+from perception.tasks.engine import Engine
+from perception.tasks.folder import TASK, versions
 from perception.types import Scene, View
 from support.aimed import look_at
 from support.interrupts import interrupt_at

@@ -10,7 +10,7 @@ import pytest
 from perception.config import MapConfig, load_config
 from perception.pipeline import checkpoint
 from perception.pipeline.mapping import build_map
-from perception.pipeline.summary import info_text
+from perception.report.text import info_text
 from support.interrupts import interrupt_at
 from support.progress import Told
 

@@ -10,7 +10,7 @@ from PIL import Image
 
 from perception.config import load_config
 from perception.errors import InputError
-from perception.io.inputs import PhotoSizes, photo_sizes
+from perception.inputs.load import PhotoSizes, photo_sizes
 from perception.pipeline import estimate as module
 from perception.pipeline.estimate import check_memory, log_estimate, needed_bytes
 

@@ -11,7 +11,7 @@ import pytest
 from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
-from perception.io.store import Map
+from perception.map.write import Map
 from perception.pipeline.fleet import read_jobs
 from perception.pipeline.mapping import build_map
 

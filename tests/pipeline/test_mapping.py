@@ -20,7 +20,7 @@ from perception.config import load_config
 from perception.errors import InputError
 from perception.io.atomic import lock_file
 from perception.io.cloud import read_cloud
-from perception.io.store import read_map
+from perception.map.write import read_map
 from perception.pipeline import checkpoint
 from perception.pipeline.checkpoint import work_folder
 from perception.pipeline.demo import DemoTruth, truth_in_map_frame

@@ -12,8 +12,8 @@ from PIL import Image
 
 from perception.cli import main
 from perception.geometry import align_similarity, camera_centres
-from perception.io.photo_folder import view_name
-from perception.io.store import read_map
+from perception.map.write import read_map
+from perception.photos.folder import view_name
 from support.videos import turn_video, write_video
 from worlds import make_photos
 

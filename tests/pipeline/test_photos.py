@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perception.pipeline.photos import exposed_as_neighbours
+from perception.gaussians.photos import exposed_as_neighbours
 from perception.types import View
 
 

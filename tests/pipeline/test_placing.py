@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from perception.cli import main
 from perception.errors import InputError
+from perception.export.export_map import read_transform
 from perception.io.cloud import read_cloud, write_cloud
 from perception.io.open3d import load_open3d
-from perception.io.store import write_map
-from perception.pipeline.exporting import read_transform
+from perception.map.write import write_map
 from perception.query import load_map
 from perception.types import PointCloud
 from support.viewer_maps import small_map

@@ -15,9 +15,9 @@ pytest.importorskip("perception._core")
 from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
-from perception.io.model_store import cache_folder
 from perception.io.object_store import fetch
-from perception.io.store import Map
+from perception.map.write import Map
+from perception.onnx.store import cache_folder
 from perception.pipeline import mapping, remote
 from perception.pipeline.mapping import build_map
 from perception.pipeline.optimise import optimise

@@ -22,7 +22,7 @@ from perception.config import MapConfig, load_config
 from perception.errors import InputError
 from perception.gaussians import train
 from perception.gaussians.views import psnr
-from perception.io.store import read_map
+from perception.map.write import read_map
 from perception.pipeline import checkpoint, mapping
 from perception.pipeline.checkpoint import (
     BEFORE_MASKS,
@@ -140,7 +140,7 @@ def test_when_to_stop_is_no_part_of_the_fingerprint(small_scene: Path, tmp_path:
 def test_sigterm_is_ctrl_c(small_scene: Path, tmp_path: Path) -> None:
     """COLMAP's logger answers SIGTERM with a native stack trace; that its module is loaded must not matter."""
     code = (
-        "import sys; from perception.cli import main; from perception.io.lens import load_pycolmap\n"
+        "import sys; from perception.cli import main; from perception.photos.lens import load_pycolmap\n"
         "import perception.pipeline.mapping as m; load = m.load_scene\n"
         "def load_scene(*a, **k):\n    load_pycolmap()\n    return load(*a, **k)\n"
         "m.load_scene = load_scene\n"

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from perception.io.map_views import StoredView
-from perception.io.store import read_map, write_map
+from perception.map.write import read_map, write_map
+from perception.photos.view_json import StoredView
 from perception.query import load_map
 from perception.query.crops import best_crop
 from perception.query.requests import UnknownInstance

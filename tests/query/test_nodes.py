@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from perception.errors import InputError
+from perception.export.export_map import at_granularity, export_map
 from perception.export.transfer import ExportOptions
 from perception.io.cloud import read_cloud
-from perception.io.store import read_map, write_map
 from perception.language.colors import PALETTE
 from perception.language.description import InstanceDescription, to_arrays
-from perception.pipeline.exporting import at_granularity, export_map
+from perception.map.write import read_map, write_map
 from perception.query import QueryMap, load_map
 from support.query_maps import HashEncoder, encoders, write_map_of
 

@@ -22,7 +22,7 @@ from support.query_maps import encoders, write_map_of
 pytest.importorskip("starlette", reason="the extra 'serve' is not installed")
 from perception.cli import build_parser
 from perception.io.cloud import read_cloud
-from perception.io.store import read_map
+from perception.map.write import read_map
 from perception.query.query_map import load_map
 from support.processes import served
 from support.synthetic_map import SIGMA

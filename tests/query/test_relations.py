@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from perception.language.description import InstanceDescription
-from perception.language.ranking import Ranker
+from perception.query.ranking import Ranker
 from perception.query.relations import Places, Relation, parse, ranked
 
 

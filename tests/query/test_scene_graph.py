@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from perception.errors import InputError
-from perception.io.map import Map
+from perception.map.map import Map
 from perception.query.scene_graph import scene_graph, write_graph
 from perception.types import View
 from support.aimed import look_at

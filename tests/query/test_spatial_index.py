@@ -9,7 +9,7 @@ import pytest
 
 import perception
 from perception.errors import InputError
-from perception.io.store import Map, read_map, set_labels
+from perception.map.write import Map, read_map, set_labels
 from perception.query import Frame, QueryMap, Where, axis_box, load_map
 from perception.types import OrientedBox
 from support.query_maps import NAMES, encoders, write_map_of

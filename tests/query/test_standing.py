@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perception.errors import InputError
-from perception.frame.floor_grid import HEIGHT
 from perception.query import Frame
+from perception.query.floor_grid import HEIGHT
 from perception.query.query_map import UnknownInstance
 from perception.query.standing import CELL, Stand, where_to_stand
 from support.box_rooms import FURNISHED, Boxes, cast, points

@@ -17,12 +17,13 @@ import perception
 from kills import children
 from perception.cli import main
 from perception.errors import InputError
-from perception.io.store import Map, read_map, set_labels, write_map
 from perception.language.base import Part, Reading
 from perception.language.colors import palette
 from perception.language.description import to_arrays
-from perception.query import QueryEngine, QueryMap, Where, load_map
+from perception.map.write import Map, read_map, set_labels, write_map
+from perception.query import QueryMap, Where, load_map
 from perception.query.indexing import index_maps
+from perception.serve.engine import QueryEngine
 from support.query_maps import NAMES, HashEncoder, encoders, write_map_of
 from support.views_at import views_at
 

@@ -26,10 +26,11 @@ from perception.cli import main
 from perception.config import read_toml, settings_from
 from perception.errors import InputError
 from perception.io.cloud import read_cloud
-from perception.io.store import read_map
-from perception.listening import check_address, is_local, read_token
-from perception.query import QueryEngine, QueryMap
+from perception.map.write import read_map
+from perception.query import QueryMap
 from perception.serve.app import build_app
+from perception.serve.engine import QueryEngine
+from perception.serve.listening import check_address, is_local, read_token
 from perception.serve.server import ServeSettings, serve
 
 TOKEN = "0123456789abcdef0123"

@@ -17,8 +17,8 @@ from support.query_maps import encoders, write_map_of
 pytest.importorskip("fastapi", reason="the extra 'serve' is not installed")
 from starlette.testclient import TestClient
 
-from perception.query import QueryEngine
 from perception.serve.app import build_app
+from perception.serve.engine import QueryEngine
 from perception.serve.server import ServeSettings
 
 EXAMPLES = settings(max_examples=120, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from perception.io.engine import Engine
 from perception.progress import Progress
+from perception.tasks.engine import Engine
 
 
 class Elsewhere(Engine):

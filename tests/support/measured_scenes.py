@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from perception.io.recentre import moved
+from perception.frame.recentre import moved
 from perception.types import View
 from support.rotations import rotation_from_quaternion
 from worlds.cameras import orbit, walk

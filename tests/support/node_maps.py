@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from perception.boxes import oriented_box
-from perception.io.store import Map, write_map
 from perception.language.description import InstanceDescription, to_arrays
+from perception.map.write import Map, write_map
 
 DIM = 16
 

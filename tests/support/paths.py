@@ -7,5 +7,5 @@ from pathlib import Path
 SUPPORT = Path(__file__).resolve().parent
 TESTS = SUPPORT.parent
 REPOSITORY = TESTS.parent
-MAPS = TESTS / "io" / "maps"
+MAPS = TESTS / "map" / "maps"
 """A small map of every released format version, and the photos of the first."""

@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from perception.editing import Editor
+from perception.edit.editor import Editor
 from perception.errors import InputError
+from perception.export.export_map import export_map
 from perception.export.transfer import ExportOptions
-from perception.io.inputs import save_scene
-from perception.io.store import read_map, set_labels, verify_map, write_map
+from perception.inputs.load import save_scene
+from perception.map.write import read_map, set_labels, verify_map, write_map
 from perception.masks.label_images import write_labels
 from perception.pipeline.checkpoint import save_checkpoint
-from perception.pipeline.exporting import export_map
 from perception.types import Scene
 
 DONE = "done"

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from perception.boxes import oriented_box
-from perception.io.store import Map, write_map
 from perception.language.base import Encoder
 from perception.language.description import InstanceDescription, to_arrays
+from perception.map.write import Map, write_map
 
 CELL = 1.0
 """Distance in metres between the centres of neighbouring instances."""

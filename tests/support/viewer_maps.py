@@ -6,7 +6,7 @@ import socket
 
 import numpy as np
 
-from perception.io.store import Map
+from perception.map.write import Map
 from support.views_at import views_at
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perception.io.store import write_map
+from perception.map.write import write_map
 from perception.viewer.levels import level
 from perception.viewer.picking import covariances
 from support.viewer_maps import small_map

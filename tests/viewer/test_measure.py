@@ -14,7 +14,7 @@ import pytest
 
 from perception.cli import main
 from perception.errors import InputError
-from perception.io.store import Map, read_map, set_labels, write_map
+from perception.map.write import Map, read_map, set_labels, write_map
 from perception.viewer.picking import pick_point
 from perception.viewer.session import Session
 from support.viewer_maps import free_port, small_map

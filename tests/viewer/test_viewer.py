@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from perception.errors import InputError
-from perception.io.store import write_map
+from perception.map.write import write_map
 from perception.viewer.picking import covariances, pick
 from perception.viewer.session import HIGHLIGHT, MODES, highlight, paint
 from support.processes import hears_ctrl_c

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from perception.io.atomic import writing
-from perception.io.store import read_map, set_labels, write_map
 from perception.language.description import InstanceDescription, to_arrays
+from perception.map.write import read_map, set_labels, write_map
 from perception.query import QueryMap
 from support.viewer_maps import free_port, small_map
 

@@ -13,7 +13,7 @@ import pytest
 
 from perception.cli import main
 from perception.errors import InputError
-from perception.io.store import write_map
+from perception.map.write import write_map
 from perception.viewer import Viewer
 from support.viewer_maps import free_port, small_map
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from perception.config import Settings, settings_from
 from perception.errors import InputError
-from perception.io.map import Map
+from perception.map.map import Map
 from perception.query import Frame, QueryMap
 
 
@@ -35,7 +35,7 @@ class FrameFile(Settings):
             )
         held: Map = gmap
         if self.scale not in (None, 1.0):
-            from perception.frame.scaled_map import scaled
+            from perception.edit.scale import scaled
 
             held = scaled(gmap, self.scale)
         made = QueryMap.of(held, info={**held.info, "frame": child, "metric": True})

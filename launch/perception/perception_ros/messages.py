@@ -95,7 +95,7 @@ def planning_scene_world(hits: Iterable[Hit], stamp: Stamp) -> Message:
 def occupancy_grid(
     cells: np.ndarray, frame_from_grid: np.ndarray, resolution: float, frame: str, stamp: Stamp
 ) -> Message:
-    """nav_msgs/OccupancyGrid of `perception.frame.floor_grid`.
+    """nav_msgs/OccupancyGrid of `perception.query.floor_grid`.
 
     info.origin: the outer corner of cell (0, 0) on the floor. Its orientation is the identity where the frame's z is
     up; planners such as Nav2 expect that.

@@ -22,14 +22,24 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.signals import SignalHandlerOptions
 
 from perception.errors import InputError
-from perception.frame.floor_grid import floor_grid
 from perception.node import answers
 from perception.node.config import NodeConfig, node_config
 from perception.node.core import Core
 from perception.node.ros import RosTransport, fill, message_class, spin, stop_on_signals
-from perception.query import AnswerTimeout, EngineBusy, EngineClosed, Frame, QueryEngine, QueryMap, Reply, Request
-from perception.query.requests import TOP, UnknownFrame, error_kind
+from perception.query import Frame, QueryMap
+from perception.query.floor_grid import floor_grid
+from perception.query.requests import (
+    TOP,
+    AnswerTimeout,
+    EngineBusy,
+    EngineClosed,
+    Reply,
+    Request,
+    UnknownFrame,
+    error_kind,
+)
 from perception.query.standing import Stand, where_to_stand
+from perception.serve.engine import QueryEngine
 from perception_ros import messages
 from perception_ros.frames import FrameFile, read_frame
 

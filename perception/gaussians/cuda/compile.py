@@ -12,7 +12,7 @@ from pathlib import Path
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
-from perception.io.model_store import cache_folder
+from perception.onnx.store import cache_folder
 
 MAX_FEATURES = 8  # channels that the kernels take at once; more go through in slices
 OLDEST_ARCHITECTURE = 75  # Turing

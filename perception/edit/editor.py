@@ -1,0 +1,326 @@
+"""Manual corrections of a map: rename, hide, merge, split, remove; with undo, redo and save.
+
+An `Editor` holds one opened map. Edits change memory only; `save` writes the whole map to a new place and swaps it in.
+Thread-safe: each edit is one step under a lock, so it is applied completely or not at all. A map that another program
+changed meanwhile is not overwritten.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from perception.boxes import instance_entry
+from perception.config import FrameConfig, InstanceConfig
+from perception.edit.scale import scale_map
+from perception.errors import InputError
+from perception.io.atomic import writing
+from perception.language.description import InstanceDescription, from_arrays, to_arrays
+from perception.map.files import map_signature, read_info
+from perception.map.map import Map, language_in, prefixed
+from perception.map.write import read_map, write_map
+
+UNDO_DEPTH = 100
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class _State:
+    """One state of the edit history; arrays are never changed in place, so states share the unchanged ones."""
+
+    what: str
+    ids: np.ndarray
+    instances: tuple[dict[str, Any], ...]
+    descriptions: tuple[InstanceDescription, ...]
+
+
+def _step(method: F) -> F:
+    @wraps(method)
+    def locked(self: Editor, *args: Any, **kwargs: Any) -> Any:
+        with self._lock:
+            return method(self, *args, **kwargs)
+
+    return locked  # type: ignore[return-value]
+
+
+class Editor:
+    """A map and its edit history. Instances are named by their `id`, which never changes; merged ones get a new id."""
+
+    def __init__(self, path: Path):
+        self.path = Path(path)
+        self._lock = threading.RLock()
+        read_info(self.path)  # its error is the clearest when there is no map
+        self._signature = map_signature(self.path)
+        self.original = read_map(self.path)
+        gmap = self.original
+        descriptions, self._encoder = from_arrays(gmap.language) if gmap.language else ([], "")
+        self._past = [_State("opened", gmap.instance_ids, tuple(gmap.instances), tuple(descriptions))]
+        self._future: list[_State] = []
+        self._saved = self._past[0]
+
+    # ------------------------------------------------------------------ reading
+
+    @property
+    def _now(self) -> _State:
+        return self._past[-1]
+
+    @property
+    def instances(self) -> tuple[dict[str, Any], ...]:
+        """The entries of instances.json in their current state."""
+        return self._now.instances
+
+    @property
+    def ids(self) -> np.ndarray:
+        """[N] int32 instance of every Gaussian of the opened map, −1 = none."""
+        return self._now.ids
+
+    @property
+    def part_ids(self) -> np.ndarray:
+        """[N] part of every Gaussian as opened, −1 = none; without the parts of merged, split or removed instances."""
+        known = [part["id"] for entry in self.instances for part in entry.get("parts", [])]
+        ids = self.original.parts.get("ids")
+        return np.full(len(self.ids), -1) if ids is None else np.where(np.isin(ids, known), ids, -1)
+
+    @property
+    def dirty(self) -> bool:
+        """Whether there are unsaved edits."""
+        return self._now is not self._saved
+
+    @property
+    def history(self) -> list[str]:
+        """Descriptions of the edits, oldest first."""
+        return [state.what for state in self._past[1:]]
+
+    def entry(self, instance: int) -> dict[str, Any]:
+        """The entry of instance id `instance`; raises InputError when there is none."""
+        return self.instances[self._place(instance)]
+
+    def _place(self, instance: int) -> int:
+        for place, entry in enumerate(self.instances):
+            if entry["id"] == instance:
+                return place
+        raise InputError(f"instance {instance}: not in {self.path}; expected one of its {len(self.instances)} ids")
+
+    @_step
+    def current(self) -> Map:
+        """The edited map."""
+        now = self._now
+        same = [entry["id"] for entry in now.instances] == [entry["id"] for entry in self.original.instances]
+        return dataclasses.replace(
+            self.original,
+            instance_ids=now.ids,
+            membership=np.where(now.ids >= 0, self.original.membership, 0).astype(np.float32),
+            instances=list(now.instances),
+            language=to_arrays(now.descriptions, self._encoder) if self._encoder else {},
+            parts=self._parts_now(),
+            groups=self.original.groups if same else {},
+        )
+
+    def _parts_now(self) -> dict[str, np.ndarray]:
+        """The arrays of parts.npz, without the parts of instances that were merged, split or removed."""
+        parts = self.original.parts
+        if "ids" not in parts:
+            return parts
+        known = [part["id"] for entry in self._now.instances for part in entry.get("parts", [])]
+        alive = np.isin(np.unique(parts["ids"][parts["ids"] >= 0]), known)
+        parts = {**parts, "ids": self.part_ids.astype(np.int32)}
+        language = language_in(parts)
+        if not language or alive.all():
+            return parts
+        descriptions, encoder = from_arrays(language)
+        left = [description for description, lives in zip(descriptions, alive, strict=True) if lives]
+        return {"ids": parts["ids"], **prefixed(to_arrays(left, encoder))}
+
+    # ------------------------------------------------------------------ editing
+
+    def _push(self, what: str, **changes: Any) -> None:
+        self._past.append(dataclasses.replace(self._now, what=what, **changes))
+        self._future.clear()
+        del self._past[: max(0, len(self._past) - UNDO_DEPTH)]
+
+    def _change(self, what: str, instance: int, **values: Any) -> None:
+        place = self._place(instance)
+        instances = list(self.instances)
+        instances[place] = {**instances[place], **values}
+        self._push(what, instances=tuple(instances))
+
+    @_step
+    def rename(self, instance: int, label: str | None) -> None:
+        """Sets the user's label of an instance; an empty label or None removes it."""
+        label = " ".join(label.split()) if label else None
+        self._change(f"named {instance} '{label}'" if label else f"took the name of {instance}", instance, label=label)
+
+    @_step
+    def hide(self, instance: int, hidden: bool = True) -> None:
+        """Marks an instance as hidden or visible in the viewer; it stays in the map."""
+        self._change(f"{'hid' if hidden else 'showed'} {instance}", instance, hidden=hidden)
+
+    @_step
+    def merge(self, chosen: list[int]) -> int:
+        """Joins instances into one with a new id, which is returned; it keeps the first label among them."""
+        chosen = sorted(set(chosen))
+        if len(chosen) < 2:
+            raise InputError(f"merge: found {len(chosen)} instance, expected at least 2; choose another one to join")
+        places = [self._place(instance) for instance in chosen]
+        new = self._next_id()
+        ids = np.where(np.isin(self.ids, chosen), new, self.ids).astype(np.int32)
+        entries = [self.instances[place] for place in places]
+        weights = np.array([entry["num_gaussians"] for entry in entries], np.float64)
+        label = next((entry["label"] for entry in entries if entry.get("label")), None)
+        score = float(weights @ [entry["score"] for entry in entries] / weights.sum())
+        merged = self._entry(new, ids, score, max(int(entry.get("views", 0)) for entry in entries), label)
+        if texts := [text for entry in entries for text in entry.get("texts", [])]:
+            merged["texts"] = texts
+        self._replace(f"merged {', '.join(map(str, chosen))} into {new}", places, ids, [merged], _joined)
+        return new
+
+    @_step
+    def split(self, instance: int) -> list[int]:
+        """Splits an instance into new ones; returns their ids. Raises InputError when it cannot be split.
+
+        The parts in the map's hierarchy are used where the instance has any. Otherwise its Gaussians alone are
+        clustered by their features again, with finer settings.
+        """
+        place = self._place(instance)
+        rows = np.flatnonzero(self.ids == instance)
+        gmap = self.original
+        found = self._parts_of(self.instances[place], rows)
+        if found.max(initial=-1) < 1:
+            raise InputError(f"instance {instance}: its Gaussians are all alike, there is nothing to split")
+        first = self._next_id()
+        ids = self.ids.copy()
+        known, means = found >= 0, gmap.means[rows]
+        ids[rows] = np.where(known, found, found[known][cKDTree(means[known]).query(means)[1]]) + first
+        news = list(range(first, first + int(found.max()) + 1))
+        entry = self.instances[place]
+        parts = [self._entry(new, ids, entry["score"], entry.get("views", 0)) for new in news]
+        self._replace(f"split {instance} into {len(parts)}", [place], ids, parts, lambda descriptions: descriptions[0])
+        return news
+
+    @_step
+    def remove(self, instance: int) -> None:
+        """Removes an instance from the list; its Gaussians stay and belong to no instance."""
+        place = self._place(instance)
+        ids = np.where(self.ids == instance, -1, self.ids).astype(np.int32)
+        self._replace(f"removed {instance}", [place], ids, [], _joined)
+
+    @_step
+    def undo(self) -> str | None:
+        """Undoes the last edit; returns its description, None when there is none."""
+        if len(self._past) < 2:
+            return None
+        state = self._past.pop()
+        self._future.append(state)
+        return state.what
+
+    @_step
+    def redo(self) -> str | None:
+        """Repeats the edit that was undone last; returns its description, None when there is none."""
+        if not self._future:
+            return None
+        self._past.append(self._future.pop())
+        return self._now.what
+
+    @property
+    @_step
+    def outdated(self) -> bool:
+        """Whether another program changed the map since it was opened or saved; InputError when it is missing."""
+        return map_signature(self.path) != self._signature
+
+    @_step
+    def save(self) -> None:
+        """Writes the edited map in place of the old one; InputError if another program changed that meanwhile."""
+        with writing(self.path):
+            if self.outdated:
+                raise InputError(
+                    f"{self.path}: was changed by another program since it was opened; nothing is saved: open it again "
+                    "and repeat the corrections"
+                )
+            write_map(self.path, self.current(), keep_report=True)
+            self._signature = map_signature(self.path)
+        self._saved = self._now
+
+    @_step
+    def set_scale(self, known_length: str) -> dict[str, Any]:
+        """Writes the map in metres by `scale_map`, whose result is returned, and opens it anew without history.
+
+        InputError as `save`, with unsaved edits, or when the map's own scale is more certain.
+        """
+        with writing(self.path):
+            if self.dirty or self.outdated:
+                found = "unsaved corrections; save them" if self.dirty else "changes by another program; open it"
+                raise InputError(f"{self.path}: has {found} first, then set the scale")
+            facts = scale_map(self.path, None, FrameConfig(known_length=known_length), improve=True)
+            self.reopen()
+        return facts
+
+    @_step
+    def reopen(self) -> None:
+        """Opens the map that is on disk now. Unsaved edits and the history are dropped."""
+        self.__dict__.update({name: value for name, value in vars(Editor(self.path)).items() if name != "_lock"})
+
+    # ------------------------------------------------------------------ helpers
+
+    def _parts_of(self, entry: dict[str, Any], rows: np.ndarray) -> np.ndarray:
+        """[R] index of the part of each Gaussian of an instance, from 0; −1 = none."""
+        from perception.instances.cluster import cluster_gaussians
+
+        gmap = self.original
+        if entry.get("parts") and "ids" in gmap.parts:
+            own = gmap.parts["ids"][rows]
+            known = np.unique(own[np.isin(own, [part["id"] for part in entry["parts"]])])
+            return np.where(np.isin(own, known), np.searchsorted(known, own), -1)
+        finer = InstanceConfig(min_cluster_size=max(8, len(rows) // 20), min_samples=8)
+        return cluster_gaussians(gmap.means[rows], gmap.scales[rows], gmap.opacities[rows], gmap.features[rows], finer)
+
+    def _next_id(self) -> int:
+        entries = [entry for state in (*self._past, *self._future) for entry in state.instances]
+        return 1 + max((e["id"] for entry in entries for e in (entry, *entry.get("parts", []))), default=-1)
+
+    def _entry(self, instance: int, ids: np.ndarray, score: float, views: int, label: Any = None) -> dict[str, Any]:
+        gmap, rows = self.original, ids == instance
+        points, weights = gmap.means[rows].astype(np.float64), gmap.opacities[rows].astype(np.float64)
+        return instance_entry(instance, points, weights, score, views, label)
+
+    def _replace(
+        self,
+        what: str,
+        places: list[int],
+        ids: np.ndarray,
+        news: list[dict[str, Any]],
+        describe: Callable[[list[InstanceDescription]], InstanceDescription],
+    ) -> None:
+        """Replaces the entries at `places` by `news`, which are inserted at the first of these places."""
+        entries, descriptions = list(self.instances), list(self._now.descriptions)
+        said = [descriptions[place] for place in places] if descriptions else []
+        for place in reversed(places):
+            del entries[place]
+            if descriptions:
+                del descriptions[place]
+        entries[places[0] : places[0]] = news
+        if said:
+            descriptions[places[0] : places[0]] = [describe(said) for _ in news]
+        self._push(what, ids=ids, instances=tuple(entries), descriptions=tuple(descriptions))
+
+
+def _joined(descriptions: list[InstanceDescription]) -> InstanceDescription:
+    """One description of several instances: all views, their mean embedding, the palette of the one with most views."""
+    best = max(descriptions, key=lambda d: len(d.views))
+    total = np.sum([d.embedding * len(d.views) for d in descriptions], axis=0)
+    norm = float(np.linalg.norm(total))
+    return InstanceDescription(
+        (total / norm if norm > 0 else best.embedding).astype(np.float32),
+        np.concatenate([d.per_view for d in descriptions]),
+        best.palette,
+        [name for d in descriptions for name in d.views],
+        [box for d in descriptions for box in d.boxes],
+    )

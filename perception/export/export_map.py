@@ -1,0 +1,191 @@
+"""`perception export`: transfers the instances of a map to a cloud, or to the map's own surface points. A scan from
+another frame is placed in the map by a known transform, or by registration.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.colors import instance_palette, rgb8_from_sh
+from perception.errors import InputError
+from perception.export.align import align
+from perception.export.depth_views import DepthView, depth_views
+from perception.export.render import as_gaussians, map_views
+from perception.export.sog import write_sog
+from perception.export.spz import write_spz
+from perception.export.transfer import ExportOptions, check_overlap, export_labels, write_export
+from perception.frame.recentre import map_from_input
+from perception.geometry import check_similarity, move_points, scale_of
+from perception.io.cloud import read_cloud
+from perception.map.write import Map, read_map
+from perception.types import PointCloud
+
+MOST_VIEWS, LONG_SIDE = 90, 320
+"""Views rendered for a registration, and their size in pixels."""
+
+
+def rendered_depth(gmap: Map, most: int, long_side: int) -> list[DepthView]:
+    """Depth from up to `most` of the map's views, evenly chosen, in the map's frame; InputError without views."""
+    views = map_views(gmap, held_out=False)
+    if not views:
+        raise InputError(f"{gmap.path}: holds no views, and depth is rendered from those; map again from photos")
+    return depth_views(as_gaussians(gmap), views[:: -(-len(views) // most)], long_side)
+
+
+def aligned(gmap: Map, scan: PointCloud, name: str) -> tuple[np.ndarray, dict[str, Any]]:
+    """(map_from_scan [4, 4], facts); InputError naming the scan if refused.
+
+    With a scale where the map's unit is not known to be the metre.
+    """
+    found = align(rendered_depth(gmap, MOST_VIEWS, LONG_SIDE), scan, similar=not gmap.metric)
+    if found.refusal is not None:
+        raise InputError(
+            f"{name}: cannot be aligned with the map: {found.refusal}; give the place with --transform FILE"
+        )
+    facts = {
+        key: round(float(getattr(found, key)), 6) for key in ("scale", "agreement", "overlap", "cover", "rms", "rival")
+    }
+    return found.map_from_scan, {"verdict": "accepted", **facts}
+
+
+def read_transform(path: Path) -> np.ndarray:
+    """map_from_scan [4, 4] float64: four rows of four numbers as text or JSON, or a JSON object that holds them as
+    `map_from_scan`, as `export` writes. InputError unless it is a rotation, a positive scale and a translation."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        if text.lstrip()[:1] in ("[", "{"):
+            rows = json.loads(text)
+            rows = rows["map_from_scan"] if isinstance(rows, dict) else rows
+        else:
+            rows = [
+                [float(word) for word in line.replace(",", " ").split()] for line in text.splitlines() if line.strip()
+            ]
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: expected a 4 × 4 matrix as text or JSON ({error})") from error
+    return check_similarity(rows, str(path))
+
+
+COMPRESSED = {".spz": write_spz, ".sog": write_sog}
+SUFFIXES = (".ply", ".pcd", ".npz", *COMPRESSED)
+SURFACE_OPACITY = 0.5
+"""Gaussians of at least this opacity are the surface points of a map."""
+
+
+def export_map(
+    map_path: Path,
+    output: Path,
+    points: Path | None,
+    options: ExportOptions,
+    color: str = "original",
+    place: Path | bool = False,
+    granularity: str = "default",
+) -> tuple[dict[str, Any], str]:
+    """Labels a cloud, writes it and its sidecar JSON, and returns (JSON-able facts, table).
+
+    Without `points` the map's opaque Gaussians are the cloud and keep their own instance ids. `points` and the
+    result are in the coordinates of the map's input (`map_from_input`). Without `points` they are the map's, or the
+    input's if that was only shifted.
+
+    color: of the written points, "original" or "instance". place: `points` lie in a frame of their own: True registers
+    them (`export.align`), a path names a file with map_from_scan [4, 4]. The result keeps that frame; the sidecar and
+    the facts hold `map_from_scan`. granularity: see `at_granularity`.
+    """
+    if output.suffix.lower() in COMPRESSED:
+        return _export_compressed(map_path, output, points)
+    if output.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected one of {', '.join(SUFFIXES)}")
+    if place and points is None:
+        raise InputError("--align and --transform place a scan in the map; give it with --points")
+    known = None if isinstance(place, bool) else read_transform(place)
+    gmap = read_map(map_path)
+    ids, instances = at_granularity(gmap, granularity)
+    given = None if points is None else read_cloud(points)
+    placed = map_from_input(map_path, gmap.info)
+    if points is None and not np.array_equal(placed[:3, :3], np.eye(3)):
+        placed = np.eye(4)
+    facts: dict[str, Any] = {}
+    if known is not None:
+        placed = known
+    elif place and given is not None:
+        placed, facts["alignment"] = aligned(gmap, given, str(points))
+    if place:
+        facts["map_from_scan"] = placed.tolist()
+    moved = not np.array_equal(placed, np.eye(4))
+    means = move_points(np.linalg.inv(placed), gmap.means.astype(np.float64)) if moved else gmap.means
+    began = time.perf_counter()
+    if given is None:
+        rows, options = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY), ExportOptions(smooth=False)
+        given = PointCloud(means[rows], rgb8_from_sh(gmap.sh[rows, 0]))
+        labels = ids[rows].astype(np.int32)
+    else:
+        labels = export_labels(means, ids, given, options)
+    cloud, inside = given, check_overlap(means, given.points)
+    if color == "instance":
+        cloud = replace(cloud, colors=instance_palette(labels))
+    sidecar = write_export(output, cloud, labels, instances, facts)  # last: where it is, everything was written
+    result = {
+        "points": len(labels),
+        "labelled": int((labels >= 0).sum()),
+        "inside_map": inside,
+        "seconds": time.perf_counter() - began,
+        "max_distance": options.max_distance,
+        "metric": gmap.metric and abs(scale_of(placed) - 1) < 1e-9,
+        "smoothed": options.smooth,
+        **sidecar,
+    }
+    return result, _table(result)
+
+
+def _export_compressed(map_path: Path, output: Path, points: Path | None) -> tuple[dict[str, Any], str]:
+    """All Gaussians of the map, for viewers in the browser."""
+    kind = output.suffix.lower()
+    if points is not None:
+        raise InputError(f"{output}: {kind} holds the map's Gaussians; labels of a scan go to .ply, .pcd or .npz")
+    gmap = read_map(map_path)
+    COMPRESSED[kind](output, gmap)
+    size, ids = output.stat().st_size, output.with_suffix(".npy")
+    share = size / max((map_path / "gaussians.ply").stat().st_size, 1)
+    told = f"{output}: {len(gmap)} Gaussians, {share:.0%} of the PLY's size; instance ids in {ids}"
+    return {kind[1:]: str(output), "gaussians": len(gmap), "bytes": size, "instance_ids": str(ids)}, told
+
+
+def at_granularity(gmap: Map, granularity: str) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
+    """Ids [N] int32, −1 = none, and the entry of each id: of "parts" (and instances, for what is in none), "default",
+    or "groups", with the id of the first of their `instances`. InputError where the map has no such level."""
+    entries = {entry["id"]: entry for entry in gmap.instances}
+    if granularity == "default":
+        return gmap.instance_ids, entries
+    if granularity == "parts" and "ids" in gmap.parts:
+        parts = {part["id"]: part for entry in gmap.instances for part in entry.get("parts", [])}
+        return np.where(np.isin(gmap.parts["ids"], list(parts)), gmap.parts["ids"], gmap.instance_ids), entries | parts
+    groups = gmap.group_ids
+    if granularity != "groups" or not (groups >= 0).any():
+        why = "only built-in masks that were unsure make them (parts also: photos that disagree)"
+        raise InputError(f"{gmap.path}: holds no {granularity} of instances; {why}; leave out --granularity")
+    ids = gmap.instance_ids.copy()
+    for group, score in enumerate(gmap.groups["scores"].tolist()):
+        members = np.unique(ids[groups == group]).tolist()
+        ids[groups == group] = members[0]
+        entries[members[0]] = {"label": None, "score": score, "instances": members}
+    return ids, entries
+
+
+def _table(result: dict[str, Any]) -> str:
+    lines = [f"{'id':>6}{'points':>12}{'score':>8}  label"]
+    rows = sorted(result["instances"].items(), key=lambda row: -row[1]["num_points"])
+    lines += [f"{i:>6}{r['num_points']:>12}{r['score']:>8.3f}  {r['label'] or ''}" for i, r in rows]
+    unit = "metres" if result["metric"] else "units of the reconstruction"
+    lines.append(f"{result['labelled']} of {result['points']} points labelled, in {unit}, {result['seconds']:.1f} s")
+    if "alignment" in result:
+        lines.append("aligned: " + ", ".join(f"{key} {value}" for key, value in result["alignment"].items()))
+    if result["max_distance"] is not None:
+        lines.append(f"points farther than {result['max_distance']:.4g} from every Gaussian are -1")
+    if result["inside_map"] < 0.5:
+        lines.append(f"only {result['inside_map']:.0%} of the points lie inside the map: same frame and unit?")
+    return "\n".join(lines)

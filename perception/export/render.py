@@ -1,0 +1,151 @@
+"""`perception render`: images of a map from cameras."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import torch
+
+from perception.errors import InputError
+from perception.frame.recentre import map_from_input, moved
+from perception.gaussians.model import Gaussians
+from perception.gaussians.render import render
+from perception.gaussians.views import depth_image
+from perception.instances.silhouettes import render_silhouettes
+from perception.io.documents import safe_name
+from perception.map.write import Map, read_map
+from perception.query.crops import cut_out
+from perception.query.query_map import QueryMap
+from perception.types import View
+
+KINDS = ("rgb", "depth", "instances", "features")
+
+
+def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[str]) -> tuple[dict[str, Any], str]:
+    """Writes one image per camera and kind: `NAME.png` for a single kind, `KIND/NAME.png` for several.
+
+    rgb: 8-bit PNG. depth: 16-bit PNG, thousandths of the map's unit along the optical axis, 0 = nothing. instances:
+    16-bit PNG of id + 1, 0 = none. features: 8-bit PNG of the three main components.
+    cameras: a transforms.json in the coordinates of the map's input; None takes the map's held-out views (all views if
+    none were held out). A camera with lens distortion is rendered with that distortion, so that the image aligns with
+    its photo. InputError for a name that points outside `output`.
+    """
+    for kind in what:
+        if kind not in KINDS:
+            raise InputError(f"--what: found '{kind}', expected one of: {', '.join(KINDS)}")
+    gmap = read_map(map_path)
+    if cameras is None:
+        views = map_views(gmap)
+    else:
+        placed = map_from_input(map_path, gmap.info)
+        views = [moved(view, placed) for view in _cameras(cameras)]
+    names = [safe_name(view.name, cameras or map_path) for view in views]  # no path outside `output`
+    gaussians = as_gaussians(gmap)
+    for kind in what:
+        folder = output if len(what) == 1 else output / kind
+        for name, view in zip(names, views, strict=True):
+            write_picture((folder / name).with_suffix(".png"), _through_lens(kind, gaussians, gmap, view))
+    facts = {"output": str(output), "views": len(views), "what": what}
+    return facts, f"{output}: {len(views)} views of {', '.join(what)}"
+
+
+def as_gaussians(gmap: Map) -> Gaussians:
+    """A map's Gaussians as tensors."""
+    names = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
+    return Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(getattr(gmap, name))) for name in names})
+
+
+def rendered_crop(gmap: QueryMap, instance_id: int, side: int) -> np.ndarray | None:
+    """`query.crops.best_crop` of the map's own picture in place of the photo."""
+    found = gmap.best_view(instance_id)
+    return None if found is None else cut_out(_picture("rgb", as_gaussians(gmap), gmap, found[0]), found[1], side)
+
+
+def map_views(gmap: Map, held_out: bool = True) -> list[View]:
+    """The held-out views of a map, or all when none were (or `held_out` is False), for undistorted pictures: without
+    the lens of their photos."""
+    views = [view for view in gmap.views if view.held_out or not held_out] or gmap.views
+    return [replace(view, lens=None) for view in views]
+
+
+def _cameras(path: Path) -> list[View]:
+    """The frames of a transforms.json as views; their photos need not exist."""
+    from perception.inputs.transforms import read_frames
+    from perception.photos.reading import make_view
+
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a transforms.json with the cameras to render")
+    frames = read_frames(path)
+    try:
+        folder = os.path.commonpath([str(PurePosixPath(name).parent) for name, _, _ in frames]) if frames else ""
+    except ValueError as error:
+        raise InputError(f"{path}: some file_path are absolute, others relative; write all of one kind") from error
+    short = [PurePosixPath(name).relative_to(folder).as_posix() for name, _, _ in frames]
+    return [make_view(name, path, lens, pose, path) for name, (_, pose, lens) in zip(short, frames, strict=True)]
+
+
+def _through_lens(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarray:
+    """The image with the view's lens distortion, warped from a wider pinhole image."""
+    if view.lens is None:
+        return _picture(kind, gaussians, gmap, view)
+    import cv2
+
+    from perception.photos.lens import camera_from_lens
+
+    width, height = view.lens.width, view.lens.height
+    grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
+    rays = np.asarray(camera_from_lens(view.lens).cam_from_img(grid), np.float64)[:, :2]
+    low, high = rays.min(axis=0), rays.max(axis=0)
+    fx, fy = view.K[0, 0], view.K[1, 1]
+    K = np.array([[fx, 0, 1 - fx * low[0]], [0, fy, 1 - fy * low[1]], [0, 0, 1.0]])
+    size = np.ceil((high - low) * [fx, fy] + 2).astype(int)
+    wide = View(view.name, view.photo, K, int(size[0]), int(size[1]), view.camera_from_world)
+    picture = _picture(kind, gaussians, gmap, wide)
+    where = (rays * [fx, fy] + K[:2, 2] - 0.5).astype(np.float32).reshape(height, width, 2)
+    nearest = picture.dtype != np.uint8  # ids and depths must not be interpolated
+    how = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC
+    return np.asarray(cv2.remap(picture, where[..., 0], where[..., 1], how))
+
+
+@torch.no_grad()
+def _picture(kind: str, gaussians: Gaussians, gmap: Map, view: View) -> np.ndarray:
+    pose = torch.from_numpy(view.camera_from_world.astype(np.float32))
+    K = torch.from_numpy(view.K.astype(np.float32))
+    if kind == "instances":
+        found = render_silhouettes(gaussians, [gmap.instance_ids], pose, K, view.width, view.height)[0]
+        return (found.ids + 1).astype(np.uint16)
+    if kind == "depth":
+        depth = depth_image(gaussians, pose, K, view.width, view.height)
+        return (depth * 1000).round().clamp(0, 65535).numpy().astype(np.uint16)
+    out = render(
+        gaussians,
+        pose,
+        K,
+        view.width,
+        view.height,
+        harmonics=True,
+        features=gaussians.features if kind == "features" else None,
+    )
+    if kind == "rgb":
+        return (out.colors[0].clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+    if kind == "features":
+        from perception.pictures import features_to_rgb
+
+        assert out.features is not None  # features were given
+        return features_to_rgb(out.features[0].numpy())
+    raise ValueError(f"unknown kind of picture: {kind}")
+
+
+def write_picture(path: Path, image: np.ndarray) -> None:
+    """Writes an image [H, W] or [H, W, 3] RGB; folders are made. InputError when that fails."""
+    import cv2
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if image.ndim == 3:
+        image = np.ascontiguousarray(image[..., ::-1])
+    if not cv2.imwrite(str(path), image):
+        raise InputError(f"{path}: cannot be written; choose a writable -o")

@@ -1,0 +1,100 @@
+"""Training views from posed photos and label images, decoded once at training size."""
+
+from __future__ import annotations
+
+from bisect import bisect
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+
+from perception.errors import InputError
+from perception.gaussians.train import TrainingView
+from perception.io.memory import Keep
+from perception.masks.label_images import load_labels
+from perception.photos.decode import load_photo, scaled_K
+from perception.photos.depth import load_depth, without_edges
+from perception.photos.ignore_masks import load_weight
+from perception.progress import Progress
+from perception.types import View
+
+
+def split_views(views: list[View], holdout: int, listed: str | None = None) -> tuple[list[View], list[View]]:
+    """(training, held out), sorted by name: index % holdout == 0 is held out; none with holdout 0 or a single view.
+
+    listed: a text file that names the held-out photos instead, one per line.
+    """
+    if listed is not None:
+        names = _names(Path(listed))
+        named = [bool(names & {view.name, PurePosixPath(view.name).stem}) for view in views]
+        if all(named):
+            raise InputError(f"{listed}: names all {len(views)} photos; some must be left to train on")
+        return [v for v, is_held in zip(views, named, strict=True) if not is_held], [
+            v for v, is_held in zip(views, named, strict=True) if is_held
+        ]
+    if holdout <= 1 or len(views) < 4:
+        return list(views), []
+    held = [view for i, view in enumerate(views) if i % holdout == 0]
+    return [view for i, view in enumerate(views) if i % holdout != 0], held
+
+
+def _names(listed: Path) -> set[str]:
+    try:
+        return {line.strip() for line in listed.read_text(encoding="utf-8").splitlines() if line.strip()}
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{listed}: cannot be read; expected a text file of photo names, one a line") from error
+
+
+def exposed_as_neighbours(held_out: list[View], training: list[View]) -> list[View]:
+    """Held-out views, each with the geometric mean of the gains of the training views before and after it by name.
+
+    Their own gains come from the photos that they are to be compared with.
+    """
+    names = [view.name for view in training]
+    exposed = []
+    for view in held_out:
+        place = bisect(names, view.name)
+        near = [other.gain for other in training[max(place - 1, 0) : place + 1] if other.gain is not None]
+        gain = None if view.gain is None or not near else tuple(np.exp(np.log(near).mean(axis=0)).tolist())
+        exposed.append(replace(view, gain=gain))
+    return exposed
+
+
+def training_view(view: View, max_side: int) -> TrainingView:
+    """Decodes one photo, its mask of pixels to ignore, and its depth image without ignored pixels."""
+    photo = load_photo(view, max_side)
+    height, width = photo.shape[:2]
+    weight = load_weight(view, width, height)
+    depth = None
+    if view.depth is not None:
+        depth = without_edges(load_depth(view, width, height)) * (1 if weight is None else weight > 0)
+    return TrainingView(
+        view.name,
+        torch.from_numpy(photo),
+        None,
+        torch.from_numpy(scaled_K(view, width, height).astype(np.float32)),
+        torch.from_numpy(view.camera_from_world.astype(np.float32)),
+        weight=None if weight is None else torch.from_numpy(weight),
+        depth=None if depth is None else torch.from_numpy(depth),
+        gain=None if view.gain is None else torch.tensor(view.gain),
+    )
+
+
+def with_labels(decoded: TrainingView, view: View, folder: Path) -> TrainingView:
+    """The decoded photo with its label image from `folder`, in the smallest type; ignored pixels are unlabelled."""
+    labels = load_labels(folder, view)
+    most = int(labels.max(initial=0))
+    labels = labels.astype(np.uint8 if most < 256 else np.int16 if most < 1 << 15 else np.int32)
+    if decoded.weight is not None:
+        labels[decoded.weight.numpy() == 0] = 0
+    return replace(decoded, labels=torch.from_numpy(decoded.keep(labels)))
+
+
+def load_all(views: list[View], max_side: int, progress: Progress, keep: Keep = np.asarray) -> list[TrainingView]:
+    """Decodes all `views`; `keep` takes 3 bytes per pixel, and 4 more with depth."""
+    loaded = []
+    for done, view in enumerate(views, start=1):
+        loaded.append(replace(training_view(view, max_side), keep=keep).stored())
+        progress.update("photos", done, len(views))
+    return loaded

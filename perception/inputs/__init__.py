@@ -1,0 +1,1 @@
+"""Readers of inputs: photos, COLMAP, transforms.json, RGB-D recordings."""

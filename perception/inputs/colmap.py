@@ -1,0 +1,199 @@
+"""COLMAP workspaces: `images/` beside `sparse/0`, `sparse/*` or `sparse`, binary or text, any undistortable camera.
+
+pycolmap does not check counts and string ends, so a damaged binary file can make it loop for ever or take all memory.
+Here each file is read once before, and damage is reported by file and record. Layout: COLMAP's documentation, "Output
+Format"; little endian. Rigs and frames came with COLMAP 3.12.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from struct import Struct
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.documents import safe_name
+from perception.photos.decode import why_left_out
+from perception.photos.ignore_masks import mask_of
+from perception.photos.lens import lens_from_camera, load_pycolmap
+from perception.photos.reading import Reading, fit_lens, make_view
+from perception.sfm.exposure import with_gains
+from perception.sfm.tracks import tracks_of_model
+from perception.sfm.triangulate import MIN_POINTS, cloud_of, posed_scene
+from perception.types import Scene, View
+
+_PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
+"""Number of parameters of a camera, by COLMAP's model id."""
+_LONGEST_NAME = 4096
+_HEADS = {  # of a record, up to its first name or list; where a list follows at once, the last number is its length
+    "cameras": Struct("<IiQQ"),  # id, model, width, height
+    "images": Struct("<I7dI"),  # id, pose, camera
+    "points3D": Struct("<Q3d3BdQ"),
+    "rigs": Struct("<II"),
+    "frames": Struct("<II7dI"),  # id, rig, pose
+}
+_COUNT, _FLAG, _SENSOR, _POSE = Struct("<Q"), Struct("<B"), Struct("<iI"), Struct("<7d")
+
+
+def is_workspace(folder: Path) -> bool:
+    """True for a folder with photos in `images/` and a sparse model."""
+    return (folder / "images").is_dir() and bool(_models(folder))
+
+
+def read_workspace(folder: Path, how: Reading) -> Scene:
+    """The largest sparse model of a workspace as a Scene, in COLMAP's world.
+
+    Photos that are missing or damaged are left out and reported. Image names that point outside the photo folder raise
+    InputError.
+    """
+    found = {path: _read_model(path) for path in _models(folder)}
+    path, model = max(found.items(), key=lambda item: item[1].num_reg_images())
+    if model.num_reg_images() == 0:
+        raise InputError(f"{path}: the sparse model is empty (no registered photo); run structure from motion again")
+    names = {image_id: safe_name(model.images[image_id].name, path) for image_id in model.reg_image_ids()}
+    located = {image_id: (name, folder / "images" / name) for image_id, name in names.items()}
+    views, facts = views_of_model(model, located, path, how)
+    if len(found) > 1:
+        sizes = ", ".join(f"{p.name}: {m.num_reg_images()}" for p, m in found.items())
+        facts["warnings"].append(f"{folder}: {len(found)} sparse models (photos in {sizes}); the largest is used")
+    cloud = how.cloud or cloud_of(model)
+    if len(cloud[0]) < MIN_POINTS:
+        facts["warnings"].append(f"{path}: the sparse model holds {len(cloud[0])} points; new ones are triangulated")
+    facts |= {"model": path.relative_to(folder).as_posix(), "mean_reprojection_error_px": _reprojection_error(model)}
+    return posed_scene(views, cloud, {"input": "colmap", **facts}, how, MIN_POINTS)
+
+
+def views_of_model(
+    model: Any, located: dict[int, tuple[str, Path]], source: Path, how: Reading
+) -> tuple[list[View], dict[str, Any]]:
+    """Views sorted by name, and facts: "left_out" with reasons, "warnings", "exposure". located: view name and photo by
+    image id. InputError when no photo is left."""
+    views, missing, notes = [], [], set()
+    lenses = {camera_id: lens_from_camera(camera) for camera_id, camera in model.cameras.items()}
+    for image_id, (name, photo) in located.items():
+        image = model.images[image_id]
+        there = photo.is_file()
+        why = why_left_out(photo, how.strict) if there else "in the sparse model, but the photo is missing"
+        if why is not None:
+            missing.append({"name": name, "why": why})
+            continue
+        lens, note = fit_lens(lenses[image.camera_id], photo, source)
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().matrix()
+        views.append(replace(make_view(name, photo, lens, pose, source), mask=mask_of(how.masks, name)))
+        if note:
+            notes.add(note)
+    if not views:
+        raise InputError(f"{source}: none of the {len(located)} photos of the sparse model is there")
+    names = {image_id: name for image_id, (name, _) in located.items()}
+    views.sort(key=lambda view: view.name)
+    views, exposure = with_gains(views, tracks_of_model(model, views, names))
+    return views, {"left_out": sorted(missing, key=lambda item: item["name"]), "warnings": sorted(notes), **exposure}
+
+
+def _reprojection_error(model: Any) -> float | None:
+    """Mean reprojection error in pixels, recomputed from the tracks as files may lack it; None without observations."""
+    if not any(point.track.length() for point in model.points3D.values()):
+        return None
+    model.update_point_3d_errors()
+    error = float(model.compute_mean_reprojection_error())
+    return error if np.isfinite(error) else None
+
+
+def _models(folder: Path) -> list[Path]:
+    sparse = folder / "sparse"
+    if not sparse.is_dir():
+        return []
+    inside = sorted(path for path in sparse.iterdir() if path.is_dir())
+    return [path for path in [sparse, *inside] if any((path / f"images.{kind}").is_file() for kind in ("bin", "txt"))]
+
+
+def _read_model(path: Path) -> Any:
+    pycolmap = load_pycolmap()
+    suffix = ".bin" if (path / "images.bin").is_file() else ".txt"
+    needed = [f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
+    absent = [name for name in needed if not (path / name).is_file()]
+    if absent:
+        raise InputError(f"{path}: the sparse model lacks {', '.join(absent)}")
+    if suffix == ".bin":
+        check_binary_model(path)
+    else:
+        _refuse_nan_text(path)
+    try:
+        return pycolmap.Reconstruction(path)
+    except (ValueError, RuntimeError, LookupError, TypeError) as error:
+        reason = str(error).splitlines()[0][:120] if str(error) else "unknown reason"
+        raise InputError(f"{path}: not a readable COLMAP model ({reason})") from error
+
+
+def _refuse_nan_text(path: Path) -> None:
+    """InputError naming the file for NaN poses in a text model, on which COLMAP may abort the process."""
+    file = path / "images.txt"
+    lines = [line for line in file.read_text(errors="replace").splitlines() if line and not line.startswith("#")]
+    for line in lines:
+        fields = line.split()
+        if len(fields) == 10 and any(value.lower().lstrip("+-") in ("nan", "inf") for value in fields[1:8]):
+            raise InputError(f"{file}: the pose of {fields[9]} is not finite (NaN); repair or remove that photo")
+
+
+def check_binary_model(folder: Path) -> None:
+    """InputError naming the first file and record that is not valid."""
+    heads = {kind: _heads(folder / f"{kind}.bin", kind) for kind in _HEADS}
+    known = {camera for camera, _ in heads["cameras"]}
+    for image, camera in heads["images"]:
+        if camera not in known:
+            raise InputError(f"{folder / 'images.bin'}: image {image} has camera {camera}, which cameras.bin lacks")
+
+
+def _heads(file: Path, kind: str) -> list[tuple[int, int]]:
+    """First and last number of each record's head; [] if the file does not exist. InputError for an id that repeats."""
+    if not file.is_file():
+        return []
+    data, at, found = file.read_bytes(), 0, list[tuple[int, int]]()
+
+    def take(layout: Struct) -> tuple:
+        skip(1, layout.size)
+        return layout.unpack_from(data, at - layout.size)
+
+    def skip(count: int, size: int) -> None:
+        nonlocal at
+        at += count * size
+        if at > len(data):
+            raise ValueError("the file is cut short")
+
+    try:
+        for _ in range(take(_COUNT)[0]):
+            head = take(_HEADS[kind])
+            pose = head[1:8] if kind == "images" else head[2:9] if kind == "frames" else (1.0,)
+            if not all(map(math.isfinite, pose)) or not any(pose[:4]):
+                raise ValueError(f"the pose of {kind[:-1]} {head[0]} is not finite, or no rotation")
+            if kind == "cameras":
+                if not 0 <= head[1] < len(_PARAMS) or max(head[2:]) > 1 << 30:
+                    raise ValueError(f"camera {head[0]} of model {head[1]} and {head[2]}×{head[3]} pixels")
+                if not all(map(math.isfinite, take(Struct(f"<{_PARAMS[head[1]]}d")))):
+                    raise ValueError(f"camera {head[0]} has a parameter that is not finite")
+            elif kind == "images":
+                end = data.find(b"\0", at, at + _LONGEST_NAME)
+                if end < 0:
+                    raise ValueError("its name has no end")
+                data[at:end].decode("utf-8")
+                skip(end + 1 - at, 1)
+                skip(take(_COUNT)[0], 24)
+            elif kind == "rigs":
+                for number in range(head[1]):
+                    take(_SENSOR)
+                    if number and take(_FLAG)[0]:
+                        take(_POSE)
+            else:
+                skip(head[-1], 8 if kind == "points3D" else 16)
+            found.append((head[0], head[-1]))
+        if len({head[0] for head in found}) != len(found):
+            raise ValueError("an id occurs twice")
+    except ValueError as error:
+        what = f"what follows {len(found)} good records cannot be right ({error})"
+        raise InputError(f"{file}: {what}; the model is damaged") from error
+    return found

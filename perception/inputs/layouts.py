@@ -1,0 +1,249 @@
+"""Folders of RGB-D data sets: TUM RGB-D, ScanNet, 7-Scenes, 3DMatch, and Redwood / Open3D, recognised by content.
+
+All write pixel centres at whole numbers, so 0.5 is added to their principal points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from perception.errors import InputError
+from perception.geometry import interpolated_pose
+from perception.inputs.recordings import Frame, Recording
+from perception.io.documents import brief, read_json
+from perception.photos.decode import open_photo, photo_size
+from perception.photos.lens import opencv_lens
+from perception.types import Lens
+
+TUM_APART, TUM_GAP = 0.02, 0.1
+"""Greatest time in seconds between a photo and its depth image, and between two poses that are interpolated."""
+_TUM_LENSES = {  # fx fy cx cy k1 k2 p1 p2 k3, from the data set's page on calibration
+    "freiburg1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    "freiburg2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6),
+}
+_PRIMESENSE = (525.0, 525.0, 319.5, 239.5)  # the intrinsics that Redwood and Open3D assume for 640 × 480 pixels
+_KINECT_DEPTH, _KINECT_COLOR = (585.0, 585.0, 320.0, 240.0), (525.0, 525.0, 320.0, 240.0)
+_SIZE = (640, 480)
+_COLOR_FOLDERS = ("color", "image", "rgb")
+
+
+def find_recording(source: Path) -> Recording | None:
+    """The recording in folder `source`, or None when it has none of the layouts. InputError for one that is damaged."""
+    if (source / "rgb.txt").is_file() and (source / "depth.txt").is_file():
+        return _tum(source)
+    if (source / "color").is_dir() and (source / "pose").is_dir():
+        return _scannet(source)
+    if any(source.glob("frame-*.color.*")) or any(source.glob("seq*/frame-*.color.*")):
+        return _seven_scenes(source)
+    color = next((source / name for name in _COLOR_FOLDERS if (source / name).is_dir()), None)
+    if color is not None and (source / "depth").is_dir() and any(source.glob("*.log")):
+        return _redwood(source, color)
+    return None
+
+
+def refuse_depth_without_poses(source: Path) -> None:
+    """InputError for a folder of photos that holds 16-bit depth images, which would be taken for photos."""
+    first = next(iter(sorted((source / "depth").glob("*.png"))), None)
+    if first is None:
+        return
+    with open_photo(first) as image:
+        is_depth = image.mode.startswith("I")
+    if is_depth:
+        raise InputError(
+            f"{source}: has depth images but no poses; expected transforms.json with depth_file_path, groundtruth.txt "
+            "(TUM), pose/*.txt (ScanNet) or a trajectory *.log (Redwood); to map the photos alone, give their folder"
+        )
+
+
+def _tum(source: Path) -> Recording:
+    """Lists of "time file" for photos and depth, "time tx ty tz qx qy qz qw" for poses; 5000 units of depth a metre."""
+    truth = source / "groundtruth.txt"
+    if not truth.is_file():
+        raise InputError(f"{truth}: missing, so depth has no poses; expected lines 'time tx ty tz qx qy qz qw'")
+    (at, photos), (depth_at, depths) = (_listed(source / name) for name in ("rgb.txt", "depth.txt"))
+    rows = _numbers(truth, 8)
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    if (np.linalg.norm(rows[:, 4:], axis=1) < 1e-6).any():
+        raise InputError(f"{truth}: a quaternion is zero; expected lines 'time tx ty tz qx qy qz qw'")
+    times, poses = rows[:, 0], np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:8]).as_matrix()
+    poses[:, :3, 3] = rows[:, 1:4]
+    nearest = np.abs(depth_at[None] - at[:, None]).argmin(axis=1)
+    apart = np.abs(depth_at[nearest] - at)
+    if apart.min() > TUM_APART:
+        found = f"photos and depth are at least {apart.min():.3g} s apart, at most {TUM_APART} are allowed"
+        raise InputError(f"{source}: {found}; do rgb.txt and depth.txt use one clock?")
+    frames = []
+    for time, photo, depth, near in zip(at, photos, nearest, apart <= TUM_APART, strict=True):
+        pose = interpolated_pose(times, poses, time, TUM_GAP)
+        if pose is not None and (source / photo).is_file():
+            frames.append(Frame(photo, source / photo, source / depths[depth] if near else None, pose))
+    if not frames:
+        raise InputError(
+            f"{source}: no photo lies between two poses; photos are from {at.min():.3f} to {at.max():.3f} s, poses "
+            f"from {times.min():.3f} to {times.max():.3f} s"
+        )
+    lens = next((_lens(k, _SIZE) for name, k in _TUM_LENSES.items() if name in source.resolve().name), None)
+    notes = _missing(len(photos) - len(frames), len(photos), "a pose")
+    notes += _missing(sum(frame.depth is None for frame in frames), len(frames), f"depth within {TUM_APART} s")
+    return Recording(source, "TUM RGB-D", frames, lens, 5000.0, None, notes)
+
+
+def _listed(file: Path) -> tuple[np.ndarray, list[str]]:
+    """Times [N] in ascending order, and the files."""
+    try:
+        rows = sorted(((float(row[0]), row[1]) for row in _rows(file)), key=lambda row: row[0])
+    except (ValueError, IndexError) as error:
+        raise InputError(f"{file}: expected lines 'time file' ({error})") from error
+    return np.array([time for time, _ in rows]), [name for _, name in rows]
+
+
+def _scannet(source: Path) -> Recording:
+    """Exported frames: color/, depth/ in mm, pose/ world_from_camera, infinite where tracking was lost."""
+    photos = _images(source / "color")
+    frames = _posed(source, photos, lambda photo, kind: source / kind / photo.stem)
+    intrinsics = source / "intrinsic"
+    depth = next((frame.depth for frame in frames if frame.depth is not None), None)
+    own = None if depth is None else _matrix_lens(intrinsics / "intrinsic_depth.txt", photo_size(depth))
+    notes = _missing(len(photos) - len(frames), len(photos), "a pose (tracking was lost)")
+    lens = _matrix_lens(intrinsics / "intrinsic_color.txt", photo_size(photos[0]))
+    return Recording(source, "ScanNet", frames, lens, 1000.0, own, notes)
+
+
+def _seven_scenes(source: Path) -> Recording:
+    """frame-*.color.png, .depth.png in mm and .pose.txt, in the folder or in seq-*; 3DMatch adds the intrinsics."""
+    photos = sorted(source.glob("frame-*.color.*")) or sorted(source.glob("seq*/frame-*.color.*"))
+    frames = _posed(source, photos, lambda photo, kind: photo.with_name(f"{photo.name.partition('.')[0]}.{kind}"))
+    notes = _missing(len(photos) - len(frames), len(photos), "a pose")
+    for folder in (source, source.parent):
+        lens = _matrix_lens(folder / "camera-intrinsics.txt", photo_size(photos[0]))
+        if lens is not None:
+            folders = {photo.parent for photo in photos}
+            if len(folders) > 1:
+                raise InputError(f"{source}: {len(folders)} sequences, each with a world of its own; give one of them")
+            return Recording(source, "3DMatch", frames, lens, 1000.0, None, notes)
+    warning = (
+        f"{source}: 7-Scenes does not register depth to the photos; the nominal lenses are used (focal length "
+        f"{_KINECT_COLOR[0]:g} and {_KINECT_DEPTH[0]:g} pixels), and the 2 to 3 cm between the cameras are neglected"
+    )
+    color, depth_lens = _lens(_KINECT_COLOR, _SIZE), _lens(_KINECT_DEPTH, _SIZE)
+    return Recording(source, "7-Scenes", frames, color, 1000.0, depth_lens, notes, [warning])
+
+
+def _posed(source: Path, photos: list[Path], beside: Callable[[Path, str], Path]) -> list[Frame]:
+    """The photos with a pose, a file of world_from_camera that is neither infinite nor all zero (tracking was lost).
+    beside: the photo's file of kind "depth" (.png) or "pose" (.txt), without suffix."""
+    frames = []
+    for photo in photos:
+        depth, pose = (Path(f"{beside(photo, kind)}{suffix}") for kind, suffix in (("depth", ".png"), ("pose", ".txt")))
+        matrix = _numbers(pose, 4) if pose.is_file() else np.zeros((4, 4))
+        if matrix.shape != (4, 4):
+            raise InputError(f"{pose}: {len(matrix)} rows, expected a 4×4 matrix world_from_camera")
+        if np.isfinite(matrix).all() and matrix[:3, :3].any():
+            name = photo.relative_to(source).as_posix()
+            frames.append(Frame(name, photo, depth if depth.is_file() else None, matrix))
+    return frames
+
+
+def _redwood(source: Path, folder: Path) -> Recording:
+    """color/ (or image/, rgb/) and depth/ in mm in equal order, and a .log of world_from_camera matrices."""
+    photos, depths = _images(folder), _images(source / "depth")
+    if len(photos) != len(depths):
+        raise InputError(f"{source}: {len(photos)} photos in {folder.name}/, {len(depths)} images in depth/; pair them")
+    logs = sorted(source.glob("*.log"))
+    named = [log for log in logs if log.name == "trajectory.log"] or logs
+    if len(named) > 1:
+        raise InputError(f"{source}: several trajectories ({', '.join(log.name for log in logs)}); keep one of them")
+    poses = _trajectory(named[0], len(photos))
+    frames = [Frame(f"{folder.name}/{photos[i].name}", photos[i], depths[i], pose) for i, pose in poses.items()]
+    lens, notes = None, _missing(len(photos) - len(poses), len(photos), "a pose")
+    cameras = sorted(source.glob("*intrinsic*.json")) + sorted(source.glob("camera*.json"))
+    if cameras:
+        lens = _open3d_lens(cameras[0])
+    elif photo_size(photos[0]) == _SIZE:
+        lens = _lens(_PRIMESENSE, _SIZE)
+        notes.append(f"{source}: no intrinsics, those of PrimeSense are used ({_PRIMESENSE[0]:g} pixels)")
+    return Recording(source, "Redwood / Open3D", frames, lens, 1000.0, None, notes)
+
+
+def _trajectory(file: Path, photos: int) -> dict[int, np.ndarray]:
+    """Blocks of a line of three whole numbers, the first the number of the photo from 0, and four rows of a matrix."""
+    rows = _rows(file)
+    try:
+        numbers = [int(row[0]) for row in rows[::5]]
+        matrices = np.array([row for index, row in enumerate(rows) if index % 5], np.float64).reshape(-1, 4, 4)
+        places = list(range(photos)) if len(numbers) == photos else numbers
+        poses = dict(zip(places, matrices, strict=True))
+    except ValueError as error:
+        raise InputError(f"{file}: expected blocks of a line 'i i i+1' and four rows of four numbers") from error
+    if min(places) < 0 or max(places) >= photos:
+        raise InputError(f"{file}: tells the pose of photo {max(places)} (counted from 0), there are {photos} photos")
+    return poses
+
+
+def _images(folder: Path) -> list[Path]:
+    """PNG and JPEG files in order of their numbers, which need not be padded with zeros."""
+    found = [path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
+    if not found:
+        raise InputError(f"{folder}: holds no PNG or JPEG images")
+    return sorted(found, key=lambda path: (len(path.stem), path.name))
+
+
+def _numbers(file: Path, columns: int) -> np.ndarray:
+    """[N, at least `columns`] float64."""
+    try:
+        table = np.array(_rows(file), np.float64)
+        if table.shape[1] < columns:
+            raise ValueError(f"found {table.shape[1]}")
+    except ValueError as error:
+        raise InputError(f"{file}: expected lines of {columns} numbers ({brief(error)})") from error
+    return table
+
+
+def _rows(file: Path) -> list[list[str]]:
+    """The words of each line that is not empty and no comment; InputError where there is none."""
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: cannot be read as text") from error
+    rows = [line.replace(",", " ").split() for line in lines if not line.lstrip().startswith("#")]
+    rows = [row for row in rows if row]
+    if not rows:
+        raise InputError(f"{file}: is empty")
+    return rows
+
+
+def _matrix_lens(file: Path, size: tuple[int, int]) -> Lens | None:
+    if not file.is_file():
+        return None
+    K = _numbers(file, 3)
+    if len(K) < 3:
+        raise InputError(f"{file}: {len(K)} rows, expected a matrix of intrinsics, 3×3 or 4×4")
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    if not (min(fx, fy) > 0 and abs(cx / size[0] - 0.5) < 0.25 and abs(cy / size[1] - 0.5) < 0.25):
+        found = f"focal length {fx:g} and centre ({cx:g}, {cy:g}) are not those of images of {size[0]}×{size[1]}"
+        raise InputError(f"{file}: {found}; were they resized? give --camera FILE, or the original images")
+    return _lens((fx, fy, cx, cy), size)
+
+
+def _open3d_lens(file: Path) -> Lens:
+    data = read_json(file)
+    try:
+        K = np.array(data["intrinsic_matrix"], np.float64).reshape(3, 3).T  # stored by columns
+        return _lens((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), (int(data["width"]), int(data["height"])))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{file}: expected Open3D's camera intrinsics: width, height, intrinsic_matrix") from error
+
+
+def _lens(values: tuple[float, ...], size: tuple[int, int]) -> Lens:
+    fx, fy, cx, cy, *k = (float(value) for value in values)
+    return opencv_lens((fx, fy, cx + 0.5, cy + 0.5), k, *size)
+
+
+def _missing(count: int, total: int, what: str) -> list[str]:
+    return [f"{count} of {total} photos have not {what}"] if count else []

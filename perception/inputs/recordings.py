@@ -1,0 +1,138 @@
+"""RGB-D recordings: thousands of posed frames with depth, of which sharp, well-spaced ones become a Scene in metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from perception.errors import InputError
+from perception.geometry import inverse_se3
+from perception.io.documents import safe_name
+from perception.photos.depth import read_depth
+from perception.photos.ignore_masks import mask_of
+from perception.photos.reading import NO_CLOUD, Reading, fit_lens, make_view, rigid_pose
+from perception.photos.video import Chooser
+from perception.progress import Progress
+from perception.sfm.triangulate import posed_scene
+from perception.types import DepthImage, Lens, Scene, View
+
+MOST_FRAMES = 200
+LOOKED_AT = 10
+"""Depth images from which the median depth of a recording is estimated."""
+NEAREST, FARTHEST = 0.1, 50.0
+"""Range in metres of a plausible median depth; outside of it the unit must be another."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One photo of a recording with its pose world_from_camera [4, 4] in metres; depth None where none was taken."""
+
+    name: str
+    photo: Path
+    depth: Path | None
+    world_from_camera: np.ndarray
+
+
+@dataclass(frozen=True)
+class Recording:
+    """kind: for messages. frames: in order of time. lens: of all photos, None when the folder does not tell.
+
+    metre: stored units of depth per metre. depth_lens: of the depth camera, at the photo's pose; None when depth shows
+    what the photo shows. notes, warnings: one line each.
+    """
+
+    source: Path
+    kind: str
+    frames: list[Frame]
+    lens: Lens | None
+    metre: float = 1000.0
+    depth_lens: Lens | None = None
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def recorded_scene(recording: Recording, how: Reading) -> Scene:
+    """The chosen frames of a recording as a Scene in its own world, whose unit is the metre.
+    InputError for poses that are not rigid, a missing lens, and depth whose unit cannot be right."""
+    source, kind, lens = recording.source, recording.kind, recording.lens
+    if not recording.frames:
+        raise InputError(f"{source}: a recording as of {kind}, but no frame has both photo and pose")
+    if lens is None:
+        raise InputError(f"{source}: a recording as of {kind} without the intrinsics of its photos; give --camera FILE")
+    for frame in recording.frames:
+        rigid_pose(frame.world_from_camera, f"{source}: the pose of {frame.name}")
+    chosen, damaged = choose_frames(recording, lens, how.progress, how.strict)
+    views = [_view(recording, frame, lens, how.masks) for frame in chosen]
+    taken = f"{len(chosen)} of {len(recording.frames)} frames chosen, sharp and well spaced"
+    facts: dict[str, Any] = {
+        "input": kind,
+        "left_out": [{"name": name, "why": "the photo cannot be read"} for name in damaged],
+        "notes": [f"{source}: {kind}, {taken}", *recording.notes],
+        "warnings": recording.warnings,
+        "mean_reprojection_error_px": None,
+        "scale": {"source": f"poses and depth of {kind}, in metres by definition"},
+    }
+    views.sort(key=lambda view: view.name)
+    return replace(posed_scene(views, how.cloud or NO_CLOUD, facts, how, least=1), metric=True)
+
+
+def choose_frames(
+    recording: Recording, lens: Lens, progress: Progress, strict: bool = False
+) -> tuple[list[Frame], list[str]]:
+    """At most MOST_FRAMES frames: the sharpest of each stretch of motion (see `Chooser`); names of unreadable photos.
+
+    The motion between frames is what poses say: f / width (angle + distance / median depth), as a share of the width.
+    """
+    share, depth = lens.params[0] / lens.width, median_depth(recording)
+    chooser = Chooser()
+    shown: list[Frame] = []
+    damaged: list[str] = []
+    for done, frame in enumerate(recording.frames, start=1):
+        picture = cv2.imdecode(np.fromfile(frame.photo, np.uint8), cv2.IMREAD_REDUCED_COLOR_2)
+        if picture is None:
+            if strict:
+                raise InputError(f"{frame.photo}: not a readable photo; replace or remove it")
+            damaged.append(frame.name)
+            continue
+        motion = 0.0
+        if shown:
+            step = inverse_se3(shown[-1].world_from_camera) @ frame.world_from_camera
+            angle = np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1, 1))
+            motion = float(share * (angle + np.linalg.norm(step[:3, 3]) / depth))
+        chooser.show(picture, motion)
+        shown.append(frame)
+        progress.update("poses: choosing frames", done, len(recording.frames))
+    if not shown:
+        raise InputError(f"{recording.source}: none of the {len(recording.frames)} photos can be read")
+    return [shown[index] for index in chooser.chosen(MOST_FRAMES)], damaged
+
+
+def median_depth(recording: Recording) -> float:
+    """Median in metres over some depth images of the recording. InputError when nothing or nonsense was measured."""
+    paths = [frame.depth for frame in recording.frames if frame.depth is not None]
+    if not paths:
+        raise InputError(f"{recording.source}: a recording as of {recording.kind}, but no photo has a depth image")
+    some = [paths[i] for i in np.unique(np.linspace(0, len(paths) - 1, LOOKED_AT).round().astype(int))]
+    measured = [depth[depth > 0] for depth in map(read_depth, some)]
+    found = [float(np.median(values)) / recording.metre for values in measured if values.size]
+    if not found:
+        raise InputError(f"{some[0]}: this and {len(some) - 1} other depth images hold nothing measured")
+    depth = float(np.median(found))
+    if not NEAREST <= depth <= FARTHEST:
+        raise InputError(
+            f"{some[0]}: the median depth is {depth:.3g} m if {recording.metre:g} stored units are a metre, as for "
+            f"{recording.kind}; expected {NEAREST:g} to {FARTHEST:g} m"
+        )
+    return depth
+
+
+def _view(recording: Recording, frame: Frame, lens: Lens, masks: Path | None) -> View:
+    fitted, _ = fit_lens(lens, frame.photo, recording.source)
+    name = safe_name(frame.name, recording.source)
+    view = make_view(name, frame.photo, fitted, inverse_se3(frame.world_from_camera), recording.source)
+    depth = None if frame.depth is None else DepthImage(frame.depth, 1 / recording.metre, recording.depth_lens)
+    return replace(view, depth=depth, mask=mask_of(masks, name))

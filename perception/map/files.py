@@ -1,0 +1,231 @@
+"""The files of a map folder: map.json is read at opening, arrays are memory-mapped, other data are read on demand."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.arrays import map_npy, read_npz
+from perception.io.atomic import standing
+from perception.io.documents import DAMAGE, brief
+from perception.io.ply import map_ply
+from perception.map.checksums import EDITABLE, FACTS, STORE, check_file, check_sizes, damaged
+from perception.photos.view_json import check_names, views_of_facts
+
+FORMAT_VERSION = 2
+READABLE = (1, 2)
+"""Readable format versions. 1 stores the views in map.json and as arrays in cameras.npz, 2 in map.json only."""
+_ARRAYS = {"features": 2, "instance_ids": 1, "membership": 1}
+ARCHIVES = ("cameras", "language", "parts", "groups")
+_TRIES = 5
+
+Signature = tuple[tuple[int, int, int], ...]
+
+
+class MapFiles:
+    """The contents of a map folder, consistent also when the folder is replaced by another map at any time.
+
+    Files are opened (memory-mapped) by the constructor and stay open, so a replaced or deleted map can still be read
+    through this object. Truncating a mapped file in place, which no writer of this package does, crashes the reader.
+    facts: map.json. info: facts without the views. instances: the list of instances.json. map_id: hash of both files.
+    """
+
+    def __init__(self, path: Path):
+        self._lock = threading.Lock()
+        self._checked = False
+        for left in reversed(range(_TRIES)):
+            self.path = standing(Path(path))
+            self._identity = _folder_identity(self.path)
+            try:
+                self._open()
+            except InputError:
+                if left and self._identity != _folder_identity(self.path):
+                    continue  # the folder was replaced during opening
+                raise
+            if self._identity == _folder_identity(self.path):
+                return
+        raise InputError(f"{self.path}: was replaced again and again while it was opened; try again")
+
+    def _open(self) -> None:
+        facts, raw_facts = _read_facts(self.path)
+        check_sizes(self.path, facts)
+        for file in (self.path / name for name in (EDITABLE, "gaussians.ply", *(f"{name}.npy" for name in _ARRAYS))):
+            if file.exists() and not file.is_file():  # to open a FIFO would mean to wait for its writer
+                raise damaged(file, "is no file")
+        self.facts = facts
+        self.info = {key: value for key, value in facts.items() if key != "views"}
+        self.instances, raw = _read_instances(self.path / EDITABLE)
+        self.map_id = hashlib.sha256(raw_facts + b"\0" + raw).hexdigest()[:12]
+        try:
+            self._rows = map_ply(self.path / "gaussians.ply", "vertex")
+            self._arrays = {name: self._map_array(name, sides) for name, sides in _ARRAYS.items()}
+            archives = {name: self.path / f"{name}.npz" for name in ARCHIVES}
+            self._archives = {name: file.read_bytes() for name, file in archives.items() if file.is_file()}
+        except OSError as error:
+            raise damaged(self.path, str(error)) from error
+        for name, array in self._arrays.items():
+            if len(array) != len(self._rows):
+                found = f"holds {len(array)} rows, expected {len(self._rows)} as in gaussians.ply"
+                raise damaged(self.path / f"{name}.npy", found)
+
+    def _map_array(self, name: str, sides: int) -> np.ndarray:
+        file = self.path / f"{name}.npy"
+        try:
+            array = map_npy(file)
+        except FileNotFoundError as error:
+            raise damaged(file, "is missing") from error
+        except DAMAGE as error:
+            raise damaged(file, f"cannot be read ({brief(error)})") from error
+        kind = "i" if name == "instance_ids" else "f"
+        if array.ndim != sides or array.dtype.kind != kind:
+            raise damaged(file, f"holds {array.dtype} of shape {list(array.shape)}")
+        return array
+
+    def read(self, name: str) -> Any:
+        """The field `name` of a `Map`, in memory. Checksums are verified before whole files are read.
+        Arrays are copies, float32 or int32 and writable. InputError naming the file when it is damaged."""
+        if name in ("info", "instances"):
+            return getattr(self, name)
+        if name == "views":
+            return views_of_facts(self.facts, self.path / FACTS, self._unpack("cameras"))
+        if name in ("language", "parts", "groups"):
+            return self._unpack(name)
+        self._check_contents()
+        if name in _ARRAYS:
+            return np.array(self._arrays[name])
+        try:
+            return _OF_PLY[name](self._rows)
+        except (KeyError, ValueError) as error:
+            raise damaged(self.path / "gaussians.ply", f"is no 3DGS cloud ({error})") from error
+
+    def _check_contents(self) -> None:
+        """Compares the SHA-256 of every file with the one recorded, once; InputError names the first that differs.
+        Skipped when the folder has been replaced by another map."""
+        with self._lock:
+            if self._checked or _folder_identity(self.path) != self._identity:
+                return
+            for name in self.info.get("files", {}):
+                if name != EDITABLE:
+                    check_file(self.path, self.info, name)
+            self._checked = True
+
+    def _unpack(self, name: str) -> dict[str, np.ndarray]:
+        """The arrays of an .npz, {} if it does not exist; InputError when a CRC-32 differs."""
+        raw = self._archives.get(name)
+        return {} if raw is None else read_npz(raw, self.path / f"{name}.npz", "the map is damaged, build it again")
+
+
+def _columns(names: list[str]) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda rows: np.stack([rows[name] for name in names], axis=1).astype(np.float32)
+
+
+def _harmonics(rows: np.ndarray) -> np.ndarray:
+    """[N, K, 3] from f_dc_* and f_rest_*, which are channel-major (all R, then G, then B)."""
+    constant = _columns([f"f_dc_{i}" for i in range(3)])(rows)[:, None, :]
+    width = sum(name.startswith("f_rest_") for name in rows.dtype.names or ())
+    if width == 0:
+        return constant
+    rest = _columns([f"f_rest_{i}" for i in range(width)])(rows).reshape(len(constant), 3, width // 3)
+    return np.ascontiguousarray(np.concatenate([constant, rest.transpose(0, 2, 1)], axis=1))
+
+
+_OF_PLY: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "means": _columns(["x", "y", "z"]),
+    "quats": _columns([f"rot_{i}" for i in range(4)]),
+    "log_scales": _columns([f"scale_{i}" for i in range(3)]),
+    "opacity_logits": lambda rows: np.ascontiguousarray(rows["opacity"], np.float32),
+    "sh": _harmonics,
+}
+"""Functions that compute fields of a map from the rows of gaussians.ply."""
+
+
+def read_info(path: Path) -> dict[str, Any]:
+    """The content of map.json; InputError when `path` is not a map or has an unsupported format version."""
+    return _read_facts(standing(Path(path)))[0]
+
+
+def map_signature(path: Path) -> Signature:
+    """Inodes, times and sizes that change when the map or its labels, or the store, at `path` change. InputError when
+    none exists."""
+    folder = standing(path)
+    names = (STORE,) if (folder / STORE).is_file() else (FACTS, EDITABLE)
+    try:
+        stats = [file.stat() for file in (folder, *(folder / name for name in names))]
+    except OSError as error:
+        raise InputError(f"{path}: the map is gone ({error.strerror}); build it again or put it back") from error
+    return tuple((stat.st_ino, stat.st_mtime_ns if n else 0, stat.st_size if n else 0) for n, stat in enumerate(stats))
+
+
+def _folder_identity(path: Path) -> tuple[int, int]:
+    try:
+        stat = path.stat()
+    except OSError:
+        return (0, 0)
+    return (stat.st_dev, stat.st_ino)
+
+
+def _read_facts(path: Path) -> tuple[dict[str, Any], bytes]:
+    file = path / FACTS
+    if (path / STORE).is_file():
+        raise InputError(f"{path}: is a store of many maps, and this needs one map; give one of them")
+    if not file.is_file():
+        raise InputError(f"{path}: is no map (no map.json inside); give a directory made by `perception map`")
+    try:
+        raw = file.read_bytes()
+        info = json.loads(raw)
+        version = info["format_version"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{file}: cannot be read as a map's facts ({error})") from error
+    if isinstance(version, bool) or not isinstance(version, int):
+        raise damaged(file, f"format_version is {version!r}, expected {FORMAT_VERSION}")
+    if version not in READABLE:
+        advice = (
+            f"it was made by an older perception; build the map again from {info.get('source', 'its photos')}"
+            if version < FORMAT_VERSION
+            else "it was made by a newer perception; update this one"
+        )
+        known = " and ".join(map(str, READABLE))
+        raise InputError(f"{file}: format_version is {version}, this program reads {known}: {advice}")
+    check_names(info, file)
+    return info, raw
+
+
+def _read_instances(file: Path) -> tuple[list[dict[str, Any]], bytes]:
+    try:
+        raw = file.read_bytes()
+        instances = json.loads(raw)["instances"]
+        for entry in instances:
+            _check_instance(entry)
+        if len({entry["id"] for entry in instances}) != len(instances):
+            raise ValueError("an id occurs twice")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        problem = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise damaged(file, f"cannot be read as instances ({problem})") from error
+    return instances, raw
+
+
+def _check_instance(entry: dict[str, Any]) -> None:
+    """ValueError unless the id is an integer, numbers are finite and shaped as expected, the label a text or null."""
+    if isinstance(entry["id"], bool) or not isinstance(entry["id"], int):
+        raise ValueError(f"id {entry['id']!r} is no whole number")
+    box = entry["obb"]
+    for name, value, shape in (
+        ("centroid", entry["centroid"], (3,)),
+        ("obb.center", box["center"], (3,)),
+        ("obb.rotation", box["rotation"], (3, 3)),
+        ("obb.extent", box["extent"], (3,)),
+        ("score", entry["score"], ()),
+    ):
+        numbers = np.asarray(value, np.float64)
+        if numbers.shape != shape or not np.isfinite(numbers).all():
+            raise ValueError(f"instance {entry['id']}: {name} is not {'a number' if not shape else list(shape)}")
+    label = entry.get("label")
+    if label is not None and not isinstance(label, str):
+        raise ValueError(f"instance {entry['id']}: label is {type(label).__name__}, expected a text or null")

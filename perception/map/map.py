@@ -1,0 +1,216 @@
+"""A map of Gaussians and instances: the common type of mapping, queries, editing, export and viewing."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from perception.colors import rgb8_from_sh
+from perception.errors import InputError
+from perception.map.files import MapFiles
+from perception.photos.view_json import locate_photo
+from perception.types import View
+
+
+@dataclass(frozen=True)
+class InstanceIndex:
+    """ids [K] int64, ascending; points [M, 3] float32, read-only, grouped by id and in map order within an id;
+    starts [K + 1] int64: instance ids[k] owns points[starts[k] : starts[k + 1]]. Gaussians without one are left out.
+    """
+
+    ids: np.ndarray
+    starts: np.ndarray
+    points: np.ndarray
+
+    def of(self, instance_id: int) -> np.ndarray:
+        """The instance's points [P, 3]; P = 0 for an id without Gaussians."""
+        place = int(np.searchsorted(self.ids, instance_id))
+        if place == len(self.ids) or self.ids[place] != instance_id:
+            return self.points[:0]
+        return self.points[self.starts[place] : self.starts[place + 1]]
+
+
+def build_index(means: np.ndarray, instance_ids: np.ndarray) -> InstanceIndex:
+    """The index of means [N, 3] with instance_ids [N], −1 = none."""
+    held = np.asarray(instance_ids)
+    rows = np.argsort(held, kind="stable")
+    rows = rows[np.searchsorted(held[rows], 0) :]
+    ids, counts = np.unique(held[rows], return_counts=True)
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    points = np.ascontiguousarray(np.asarray(means)[rows], np.float32)
+    points.setflags(write=False)
+    return InstanceIndex(ids.astype(np.int64), starts, points)
+
+
+M = TypeVar("M", bound="Map")
+GAUSSIANS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features", "instance_ids", "membership")
+"""Fields with one row per Gaussian."""
+
+
+_PREFIX = "language_"  # of the arrays in `parts` and `groups` that correspond to those in `language`
+
+
+def language_in(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """As `Map.language`, of the parts or groups: one row per part in ascending id; {} without embeddings."""
+    return {name.removeprefix(_PREFIX): array for name, array in arrays.items() if name.startswith(_PREFIX)}
+
+
+def prefixed(language: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Inverse of `language_in`."""
+    return {_PREFIX + name: array for name, array in language.items()}
+
+
+class PhotosMoved(UserWarning):
+    """Warning: photos of a map are missing, or their files have changed since the map was made."""
+
+
+@dataclass(eq=False, repr=False)
+class Map:
+    """A finished map, in memory (made from its fields) or on disk (`Map.open`: a field is read when first used).
+
+    Arrays are float32: means [N, 3], quats [N, 4] wxyz, log_scales [N, 3], opacity_logits [N], sh [N, K, 3], as the PLY
+    stores them; features [N, D], membership [N], and instance_ids [N] int32, −1 = none. instances: the list of
+    instances.json. info: map.json without the views. views: the photos it was made from, sorted by name, `StoredView`
+    in a map read from disk. language, parts, groups: named arrays (see io.store), possibly empty. index: the points
+    of each instance. Reading a field raises InputError naming the file when it is damaged. The folder may be replaced
+    by another map meanwhile. This type needs no torch; training uses `gaussians.model.Gaussians`, which holds the same
+    values as torch tensors.
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    features: np.ndarray
+    instance_ids: np.ndarray
+    membership: np.ndarray
+    instances: list[dict[str, Any]] = field(default_factory=list)
+    info: dict[str, Any] = field(default_factory=dict)
+    views: list[View] = field(default_factory=list)
+    language: dict[str, np.ndarray] = field(default_factory=dict)
+    parts: dict[str, np.ndarray] = field(default_factory=dict)
+    groups: dict[str, np.ndarray] = field(default_factory=dict)
+    path: Path | None = None
+    index: InstanceIndex = field(init=False)
+    _files: MapFiles | None = field(default=None, init=False)
+    _warned: bool = field(default=False, init=False)
+
+    @classmethod
+    def open(cls: type[M], path: Path) -> M:
+        """The map on disk at `path`; InputError when it is missing, damaged, or of an unknown version."""
+        gmap = cls.__new__(cls)
+        gmap.path, gmap._files = Path(path), MapFiles(path)
+        return gmap
+
+    @classmethod
+    def of(cls: type[M], gmap: Map, **changes: Any) -> M:
+        """`gmap` as an instance of this class, with `changes` to its fields; arrays are shared, not read."""
+        made = cls.__new__(cls)
+        made.path, made._files = gmap.path, gmap._files
+        shared = _FIELDS if changes.keys() & {"means", "instance_ids"} else (*_FIELDS, "index")
+        made.__dict__.update({name: value for name, value in vars(gmap).items() if name in shared} | changes)
+        return made
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Reads a field at its first use; concurrent threads get the same value."""
+            if name == "index":
+                value = build_index(self.means, self.instance_ids)
+            elif name in _FIELDS and self._files is not None:
+                value = self._files.read(name)
+            else:
+                raise AttributeError(f"{type(self).__name__} has no attribute '{name}'")
+            return self.__dict__.setdefault(name, value)
+
+    def load(self: M) -> M:
+        """Reads all fields now and closes the files."""
+        for name in _FIELDS:
+            getattr(self, name)
+        self._files = None
+        return self
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def scales(self) -> np.ndarray:
+        """[N, 3] standard deviations along each Gaussian's axes."""
+        return np.exp(self.log_scales)
+
+    @property
+    def opacities(self) -> np.ndarray:
+        """[N] in (0, 1)."""
+        return 1 / (1 + np.exp(-self.opacity_logits))
+
+    @property
+    def poses(self) -> np.ndarray:
+        """[V, 4, 4] float64 camera_from_world of the views."""
+        return np.array([view.camera_from_world for view in self.views], np.float64).reshape(-1, 4, 4)
+
+    @property
+    def group_ids(self) -> np.ndarray:
+        """[N] int32 group of each Gaussian, −1 = none. InputError when the groups do not fit the instances."""
+        ids = [entry["id"] for entry in self.instances]
+        owner = np.full(max(ids, default=0) + 2, -1, np.int32)
+        if self.groups:
+            of, scores = (self.groups.get(name, np.zeros(0)) for name in ("of", "scores"))
+            if of.shape != (len(ids),) or of.dtype.kind != "i" or not set(range(len(scores))) <= set(of.tolist()):
+                raise InputError(f"{self.path}: groups.npz does not fit the instances; the map is damaged")
+            owner[ids] = of
+        return owner[self.instance_ids]
+
+    @property
+    def map_id(self) -> str:
+        """Short identifier of the map and its labels; it changes when either changes."""
+        return "unsaved" if self._files is None else self._files.map_id
+
+    @property
+    def frame(self) -> str:
+        """The name of the map's frame."""
+        return str(self.info.get("frame", "map"))
+
+    @property
+    def metric(self) -> bool:
+        """Whether the unit of length is known to be the metre."""
+        return bool(self.info.get("metric", False))
+
+    def to_open3d(self) -> Any:
+        """All Gaussians' means as an `open3d.t.geometry.PointCloud` in the map's frame: positions, colors (float32 in
+        [0, 1]), instance_id (int32, −1 = none). InputError without the package open3d."""
+        from perception.io.open3d import tensor_cloud
+
+        return tensor_cloud(self.means, rgb8_from_sh(self.sh[:, 0]), self.instance_ids)
+
+    def colors_of(self, instance_id: int) -> np.ndarray:
+        """Colours [P, 3] uint8 of an instance's points, in the order of `index`."""
+        return rgb8_from_sh(self.sh[self.instance_ids == instance_id, 0])
+
+    def with_photo(self, view: View) -> View:
+        """`view` with the current path of its photo; InputError when the photo is missing or has changed.
+        The first such error of a map also issues a PhotosMoved warning."""
+        try:
+            return replace(view, photo=locate_photo(view, self.path))
+        except InputError as error:
+            if not self._warned:
+                self._warned = True
+                warnings.warn(f"{self.path}: pictures are left out: {error}", PhotosMoved, stacklevel=2)
+            raise
+
+    def located_views(self) -> list[View]:
+        """`with_photo` of all views; views whose photo is missing get an empty path."""
+        found = []
+        for view in self.views:
+            try:
+                found.append(self.with_photo(view))
+            except InputError:
+                found.append(replace(view, photo=Path()))
+        return found
+
+
+_FIELDS = (*GAUSSIANS, "instances", "info", "views", "language", "parts", "groups")

@@ -1,0 +1,179 @@
+"""The map on disk (`name.gsmap/`): a standard 3DGS PLY, JSON facts, and arrays; docs/formats.md lists its files.
+
+instances.json may hold `parts` of an instance: entries with the same keys and `parent`, the id of the whole. Ids of
+parts follow those of the wholes. language.npz: see `language.description.to_arrays`.
+parts.npz       ids [N] int32: the part each Gaussian belongs to (−1 = none; absent without parts). With an encoder also
+                language_*: as language.npz, one row per part in ascending id
+groups.npz      instances that may be one thing: of [I] int32, group of each instance in the order of instances.json,
+                −1 = none; scores [G] float32; language_* as in parts.npz (absent without groups)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import shutil
+from collections import defaultdict
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.atomic import atomic_directory, atomic_file, writing
+from perception.io.documents import safe_name
+from perception.io.ply import write_ply
+from perception.map.checksums import EDITABLE, FACTS, REPORT, facts_of, listed_files, seal, verify
+from perception.map.files import FORMAT_VERSION, MapFiles
+from perception.map.map import Map
+from perception.photos.view_json import StoredView, moved_record, stored_view, view_from_json, view_json
+from perception.types import View
+
+LONGEST_LABEL = 200  # characters
+
+
+def write_map(path: Path, gmap: Map, keep_report: bool = False) -> None:
+    """Writes the map to a temporary folder and exchanges it with `path`: readers see the old or the new map.
+
+    keep_report: keep the report of the replaced map, for manual corrections.
+
+    InputError when another writer holds the map, or `path` cannot be written.
+    """
+    info = {**gmap.info, "format_version": FORMAT_VERSION, "num_gaussians": len(gmap)}
+    info["num_instances"] = len(gmap.instances)
+    info["sh_degree"] = math.isqrt(gmap.sh.shape[1]) - 1
+    info["views"] = [view_json(_recorded(view, path, gmap.path)) for view in gmap.views]
+    with writing(path), atomic_directory(path) as folder:
+        write_gaussian_ply(folder / "gaussians.ply", gmap)
+        np.save(folder / "features.npy", gmap.features.astype(np.float32))
+        np.save(folder / "instance_ids.npy", gmap.instance_ids.astype(np.int32))
+        np.save(folder / "membership.npy", gmap.membership.astype(np.float32))
+        if gmap.language:
+            np.savez_compressed(folder / "language.npz", **gmap.language)  # type: ignore[arg-type]
+        for name, arrays in (("parts", gmap.parts), ("groups", gmap.groups)):
+            if arrays:
+                np.savez_compressed(folder / f"{name}.npz", **arrays)  # type: ignore[arg-type]
+        _dump(folder / EDITABLE, {"instances": gmap.instances})
+        if keep_report and (path / REPORT).is_file():
+            shutil.copy2(path / REPORT, folder / REPORT)
+        facts = json.loads(json.dumps(info, allow_nan=False, default=_plain))  # as it will be read
+        _dump(folder / FACTS, seal({**facts, "files": {file.name: facts_of(file) for file in listed_files(folder)}}))
+
+
+def _recorded(view: View, path: Path, before: Path | None) -> StoredView:
+    """The record of a view for the map at `path`; before: path of the map it was read from, or None."""
+    safe_name(view.name, path)
+    if not isinstance(view, StoredView):
+        return stored_view(view, path)
+    return moved_record(view, path if before is None else before, path)
+
+
+def read_map(path: Path) -> Map:
+    """Reads a whole map into memory and verifies its checksums.
+    InputError naming the file when it is not a map, of an unknown version, or damaged."""
+    return Map.open(path).load()
+
+
+def verify_map(path: Path) -> dict[str, str]:
+    """Reads every byte: {file: "ok", "edited" or "no checksum"}; InputError naming the first damaged file."""
+    return verify(path, MapFiles(path).facts)
+
+
+def set_labels(path: Path, labels: dict[int, str | None]) -> dict[int, str | None]:
+    """Sets labels of instances, by id, in the map at `path`; None removes a label. All are written or none.
+
+    Returns the written labels, with white space normalised. InputError for an unknown id, a label that is empty or too
+    long, and while another writer holds the map.
+    """
+    tidied = {i: None if label is None else tidy_label(label) for i, label in labels.items()}
+    with writing(path):
+        files = MapFiles(path)
+        places = {entry["id"]: n for n, entry in enumerate(files.instances)}
+        for instance_id, label in tidied.items():
+            if instance_id not in places:
+                raise InputError(f"{path}: has no instance {instance_id}; it has {len(places)}")
+            files.instances[places[instance_id]]["label"] = label
+        with contextlib.ExitStack() as both:  # both are written completely before the first rename
+            facts = both.enter_context(atomic_file(path / FACTS)) if "files" in files.facts else None
+            aside = both.enter_context(atomic_file(path / EDITABLE))
+            _dump(aside, {"instances": files.instances})
+            if facts is not None:  # other checksums are kept, so damage stays detectable
+                _dump(facts, seal({**files.facts, "files": {**files.facts["files"], EDITABLE: facts_of(aside)}}))
+    return tidied
+
+
+def tidy_label(label: str) -> str:
+    """`label` on one line without outer white space; InputError when it is empty or longer than LONGEST_LABEL."""
+    tidy = " ".join(label.split())
+    if not tidy:
+        raise InputError('label: it is empty; write a name such as "grandma\'s cup", or --clear to take it away')
+    if len(tidy) > LONGEST_LABEL:
+        raise InputError(f"label: {len(tidy)} characters, at most {LONGEST_LABEL} are kept; choose a shorter name")
+    return tidy
+
+
+def relink(path: Path, folder: Path) -> dict[str, Any]:
+    """Records for every view of the map at `path` the photo below `folder` with the same name and size.
+
+    A photo is searched by the view name ("a/0001.jpg"), else by the file name alone if that is unique below `folder`.
+    Views without such a photo keep their record. Returns {"linked": count, "missing": names, "differ": names of
+    photos of another size}. InputError when no photo is found, or while the map is locked by another writer.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is no folder; give the one that holds the photos of {path}")
+    by_name: dict[str, list[Path]] = defaultdict(list)
+    for file in sorted(folder.rglob("*")):
+        by_name[file.name].append(file)
+    with writing(path):
+        files = MapFiles(path)
+        entries, linked, missing, differ = [], 0, [], []
+        for entry, view in zip(files.facts.get("views", []), files.read("views"), strict=True):
+            alike = by_name[PurePosixPath(view.name).name]
+            found = next((f for f in (folder / view.name, *(alike if len(alike) == 1 else [])) if f.is_file()), None)
+            if found is None:
+                missing.append(view.name)
+            elif view.photo_bytes not in (None, found.stat().st_size):
+                differ.append(view.name)
+            else:
+                linked += 1
+                record = view_json(stored_view(view_from_json({**entry, "photo": str(found)}), path))
+                entry = {**entry, **{key: record[key] for key in ("photo", "photo_beside", "photo_bytes")}}
+            entries.append(entry)
+        if linked == 0:
+            other = f", {len(differ)} have another size than the photos of the map" if differ else ""
+            raise InputError(f"{folder}: holds none of the {len(entries)} photos of {path}{other}; give their folder")
+        facts = {**files.facts, "views": entries}
+        with atomic_file(path / FACTS) as aside:
+            _dump(aside, seal(facts) if "files" in facts else facts)
+    return {"linked": linked, "missing": missing, "differ": differ}
+
+
+def write_gaussian_ply(path: Path, gmap: Map) -> None:
+    """The standard 3DGS properties in their usual order; f_rest is channel-major (all R, then G, then B)."""
+    rest = gmap.sh[:, 1:].transpose(0, 2, 1).reshape(len(gmap), -1)
+    groups = {
+        "xyz": gmap.means,
+        ("nx", "ny", "nz"): np.zeros((len(gmap), 3)),
+        tuple(f"f_dc_{i}" for i in range(3)): gmap.sh[:, 0],
+        tuple(f"f_rest_{i}" for i in range(rest.shape[1])): rest,
+        ("opacity",): gmap.opacity_logits[:, None],
+        tuple(f"scale_{i}" for i in range(3)): gmap.log_scales,
+        tuple(f"rot_{i}" for i in range(4)): gmap.quats,
+    }
+    columns = {name: values[:, i] for names, values in groups.items() for i, name in enumerate(names)}
+    write_ply(path, {"vertex": {name: np.ascontiguousarray(column, np.float32) for name, column in columns.items()}})
+
+
+def _dump(path: Path, value: Any) -> None:
+    path.write_text(json.dumps(value, indent=1, allow_nan=False, default=_plain) + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"cannot write {type(value).__name__} as JSON")

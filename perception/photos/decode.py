@@ -1,0 +1,245 @@
+"""Photos: decodes them upright as 8-bit RGB, undistorts and downscales them to a view's pinhole camera."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from stat import S_ISREG
+
+import cv2
+import numpy as np
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from perception.errors import InputError, missing_extra
+from perception.io.documents import DAMAGE
+from perception.photos.lens import warp_grid
+from perception.types import View
+
+HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
+SUFFIXES = HEIF_SUFFIXES | {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+LARGE_PIXELS = 200_000_000
+"""Photos of more pixels are read at 1/2, 1/4 or 1/8 of their size; `photo_size` returns the reduced size."""
+MOST_DECODED = 400_000_000
+"""Maximum number of pixels to decode; JPEG is decoded at the reduced size, other formats at full size."""
+DECODE_ERRORS = (*DAMAGE, Image.DecompressionBombError)
+"""Exceptions that Pillow raises on bytes that are not an image, or on a truncated image."""
+
+
+def photo_size(path: Path) -> tuple[int, int]:
+    """(width, height) of what read_photo returns, from the header: EXIF rotation applied, large photos reduced."""
+    with open_photo(path) as image:
+        tags = getattr(image, "tag_v2", {})  # depending on its version, Pillow has rotated the size of a TIFF
+        size = reduced_size(int(tags.get(0x0100, image.width)), int(tags.get(0x0101, image.height)), _reduction(image))
+        turned = exif_of(image, path).get(0x0112) in (5, 6, 7, 8)  # other values do not swap the sides
+        return size[::-1] if turned else size
+
+
+def stored_size(path: Path) -> tuple[int, int]:
+    """(width, height) in the file's header: without EXIF rotation, not reduced."""
+    with open_photo(path) as image:
+        return image.size
+
+
+def reduced_size(width: int, height: int, factor: int) -> tuple[int, int]:
+    """The size of a photo read at 1 / factor: rounded up, as Pillow's JPEG decoder and `reduce` do."""
+    return -(-width // factor), -(-height // factor)
+
+
+def _reduction(image: Image.Image) -> int:
+    """The power of two by which a photo is reduced to at most LARGE_PIXELS; 1 for smaller photos."""
+    factor = 1
+    while image.width * image.height > LARGE_PIXELS * factor**2:
+        factor *= 2
+    return factor
+
+
+def exif_of(image: Image.Image, path: Path) -> Image.Exif:
+    """The EXIF data of an open photo, empty if it has none. Raises InputError if they are damaged."""
+    try:
+        return image.getexif()
+    except DECODE_ERRORS as error:
+        raise _bad_exif(path) from error
+
+
+def upright(image: Image.Image, path: Path) -> Image.Image:
+    """An open photo rotated according to its EXIF data. Raises InputError if they are damaged."""
+    try:
+        return ImageOps.exif_transpose(image)
+    except DECODE_ERRORS as error:  # it decodes the EXIF data and rewrites them without the rotation
+        raise _bad_exif(path) from error
+
+
+def _bad_exif(path: Path) -> InputError:
+    return InputError(f"{path}: the photo's EXIF data are damaged; save it anew without them, or remove it")
+
+
+def why_left_out(path: Path, strict: bool = False) -> str | None:
+    """The error that reading the whole photo raises, or None; strict: raised. JPEG is read at 1/8 size: every byte."""
+    try:
+        with open_photo(path) as image:
+            image.draft("RGB", reduced_size(*image.size, 8))
+            decode(image, path)
+    except InputError as error:
+        if strict:
+            raise
+        return str(error)
+    return None
+
+
+def read_photo(path: Path) -> np.ndarray:
+    """The photo as uint8 [h, w, 3] RGB, rotated as in EXIF; (w, h) = photo_size(path).
+
+    Grey is repeated to three channels, 16 bits become 8 (v / 257 rounded), palettes are expanded; transparent pixels
+    are composited on black. Floating-point images are refused. HEIC needs pillow-heif (extra "heic").
+    """
+    with open_photo(path) as image:
+        factor = _draft(image)
+        decode(image, path)
+        photo = to_rgb(upright(image, path), path)
+    return photo if factor == 1 else np.array(Image.fromarray(photo).reduce(factor))
+
+
+def read_grey(path: Path) -> np.ndarray:
+    """`read_photo` as uint8 [h, w] grey."""
+    return np.asarray(cv2.cvtColor(read_photo(path), cv2.COLOR_RGB2GRAY))
+
+
+def _draft(image: Image.Image) -> int:
+    """Prepares an open photo to be decoded at its reduced size if its format can; returns the factor that remains."""
+    factor = _reduction(image)
+    if factor > 1:
+        width, height = image.size
+        image.draft(None, (width // factor, height // factor))
+        factor = max(1, round(factor * image.width / width))
+    return factor
+
+
+def scaled_size(view: View, max_side: int | None) -> tuple[int, int]:
+    """(width, height) of the view with its long side at most `max_side` pixels; None keeps the size, none grows."""
+    side = max(view.width, view.height)
+    if max_side is None or side <= max_side:
+        return view.width, view.height
+    return max(1, round(view.width * max_side / side)), max(1, round(view.height * max_side / side))
+
+
+def scaled_K(view: View, width: int, height: int) -> np.ndarray:
+    """Intrinsics [3, 3] float64 of the view resized to width × height: the true ratio of the sizes, per axis."""
+    return np.diag([width / view.width, height / view.height, 1.0]) @ view.K
+
+
+def load_photo(view: View, max_side: int | None = None) -> np.ndarray:
+    """The view's picture as uint8 [h, w, 3] RGB through its ideal pinhole, (w, h) = scaled_size(view, max_side).
+
+    The photo is downscaled by area averaging, then undistorted with bilinear interpolation. Only the last warps are
+    cached. A photo is used without EXIF rotation if only then its size fits the camera (COLMAP ignores EXIF).
+    """
+    width, height = scaled_size(view, max_side)
+    photo = _oriented(view)
+    if view.lens is None:
+        return _shrink(photo, width, height)
+    h, w = photo.shape[:2]
+    small_w = min(w, max(1, round(w * width / view.width)))
+    small_h = min(h, max(1, round(h * height / view.height)))
+    small = _shrink(photo, small_w, small_h)
+    x, y = _grid(view, width, height)
+    map_x = x * np.float32(small_w / w) - np.float32(0.5)  # cv2 has pixel centres at integers
+    map_y = y * np.float32(small_h / h) - np.float32(0.5)
+    return cv2.remap(small, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def warp_labels(view: View, labels: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Labels [H, W] in the photo's geometry to int32 [height, width] in the view's pinhole, nearest sampling.
+    Pixels outside the photo get 0. The label image must have the photo's size (after EXIF rotation)."""
+    across, down = view.photo_size
+    if labels.shape != (down, across):
+        found = "×".join(map(str, labels.shape[::-1]))
+        raise InputError(f"{view.name}: the label image is {found}, expected {across}×{down} like the photo")
+    if view.lens is None:
+        column = ((np.arange(width) + 0.5) * view.width / width).astype(np.int64)
+        row = ((np.arange(height) + 0.5) * view.height / height).astype(np.int64)
+        return labels[row[:, None], column[None, :]].astype(np.int32)
+    x, y = _grid(view, width, height)
+    inside = (x >= 0) & (y >= 0) & (x < across) & (y < down)
+    warped = np.zeros((height, width), np.int32)
+    warped[inside] = labels[y[inside].astype(np.int64), x[inside].astype(np.int64)]
+    return warped
+
+
+def _grid(view: View, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    assert view.lens is not None
+    K = scaled_K(view, width, height)
+    return warp_grid(view.lens, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), width, height)
+
+
+def _oriented(view: View) -> np.ndarray:
+    width, height = view.photo_size
+    photo = read_photo(view.photo)
+    if photo.shape[:2] == (height, width):
+        return photo
+    if stored_size(view.photo) == view.photo_size:
+        with open_photo(view.photo) as image:
+            decode(image, view.photo)
+            return to_rgb(image, view.photo)
+    found = "×".join(map(str, photo.shape[1::-1]))
+    raise InputError(f"{view.photo}: the photo is {found}, its camera expects {width}×{height}")
+
+
+def _shrink(photo: np.ndarray, width: int, height: int) -> np.ndarray:
+    if photo.shape[:2] == (height, width):
+        return photo
+    return cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
+
+
+_OPENING = threading.Lock()
+_HEADER = 1 << 16
+"""Bytes of a file's beginning."""
+
+
+def open_photo(path: Path) -> Image.Image:
+    """The photo opened by Pillow, not decoded. InputError if it is missing or Pillow cannot read it."""
+    if path.suffix.lower() in HEIF_SUFFIXES:
+        try:
+            import pillow_heif
+        except ImportError as error:
+            raise missing_extra("pillow-heif", "heic") from error
+        pillow_heif.register_heif_opener(thumbnails=False)
+    try:
+        if not S_ISREG(path.stat().st_mode):
+            raise ValueError("no file")  # to open a FIFO would mean to wait for its writer
+        with path.open("rb") as file:
+            file.read(_HEADER)  # on a disk that hangs, this waits, without the lock that other photos need
+        with _OPENING:  # Pillow's limit is global and lies below LARGE_PIXELS; MOST_DECODED is checked instead
+            limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+            try:
+                return Image.open(path)
+            finally:
+                Image.MAX_IMAGE_PIXELS = limit
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such photo") from error
+    except (UnidentifiedImageError, *DECODE_ERRORS) as error:
+        raise InputError(f"{path}: not a readable image; replace or remove it") from error
+
+
+def decode(image: Image.Image, path: Path) -> None:
+    """Decodes an open photo. Raises InputError if the file is damaged or has more than MOST_DECODED pixels."""
+    if image.width * image.height > MOST_DECODED:
+        raise InputError(f"{path}: {image.width}×{image.height} pixels, at most {MOST_DECODED} are read; shrink it")
+    try:
+        image.load()
+    except DECODE_ERRORS as error:
+        raise InputError(f"{path}: the photo is truncated or damaged; replace or remove it") from error
+
+
+def to_rgb(image: Image.Image, path: Path) -> np.ndarray:
+    """A decoded photo as uint8 [h, w, 3]; see read_photo."""
+    if image.mode.startswith("I"):  # 16-bit grey, as "I;16" or as 32-bit "I"
+        grey = np.clip(np.asarray(image).astype(np.float64), 0, 65535)
+        eight = (grey / 257 + 0.5).astype(np.uint8)
+        return np.ascontiguousarray(np.repeat(eight[..., None], 3, axis=2))
+    if image.mode == "F":
+        raise InputError(f"{path}: floating-point images are not photos; convert it to 8 or 16 bit")
+    if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
+        rgba = image.convert("RGBA")
+        black = Image.new("RGBA", rgba.size, (0, 0, 0, 255))
+        image = Image.alpha_composite(black, rgba)
+    return np.array(image.convert("RGB"))

@@ -1,0 +1,209 @@
+"""Folders of photos: finds the photos, and selects those that are useful for structure from motion."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from perception.cores import cores
+from perception.errors import InputError
+from perception.photos.decode import SUFFIXES, decode, open_photo, photo_size, upright
+from perception.photos.video import FRAMES_RECORD, THUMBNAIL, motion_between
+from perception.progress import Progress
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
+SAME_MOTION, SAME_GREY = 0.006, 6.0
+"""Neighbouring photos are duplicates when their corners move by less than this share of the width and their 320 pixel
+thumbnails differ by less than this mean grey level. Measured between neighbours on a walk: at least 0.011 and 11."""
+PANORAMA_ASPECT, PANORAMA_EXCESS = 2.2, 1.5
+"""Least aspect ratio (long / short side) of a panorama: absolute, and as a multiple of the folder's median."""
+BLURRED = 0.1
+"""Share of the median sharpness (variance of the thumbnail's Laplacian) below which a photo is reported as blurred."""
+_SHOWN = 5
+
+
+@dataclass
+class PhotoSet:
+    """photos: sorted by relative path; names[i] is that path, escaped. left_out: name, reason. notes: one line each."""
+
+    photos: list[Path] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+    left_out: list[dict[str, str]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass
+class _Look:
+    """Data of one photo: a grey thumbnail [h, w] uint8 of at most 320 pixels, or the error of reading it."""
+
+    path: Path
+    name: str
+    size: tuple[int, int] = (0, 0)
+    grey: np.ndarray = field(default_factory=lambda: np.zeros((1, 1), np.uint8))
+    sharpness: float = 0.0
+    stitched: bool = False
+    error: InputError | None = None
+    why: str | None = None
+
+
+def list_photos(folder: Path, suffixes: frozenset[str] = SUFFIXES) -> list[Path]:
+    """All photos, or files of other suffixes, under `folder`, sorted by their path relative to it.
+
+    Skipped: hidden files and folders, maps and work folders (*.gsmap*), frames taken from a video. Linked folders are
+    followed; each real folder is listed once.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of photos")
+    found, seen, waiting = [], set(), [folder]
+    while waiting:  # links last, so that a folder is listed under its own path
+        waiting.sort(key=lambda path: (path.is_symlink(), path))
+        here = waiting.pop(0)
+        identity = (here.stat().st_dev, here.stat().st_ino)
+        if identity in seen:
+            continue
+        seen.add(identity)
+        try:
+            inside = list(here.iterdir())
+        except OSError:  # a folder without read permission
+            continue
+        for path in inside:
+            if path.name.startswith("."):
+                continue
+            if path.is_dir():
+                if ".gsmap" not in path.name and not (path / FRAMES_RECORD).is_file():
+                    waiting.append(path)
+            elif path.suffix.lower() in suffixes and path.is_file():
+                found.append(path.relative_to(folder))
+    return [folder / path for path in sorted(found)]
+
+
+def view_name(photo: Path, folder: Path) -> str:
+    """The photo's path below `folder`, as `safe_name` accepts it.
+
+    In a name with control characters, bytes that are no UTF-8, or a backslash, these and "%" become %XX (hexadecimal).
+    """
+    name = photo.relative_to(folder).as_posix()
+    if name.isprintable() and "\\" not in name:
+        return name
+    plain = (c if c.isprintable() and c not in "%\\" else "".join(f"%{b:02X}" for b in os.fsencode(c)) for c in name)
+    return "".join(plain)
+
+
+def choose_photos(folder: Path, strict: bool, progress: Progress) -> PhotoSet:
+    """The photos under `folder` to use for structure from motion; each photo is read once, in several threads.
+
+    Left out with the reason: damaged photos, panoramas (not pinhole images) and duplicates. Of neighbours by name with
+    nearly the same picture (bursts, JPEG and HEIC of one photo) the sharpest is kept, of equal pictures the first.
+    Blurred photos are kept and reported. strict: the first photo that cannot be read is raised as InputError.
+    """
+    paths = list_photos(folder)
+    looks: list[_Look] = []
+    taken: set[str] = set()
+    with ThreadPoolExecutor(min(4, cores())) as pool:
+        for done, look in enumerate(pool.map(lambda path: _look(path, folder, strict), paths), start=1):
+            while look.name in taken:  # an escaped name that is already in use
+                look.name += "_"
+            taken.add(look.name)
+            looks.append(look)
+            progress.update("poses: photos", done, len(paths))
+    _leave_out_panoramas([look for look in looks if look.why is None])
+    _leave_out_doubles([look for look in looks if look.why is None])
+    kept = [look for look in looks if look.why is None]
+    left_out = [{"name": look.name, "why": look.why} for look in looks if look.why is not None]
+    return PhotoSet([k.path for k in kept], [k.name for k in kept], left_out, _notes(folder, looks, kept))
+
+
+def _look(path: Path, folder: Path, strict: bool) -> _Look:
+    look = _Look(path, view_name(path, folder))
+    try:
+        look.size = photo_size(path)
+        with open_photo(path) as image:
+            xmp = image.info.get("xmp", b"")
+            look.stitched = b"GPano:" in (xmp if isinstance(xmp, bytes) else str(xmp).encode())
+            image.draft("RGB", _thumbnail_size(image.size))
+            decode(image, path)
+            scale = max(1, max(image.size) // THUMBNAIL)
+            small = image.reduce(scale) if scale > 1 and image.mode in ("L", "RGB") else image
+            grey = upright(small, path).convert("L")
+            look.grey = np.array(grey.resize(_thumbnail_size(look.size), Image.Resampling.BOX))
+    except InputError as error:
+        if strict:
+            raise
+        look.error, look.why = error, str(error)
+        return look
+    look.sharpness = float(cv2.Laplacian(look.grey, cv2.CV_64F).var())
+    return look
+
+
+def _thumbnail_size(size: tuple[int, int]) -> tuple[int, int]:
+    scale = min(1.0, THUMBNAIL / max(size))
+    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+
+
+def _leave_out_panoramas(looks: list[_Look]) -> None:
+    aspects = [max(look.size) / min(look.size) for look in looks]
+    least = max(PANORAMA_ASPECT, PANORAMA_EXCESS * float(np.median(aspects))) if aspects else 0.0
+    for look, aspect in zip(looks, aspects, strict=True):
+        if look.stitched or aspect >= least:
+            look.why = f"a panorama ({look.size[0]}×{look.size[1]}): stitched photos fit no camera; use ordinary photos"
+
+
+def _leave_out_doubles(looks: list[_Look]) -> None:
+    """Marks all but the sharpest of similar neighbours, then all but the first of equal pictures, as left out."""
+    runs: list[list[_Look]] = []
+    for look in looks:
+        if runs and _same_picture(runs[-1][0], look):
+            runs[-1].append(look)
+        else:
+            runs.append([look])
+    pictures: dict[tuple[tuple[int, int], bytes], _Look] = {}
+    for run in runs:
+        best = max(run, key=lambda look: look.sharpness)
+        for look in run:
+            if look is not best:
+                look.why = f"a double: nearly the same picture as {best.name}"
+        first = pictures.setdefault((best.size, best.grey.tobytes()), best)
+        if first is not best:
+            best.why = f"a double: the same picture as {first.name}"
+
+
+def _same_picture(a: _Look, b: _Look) -> bool:
+    if a.grey.shape != b.grey.shape or np.abs(a.grey.astype(np.int16) - b.grey).mean() >= SAME_GREY:
+        return False
+    return motion_between(a.grey, b.grey) < SAME_MOTION
+
+
+def _notes(folder: Path, looks: list[_Look], kept: list[_Look]) -> list[str]:
+    notes = []
+    of = f"of {len(looks)} photos"
+    doubles = [look.name for look in looks if look.why is not None and look.why.startswith("a double")]
+    if doubles:
+        notes.append(f"{len(doubles)} {of} are doubles (bursts, copies) and left out: {_some(doubles)}")
+    broken = [look for look in looks if look.error is not None]
+    if broken:
+        names = _some([look.name for look in broken])
+        notes.append(f"warning: {len(broken)} {of} cannot be read and are left out: {names} ({broken[0].error})")
+    usual = float(np.median([look.sharpness for look in kept])) if kept else 0.0
+    blurred = [look.name for look in kept if look.sharpness < BLURRED * usual]
+    if blurred:
+        notes.append(f"{len(blurred)} {of} are far more blurred than the others, and used: {_some(blurred)}")
+    videos = list_photos(folder, VIDEO_SUFFIXES)
+    if videos:
+        stems = {look.path.with_suffix("") for look in looks}
+        live = sum(video.with_suffix("") in stems for video in videos)
+        notes.append(
+            f"{len(videos)} videos beside the photos are not read, {live} of them belong to Live Photos: "
+            + _some([view_name(video, folder) for video in videos])
+        )
+    return notes
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:_SHOWN]) + (", …" if len(names) > _SHOWN else "")

@@ -1,0 +1,92 @@
+"""Masks of pixels to ignore (people, the robot's own arm): black (0) is ignored, everything else is used.
+
+As in COLMAP and nerfstudio. They keep pixels out of features, label images, losses and scores.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from perception.errors import InputError
+from perception.photos.decode import photo_size, warp_labels
+from perception.types import Scene, View
+
+_ASPECT = 0.02
+"""Largest relative difference between the aspect ratios of a mask and its photo: sizes are whole pixels."""
+
+
+def mask_of(folder: Path | None, name: str) -> Path | None:
+    """The mask of photo `name` in `folder`: "a/1.png" or "a/1.jpg.png" for "a/1.jpg"; None without one."""
+    if folder is None:
+        return None
+    places = (folder / Path(name).with_suffix(".png"), folder / f"{name}.png")
+    return next((place for place in places if place.is_file()), None)
+
+
+def read_mask(path: Path, width: int, height: int) -> np.ndarray:
+    """[height, width] uint8, 255 = used, 0 = ignored; a mask of another resolution is sampled at the nearest pixel.
+
+    Ignored are pixels that are black in all channels, or transparent. InputError for a file that is missing, no image,
+    or of another aspect ratio.
+    """
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    if image is None:
+        raise InputError(f"{path}: not a readable mask; expected a PNG in which black (0) pixels are ignored")
+    channels = image.reshape(*image.shape[:2], -1)
+    used: np.ndarray = np.any(channels[..., :3] > 0, axis=2)
+    if channels.shape[2] in (2, 4):
+        used &= channels[..., -1] > 0
+    rows, columns = used.shape
+    if abs(columns * height / (rows * width) - 1) > _ASPECT:
+        raise InputError(f"{path}: the mask is {columns}×{rows}, its photo {width}×{height}; expected the same shape")
+    down = ((np.arange(height) + 0.5) * rows / height).astype(np.int64)
+    right = ((np.arange(width) + 0.5) * columns / width).astype(np.int64)
+    return used[down[:, None], right[None, :]].astype(np.uint8) * 255
+
+
+def load_weight(view: View, width: int, height: int) -> np.ndarray | None:
+    """Weight [height, width] float32 of the pixels of the view's pinhole: 1 = used, 0 = ignored; None without mask."""
+    if view.mask is None:
+        return None
+    return (warp_labels(view, read_mask(view.mask, *view.photo_size), width, height) > 0).astype(np.float32)
+
+
+def stage_masks(folder: Path, photos: list[Path], names: list[str], masks: list[Path | None]) -> None:
+    """Writes the masks into the new `folder` as COLMAP names them ("NAME.png"), white for photos without a mask."""
+    folder.mkdir()
+    for photo, name, mask in zip(photos, names, masks, strict=True):
+        width, height = photo_size(photo)
+        used = np.full((height, width), 255, np.uint8) if mask is None else read_mask(mask, width, height)
+        (folder / f"{name}.png").write_bytes(cv2.imencode(".png", used)[1].tobytes())
+
+
+def with_checked_masks(scene: Scene, folder: Path | None) -> Scene:
+    """The scene without the photos that their masks ignore completely, and a note on what is ignored.
+
+    folder: where the user said masks are. InputError when it holds none for these photos, a mask is unreadable, or
+    nothing is left.
+    """
+    masked = [view for view in scene.views if view.mask is not None]
+    if folder is not None and not masked:
+        raise InputError(
+            f"{folder}: holds no mask for any of the {len(scene.views)} photos; expected a PNG of the same stem, such "
+            f"as {Path(scene.views[0].name).with_suffix('.png')}, in which black (0) pixels are ignored"
+        )
+    if not masked:
+        return scene
+    weights = ((view.name, load_weight(view, view.width, view.height)) for view in masked)
+    shares = {name: 0.0 if weight is None else 1.0 - float(weight.mean()) for name, weight in weights}
+    views = [view for view in scene.views if shares.get(view.name) != 1.0]
+    if not views:
+        raise InputError(f"{masked[0].mask}: this and all other masks are black (0 = ignored); are they inverted?")
+    black = [view for view in masked if shares[view.name] == 1.0]
+    out = [{"name": view.name, "why": f"{view.mask}: ignores every pixel"} for view in black]
+    share = float(np.mean(list(shares.values())))
+    note = f"masks: {share:.1%} of the pixels of {len(masked)} of {len(scene.views)} photos are ignored"
+    report = {**scene.report, "notes": [*scene.report.get("notes", []), note]}
+    report["left_out"] = [*report.get("left_out", []), *out]
+    return replace(scene, views=views, report=report)

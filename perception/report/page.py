@@ -1,0 +1,295 @@
+"""The report of a map: one self-contained HTML page, images inlined, no scripts, no external resources.
+
+The page is the Jinja2 template report.html, which escapes every value.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Mapping, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from perception.colors import instance_palette
+from perception.config import flat
+from perception.errors import InputError
+from perception.export.render import as_gaussians
+from perception.gaussians.render import render
+from perception.gaussians.views import TrainingView, render_view
+from perception.instances.crops import expand_box, mask_box
+from perception.instances.silhouettes import render_silhouettes
+from perception.io.atomic import atomic_file
+from perception.map.write import REPORT, Map
+from perception.photos.decode import load_photo, scaled_K
+from perception.pictures import error_map, features_to_rgb, outline, overlay, titled_row
+from perception.progress import Progress
+from perception.query import QueryMap, load_map
+from perception.query.hit import printed_texts
+from perception.report.text import depth_text
+
+SHOWN = ("worst", "middle", "best")
+"""Held-out views shown beside their photos, by PSNR."""
+LIMIT = 3_000_000
+"""Maximum size of the page in bytes."""
+SIZES = ((460, 82), (360, 74), (260, 66), (180, 55), (120, 45))
+"""(longest side, quality) of the images, tried in this order."""
+
+
+def write_own_report(path: Path, progress: Progress) -> None:
+    """Writes report.html into the map. A failure is only a warning: `perception report` can be run later."""
+    try:
+        write_map_report(load_map(path), path / REPORT, [])
+    except InputError as error:
+        progress.log(f"warning: no report: {error}")
+
+
+def write_map_report(opened: QueryMap, path: Path, queries: list[str]) -> Path:
+    """The one-page report of a map, with the answers to `queries`; missing photos are left out."""
+    info, album = opened.info, _Album(opened)
+    data = {
+        "title": (opened.path or path).stem,
+        "subtitle": f"from {info['source']}",
+        "figures": _figures(opened),
+        "seconds": {name: value for name, value in info["seconds"].items() if name != "total" and value > 0},
+        "views": _view_rows(opened, album),
+        "overview": _overview(opened, album),
+        "instances": _instance_rows(opened, album),
+        "metric": opened.metric,
+        "queries": [_query_row(opened, text, album) for text in queries],
+        "warnings": _warnings(info),
+        "settings": dict(flat(info["config"])),
+    }
+    try:
+        return write_page(path, data)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def write_page(path: Path, data: Mapping[str, Any]) -> Path:
+    """Writes the page, replacing an old one atomically. Images shrink until it is under LIMIT.
+
+    data: what `write_map_report` gives; images are [H, W, 3] uint8.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    folder = FileSystemLoader(Path(__file__).parent)
+    template = Environment(loader=folder, autoescape=True, undefined=StrictUndefined).get_template("report.html")
+    sides = partial(_sides, scale=100.0 if data["metric"] else 1.0)
+    page = b""
+    for side, quality in SIZES:
+        image = partial(_image, side=side, quality=quality)
+        text = template.render(data=data, image=image, sides=sides, clock=clock, palette=instance_palette)
+        page = text.encode(errors="replace")  # an unpaired surrogate in a file name cannot be encoded as UTF-8
+        if len(page) < LIMIT:
+            break
+    with atomic_file(path) as aside:
+        aside.write_bytes(page)
+    return path
+
+
+def _image(picture: np.ndarray, side: int, quality: int) -> tuple[int, int, str]:
+    """(width, height, data URI) of an image [H, W, 3] uint8, with a longer side of at most `side` pixels."""
+    from PIL import Image
+
+    image = Image.fromarray(np.ascontiguousarray(picture[..., :3], np.uint8))
+    image.thumbnail((side, side), Image.Resampling.LANCZOS)
+    buffer = io.BytesIO()
+    image.save(buffer, "WEBP", quality=quality, method=4)
+    code = base64.b64encode(buffer.getvalue()).decode()
+    return image.width, image.height, f"data:image/webp;base64,{code}"
+
+
+def _sides(extent: Sequence[float], scale: float) -> str:
+    """Box sides times `scale`, with so many decimals that the longest has three digits."""
+    sides = [scale * side for side in extent]
+    decimals = int(np.clip(2 - np.floor(np.log10(max(*sides, 1e-12))), 0, 6))
+    return " × ".join(f"{side:.{decimals}f}" for side in sides)
+
+
+def clock(seconds: float) -> str:
+    """42.3 -> 42 s, 95 -> 1 min 35 s."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60:02d} s"
+
+
+def _warnings(info: dict[str, Any]) -> list[str]:
+    """Warnings on the quality of the map, most severe first."""
+    scored = info["quality"].get("views", {})
+    mean = info["quality"].get("psnr")
+    bad = [f"{name} ({figures['psnr']:.1f} dB)" for name, figures in scored.items() if mean - figures["psnr"] > 6]
+    lines = [*_left_out(info["scene"]), *info["scene"].get("warnings", []), *info["masks"].get("warnings", [])]
+    if skipped := info["training"].get("skipped_gradients"):
+        lines.append(f"{skipped} gradients were not finite and were skipped")
+    if bad:
+        lines.append(f"held-out views far below the mean of {mean:.1f} dB: {', '.join(bad)}")
+    return lines
+
+
+def _left_out(scene: dict[str, Any], most: int = 12) -> list[str]:
+    """The photos that are not in the map, one line per reason."""
+    reasons: dict[str, list[str]] = {}
+    for entry in scene.get("left_out", []):
+        reasons.setdefault(entry["why"], []).append(entry["name"])
+    lines = []
+    for why, names in reasons.items():
+        more = f" and {len(names) - most} more" if len(names) > most else ""
+        count = "1 photo" if len(names) == 1 else f"{len(names)} photos"
+        lines.append(f"{count} not in the map, {why}: {', '.join(names[:most])}{more}")
+    return lines
+
+
+class _Album:
+    """Photos, renders and silhouettes of the map's views at training size, computed on first use.
+
+    `render`, `ids` and `features` are for views whose `photo` can be read.
+    """
+
+    def __init__(self, gmap: Map):
+        self.gmap, self.gaussians = gmap, as_gaussians(gmap)
+        self.views = {view.name: view for view in gmap.views}
+        self.photo, self.ids = cache(self._photo), cache(self._ids)
+
+    def _photo(self, name: str) -> np.ndarray | None:
+        """[h, w, 3] uint8; None when it can no longer be read."""
+        try:
+            return load_photo(
+                self.gmap.with_photo(self.views[name]), int(self.gmap.info["config"]["photos"]["max_side"])
+            )
+        except InputError:
+            return None
+
+    def _camera(self, name: str) -> tuple[torch.Tensor, torch.Tensor, int, int]:
+        """camera_from_world [4, 4], K [3, 3], width and height of a view's photo as it was trained."""
+        view, photo = self.views[name], self.photo(name)
+        assert photo is not None  # see the class
+        height, width = photo.shape[:2]
+        pose, K = view.camera_from_world.astype(np.float32), scaled_K(view, width, height).astype(np.float32)
+        return torch.from_numpy(pose), torch.from_numpy(K), width, height
+
+    def render(self, name: str) -> np.ndarray:
+        """[h, w, 3] uint8: the map rendered from the camera of the photo."""
+        pose, K, _, _ = self._camera(name)
+        gain = self.views[name].gain
+        exposure = None if gain is None else torch.tensor(gain)
+        view = TrainingView(name, torch.from_numpy(self.photo(name)), None, K, pose, gain=exposure)
+        return (render_view(self.gaussians, view) * 255 + 0.5).to(torch.uint8).numpy()
+
+    def _ids(self, name: str) -> np.ndarray:
+        """[h, w] instance ids rendered from the camera of the photo, −1 = none."""
+        return render_silhouettes(self.gaussians, [self.gmap.instance_ids], *self._camera(name))[0].ids
+
+    def features(self, name: str) -> np.ndarray:
+        """[h, w, 3] uint8: rendered features, first three principal components as RGB."""
+        out = render(self.gaussians, *self._camera(name), features=self.gaussians.features)
+        assert out.features is not None  # features were given
+        return features_to_rgb(out.features[0].numpy())
+
+
+def map_picture(opened: QueryMap, text: str) -> np.ndarray:
+    """Four images in a row for the photo that best shows the answer to `text`: photo, render, instances, answer."""
+    album = _Album(opened)
+    hits = opened.query(text, top_k=1)
+    names = list(album.views)
+    name = hits[0].views[0] if hits and hits[0].views else names[len(names) // 2]
+    photo = album.photo(name)
+    if photo is None:
+        raise InputError(f"{album.views[name].photo}: cannot be read any more; the picture needs the photo")
+    ids = album.ids(name)
+    answer = outline(photo, ids == hits[0].instance_id) if hits else photo
+    titles = ["photo", "the map from the same place", "instances", f'"{text}"']
+    return titled_row([photo, album.render(name), overlay(photo, ids), answer], titles)
+
+
+def _figures(gmap: Map) -> dict[str, str]:
+    info = gmap.info
+    figures = {"Gaussians": f"{len(gmap):,}", "Instances": str(len(gmap.instances))}
+    if "psnr" in info["quality"]:
+        figures |= {"Held-out PSNR": f"{info['quality']['psnr']:.2f} dB", "SSIM": f"{info['quality']['ssim']:.3f}"}
+    if info["quality"].get("depth"):
+        figures["Held-out depth"] = depth_text(info["quality"]["depth"])
+    figures["Time"] = f"{info['seconds']['total']:.0f} s"
+    figures["Peak memory"] = f"{info['peak_memory_mib']:.0f} MiB"
+    return figures
+
+
+def _view_rows(gmap: Map, album: _Album) -> list[dict[str, np.ndarray]]:
+    """{caption: image} of the held-out views in SHOWN: the photo, the render, their difference."""
+    scored = gmap.info["quality"].get("views", {})
+    by_psnr = sorted(scored, key=lambda name: float(scored[name]["psnr"]))
+    places = dict.fromkeys((0, len(by_psnr) // 2, len(by_psnr) - 1) if by_psnr else ())
+    rows = []
+    for place, rank in zip(places, SHOWN, strict=False):
+        name = by_psnr[place]
+        photo = album.photo(name)
+        if photo is None:
+            continue
+        render, note = album.render(name), f", {rank} of {len(by_psnr)}" if len(by_psnr) > 1 else ""
+        rows.append(
+            {
+                f"photo {name}, not used for the map": photo,
+                f"render: {scored[name]['psnr']:.2f} dB, SSIM {scored[name]['ssim']:.3f}{note}": render,
+                "error: black is none, bright is a quarter of the range": error_map(photo, render),
+            }
+        )
+    return rows
+
+
+def _overview(gmap: Map, album: _Album) -> dict[str, np.ndarray]:
+    """Instances and features of the middle photo of the sequence."""
+    names = list(album.views)
+    name = names[len(names) // 2]
+    photo = album.photo(name)
+    if photo is None or not gmap.instances:
+        return {}
+    return {
+        f"instances in {name}": overlay(photo, album.ids(name)),
+        "instance features (main components)": album.features(name),
+    }
+
+
+def _best_crop(opened: QueryMap, index: int, album: _Album, whole: bool) -> np.ndarray | None:
+    """The instance in the photo that shows it best: outlined in the whole photo, or cut out with a margin."""
+    hit = opened.hit(index)
+    if not hit.views:
+        return None
+    photo = album.photo(hit.views[0])
+    if photo is None:
+        return None
+    mask = album.ids(hit.views[0]) == hit.instance_id
+    if not mask.any():
+        return None
+    picture = outline(photo, mask)
+    if whole:
+        return picture
+    x0, y0, x1, y1 = expand_box(mask_box(mask) or (0, 0, *mask.shape[::-1]), 0.15, *mask.shape[::-1])
+    return picture[y0:y1, x0:x1]
+
+
+def _instance_rows(opened: QueryMap, album: _Album) -> list[dict[str, Any]]:
+    """Every instance with its best crop, printed texts and likely names; names need an encoder."""
+    names = opened.likely_names() if opened.problem is None else [[] for _ in opened.instances]
+    return [
+        {
+            "id": entry["id"],
+            "crop": _best_crop(opened, i, album, whole=False),
+            "label": entry.get("label"),
+            "names": printed_texts(entry)[:2] + names[i],
+            "score": entry["score"],
+            "extent": entry["obb"]["extent"],
+            "num_gaussians": entry["num_gaussians"],
+        }
+        for i, entry in enumerate(opened.instances)
+    ]
+
+
+def _query_row(opened: QueryMap, text: str, album: _Album) -> dict[str, Any]:
+    hits = opened.query(text)
+    picture = _best_crop(opened, opened.position(hits[0].instance_id), album, whole=True) if hits else None
+    return {"text": text, "hits": [(hit.instance_id, hit.score) for hit in hits], "picture": picture}

@@ -1,0 +1,1 @@
+"""Structure from motion: poses and a sparse cloud."""

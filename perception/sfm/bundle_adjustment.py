@@ -1,0 +1,216 @@
+"""Bundle adjustment of posed views with depth: robust Gauss-Newton on poses and points, the given poses as priors.
+
+Triggs et al. 2000, "Bundle adjustment: a modern synthesis": Levenberg-Marquardt, points eliminated (section 6.1); the
+reduced system is solved by preconditioned conjugate gradients (Agarwal et al. 2010). All sums have a fixed order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from perception.sfm.tracks import Tracks
+
+ROUNDS, STEPS, GAIN = 4, 12, 1e-3
+"""Most steps of a round; it ends when a step lowers the cost by less than GAIN. Each round estimates the noise anew."""
+CAUCHY = 3.0
+"""Scale of the loss in standard errors of the noise."""
+LEAST_PIXELS, LEAST_DEPTH = 0.1, 1e-3
+"""Smallest standard error of features in pixels, and of measured depth relative to it."""
+LOOSE = 3.0
+"""The priors on the given poses are this much wider than those on the drift between consecutive views."""
+NEAR = 1e-9
+
+
+@dataclass(frozen=True)
+class Poses:
+    """rotation [N, 3, 3] camera_from_world, center [N, 3] in the world: x_camera = rotation (x − center)."""
+
+    rotation: np.ndarray
+    center: np.ndarray
+
+    def turned(self, delta: np.ndarray) -> Poses:
+        """Each camera turned by delta[:, :3] (rotation vector, world axes, radians) and moved by delta[:, 3:]."""
+        return Poses(self.rotation @ Rotation.from_rotvec(-delta[:, :3]).as_matrix(), self.center + delta[:, 3:])
+
+    def matrices(self) -> np.ndarray:
+        """camera_from_world [N, 4, 4]."""
+        result = np.tile(np.eye(4), (len(self.center), 1, 1))
+        result[:, :3, :3] = self.rotation
+        result[:, :3, 3] = -np.einsum("nij,nj->ni", self.rotation, self.center)
+        return result
+
+    def since(self, given: Poses) -> np.ndarray:
+        """delta [N, 6] with given.turned(delta) equal to this."""
+        turned = np.einsum("nji,njk->nik", self.rotation, given.rotation)
+        return np.concatenate([Rotation.from_matrix(turned).as_rotvec(), self.center - given.center], axis=1)
+
+
+def starting_points(tracks: Tracks, poses: Poses) -> np.ndarray:
+    """Points [P, 3]: the least-squares intersection of the rays, each ended at its measured depth if there is one."""
+    rays = np.concatenate([tracks.rays, np.ones((len(tracks.rays), 1))], axis=1)
+    world = np.einsum("oji,oj->oi", poses.rotation[tracks.view], rays)
+    origin = poses.center.mean(axis=0)  # the world's may be far away
+    ends = (poses.center - origin)[tracks.view] + world * tracks.depth[:, None]
+    along = world / np.linalg.norm(world, axis=1, keepdims=True)
+    across = np.eye(3) - along[:, :, None] * along[:, None, :]
+    # Σ A_o (x − e_o) = 0, where A_o is the projection across the ray, or with depth nearly the identity.
+    weight = np.where(tracks.depth[:, None, None] > 0, np.eye(3), across)
+    system = _sums(weight, tracks.point, tracks.size)
+    right = _sums(np.einsum("oij,oj->oi", weight, ends), tracks.point, tracks.size)
+    system += 1e-9 * np.trace(system, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    return np.asarray(np.linalg.solve(system, right[..., None])[..., 0] + origin)
+
+
+def residuals(tracks: Tracks, poses: Poses, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """pixel errors [O, 2], relative errors of depth [O] (0 without depth), points in camera axes [O, 3]."""
+    x = np.einsum("oij,oj->oi", poses.rotation[tracks.view], points[tracks.point] - poses.center[tracks.view])
+    z = np.where(x[:, 2] > NEAR, x[:, 2], np.inf)
+    error = tracks.focal[:, None] * (x[:, :2] / z[:, None] - tracks.rays)
+    known = tracks.depth > 0
+    return error, np.where(known, x[:, 2] / np.where(known, tracks.depth, 1.0) - 1.0, 0.0), x
+
+
+def adjust(tracks: Tracks, given: Poses, poses: Poses, prior: tuple[float, float]) -> tuple[Poses, np.ndarray]:
+    """`poses` adjusted, and points [P, 3]. given: the poses that the priors pull to.
+
+    prior: standard errors of a given pose relative to that of the next view: angle in radians, centre in scene units.
+    The priors keep the world frame, and hold views that have no features.
+    """
+    points = starting_points(tracks, poses)
+    for _ in range(ROUNDS):
+        error, depth, _ = residuals(tracks, poses, points)
+        known = np.abs(depth[tracks.depth > 0])
+        # Standard errors from the medians of normal residuals in 2D (1.18 σ) and 1D (0.67 σ).
+        sigma = max(float(np.median(np.hypot(*error.T))) / 1.1774, LEAST_PIXELS)
+        depth_sigma = max(float(np.median(known)) / 0.6745 if len(known) else 0.0, LEAST_DEPTH)
+        problem = _Problem(tracks, given, prior, sigma, depth_sigma)
+        poses, points = _round(problem, poses, points)
+    return poses, points
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """sigma: standard error of features in pixels; depth_sigma: relative, of measured depth."""
+
+    tracks: Tracks
+    given: Poses
+    prior: tuple[float, float]
+    sigma: float
+    depth_sigma: float
+
+
+def _round(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[Poses, np.ndarray]:
+    damping, cost = 1e-4, _cost(problem, poses, points)
+    for _ in range(STEPS):
+        delta, shift = _step(problem, poses, points, damping)
+        moved, shifted = poses.turned(delta), points + shift
+        now = _cost(problem, moved, shifted)
+        if not now < cost:
+            damping *= 10
+            continue
+        poses, points, damping, gain, cost = moved, shifted, max(damping / 10, 1e-9), 1 - now / cost, now
+        if gain < GAIN:
+            break
+    return poses, points
+
+
+def _normalised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """residuals over their standard errors: pixels [O, 2], depths [O]; points in camera axes [O, 3]."""
+    error, depth, x = residuals(problem.tracks, poses, points)
+    return error / problem.sigma, depth / problem.depth_sigma, x
+
+
+def _cost(problem: _Problem, poses: Poses, points: np.ndarray) -> float:
+    """Σ s² log(1 + |r|²/s²) of pixels and of depths + Σ |priors|²."""
+    error, depth, _ = _normalised(problem, poses, points)
+    robust = CAUCHY**2 * (np.log1p((error**2).sum(1) / CAUCHY**2).sum() + np.log1p(depth**2 / CAUCHY**2).sum())
+    rows, weight = _priors(poses.since(problem.given), problem.prior)
+    return float(robust + (weight * rows**2).sum())
+
+
+def _priors(delta: np.ndarray, prior: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Rows [2N − 1, 6]: deviations from the given poses and their differences between views; their weights."""
+    inverse = np.repeat(1 / np.square(prior), 3)
+    rows = np.concatenate([delta, np.diff(delta, axis=0)])
+    return rows, np.where(np.arange(len(rows))[:, None] < len(delta), inverse / LOOSE**2, inverse)
+
+
+def _step(problem: _Problem, poses: Poses, points: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """One damped step: delta [N, 6] of the poses, shift [P, 3] of the points."""
+    from scipy.sparse import bsr_matrix
+
+    tracks, count, size = problem.tracks, len(poses.center), problem.tracks.size
+    residual, J_pose, J_point = _linearised(problem, poses, points)
+    U = _sums(np.einsum("orv,orw->ovw", J_pose, J_pose), tracks.view, count)
+    V = _sums(np.einsum("orv,orw->ovw", J_point, J_point), tracks.point, size)
+    g_pose = -_sums(np.einsum("orv,or->ov", J_pose, residual), tracks.view, count)
+    g_point = -_sums(np.einsum("orv,or->ov", J_point, residual), tracks.point, size)
+    V += np.eye(3) * (damping * np.einsum("pii->pi", V)[:, None, :] + 1e-12)
+    V_inverse = np.linalg.inv(V)
+    order = np.argsort(tracks.view, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(np.bincount(tracks.view, minlength=count))])
+    W = bsr_matrix(
+        (np.einsum("orv,orw->ovw", J_pose, J_point)[order], tracks.point[order], starts), shape=(6 * count, 3 * size)
+    )
+    eliminate = W @ bsr_matrix((V_inverse, np.arange(size), np.arange(size + 1)), shape=(3 * size, 3 * size))
+    prior_H, prior_g = _prior_system(poses.since(problem.given), problem.prior)
+    U = bsr_matrix((U, np.arange(count), np.arange(count + 1)), shape=(6 * count, 6 * count))
+    reduced = (U + prior_H - eliminate @ W.T).tocsr()
+    reduced.setdiag(reduced.diagonal() * (1 + damping))
+    delta = _solved(reduced, g_pose.ravel() + prior_g - eliminate @ g_point.ravel())
+    shift = np.einsum("pij,pj->pi", V_inverse, g_point - (W.T @ delta).reshape(size, 3))
+    return delta.reshape(count, 6), shift
+
+
+def _linearised(problem: _Problem, poses: Poses, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """residuals [O, 3] (pixels x and y, depth) and Jacobians by pose [O, 3, 6] and point [O, 3, 3], Cauchy-weighted."""
+    tracks, sigma = problem.tracks, problem.sigma
+    error, depth, x = _normalised(problem, poses, points)
+    front = x[:, 2] > NEAR
+    z = np.where(front, x[:, 2], 1.0)
+    slope = np.zeros((len(z), 3, 3))
+    slope[:, 0, 0] = slope[:, 1, 1] = tracks.focal / (sigma * z)
+    slope[:, :2, 2] = -tracks.focal[:, None] / sigma * x[:, :2] / z[:, None] ** 2
+    known = tracks.depth > 0
+    slope[:, 2, 2] = np.where(known, 1 / (problem.depth_sigma * np.where(known, tracks.depth, 1)), 0)
+    weight = np.repeat(1 / (1 + (error**2).sum(1) / CAUCHY**2), 2).reshape(-1, 2)
+    weight = np.concatenate([weight, 1 / (1 + depth[:, None] ** 2 / CAUCHY**2)], axis=1)
+    root = np.sqrt(np.where(front[:, None], weight, 0.0))
+    J_point = root[..., None] * (slope @ poses.rotation[tracks.view])
+    arm = points[tracks.point] - poses.center[tracks.view]
+    # x_camera = R Exp(θ)ᵀ (p − c − δ):  ∂/∂θ = R [p − c]×,  ∂/∂δ = −R.
+    J_pose = np.concatenate([np.cross(J_point, arm[:, None]), -J_point], axis=2)
+    residual = np.concatenate([np.where(front[:, None], error, 0.0), depth[:, None]], axis=1)
+    return root * residual, J_pose, J_point
+
+
+def _prior_system(delta: np.ndarray, prior: tuple[float, float]) -> tuple[Any, np.ndarray]:
+    """Matrix [6N, 6N] and right side [6N] of the normal equations of the priors."""
+    from scipy.sparse import diags, identity, kron, vstack
+
+    count = len(delta)
+    rows, weight = _priors(delta, prior)
+    steps = diags([-np.ones(max(count - 1, 1)), np.ones(max(count - 1, 1))], [0, 1], shape=(count - 1, count))
+    A = kron(vstack([identity(count), steps]), identity(6)).tocsr()
+    return A.T @ diags(weight.ravel()) @ A, -(A.T @ (weight * rows).ravel())
+
+
+def _solved(A: Any, b: np.ndarray) -> np.ndarray:
+    """x of A x = b, A [6N, 6N] sparse, symmetric and positive, preconditioned by its diagonal blocks [6, 6]."""
+    from scipy.sparse import bsr_matrix
+    from scipy.sparse.linalg import cg
+
+    blocks = np.stack([A[i : i + 6, i : i + 6].toarray() for i in range(0, len(b), 6)])
+    inverse = bsr_matrix((np.linalg.inv(blocks), np.arange(len(blocks)), np.arange(len(blocks) + 1)), shape=A.shape)
+    return np.asarray(cg(A, b, rtol=1e-6, M=inverse, maxiter=10 * len(b))[0])
+
+
+def _sums(values: np.ndarray, index: np.ndarray, count: int) -> np.ndarray:
+    """Sums [count, ...] of values [O, ...] by index [O]."""
+    flat = values.reshape(len(values), -1)
+    summed = [np.bincount(index, flat[:, i], minlength=count) for i in range(flat.shape[1])]
+    return np.stack(summed, axis=1).reshape(count, *values.shape[1:])

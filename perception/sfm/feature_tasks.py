@@ -1,0 +1,142 @@
+"""Features and matches made by tasks on other machines: the same database as `features.extract` and `match` make here.
+
+A task has a folder with a part of the photos or pairs, and leaves a COLMAP database there, whose rows are copied.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+from perception.errors import InputError
+from perception.io.atomic import atomic_directory
+from perception.photos.ignore_masks import stage_masks
+from perception.photos.lens import load_pycolmap
+from perception.progress import QUIET, Progress
+from perception.sfm.features import extract, import_photos, match
+from perception.sfm.staging import stage_photos
+from perception.tasks.engine import Engine
+from perception.tasks.folder import has_task, read_facts, write_task
+
+PHOTOS_A_TASK, PAIRS_A_TASK = 64, 2000
+"""About half a minute on two cores each."""
+RESULT, DATABASE = "result", "database.db"
+_IMAGES = ("rigs", "rig_sensors", "cameras", "frames", "frame_data", "images")
+_FEATURES, _MATCHES = ("keypoints", "descriptors"), ("matches", "two_view_geometries")
+_PAIR = 2147483647
+"""COLMAP's id of a pair is _PAIR × the smaller image id + the larger."""
+
+
+class FeatureTasks:
+    """Runs the tasks of one set of photos. folder: of the tasks, which every worker reaches under the same path."""
+
+    def __init__(self, folder: Path, engine: Engine, progress: Progress) -> None:
+        self.folder, self.engine, self.progress = folder, engine, progress
+
+    def extract(self, database: Path, photos: Sequence[Path], masks: Sequence[Path | None] | None) -> None:
+        """Fills the database of imported photos with their features."""
+        homes = []
+        for first in range(0, len(photos), PHOTOS_A_TASK):
+            some = slice(first, first + PHOTOS_A_TASK)
+            homes.append(self.folder / f"photos-{first}")
+            if not has_task(homes[-1]):
+                paths = [str(photo.resolve()) for photo in photos[some]]
+                covered = None if masks is None else [mask and str(mask.resolve()) for mask in masks[some]]
+                write_task(homes[-1], photos=paths, masks=covered)
+        self._run(extract_task, homes, "feature set")
+        with closing(sqlite3.connect(database)) as own, own:
+            ids = _ids_by_name(own)
+            for home in homes:
+                with closing(sqlite3.connect(home / RESULT / DATABASE)) as theirs:
+                    theirs_ids = _ids_by_name(theirs)
+                    mine = dict(zip(theirs_ids, ids[: len(theirs_ids)], strict=True))
+                    del ids[: len(theirs_ids)]
+                    for table in _FEATURES:
+                        for image, *row in theirs.execute(f"SELECT * FROM {table}"):
+                            own.execute(_insert(table, 1 + len(row)), (mine[image], *row))
+
+    def match(self, database: Path, chosen: Sequence[tuple[str, str]], seed: int) -> None:
+        """Adds the matches of the chosen pairs to a database with features."""
+        homes = []
+        for first in range(0, len(chosen), PAIRS_A_TASK):
+            some = chosen[first : first + PAIRS_A_TASK]
+            homes.append(self.folder / f"pairs-{first}")
+            if not has_task(homes[-1]):
+                homes[-1].mkdir(parents=True, exist_ok=True)
+                write_part(database, _ids(database, {name for pair in some for name in pair}), homes[-1] / DATABASE)
+                write_task(homes[-1], pairs=some, seed=seed)
+        self._run(match_task, homes, "pair set")
+        with closing(sqlite3.connect(database)) as own, own:
+            for home in homes:
+                with closing(sqlite3.connect(home / RESULT / DATABASE)) as theirs:
+                    for table in _MATCHES:
+                        for row in theirs.execute(f"SELECT * FROM {table}"):
+                            own.execute(_insert(table, len(row)), row)
+
+    def _run(self, task: object, homes: list[Path], what: str) -> None:
+        self.engine.run(task, [str(home.resolve()) for home in homes], what, self.progress)  # type: ignore[arg-type]
+        for home in homes:
+            if not (home / RESULT / DATABASE).is_file():
+                raise InputError(f"{home}: has no {RESULT} after its task; workers must share the output's folder")
+
+
+def extract_task(folder: str, progress: Progress = QUIET) -> None:
+    """Extracts the features of the photos whose task lies in `folder`, unless it is done."""
+    home, facts = Path(folder), read_facts(Path(folder))
+    if (home / RESULT).is_dir():
+        return
+    photos, masks = [Path(photo) for photo in facts["photos"]], facts["masks"]
+    with atomic_directory(home / RESULT) as new:
+        names = stage_photos(new / "photos", photos, progress)
+        if masks is not None:
+            stage_masks(new / "masks", photos, names, [mask and Path(mask) for mask in masks])
+        groups = import_photos(new / DATABASE, new / "photos", photos, names, [None] * len(photos))
+        extract(new / DATABASE, new / "photos", groups, progress)
+
+
+def match_task(folder: str, progress: Progress = QUIET) -> None:
+    """Matches the pairs whose task and database lie in `folder`, unless it is done."""
+    home, facts = Path(folder), read_facts(Path(folder))
+    if (home / RESULT).is_dir():
+        return
+    with atomic_directory(home / RESULT) as new:
+        with closing(sqlite3.connect(home / DATABASE)) as given, closing(sqlite3.connect(new / DATABASE)) as copy:
+            given.backup(copy)
+        chosen = [(one, other) for one, other in facts["pairs"]]
+        match(new / DATABASE, chosen, facts["seed"], progress)
+
+
+def _ids_by_name(database: sqlite3.Connection) -> list[int]:
+    """Ids of the images in the order of their names, which are numbers of photos."""
+    return [image for (image,) in database.execute("SELECT image_id FROM images ORDER BY name")]
+
+
+def _insert(table: str, columns: int) -> str:
+    return f"INSERT INTO {table} VALUES ({', '.join('?' * columns)})"
+
+
+def _ids(database: Path, names: set[str]) -> list[int]:
+    with closing(sqlite3.connect(database)) as tables:
+        return [image for image, name in tables.execute("SELECT image_id, name FROM images") if name in names]
+
+
+def write_part(
+    database: Path, images: Sequence[int], target: Path, tables: Sequence[str] = _FEATURES, matched: bool = False
+) -> None:
+    """Writes the database of some photos, under the same ids, with their rows of `tables`; matched: and the verified
+    matches between them."""
+    target.unlink(missing_ok=True)
+    load_pycolmap().Database.open(target).close()  # creates its tables
+    with closing(sqlite3.connect(target)) as part, part:
+        part.execute("ATTACH DATABASE ? AS whole", (str(database),))
+        for table in _IMAGES:
+            part.execute(f"INSERT INTO {table} SELECT * FROM whole.{table}")
+        part.execute("CREATE TEMP TABLE wanted (id INTEGER PRIMARY KEY)")
+        part.executemany("INSERT INTO wanted VALUES (?)", [(image,) for image in images])
+        for table in tables:
+            part.execute(f"INSERT INTO {table} SELECT * FROM whole.{table} WHERE image_id IN wanted")
+        if matched:
+            both = " AND ".join(f"{image} IN wanted" for image in (f"pair_id / {_PAIR}", f"pair_id % {_PAIR}"))
+            part.execute(f"INSERT INTO two_view_geometries SELECT * FROM whole.two_view_geometries WHERE {both}")

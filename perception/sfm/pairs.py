@@ -1,0 +1,140 @@
+"""Which pairs of photos are matched: neighbours by name, and photos whose largest features match."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+
+from perception.cores import cores
+from perception.photos.lens import load_pycolmap
+from perception.progress import Progress
+
+EXHAUSTIVE_BELOW = 20
+NEIGHBORS = 4
+"""Each photo is always matched with this many neighbours by name, as photos are usually taken in order."""
+COARSE_FEATURES, COARSE_MIN_MATCHES, COARSE_RATIO, PARTNERS = 256, 4, 0.7, 6
+"""Preemptive matching. The strict ratio rejects pairs that share repeated textures only; these give wrong models.
+Every photo keeps its PARTNERS best pairs, so that the match graph stays connected."""
+RETRIEVED_ABOVE, RETRIEVED, WORDS = 200, 40, 64
+"""Of more photos, only the RETRIEVED most similar of each are compared, by a global descriptor of WORDS centres."""
+AT_ONCE = 64
+"""Photos per matrix product. With one product per pair, threads waited for each other 10 times as long as they ran."""
+
+
+def select_pairs(database: Path, names: list[str], most: int, progress: Progress) -> list[tuple[int, int]]:
+    """All pairs of a small set; else neighbours by name and pairs whose largest features match, of these the `most`
+    best pairs of each photo. Indices of names, ascending.
+
+    Preemptive matching (Wu, "Towards Linear-time Incremental Structure from Motion", 3DV 2013, section 3): the
+    few largest-scale features predict whether a pair overlaps. This also finds loop closures without a vocabulary.
+    Of a large set, not all pairs are compared, but those of `similar_photos`.
+    """
+    count = len(names)
+    if count < EXHAUSTIVE_BELOW:
+        return list(combinations(range(count), 2))
+    descriptors = _largest_features(database, names)
+    compared = similar_photos(descriptors) if count > RETRIEVED_ABOVE else np.ones((count, count), bool)
+    votes = coarse_votes(descriptors, compared, progress)
+    pairs = {(i, j) for i in range(count) for j in range(i + 1, min(i + NEIGHBORS + 1, count))}
+    for i in range(count):
+        run = slice(*votes.indptr[i : i + 2])
+        best = np.argsort(-votes.data[run], kind="stable")[:most]
+        strong = votes.data[run][best] >= np.where(np.arange(len(best)) < PARTNERS, 1, COARSE_MIN_MATCHES)
+        pairs |= {(min(i, j), max(i, j)) for j in votes.indices[run][best[strong]].tolist()}
+    return sorted(pairs)
+
+
+def similar_photos(descriptors: list[np.ndarray]) -> np.ndarray:
+    """[n, n] bool, symmetric: whether one of two photos is among the RETRIEVED most similar of the other.
+
+    descriptors: unit features [F, 128] of each photo. Similarity is the cosine of two VLADs (Jégou et al., "Aggregating
+    local descriptors into a compact image representation", CVPR 2010): sums of the residuals of a photo's features to
+    the nearest of WORDS k-means centres, each sum at unit length (Arandjelović and Zisserman, CVPR 2013).
+    """
+    from scipy.cluster.vq import kmeans2
+
+    every = np.concatenate(descriptors)
+    sample = np.sort(np.random.default_rng(0).permutation(len(every))[: 200 * WORDS])
+    if len(sample) < WORDS:
+        return np.ones((len(descriptors), len(descriptors)), bool)
+    centres = kmeans2(every[sample], WORDS, iter=10, minit="points", seed=0)[0].astype(np.float32)
+    half = 0.5 * (centres**2).sum(axis=1)
+    count = len(descriptors)
+    vlads = np.zeros((count, WORDS, 128), np.float32)
+    for first in range(0, count, AT_ONCE):
+        some = descriptors[first : first + AT_ONCE]
+        features = np.concatenate(some)
+        word = (features @ centres.T - half).argmax(axis=1)  # the nearest centre
+        place = np.repeat(np.arange(len(some)), [len(each) for each in some]) * WORDS + word
+        entries = (np.ones(len(place), np.float32), (place, np.arange(len(place))))
+        sums = sparse.csr_matrix(entries, shape=(len(some) * WORDS, len(place))) @ (features - centres[word])
+        vlads[first : first + AT_ONCE] = sums.reshape(-1, WORDS, 128)
+    vlads /= np.maximum(np.linalg.norm(vlads, axis=2, keepdims=True), 1e-9)
+    rows = vlads.reshape(count, -1)
+    rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
+    similar = np.zeros((count, count), bool)
+    for first in range(0, count, AT_ONCE):
+        order = np.argsort(-(rows[first : first + AT_ONCE] @ rows.T), axis=1, kind="stable")
+        np.put_along_axis(similar[first : first + AT_ONCE], order[:, : RETRIEVED + 1], True, axis=1)
+    return similar | similar.T | np.eye(count, dtype=bool)
+
+
+def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
+    pycolmap = load_pycolmap()
+    result = []
+    db = pycolmap.Database.open(database)
+    for name in names:
+        image = db.read_image_with_name(name)
+        keypoints = db.read_keypoints(image.image_id)
+        keypoints = keypoints if isinstance(keypoints, np.ndarray) else pycolmap.keypoints_to_matrix(keypoints)
+        data = np.asarray(db.read_descriptors(image.image_id).data, dtype=np.float32)
+        area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
+        top = np.argsort(-area, kind="stable")[:COARSE_FEATURES]
+        norms = np.linalg.norm(data[top], axis=1, keepdims=True)
+        result.append(data[top] / np.maximum(norms, 1e-9))
+    db.close()
+    return result
+
+
+def coarse_votes(descriptors: list[np.ndarray], compared: np.ndarray, progress: Progress) -> sparse.csr_matrix:
+    """[n, n] number of matches of each pair of photos in `compared` [n, n], from unit descriptors [F, 128] of each.
+    The columns of each row ascend."""
+    count = len(descriptors)
+
+    def compare(i: int) -> sparse.csr_matrix:
+        later, found = i + 1 + np.flatnonzero(compared[i, i + 1 :]), list[int]()
+        for chosen in (later[first : first + AT_ONCE] for first in range(0, len(later), AT_ONCE)):
+            others = [descriptors[j] for j in chosen]
+            similarity = descriptors[i] @ np.concatenate(others).T
+            blocks = np.split(similarity, np.cumsum([len(other) for other in others])[:-1], axis=1)
+            found += [_mutual_matches(block) for block in blocks]
+        votes = np.array(found, np.int64)
+        more = votes > 0
+        return sparse.csr_matrix((votes[more], (np.zeros(more.sum(), int), later[more])), shape=(1, count))
+
+    rows = []
+    with ThreadPoolExecutor(cores() if count > RETRIEVED_ABOVE else 1) as pool:
+        for done, row in enumerate(pool.map(compare, range(count)), start=1):
+            rows.append(row)
+            progress.update("poses: pairing", done, count)
+    votes = sparse.vstack(rows, format="csr")
+    votes = sparse.csr_matrix(votes + votes.T)
+    votes.sort_indices()
+    return votes
+
+
+def _mutual_matches(similarity: np.ndarray) -> int:
+    """Number of mutual nearest neighbours that pass Lowe's ratio test; [F, G] dot products of unit descriptors.
+    The largest value of each row is overwritten."""
+    if min(similarity.shape) < 2:
+        return 0
+    rows = np.arange(len(similarity))
+    best = similarity.argmax(1)
+    mutual = similarity.argmax(0)[best] == rows
+    first = similarity[rows, best]
+    similarity[rows, best] = -1
+    return int((mutual & (1 - first <= COARSE_RATIO**2 * (1 - similarity.max(1)))).sum())

@@ -1,0 +1,161 @@
+"""Checks given poses against matched features and depth, and refines them where they are worse than features."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from perception.geometry import camera_centres, nearest_rotation
+from perception.photos.reading import view_lens
+from perception.sfm.bundle_adjustment import Poses, adjust, residuals, starting_points
+from perception.sfm.tracks import Features, tracks_of
+from perception.types import View
+
+TOLERANCE, TOLERANCE_SIDE = 1.0, 800
+"""Poses are refined when matched features lie more than TOLERANCE pixels off their epipolar lines in the median; pixels
+of photos with a long side of TOLERANCE_SIDE, if they are larger. Exact poses read 0.3, those of a drifting robot 2."""
+GATE, ROUNDS = 8.0, 2
+"""Matches with more than GATE times the median error of all are wrong. This is judged again with the refined poses."""
+LEAST_MATCHES = 100
+IMPROVED, HOPELESS = 0.8, 3.0
+"""Refined poses are used only if their error is at most this share of that of the given poses, and at most this many
+times the tolerance."""
+UNIT = 1.5
+"""Depth is left out if the median ratio of triangulated to measured depth is farther from 1 than this factor."""
+
+
+def poses_of(views: list[View]) -> Poses:
+    """The poses of `views`."""
+    matrices = np.stack([view.camera_from_world for view in views])
+    return Poses(matrices[:, :3, :3], camera_centres(matrices))
+
+
+def match_errors(features: Features, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel errors of the matches in both directions, [2M] each: distance from the epipolar line; and from the feature
+    that is carried over by its measured depth, NaN without depth."""
+    lines, carried = [], []
+    for a, b in (features.pairs.T, features.pairs.T[::-1]):
+        first, second = features.view[a], features.view[b]
+        b_from_world = poses.rotation[second]
+        ray = np.einsum("mij,mkj,mk->mi", b_from_world, poses.rotation[first], _rays(features, a))
+        origin = np.einsum("mij,mj->mi", b_from_world, poses.center[first] - poses.center[second])
+        line = np.cross(origin, ray)
+        norm = np.maximum(np.linalg.norm(line[:, :2], axis=1), 1e-300)
+        lines.append(features.focal[b] * np.abs((line * _rays(features, b)).sum(1)) / norm)
+        x = origin + ray * features.depth[a][:, None]
+        z = np.where((features.depth[a] > 0) & (x[:, 2] > 0), x[:, 2], np.nan)
+        carried.append(features.focal[b] * np.linalg.norm(x[:, :2] / z[:, None] - features.rays[b], axis=1))
+    return np.concatenate(lines), np.concatenate(carried)
+
+
+def checked_poses(views: list[View], features: Features, how: str) -> tuple[list[View], dict[str, Any]]:
+    """`views` as given or with refined poses, and the report's entries: "poses", "notes", "warnings".
+
+    how: "auto" refines poses that are worse than TOLERANCE, "refine" any that gain by it. Views that are held out for
+    scoring are refined as well, by features and depth alone.
+    """
+    given = poses_of(views)
+    if len(features.pairs) < LEAST_MATCHES:
+        note = f"given poses not checked: {len(features.pairs)} matched features, {LEAST_MATCHES} are needed"
+        return views, {"poses": {}, "notes": [note], "warnings": []}
+    side = max(max(lens.width, lens.height) for lens in map(view_lens, views))
+    before, good = _medians(features, given), TOLERANCE * max(1.0, side / TOLERANCE_SIDE)
+    facts: dict[str, Any] = {"refined": False, "given_error_px": before}
+    report: dict[str, Any] = {
+        "poses": facts,
+        "notes": [f"given poses: matched features {_text(before)}"],
+        "warnings": [],
+    }
+    usable, unit = views, _depth_unit(features, given)
+    if not 1 / UNIT < unit < UNIT:
+        what = f"features triangulate at {unit:.3g} times their measured depth, as if in another unit than the poses"
+        report["warnings"] = [f"{what}; depth is not used"]
+        usable, features = [replace(v, depth=None) for v in views], replace(features, depth=0 * features.depth)
+    if how == "auto" and before["epipolar"] <= good:
+        return usable, report
+    refined = refine(features, given)
+    after = _medians(features, refined)
+    if after["epipolar"] <= min(IMPROVED * before["epipolar"], HOPELESS * good):
+        changes, text = _changes(refined.since(given))
+        facts |= {"refined": True, "error_px": after, **changes}
+        report["notes"].append(f"refined poses: {_text(after)}; {text}")
+        return [replace(v, camera_from_world=m) for v, m in zip(usable, refined.matrices(), strict=True)], report
+    if before["epipolar"] <= HOPELESS * good:
+        report["notes"].append(f"refining them gains little ({_text(after)}); they are used as they are")
+        return usable, report
+    warning = "the given poses do not fit the photos, and refining them did not help; they are used as they are"
+    return views, {**report, "warnings": [warning]}
+
+
+def refine(features: Features, given: Poses) -> Poses:
+    """Poses that agree with the matches and the measured depth, in the world frame of the given ones."""
+    poses = given
+    for _ in range(ROUNDS):
+        tracks = tracks_of(features, features.pairs[_agreeing(features, poses)])
+        if poses is given:
+            angle = max(_medians(features, given).values()) / float(np.median(features.focal))
+            depth = residuals(tracks, poses, starting_points(tracks, poses))[2][:, 2]
+            if not (depth > 0).any():
+                return given
+            prior = angle, angle * float(np.median(depth[depth > 0]))
+        poses = adjust(tracks, given, poses, prior)[0]
+    return moved_back(poses, given, prior[1] / prior[0])
+
+
+def moved_back(poses: Poses, given: Poses, distance: float) -> Poses:
+    """`poses` moved as a whole to where what the cameras see, at `distance`, lies as by the given ones.
+    Least sum of the displacements of five places ahead of each camera, by reweighting: the priors hold them loosely."""
+    ahead = distance * np.array([[0, 0, 1], [0.4, 0, 1], [-0.4, 0, 1], [0, 0.4, 1], [0, -0.4, 1]])
+    a, b = ((np.einsum("nji,kj->nki", p.rotation, ahead) + p.center[:, None]).reshape(-1, 3) for p in (poses, given))
+    weights = np.ones((len(a), 1))
+    for _ in range(20):
+        mean_a, mean_b = ((weights * places).sum(axis=0) / weights.sum() for places in (a, b))
+        turn = nearest_rotation(np.einsum("ni,nj->ij", weights * (b - mean_b), a - mean_a))
+        off = np.einsum("nj,ij->ni", a - mean_a, turn) - (b - mean_b)
+        weights = 1 / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), 1e-3 * distance)
+    center = np.einsum("nj,ij->ni", poses.center - mean_a, turn) + mean_b
+    return Poses(np.einsum("nij,kj->nik", poses.rotation, turn), center)
+
+
+def _agreeing(features: Features, poses: Poses) -> np.ndarray:
+    """Mask [M] of the matches whose errors are at most GATE times the median."""
+    good = np.ones(2 * len(features.pairs), bool)
+    for errors in match_errors(features, poses):
+        if np.isfinite(errors).any():
+            good &= np.isnan(errors) | (errors <= GATE * np.nanmedian(errors))
+    return np.asarray(good.reshape(2, -1).all(0))
+
+
+def _depth_unit(features: Features, poses: Poses) -> float:
+    """Median ratio of triangulated to measured depth; 1 without depth."""
+    tracks = tracks_of(features, features.pairs[_agreeing(replace(features, depth=0 * features.depth), poses)])
+    blind = replace(tracks, depth=0 * tracks.depth)
+    along = residuals(blind, poses, starting_points(blind, poses))[2][:, 2]
+    known = (tracks.depth > 0) & (along > 0)
+    return float(np.median(along[known] / tracks.depth[known])) if known.any() else 1.0
+
+
+def _medians(features: Features, poses: Poses) -> dict[str, float]:
+    lines, carried = match_errors(features, poses)
+    known = carried[np.isfinite(carried)]
+    return {"epipolar": float(np.median(lines)), **({"by_depth": float(np.median(known))} if len(known) else {})}
+
+
+def _text(errors: dict[str, float]) -> str:
+    by_depth = f", {errors['by_depth']:.2f} px from each other by depth" if "by_depth" in errors else ""
+    return f"{errors['epipolar']:.2f} px off their epipolar lines{by_depth} (medians)"
+
+
+def _changes(delta: np.ndarray) -> tuple[dict[str, Any], str]:
+    """How far the cameras moved, in scene units, and turned, for changes [N, 6] of the poses; the same as text."""
+    lengths = (np.linalg.norm(vectors, axis=1) for vectors in (delta[:, 3:], np.degrees(delta[:, :3])))
+    moved, turned = ({"median": float(np.median(each)), "max": float(each.max())} for each in lengths)
+    text = f"cameras moved {moved['median']:.3g} units in the median, at most {moved['max']:.3g}, "
+    text += f"and turned {turned['median']:.2g}°, at most {turned['max']:.2g}°"
+    return {"moved": moved, "turned_deg": turned}, text
+
+
+def _rays(features: Features, of: np.ndarray) -> np.ndarray:
+    return np.concatenate([features.rays[of], np.ones((len(of), 1))], axis=1)

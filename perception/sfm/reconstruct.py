@@ -1,0 +1,142 @@
+"""Structure from motion from a folder of photos: features, matches, a model (pycolmap), checks, report.
+
+The seed fixes every random choice: the same machine gives the same poses bit for bit up to
+incremental_sfm.REPEATABLE_PHOTOS photos. More are mapped place by place, where cameras of 1,200 photos differed by
+micrometres from run to run, or in one piece by several threads.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from perception.errors import InputError
+from perception.inputs.colmap import views_of_model
+from perception.io.atomic import atomic_directory, recover
+from perception.photos.decode import photo_size
+from perception.photos.folder import PhotoSet, choose_photos
+from perception.photos.ignore_masks import mask_of
+from perception.photos.lens import lens_from_camera, lens_text, load_pycolmap
+from perception.photos.reading import Reading
+from perception.sfm.features import FeatureStore, build_features, verified_matches
+from perception.sfm.incremental import REPEATABLE_PHOTOS, map_photos, model_warnings
+from perception.sfm.submodels import map_places
+from perception.sfm.triangulate import cloud_of
+from perception.tasks.engine import Engine
+from perception.types import Lens, Scene
+
+MIN_PHOTOS = 3
+
+
+def reconstruct(folder: Path, lens: Lens | None, how: Reading) -> Scene:
+    """Poses and a sparse cloud of the photos in `folder`, from the largest model; unit and orientation are arbitrary.
+
+    lens: known intrinsics shared by all photos, kept fixed; None estimates focal length and radial distortion.
+    Results in the workdir are reused for unchanged photos, lens and seed. `choose_photos` decides which photos are left
+    out.
+    """
+    chosen = choose_photos(folder, how.strict, how.progress)
+    photos = chosen.photos
+    if len(photos) < MIN_PHOTOS:
+        raise _too_few(folder, chosen)
+    for photo in photos:
+        if lens and photo_size(photo) != (lens.width, lens.height):
+            found = "×".join(map(str, photo_size(photo)))
+            raise InputError(f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}")
+    ignored = [mask_of(how.masks, name) for name in chosen.names]
+    store = build_features(
+        photos, [lens] * len(photos), how.workdir, how.seed, how.progress, ignored, engine=how.engine
+    )
+    model, report = _map(store, chosen, folder, lens is not None, how)
+    staged = dict(zip(store.names, zip(chosen.names, photos, strict=True), strict=True))
+    located = {image_id: staged[model.images[image_id].name] for image_id in model.reg_image_ids()}
+    views, facts = views_of_model(model, located, folder, how)
+    points, colors = cloud_of(model)
+    report["left_out"] = sorted([*chosen.left_out, *report["left_out"]], key=lambda entry: entry["name"])
+    return Scene(views, points, colors, report={**report, "exposure": facts["exposure"], "notes": chosen.notes})
+
+
+def _too_few(folder: Path, chosen: PhotoSet) -> InputError:
+    found = f"{folder}: no photos found" if not chosen.photos else f"{folder}: {len(chosen.photos)} photo(s) found"
+    if chosen.left_out:
+        first = chosen.left_out[0]
+        found += f" that can be used ({len(chosen.left_out)} left out: {first['name']}: {first['why']})"
+    elif not chosen.photos:
+        return InputError(f"{found}; expected .jpg, .heic, .png, .tif, .bmp or .webp files" + "".join(chosen.notes[:1]))
+    return InputError(f"{found}; at least {MIN_PHOTOS} are needed, 20 or more give good maps")
+
+
+def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, fixed: bool, how: Reading) -> tuple[Any, dict[str, Any]]:
+    pycolmap = load_pycolmap()
+    done = store.folder / "model"
+    recover(done)
+    if not done.is_dir():
+        started = time.perf_counter()
+        found = None
+        if len(chosen.photos) > REPEATABLE_PHOTOS:
+            found = map_places(store, fixed, how.seed, how.engine or Engine(), how.progress)
+        models, contradicted = found or map_photos(store, fixed, how.seed, len(chosen.photos), how.progress)
+        if not models:
+            advice = "take sharp, overlapping photos of a textured scene from different places"
+            raise InputError(f"{folder}: none of the {len(chosen.photos)} photos could be registered; {advice}")
+        seconds = {**store.facts["seconds"], "mapping": time.perf_counter() - started}
+        report = _report(models, contradicted, store, chosen.names, seconds)
+        with atomic_directory(done) as new:
+            models[0].write(new)
+            (new / "report.json").write_text(json.dumps(report))
+    return pycolmap.Reconstruction(done), json.loads((done / "report.json").read_text())
+
+
+def _report(
+    models: list[Any], contradicted: set[str], store: FeatureStore, shown: list[str], seconds: dict[str, float]
+) -> dict[str, Any]:
+    best = models[0]
+    inside = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
+    matches = _best_partners(store)
+    left_out = []
+    for name, photo in zip(store.names, shown, strict=True):
+        if name not in inside[0]:
+            left_out.append({"name": photo, "why": _reason(name, contradicted, inside[1:], matches)})
+    return {
+        "input": "photos",
+        "photos": len(shown),
+        "registered": len(inside[0]),
+        "left_out": left_out,
+        "models": [len(names) for names in inside],
+        "points": best.num_points3D(),
+        "mean_reprojection_error_px": float(best.compute_mean_reprojection_error()),
+        "mean_track_length": float(best.compute_mean_track_length()),
+        "cameras": [lens_text(lens_from_camera(best.cameras[key])) for key in sorted(best.cameras)],
+        "pairs_matched": store.facts["pairs_matched"],
+        "pairs_possible": store.facts["pairs_possible"],
+        "seconds": seconds,
+        "warnings": model_warnings(models, store.database, len(shown)),
+    }
+
+
+def _best_partners(store: FeatureStore) -> dict[str, tuple[int, int]]:
+    """name -> (features, geometrically verified matches with the best partner)."""
+    db = load_pycolmap().Database.open(store.database)
+    images = {image.image_id: image.name for image in db.read_all_images()}
+    features = {number: (name, db.num_keypoints_for_image(number)) for number, name in images.items()}
+    db.close()
+    best = dict.fromkeys(features, 0)
+    for pair, found in verified_matches(store.database).items():
+        for image_id in pair:
+            best[image_id] = max(best[image_id], len(found))
+    return {name: (count, best[image_id]) for image_id, (name, count) in features.items()}
+
+
+def _reason(name: str, contradicted: set[str], others: list[set[str]], matches: dict[str, tuple[int, int]]) -> str:
+    features, best = matches.get(name, (0, 0))
+    if name in contradicted:
+        return "most of its verified matches contradict every pose found for it (equal textures?)"
+    if any(name in other for other in others):
+        return "registered in another, smaller model that does not connect to the largest"
+    if features < 100:
+        return f"too few features ({features}): blurred, dark or without texture"
+    if best < 30:
+        return f"too few verified matches (best partner: {best}): too little overlap with the other photos"
+    return f"matches found (best partner: {best}), but no consistent pose"

@@ -1,0 +1,1 @@
+"""Where tasks run, and the folders that hold them."""

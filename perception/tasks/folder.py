@@ -1,0 +1,63 @@
+"""Tasks in folders that every worker of an engine reaches: what it must know, and maybe a part of the scene."""
+
+from __future__ import annotations
+
+import json
+import platform
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from perception.errors import InputError
+from perception.inputs.load import load_saved_scene, save_scene
+from perception.io.atomic import atomic_file
+from perception.types import Scene
+
+TASK, SCENE = "task.json", "scene"
+
+
+def write_task(folder: Path, scene: Scene | None = None, **facts: Any) -> None:
+    """Writes a task with JSON-able facts to `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if scene is not None:
+        save_scene(folder / SCENE, scene)
+    with atomic_file(folder / TASK) as aside:
+        aside.write_text(json.dumps({**facts, "versions": versions()}), encoding="utf-8")
+
+
+def has_task(folder: Path) -> bool:
+    """Whether a whole task lies in `folder`."""
+    return (folder / TASK).is_file()
+
+
+def read_facts(folder: Path) -> dict[str, Any]:
+    """The facts of a task. InputError where it was written by another version of the program."""
+    facts: dict[str, Any] = json.loads((folder / TASK).read_text(encoding="utf-8"))
+    own, theirs = versions(), facts["versions"]
+    for name in sorted({*own, *theirs}):
+        if own.get(name) != theirs.get(name):
+            found = f"this worker has {name} {own.get(name)}, the run {theirs.get(name)}"
+            raise InputError(f"{folder}: {found}; install the same")
+    return facts
+
+
+def read_task(folder: Path) -> tuple[Scene, dict[str, Any]]:
+    """The scene and the facts of a task. InputError as `read_facts`."""
+    facts = read_facts(folder)
+    scene = load_saved_scene(folder / SCENE)
+    if scene is None:
+        raise InputError(f"{folder}: the part of the scene is missing; delete the folder and run again")
+    return scene, facts
+
+
+def versions() -> dict[str, str]:
+    """Versions of this program, Python, and the libraries that can affect a map."""
+    from perception import __version__
+
+    found = {"perception": __version__, "python": platform.python_version(), "machine": platform.machine()}
+    for name in ("torch", "numpy", "pycolmap", "hdbscan", "onnxruntime", "opencv-contrib-python-headless"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found

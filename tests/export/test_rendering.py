@@ -1,0 +1,76 @@
+"""`perception render` writes below its output folder, whatever names a camera file or a received map brings."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from perception.errors import InputError
+from perception.export.render import render_map
+from perception.map.write import write_map
+from perception.masks.label_images import label_file
+from perception.types import View
+from support.viewer_maps import small_map
+
+OUTSIDE = ["../outside", "a/../../outside", "..\\outside"]
+
+
+def received_map(folder: Path, name: str) -> Path:
+    """A map whose one stored view is called `name`."""
+    path = folder / "m.gsmap"
+    gmap = small_map(60)
+    K = np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]])
+    gmap.views = [View("good.jpg", Path("gone.jpg"), K, 32, 24, np.eye(4))]
+    write_map(path, gmap)
+    text = (path / "map.json").read_text()
+    (path / "map.json").write_text(text.replace('"name": "good.jpg"', f'"name": {json.dumps(name)}'))
+    return path
+
+
+def camera_file(folder: Path, names: list[str]) -> Path:
+    frames = [{"file_path": name, "transform_matrix": np.diag([1.0, -1, -1, 1]).tolist()} for name in names]
+    head = {"fl_x": 30, "fl_y": 30, "cx": 16, "cy": 12, "w": 32, "h": 24}
+    (folder / "cameras.json").write_text(json.dumps(head | {"frames": frames}))
+    return folder / "cameras.json"
+
+
+def files(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*.png")}
+
+
+@pytest.mark.parametrize("name", [*OUTSIDE, "/tmp/outside", ""])
+def test_a_view_name_of_a_received_map_never_leaves_the_output_folder(name: str, tmp_path: Path) -> None:
+    path = received_map(tmp_path, name)
+    with pytest.raises(InputError, match=r"map\.json: the photo name"):
+        render_map(path, tmp_path / "a" / "b", None, ["rgb"])
+    assert files(tmp_path) == set()
+
+
+@pytest.mark.parametrize("names", [[*OUTSIDE[1:2], "b.jpg"], ["/tmp/x.jpg", "b.jpg"], ["a/x.jpg", "a/..\\..\\y.jpg"]])
+def test_a_name_in_a_camera_file_never_leaves_the_output_folder(names: list[str], tmp_path: Path) -> None:
+    path = received_map(tmp_path, "a.jpg")
+    with pytest.raises(InputError, match=r"cameras\.json: "):
+        render_map(path, tmp_path / "out", camera_file(tmp_path, names), ["rgb", "depth"])
+    assert files(tmp_path) == set()
+
+
+def test_photos_beside_the_camera_files_folder_are_rendered_below_the_output(tmp_path: Path) -> None:
+    path = received_map(tmp_path, "a.jpg")
+    (tmp_path / "deep").mkdir()
+    cameras = camera_file(tmp_path / "deep", ["../photos/1.jpg", "../photos/left/2.jpg"])
+    render_map(path, tmp_path / "deep" / "out", cameras, ["rgb"])
+    assert files(tmp_path) == {"deep/out/1.png", "deep/out/left/2.png"}
+    picture = cv2.imread(str(tmp_path / "deep" / "out" / "1.png"))
+    assert picture is not None and picture.shape == (24, 32, 3)
+
+
+@pytest.mark.parametrize("name", [*OUTSIDE, "/tmp/outside.jpg"])
+def test_a_label_image_lies_below_its_folder(name: str, tmp_path: Path) -> None:
+    view = View(name, tmp_path / "photo.jpg", np.eye(3), 4, 3, np.eye(4))
+    with pytest.raises(InputError, match="the photo name"):
+        label_file(tmp_path / "masks", view)
+    assert label_file(tmp_path, View("a/1.jpg", view.photo, view.K, 4, 3, np.eye(4))) == tmp_path / "a" / "1.jpg.png"

@@ -1,0 +1,165 @@
+"""RGB-D folders: every layout gives the poses, lenses and depth it was written with, in metres; bad ones one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from perception.errors import InputError
+from perception.geometry import inverse_se3
+from perception.inputs.layouts import find_recording
+from perception.inputs.load import load_scene, photo_sizes
+from perception.io.cloud import write_cloud
+from perception.photos.depth import load_depth
+from perception.photos.lens import camera_from_lens
+from perception.photos.reading import Reading
+from perception.types import PointCloud, Scene
+from support.rgbd_folders import COUNT, NAMED, SLOPE, pose, wall_depth, write_recording
+
+LAYOUTS = sorted(NAMED)
+CAMERA = """
+image_width: 160
+image_height: 120
+camera_matrix: {data: [100, 0, 79.5, 0, 100, 59.5, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {data: [0, 0, 0, 0, 0]}
+"""
+
+
+def loaded(source: Path, folder: Path, camera: Path | None = None) -> Scene:
+    """The scene, started from a cloud on the wall so that no features are needed."""
+    x, y = np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9))
+    write_cloud(folder / "c.ply", PointCloud(np.stack([x, y, 2 + SLOPE * x], axis=-1).reshape(-1, 3)))
+    return load_scene(source, Reading(folder / "work", init_points=folder / "c.ply", camera=camera, poses="keep"))
+
+
+def number(name: str, layout: str) -> int:
+    """The frame that a photo's name means."""
+    digits = Path(name).name.partition(".png")[0]
+    if layout == "tum":
+        return round((float(digits) - 100) * 10)
+    return int("".join(c for c in digits if c.isdigit())) - (layout == "redwood")
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_poses_lenses_and_depth_of_each_layout(layout: str, tmp_path: Path) -> None:
+    source = write_recording(tmp_path, layout)
+    scene = loaded(source, tmp_path)
+    assert scene.metric and "metres" in scene.report["scale"]["source"]
+    frames = [number(view.name, layout) for view in scene.views]
+    # f / width (11 · 0.04 rad + 11 · 0.05 m / (2 to 2.5 m)) is 0.54 to 0.63 of the width: 7 or 8 stretches of 0.08.
+    assert len(frames) in (7, 8) and len(set(frames)) == len(frames) and (layout != "scannet" or 5 not in frames)
+    assert f"{len(frames)} of {COUNT - (layout == 'scannet')} frames chosen" in scene.report["notes"][0]
+    for view, index in zip(scene.views, frames, strict=True):
+        np.testing.assert_allclose(inverse_se3(view.camera_from_world), pose(index), atol=1e-6)
+        true, _ = wall_depth(view.K, pose(index), view.width, view.height)
+        found = load_depth(view, view.width, view.height)
+        seen = found > 0
+        assert seen.mean() > 0.75 and not seen[0].any()  # the top rows are 0 and saturated
+        # The nearest depth pixel is half a pixel away at most (0.6 of the photo's where lenses differ); 1 mm is a unit.
+        bound = 0.65 * np.abs(np.gradient(true, axis=1)) + 1e-3
+        assert (np.abs(found - true) < bound)[seen].all()
+
+
+def test_the_order_and_number_of_frames_do_not_depend_on_the_run(tmp_path: Path) -> None:
+    source = write_recording(tmp_path, "3dmatch")
+    (tmp_path / "again").mkdir()
+    first, second = (loaded(source, folder) for folder in (tmp_path, tmp_path / "again"))
+    assert [view.name for view in first.views] == [view.name for view in second.views]
+    assert photo_sizes(source).what == f"at most {COUNT} of {COUNT} frames"
+
+
+def test_published_lenses_of_tum_equal_opencv(tmp_path: Path) -> None:
+    source = write_recording(tmp_path, "tum").rename(tmp_path / "freiburg1_x")
+    lens = find_recording(source).lens  # type: ignore[union-attr]
+    ray = np.array([[0.2, -0.1, 1.0]])
+    K, D = np.array([[517.3, 0, 318.6], [0, 516.5, 255.3], [0, 0, 1]]), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+    expected, _ = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), K, np.array(D))
+    assert lens is not None
+    np.testing.assert_allclose(camera_from_lens(lens).img_from_cam(ray)[0], expected[0, 0] + 0.5, atol=1e-9)
+    with pytest.raises(InputError, match="give --camera"):
+        loaded(source.rename(tmp_path / "mine"), tmp_path)
+    (tmp_path / "camera.yaml").write_text(CAMERA)
+    scene = loaded(tmp_path / "mine", tmp_path, tmp_path / "camera.yaml")
+    assert [view.K[0, 0] for view in scene.views] == [100.0] * len(scene.views)
+
+
+def _edit(file: Path, old: str, new: str) -> None:
+    file.write_text(file.read_text().replace(old, new))
+
+
+def _depth(source: Path, value: int) -> None:
+    for file in source.rglob("*.png"):
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        if image is not None and image.dtype == np.uint16:
+            cv2.imwrite(str(file), np.full_like(image, value))
+
+
+def _later(source: Path) -> None:
+    rows = [line.split() for line in (source / "depth.txt").read_text().splitlines()]
+    (source / "depth.txt").write_text("\n".join(f"{float(time) + 77} {name}" for time, name in rows))
+
+
+BAD = [
+    ("tum", lambda s: (s / "groundtruth.txt").unlink(), "groundtruth.txt: missing"),
+    ("tum", _later, "do rgb.txt and depth.txt use one clock"),
+    ("tum", lambda s: (s / "groundtruth.txt").write_text("1 0 0 0 0 0 0 1"), "no photo lies between two poses"),
+    ("tum", lambda s: (s / "groundtruth.txt").write_text("1 0 0 0 0 0 0 0"), "a quaternion is zero"),
+    ("tum", lambda s: (s / "groundtruth.txt").write_text("1 0 x"), "expected lines of 8 numbers"),
+    ("tum", lambda s: (s / "rgb.txt").write_text("abc"), "expected lines 'time file'"),
+    ("scannet", lambda s: shutil.rmtree(s / "intrinsic"), "give --camera"),
+    ("scannet", lambda s: np.savetxt(s / "intrinsic/intrinsic_color.txt", np.eye(4) * 900), "were they resized"),
+    ("scannet", lambda s: np.savetxt(s / "pose/0.txt", np.diag([-1.0, 1, 1, 1])), "mirrored"),
+    ("scannet", lambda s: np.savetxt(s / "pose/3.txt", 2 * np.eye(4)), "not a rigid transform"),
+    ("scannet", lambda s: np.savetxt(s / "pose/3.txt", np.eye(3)), "expected lines of 4 numbers"),
+    ("scannet", lambda s: shutil.rmtree(s / "depth"), "no photo has a depth image"),
+    ("7scenes", lambda s: _depth(s, 0), "hold nothing measured"),
+    ("7scenes", lambda s: _depth(s, 65535), "hold nothing measured"),
+    ("7scenes", lambda s: _depth(s, 2), "median depth is 0.002 m if 1000 stored units"),
+    ("redwood", lambda s: (s / "depth/000001.png").unlink(), "12 photos in image/, 11 images in depth/"),
+    ("redwood", lambda s: (s / "wall.log").write_text("0 0 1\n1 0 0 0"), "blocks of a line"),
+    ("redwood", lambda s: _edit(s / "wall.log", "11 11 12\n", "11 11 12\n9 "), "blocks of a line"),
+    ("redwood", lambda s: (s / "b.log").write_text("0"), "several trajectories"),
+    ("redwood", lambda s: (s / "camera_intrinsic.json").write_text("{}"), "Open3D's camera intrinsics"),
+    ("redwood", lambda s: (s / "wall.log").unlink(), "has depth images but no poses"),
+]
+
+
+@pytest.mark.parametrize(("layout", "damage", "words"), BAD, ids=[f"{layout}: {words}" for layout, _, words in BAD])
+def test_bad_recordings_are_one_line(layout: str, damage, words: str, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    source = write_recording(tmp_path, layout)
+    damage(source)
+    with pytest.raises(InputError, match=words) as caught:
+        if words == "has depth images but no poses":
+            load_scene(source, Reading(tmp_path / "work"))
+        loaded(source, tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_phone_depth_of_another_size_and_lenses_per_frame(tmp_path: Path) -> None:
+    """As Polycam, Record3D and the like are converted: 256×192 depth in millimetres beside 1920×1440 photos."""
+    frames = []
+    for index, focal in enumerate((1500.0, 1400.0)):
+        K = np.array([[focal, 0, 960.0], [0, focal, 720.0], [0, 0, 1]])
+        small = np.diag([256 / 1920, 192 / 1440, 1.0]) @ K
+        depth, _ = wall_depth(small, pose(index), 256, 192)
+        cv2.imwrite(str(tmp_path / f"{index}.jpg"), np.zeros((1440, 1920, 3), np.uint8))
+        cv2.imwrite(str(tmp_path / f"{index}.png"), np.round(1000 * depth).astype(np.uint16))
+        world = (pose(index) @ np.diag([1, -1, -1, 1])).tolist()
+        lens = {"fl_x": focal, "fl_y": focal, "cx": 960, "cy": 720, "w": 1920, "h": 1440}
+        frames.append(
+            {"file_path": f"{index}.jpg", "depth_file_path": f"{index}.png", "transform_matrix": world, **lens}
+        )
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    scene = loaded(tmp_path, tmp_path)
+    for index, view in enumerate(scene.views):
+        found = load_depth(view, 800, 600)
+        true, _ = wall_depth(np.diag([800 / 1920, 600 / 1440, 1.0]) @ view.K, pose(index), 800, 600)
+        assert (
+            np.abs(found - true) < 2 * np.abs(np.gradient(true, axis=1)) + 1e-3
+        ).all()  # depth pixels are 3 times larger

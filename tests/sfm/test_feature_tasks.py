@@ -1,0 +1,93 @@
+"""Features and matches made by tasks on other machines: the database is that of one process, bit for bit."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("pycolmap")
+from perception.errors import InputError
+from perception.sfm import feature_tasks
+from perception.sfm.features import build_features
+from perception.tasks.folder import TASK
+from support.elsewhere import Elsewhere
+from support.progress import Told
+
+TABLES = ("cameras", "images", "keypoints", "descriptors", "matches", "two_view_geometries")
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> list[Path]:
+    """24 photos that slide over one texture, taken with two cameras; one of them is of another format."""
+    rng = np.random.default_rng(0)
+    layers = [cv2.resize(rng.random((n, 2 * n)).astype(np.float32), (1600, 800)) for n in (16, 32, 64, 128)]
+    texture = np.uint8(255 * sum(layers) / len(layers))
+    paths = []
+    for number in range(24):
+        width, height = (200, 150) if number % 3 else (160, 200)
+        x, y = 40 * number, 100 + 20 * (number % 4)
+        paths.append(tmp_path / f"photo {number:02d}{'.bmp' if number == 5 else '.png'}")
+        cv2.imwrite(str(paths[-1]), texture[y : y + height, x : x + width])
+    return paths
+
+
+def rows(database: Path) -> dict[str, list[tuple[Any, ...]]]:
+    with closing(sqlite3.connect(database)) as tables:
+        return {name: sorted(tables.execute(f"SELECT * FROM {name}")) for name in TABLES}
+
+
+def test_the_database_is_that_of_one_process(
+    photos: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feature_tasks, "PHOTOS_A_TASK", 7)
+    monkeypatch.setattr(feature_tasks, "PAIRS_A_TASK", 11)
+    half = np.zeros((150, 200), np.uint8)
+    half[:, :120] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), half)
+    masks = [tmp_path / "mask.png" if number in (1, 8) else None for number in range(len(photos))]
+    engine, lenses = Elsewhere(), [None] * len(photos)
+    here = build_features(photos, lenses, tmp_path / "here", 3, Told(), masks)
+    there = build_features(photos, lenses, tmp_path / "there", 3, Told(), masks, engine=engine)
+    wanted = rows(here.database)
+    assert len(wanted["cameras"]) == 2 and len(wanted["keypoints"]) == 24 and len(wanted["matches"]) > 40
+    assert rows(there.database) == wanted
+    assert engine.asked == [4, -(-there.facts["pairs_matched"] // 11)]
+    assert [path.name for path in (tmp_path / "there").iterdir()] == [there.folder.name]  # no task is left
+
+
+def test_an_interrupted_run_makes_no_task_twice(
+    photos: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feature_tasks, "PHOTOS_A_TASK", 10)
+    extract, begun = feature_tasks.extract, []
+
+    def counted(*args: Any) -> None:
+        begun.append(args)
+        if len(begun) == 3:
+            raise KeyboardInterrupt
+        extract(*args)
+
+    monkeypatch.setattr(feature_tasks, "extract", counted)
+    lenses = [None] * len(photos)
+    with pytest.raises(KeyboardInterrupt):
+        build_features(photos, lenses, tmp_path / "work", 0, Told(), engine=Elsewhere())
+    store = build_features(photos, lenses, tmp_path / "work", 0, Told(), engine=Elsewhere())
+    assert len(begun) == 4  # three sets of photos, one of them begun twice
+    assert len(rows(store.database)["keypoints"]) == 24
+
+
+def test_a_worker_of_another_version_is_refused(photos: list[Path], tmp_path: Path) -> None:
+    class Older(Elsewhere):
+        def run(self, task: Any, items: Any, *rest: Any) -> list[Any]:
+            file = Path(items[0]) / TASK
+            file.write_text(file.read_text().replace('"pycolmap": "', '"pycolmap": "0.'))
+            return super().run(task, items, *rest)
+
+    with pytest.raises(InputError, match=r"this worker has pycolmap .*, the run 0\..*; install the same"):
+        build_features(photos, [None] * len(photos), tmp_path / "work", 0, Told(), engine=Older())

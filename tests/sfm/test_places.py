@@ -1,0 +1,187 @@
+"""Structure from motion place by place: division against brute force, a walk with exact truth, and equal results."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from scipy import sparse
+
+from perception.errors import InputError
+from perception.geometry import align_similarity
+from perception.sfm import features
+from perception.sfm import submodels as places
+from perception.sfm.features import FeatureStore
+from perception.tasks import engine as engines
+from perception.tasks.engine import Engine
+from support.aimed import look_at
+from support.elsewhere import Elsewhere
+from support.progress import Told
+
+PHOTOS, WIDTH, HEIGHT, FOCAL, STEP = 48, 320, 240, 250.0, 0.3
+
+
+def clusters(sizes: list[int], rng: np.random.Generator) -> dict[tuple[int, int], int]:
+    """Photos 1, 2, ... in groups that match well, each group and the next by one pair of 60 matches."""
+    matches, first = {}, 1
+    for size in sizes:
+        own = range(first, first + size)
+        matches |= {pair: int(rng.integers(100, 300)) for pair in combinations(own, 2)}
+        if first > 1:
+            matches[first - 1, first] = 60
+        first += size
+    return matches
+
+
+def test_photos_are_divided_where_few_match() -> None:
+    matches = clusters([12, 9, 14], np.random.default_rng(0))
+    assert places.divide(matches, 15) == [list(range(1, 13)), list(range(13, 22)), list(range(22, 36))]
+    assert places.divide(matches, 35) == [list(range(1, 36))]
+
+
+def test_unconnected_photos_are_in_different_places() -> None:
+    first = clusters([8], np.random.default_rng(0))
+    second = {(i + 20, j + 20): found for (i, j), found in first.items()}
+    assert places.divide({**first, **second}, 100) == [list(range(1, 9)), list(range(21, 29))]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_cut_is_the_least_along_the_eigenvector(seed: int) -> None:
+    """The dense eigenvector of the generalised problem and all cuts along it, by their definition."""
+    from scipy.linalg import eigh
+
+    rng = np.random.default_rng(seed)
+    half = np.triu(rng.integers(0, 50, (20, 20)) * (rng.random((20, 20)) < 0.5), 1).astype(float)
+    weights = half + half.T + 0.1 * (1 - np.eye(20))  # connected
+    degree = np.diag(weights.sum(axis=1))
+    vector = eigh(degree - weights, degree)[1][:, 1]
+    order, costs = np.argsort(vector), {}
+    for k in range(5, 16):
+        a, b = order[:k], order[k:]
+        across = weights[np.ix_(a, b)].sum()
+        costs[k] = across / weights[a].sum() + across / weights[b].sum()
+    best = set(order[: min(costs, key=costs.__getitem__)].tolist())
+    upper = set(np.flatnonzero(places._upper_half(sparse.csr_matrix(weights))).tolist())
+    assert upper in (best, set(range(20)) - best)
+
+
+def test_a_border_leads_into_the_next_place_and_not_into_one_that_looks_alike() -> None:
+    matches = clusters([30, 30, 30], np.random.default_rng(0))
+    matches |= {(i, 60 + i): 40 for i in range(5, 15)}  # the first and the last look alike
+    divided = places.divide(matches, 35)
+    assert [len(place) for place in divided] == [30, 30, 30]
+    first, second, third = places.with_border(divided, matches)
+    assert len(first) == len(third) == 30 + places.BORDER and len(second) == 30 + 2 * places.BORDER
+    assert max(first) <= 60 and min(third) >= 31 and 31 in first and 60 in third
+
+
+def walk(folder: Path, rng: np.random.Generator) -> tuple[FeatureStore, np.ndarray]:
+    """The features and matches of photos along an uneven wall, as a database, and the true camera centres [N, 3]."""
+    length = PHOTOS * STEP
+    points = np.stack([rng.uniform(-3, length + 3, 5000), rng.uniform(2, 4, 5000), rng.uniform(0, 2.6, 5000)], axis=1)
+    (folder / "photos").mkdir(parents=True)
+    photos, seen, centres = [], [], []
+    for number in range(PHOTOS):
+        eye = np.array([STEP * number, 0.3 * np.sin(number), 1.4 + 0.1 * np.cos(2 * number)])
+        ahead = np.array([0.6 * np.sin(0.9 * number), 1, -0.1])
+        pose = look_at(eye, eye + ahead, np.array([0, 0, 1.0]))
+        x, y, z = pose[:3, :3] @ points.T + pose[:3, 3:]
+        pixels = np.stack([FOCAL * x / z + WIDTH / 2, FOCAL * y / z + HEIGHT / 2], axis=1)
+        inside = (pixels > 0).all(axis=1) & (pixels < [WIDTH, HEIGHT]).all(axis=1)
+        seen.append((np.flatnonzero(inside), pixels[inside] + rng.normal(0, 0.3, (inside.sum(), 2))))
+        centres.append(eye)
+        photos.append(folder / "photos" / f"{number:03}.png")
+        Image.new("RGB", (WIDTH, HEIGHT), (number, 100, 100)).save(photos[-1])
+    names = [photo.name for photo in photos]
+    features.import_photos(folder / "database.db", folder / "photos", photos, names, [None] * PHOTOS)
+    db = pycolmap.Database.open(folder / "database.db")
+    ids = [db.read_image_with_name(name).image_id for name in names]
+    for image, (_, pixels) in zip(ids, seen, strict=True):
+        db.write_keypoints(image, np.concatenate([pixels, np.ones((len(pixels), 4))], axis=1).astype(np.float32))
+    for i, j in combinations(range(PHOTOS), 2):
+        _, a, b = np.intersect1d(seen[i][0], seen[j][0], return_indices=True)
+        if len(a) >= 60:
+            found = np.stack([a, b], axis=1).astype(np.uint32)
+            geometry = pycolmap.TwoViewGeometry(config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED)
+            geometry.inlier_matches = found
+            db.write_two_view_geometry(ids[i], ids[j], geometry)
+    db.close()
+    return FeatureStore(folder, names, {}), np.array(centres)
+
+
+def poses(model: Any) -> dict[str, bytes]:
+    return {model.images[i].name: model.images[i].cam_from_world().matrix().tobytes() for i in model.reg_image_ids()}
+
+
+@pytest.mark.slow
+def test_a_walk_in_places_is_the_true_one_and_always_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(places, "LARGEST", 18)
+    monkeypatch.setattr(places, "BORDER", 6)
+    found = []
+    for number, (cores, engine) in enumerate([(1, Engine()), (3, Engine()), (1, Elsewhere())]):
+        store, truth = walk(tmp_path / str(number), np.random.default_rng(0))
+        monkeypatch.setattr(engines, "cores", lambda cores=cores: cores)
+        told = Told()
+        models, left_out = places.map_places(store, False, 0, engine, told) or ([], set())
+        assert len(models) == 1 and not left_out
+        found.append(poses(models[0]))
+        if cores > 1:
+            assert ("poses: places", 4, 4) in told.updates
+    assert engine.asked == [4]  # type: ignore[attr-defined]
+    assert found[0] == found[1] == found[2]
+    assert len(found[0]) == PHOTOS
+    centres = np.array([np.frombuffer(found[0][name]).reshape(3, 4) for name in store.names])
+    centres = -np.einsum("nji,nj->ni", centres[:, :, :3], centres[:, :, 3])
+    scale, turn, shift = align_similarity(truth, centres)
+    away = np.linalg.norm(scale * centres @ turn.T + shift - truth, axis=1)
+    # .3 px are 4 mm at 3 m; errors add up along the 14 m of the walk.
+    assert np.median(away) < 0.03 and away.max() < 0.1
+
+
+@pytest.mark.slow
+def test_photos_without_a_place_are_added_and_small_repeated_models_are_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    divide = places.divide
+    monkeypatch.setattr(places, "LARGEST", 30)
+    monkeypatch.setattr(places, "divide", lambda *given: [[i for i in place if i != 7] for place in divide(*given)])
+    monkeypatch.setattr(places, "with_border", lambda divided, _: [divided[0] + divided[1][:5], *divided[1:]])
+    store, _ = walk(tmp_path / "walk", np.random.default_rng(0))
+    ((whole, *_), _) = places.map_places(store, False, 0, Engine(), Told()) or ([None], set())
+    assert whole is not None and whole.num_reg_images() == PHOTOS
+    small = pycolmap.Reconstruction(whole)
+    places.take_out(small, set(sorted(small.reg_image_ids())[10:]))
+    assert places.needed([small, whole]) == [whole]
+
+
+@pytest.mark.slow
+def test_a_contradicted_model_is_not_returned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(places, "is_contradicted", lambda pairs: len(pairs) > 100)
+    store, _ = walk(tmp_path / "walk", np.random.default_rng(0))
+    told = Told()
+    assert places.map_places(store, False, 0, Engine(), told) is None
+    assert told.lines[-1].endswith("all photos are mapped in one piece")
+
+
+def test_an_interrupted_call_stops_the_tasks_of_other_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engines, "cores", lambda: 2)
+    stopped = []
+
+    def task(item: str, progress: Any) -> None:
+        if item == "wrong":
+            raise InputError("wrong")
+        try:
+            while True:
+                progress.update("working", 0, 1)
+        except KeyboardInterrupt:
+            stopped.append(item)
+            raise
+
+    with pytest.raises(InputError, match="wrong"):
+        Engine().run(task, ["long", "wrong", "never"], "task", Told(), each_core=True)
+    assert stopped == ["long"]

@@ -1,0 +1,102 @@
+"""Where the time of a training step goes, by kind of step and number of threads, on this machine.
+
+    python -m tools speed.steps SCENE [--masks labels:FOLDER] [--at 300 1200] [--set KEY=VALUE ...]
+
+Maps SCENE once with one thread and once with two, in processes of their own, and prints the median milliseconds of
+every stage over the 120 steps around each iteration: steps of half the size, of the full size, and with features. A
+pair is one Gaussian contributing to one pixel. Stages of the rasterizer are those of `perception bench rasterizer`;
+"other" holds activations, buffers, statistics for growth and Python.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+AROUND = 60
+STAGES = ("project", "sort", "bin", "blend", "blend_backward", "reduce", "losses", "Adam", "other")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--masks", default="builtin")
+    parser.add_argument("--at", type=int, nargs="+", default=[300, 1200])
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--threads", type=int, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.threads:
+        print(json.dumps(measure(options)))
+        return
+    found = {}
+    for threads in (1, 2):
+        command = [sys.executable, __file__, *sys.argv[1:], "--threads", str(threads)]
+        environment = os.environ | {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "passive"}
+        run = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+        found[threads] = {(row["at"], row["kind"]): row for row in json.loads(run.stdout.splitlines()[-1])}
+    for key, one in found[1].items():
+        two = found[2][key]
+        print(f"\n{key[1]} around {key[0]}: {one['steps']} steps, {one['gaussians']:.0f} Gaussians, ", end="")
+        print(f"{one['pairs'] / 1e6:.2f} M pairs of {one['evaluated'] / 1e6:.2f} M evaluated")
+        print(f"{'ms':>16} {'1 thread':>9} {'2':>9} {'ratio':>6}")
+        for stage in (*STAGES, "all"):
+            a, b = one["ms"][stage], two["ms"][stage]
+            print(f"{stage:>16} {a:9.2f} {b:9.2f} {a / max(b, 1e-9):6.2f}")
+        print(f"{'ns a pair, CPU':>16} {1e6 * one['ms']['all'] / one['pairs']:9.2f}")
+
+
+def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Medians over the steps of one run, by iteration and kind."""
+    from perception import _core
+    from perception.config import load_config
+    from perception.gaussians import train
+    from perception.pipeline.mapping import build_map
+
+    _core.training.set_threads(options.threads)
+    frames: list[Any] = []
+    steps: list[dict[str, Any]] = []
+    passes, step = train.passes, train.Trainer.step
+
+    def noted(device: Any) -> Any:
+        forward, backward = passes(device)
+        return forward, lambda *a, **k: (backward(*a, **k), frames.append((a[3].frames, a[3].features is not None)))[0]
+
+    def timed(self: train.Trainer, progress: float) -> float:
+        before, start = dict(self.record.profile), time.perf_counter()
+        loss = step(self, progress)
+        whole = time.perf_counter() - start
+        (frame, features), frames[:] = frames[-1], []
+        ms = dict(frame.seconds) | {n: self.record.profile[n] - before.get(n, 0) for n in ("losses", "Adam")}
+        ms |= {"other": whole - sum(ms.values()), "all": whole}
+        coarse = features or progress < self.schedule._coarse_until
+        kind = "features" if features else "half size" if coarse else "full size"
+        pairs = {"pairs": frame.contributing, "evaluated": frame.evaluated, "gaussians": len(self.gaussians)}
+        steps.append({"iteration": self.iteration, "kind": kind, "ms": ms, **pairs})
+        return loss
+
+    train.passes, train.Trainer.step = noted, timed  # type: ignore[assignment, method-assign]
+    with tempfile.TemporaryDirectory() as folder:
+        pairs = [f"masks={options.masks}", "language.encoder=none", *options.set]
+        build_map(options.scene, Path(folder) / "a.gsmap", load_config(None, pairs))
+    rows = []
+    for at in options.at:
+        near = [s for s in steps if abs(s["iteration"] - at) <= AROUND]
+        for kind in sorted({s["kind"] for s in near}):
+            some = [s for s in near if s["kind"] == kind]
+            ms = {name: 1e3 * float(np.median([s["ms"][name] for s in some])) for name in some[0]["ms"]}
+            means = {name: float(np.mean([s[name] for s in some])) for name in ("pairs", "evaluated", "gaussians")}
+            rows.append({"at": at, "kind": kind, "steps": len(some), "ms": ms, **means})
+    return rows
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,175 @@
+"""Writes a building: furnished rooms in a row, joined by openings in their walls, with exact truth.
+
+python tests/support/building.py FOLDER [--rooms 6] [--photos 1200] [--size 480x360] [--seed 0]
+
+The walk goes round each room and on through the opening. FOLDER then holds what tools/worlds/make.py writes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+HOMES = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(HOMES))
+from support.aimed import look_at  # noqa: E402
+from worlds import room, scene  # noqa: E402
+from worlds.cameras import UP, Camera, intrinsics, walk  # noqa: E402
+from worlds.light import Body, Part, Scene, corners  # noqa: E402
+from worlds.shapes import Sheet, to_world  # noqa: E402
+
+VIEWS, FOCAL_35MM, POINTS = 1200, 26, 600_000
+OPENING, HIGH, CORNER = 0.95, 2.1, 0.12
+"""Width and height of an opening in metres, and its distance from the north wall."""
+GAP = 0.002  # between the faces of two rooms' walls
+PASSING = 0.12  # share of a room's photos that are taken on the way into the next one
+
+
+def rooms(count: int, seed: int, light_samples: int) -> list[tuple[Scene, np.ndarray, float]]:
+    """(scene, half extents [2], x of the centre) of each room, each as if it were alone."""
+    made, edge = [], 0.0
+    for number in range(count):
+        alone = room.build(seed + number, light_samples)
+        floor = next(body for body in alone.bodies if body.name == "floor").parts[0].shape
+        half = np.array(floor.size()) / 2
+        made.append((alone, half, edge + half[0]))
+        edge += 2 * half[0] + GAP
+    return made
+
+
+def build(seed: int, light_samples: int = 20, count: int = 6) -> Scene:
+    """The building: all rooms side by side along x, with openings in the walls between them."""
+    made = rooms(count, seed, light_samples)
+    passages = []  # (x of the wall, y of the opening's middle)
+    for (_, half, x), (_, beyond, _) in itertools.pairwise(made):
+        passages.append((x + half[0], min(half[1], beyond[1]) - CORNER - OPENING / 2))
+    bodies: list[Body] = []
+    for number, (alone, _, x) in enumerate(made):
+        doors = passages[max(number - 1, 0) : number + 1]
+        for body in alone.bodies:
+            moved = replace(body.placed(0, np.array([x, 0, 0])), on=None, hangs_on=None)
+            if moved.kind == "wall":
+                moved = replace(moved, parts=[piece for part in moved.parts for piece in _opened(part, doors)])
+            elif not moved.is_stuff and any(_stands_in(moved, *door) for door in doors):
+                continue
+            bodies.append(moved)
+    route = partial(_route, made=[(half, x) for _, half, x in made], passages=passages)
+    return Scene(bodies, made[0][0].lighting, route, [])
+
+
+def _opened(part: Part, doors: list[tuple[float, float]]) -> list[Part]:
+    """A wall's part, or what is left of it on both sides of an opening and above it."""
+    sheet = part.shape
+    assert isinstance(sheet, Sheet)
+    for x, y in doors:
+        if abs(sheet.origin[0] - x) < 0.01 and abs(sheet.rotation[1, 0]) > 0.99:  # it runs along y
+            along = np.sign(sheet.rotation[1, 0])
+            u = sorted(0.5 + along * (y + side * OPENING / 2 - sheet.origin[1]) / sheet.width for side in (-1, 1))
+            v = 1 - HIGH / sheet.height
+            return [_piece(part, 0, u[0], 0, 1), _piece(part, u[1], 1, 0, 1), _piece(part, u[0], u[1], 0, v)]
+    return [part]
+
+
+def _piece(part: Part, u0: float, u1: float, v0: float, v1: float) -> Part:
+    sheet = part.shape
+    assert isinstance(sheet, Sheet)
+    middle = np.array([((u0 + u1) / 2 - 0.5) * sheet.width, (0.5 - (v0 + v1) / 2) * sheet.height, 0])
+    origin = sheet.origin + sheet.rotation @ middle
+    shape = Sheet((u1 - u0) * sheet.width, (v1 - v0) * sheet.height, sheet.rotation, origin)
+    rows, columns = part.lit.shape[:2]
+    lit = part.lit[round(v0 * rows) : round(v1 * rows), round(u0 * columns) : round(u1 * columns)]
+    return replace(part, shape=shape, lit=np.ascontiguousarray(lit))
+
+
+def _stands_in(body: Body, x: float, y: float) -> bool:
+    """Whether a body is in the way through an opening."""
+    points = np.concatenate([to_world(part.shape, corners(part.shape)) for part in body.parts])
+    low, high = points.min(axis=0), points.max(axis=0)
+    reach = np.array([0.75, OPENING / 2 + 0.1])
+    return bool((low[:2] < np.array([x, y]) + reach).all() and (high[:2] > np.array([x, y]) - reach).all())
+
+
+def _route(
+    views: int, width: int, height: int, made: list[tuple[np.ndarray, float]], passages: list[tuple[float, float]]
+) -> list[Camera]:
+    """Cameras round each room, then through the opening into the next, looking ahead."""
+    cameras: list[Camera] = []
+    K = intrinsics(width, height, FOCAL_35MM)
+    for number, (half, x) in enumerate(made):
+        total = views * (number + 1) // len(made) - views * number // len(made)
+        through = round(PASSING * total) if number < len(passages) else 0
+        shift = np.eye(4)
+        shift[0, 3] = -x
+        for camera in walk(total - through, width, height, FOCAL_35MM, half):
+            cameras.append(replace(camera, camera_from_world=camera.camera_from_world @ shift))
+        if not through:
+            continue
+        (wall, y), beyond = passages[number], made[number + 1][1]
+        path = np.array([[x + 0.3 * half[0], 0.25 * y], [wall - 0.7, y], [wall + 0.7, y], [beyond - 0.5, 0.4 * y]])
+        for share in (np.arange(through) + 0.5) / through:
+            place, ahead = _along(path, share), _along(path, min(share + 0.25, 1.2))
+            eye = np.array([*place, 1.45 + 0.05 * np.sin(40 * share)])
+            cameras.append(Camera(K, look_at(eye, np.array([*ahead, 1.2]), UP), width, height))
+    return cameras
+
+
+def _along(path: np.ndarray, share: float) -> np.ndarray:
+    """The point at a share of a polyline's length, beyond its end on the last segment."""
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    at = share * steps.sum()
+    n = min(int(np.searchsorted(np.cumsum(steps), at)), len(steps) - 1)
+    return np.asarray(path[n] + (path[n + 1] - path[n]) * (at - steps[:n].sum()) / steps[n])
+
+
+class _Maker:
+    """What `make_photos` asks of a scene."""
+
+    VIEWS, FOCAL_35MM = VIEWS, FOCAL_35MM
+
+    def __init__(self, count: int) -> None:
+        self.count, self.POINTS = count, POINTS * count // 6
+
+    def build(self, seed: int, light_samples: int) -> Scene:
+        return build(seed, light_samples, self.count)
+
+
+def make_building(
+    folder: Path, count: int = 6, photos: int = VIEWS, size: tuple[int, int] = (480, 360), seed: int = 0, rays: int = 12
+) -> None:
+    """Writes photos and truth of a building of `count` rooms; transforms.json lists the depth images too."""
+    scene.SCENES["building"] = _Maker(count)  # type: ignore[assignment]
+    options = {"views": photos, "width": size[0], "height": size[1], "light_samples": rays}
+    scene.make_photos(folder / "images", scene="building", seed=seed, truth_folder=folder, **options)
+    path = folder / "transforms.json"
+    facts = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps({**facts, "ply_file_path": "points.ply"}), encoding="utf-8")
+    _sparse(folder)
+
+
+def _sparse(folder: Path) -> None:
+    """points.ply: every 20th of the true surface points, as structure from motion would find them."""
+    from perception.io.cloud import read_cloud, write_cloud
+    from perception.types import PointCloud
+
+    cloud = read_cloud(folder / "gt_points.ply")
+    assert cloud.colors is not None
+    write_cloud(folder / "points.ply", PointCloud(cloud.points[::20], cloud.colors[::20]))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--rooms", type=int, default=6)
+    parser.add_argument("--photos", type=int, default=VIEWS)
+    parser.add_argument("--size", default="480x360")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    across, down = map(int, given.size.split("x"))
+    make_building(given.folder, given.rooms, given.photos, (across, down), given.seed)

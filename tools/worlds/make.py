@@ -1,0 +1,64 @@
+"""Writes a made scene with exact truth, or the scene that the package ships for `perception demo`:
+
+python -m tools worlds.make tabletop|room FOLDER [--seed N]
+python -m tools worlds.make shipped perception/demo_scene
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+HOMES = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(HOMES))
+from worlds import DemoTruth, make_photos  # noqa: E402
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("scene", choices=("tabletop", "room", "shipped"))
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--seed", type=int, default=0, help="another N makes another scene")
+    given = parser.parse_args()
+    if given.folder.exists() and any(given.folder.iterdir()):
+        parser.error(f"{given.folder} is not empty")
+    if given.scene == "shipped":
+        ship(given.folder)
+        return
+    truth = make_photos(given.folder / "images", scene=given.scene, seed=given.seed, truth_folder=given.folder)
+    counts = f"{len(truth.names)} photos, {len(truth.instances)} instances, {len(truth.queries)} prompts"
+    print(f"{counts} in {given.folder}")
+
+
+def ship(folder: Path) -> None:
+    """The tabletop of seed 0: its photos, and what scoring needs of its truth."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as aside:
+        write_truth(folder, make_photos(folder / "photos", truth_folder=Path(aside)))
+
+
+def write_truth(folder: Path, truth: DemoTruth) -> None:
+    """truth.json and truth.npz, as `pipeline.demo` reads them."""
+    facts = {
+        "asked": truth.asked,
+        "queries": [[text, ids] for text, ids in truth.queries],
+        "instances": {instance.id: instance.name for instance in truth.instances},
+        "centres": {name: camera.center.tolist() for name, camera in zip(truth.names, truth.cameras, strict=True)},
+    }
+    (folder / "truth.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    np.savez_compressed(
+        folder / "truth.npz",
+        points=truth.points,
+        normals=truth.normals,
+        colors=truth.colors,
+        instance_ids=truth.instance_ids.astype(np.uint8),
+    )
+
+
+if __name__ == "__main__":
+    main()
