@@ -5,76 +5,85 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
+import networkx as nx
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "perception"
 
-# Bottom to top; a module may import from its own layer and those below.
-LAYERS = [
-    {
-        "cores",
-        "errors",
-        "types",
-        "config",
-        "boxes",
-        "geometry",
-        "progress",
-        "interrupts",
-        "listening",
-        "_core",
-        "pictures",
-        "colors",
-    },
-    {"io"},
-    {"masks", "calibration", "bags", "frame"},
-    {"gaussians"},
-    {"language", "instances"},
-    {
-        "query",
-        "export",
-        "evaluate",
-        "models",
-        "editing",
-    },
-    {
-        "serve",
-        "mcp",
-        "node",
-        "pipeline",
-        "viewer",
-        "bench",
-    },
-    {"cli"},
-]
-HEIGHT = {name: height for height, layer in enumerate(LAYERS) for name in layer}
+# Bottom to top: a module may import from its own layer and those below, and files of one layer never in a circle.
+LAYERS = """
+    errors types boxes geometry colors pictures config progress interrupts machine _core
+    io
+    onnx photos
+    tasks
+    sfm
+    inputs map
+    calibration bags frame
+    rasterizer masks
+    gaussians
+    language
+    instances
+    query
+    evaluate export
+    edit report
+    serve
+    node viewer pipeline bench models
+    cli
+"""
+HEIGHT = {name: height for height, layer in enumerate(LAYERS.strip().splitlines()) for name in layer.split()}
+FACE = "perception"  # its names are found when they are first used
 
 
 def modules() -> list[Path]:
     return sorted(PACKAGE.rglob("*.py"))
 
 
-def imports_of(path: Path) -> set[str]:
-    """First-level names below `perception` that a file imports, anywhere in it."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("perception"):
-            parts = node.module.split(".")
-            found |= {parts[1]} if len(parts) > 1 else {alias.name for alias in node.names}
-        elif isinstance(node, ast.Import):
-            found |= {alias.name.split(".")[1] for alias in node.names if alias.name.startswith("perception.")}
-    return found - {"__version__", "InputError"}
+def module_name(path: Path) -> str:
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_imports_point_down(path: Path) -> None:
-    if path == PACKAGE / "__init__.py":
-        return
-    own = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-    assert own in HEIGHT, f"{own} has no layer: give it one in this test"
-    for name in imports_of(path):
-        assert HEIGHT[name] <= HEIGHT[own], f"{path.name} ({own}) imports {name} from a layer above it"
+def imports() -> nx.DiGraph:
+    """An edge from every module to each that it imports, anywhere in its text."""
+    files = {module_name(path): path for path in modules()}
+    graph = nx.DiGraph()
+    graph.add_nodes_from(files)
+    for name, path in files.items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            found = []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                found = [f"{node.module}.{alias.name}" for alias in node.names]
+                found = [full if full in files else node.module for full in found]
+            elif isinstance(node, ast.Import):
+                found = [alias.name for alias in node.names]
+            graph.add_edges_from((name, other) for other in found if other in files and other not in (name, FACE))
+    graph.remove_node(FACE)
+    return graph
+
+
+def test_imports_point_down() -> None:
+    def height(name: str) -> int:
+        own = name.split(".")[1]
+        assert own in HEIGHT, f"{own} has no layer: give it one in this test"
+        return HEIGHT[own]
+
+    assert not [f"{a} imports {b}" for a, b in imports().edges if height(b) > height(a)]
+
+
+def test_no_circle_of_files() -> None:
+    assert not [sorted(circle) for circle in nx.strongly_connected_components(imports()) if len(circle) > 1]
+
+
+def test_no_folder_is_a_hall() -> None:
+    """Lines of Python in every folder, and in the bytes' own."""
+    lines = Counter[str]()
+    for path in modules():
+        lines[path.relative_to(PACKAGE).parts[0]] += len(path.read_text(encoding="utf-8").splitlines())
+    assert max(lines.values()) <= 3000, lines.most_common(1)
+    assert lines["io"] < 1500
 
 
 @pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(PACKAGE)))

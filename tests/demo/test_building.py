@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from support.building import make_building
 
 from worlds import room
+from worlds.building import make_building
 from worlds.light import Body
 
 pytestmark = pytest.mark.slow

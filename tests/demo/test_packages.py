@@ -7,11 +7,12 @@ import re
 from pathlib import Path
 
 import pytest
-from support.packages import ABSENT, make_packages
+
+from worlds.packages import ABSENT, make_packages
 
 
 def test_twenty_prompts_with_exact_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("support.packages.room_around", lambda *_: [])  # painting it takes longest
+    monkeypatch.setattr("worlds.packages.room_around", lambda *_: [])  # painting it takes longest
     make_packages(tmp_path, seed=1, views=3, width=64, height=48, rays=1)
     scene = json.loads((tmp_path / "scene.json").read_text(encoding="utf-8"))
     names = {entry["id"]: entry["name"] for entry in scene["instances"]}

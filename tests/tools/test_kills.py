@@ -1,4 +1,4 @@
-"""A short run of the harness that kills mapping, exporting and editing; `python -m tools kills.run` is the long one."""
+"""A short run of the harness that kills mapping, exporting and editing; `python tools kills.run` is the long one."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import pytest
 
 pytestmark = pytest.mark.slow
 
-HERE = Path(__file__).resolve().parent
+TOOLS = Path(__file__).resolve().parents[2] / "tools"
 
 
 @pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="the harness needs Linux")
 def test_nothing_is_lost_to_a_few_kills(small_scene: Path, tmp_path: Path) -> None:
     """Kills around changes to the file system, which do not hang on the clock; the long run also draws times."""
     facts = tmp_path / "kills.json"
-    command = [sys.executable, HERE / "run.py", "--kills", "0", "--writes", "3", "--json", facts]
+    command = [sys.executable, TOOLS, "kills.run", "--kills", "0", "--writes", "3", "--json", facts]
     command += ["--no-sfm", "--no-fresh", "--iterations", "100", "--scene", small_scene, "--folder", tmp_path]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr

@@ -1,4 +1,4 @@
-"""The benches of public data sets, from the download to the table: python -m tools bench.run NAME DIR -o WORK
+"""The benches of public data sets, from the download to the table: python tools bench.run NAME DIR -o WORK
 
 NAME: lerf-mask, lerf-ovs or scannetpp; NAME --help lists the options.
 """
@@ -6,12 +6,10 @@ NAME: lerf-mask, lerf-ovs or scannetpp; NAME --help lists the options.
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
-from bench.lerf import LerfMask, LerfOvs  # noqa: E402
-from bench.scannetpp import ScanNetPP  # noqa: E402
-from perception.errors import InputError  # noqa: E402
+from bench.lerf import LerfMask, LerfOvs
+from bench.scannetpp import ScanNetPP
+from perception.errors import InputError
 
 BENCHES = {bench.name: bench for bench in (LerfMask, LerfOvs, ScanNetPP)}
 

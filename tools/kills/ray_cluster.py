@@ -1,6 +1,6 @@
 """Maps on local Ray clusters of 1, 2 and 4 nodes; workers and the driver are killed on the way:
 
-python -m tools kills.ray_cluster        # a quarter of an hour on two cores
+python tools kills.ray_cluster        # a quarter of an hour on two cores
 
 A row of things with given poses is mapped in blocks, a tabletop from photos alone, with features, matches and places by
 tasks. Every map must be that of the local engine. Of every kind of task a worker must have been killed, and the driver
@@ -23,12 +23,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-HOMES = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(HOMES))
-os.environ["PYTHONPATH"] = os.pathsep.join([str(HOMES), str(HOMES.parent), os.environ.get("PYTHONPATH", "")])
-from kills.cases import contents  # noqa: E402
-from support.row_scene import write_row  # noqa: E402
-from worlds import make_photos  # noqa: E402
+from kills.cases import contents
+from support.row_scene import write_row
+from worlds import make_photos
 
 SETTINGS = ["train.budget=1200", "densify.every=20", "language.encoder=none"]
 OF_SCENE = {

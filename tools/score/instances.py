@@ -1,4 +1,4 @@
-"""Maps' instances against their scenes' truth: `python -m tools score.instances SCENE MAP …`.
+"""Maps' instances against their scenes' truth: `python tools score.instances SCENE MAP …`.
 
 AP with the map's scores and with constant ones, things and stuff together and apart, and mIoU of rendered masks.
 Reliability: of all instances with 100 points or more, the score, and whether the IoU with a true one exceeds 0.5.
@@ -6,7 +6,6 @@ Reliability: of all instances with 100 points or more, the score, and whether th
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,8 @@ from perception.geometry import align_similarity, camera_centres
 from perception.io.documents import read_json
 from perception.map.map import Map
 from perception.types import PointCloud
-
-sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
-from score.masks import evaluate_rendered  # noqa: E402
-from score.reliability import SCORED, finish_reliability, parse_pairs  # noqa: E402
+from score.masks import evaluate_rendered
+from score.reliability import SCORED, finish_reliability, parse_pairs
 
 
 def read_scene(scene: Path) -> dict[str, Any]:

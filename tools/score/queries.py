@@ -1,4 +1,4 @@
-"""How well finished maps answer text on scenes with exact truth: `python -m tools score.queries MAP SCENE …`.
+"""How well finished maps answer text on scenes with exact truth: `python tools score.queries MAP SCENE …`.
 
 A hit is right when the true object under most of the instance's exported points answers the prompt. Prompts
 are those of scene.json whose objects some photo shows. Absent prompts: 30 things of street, farm, sea and
@@ -11,7 +11,6 @@ nothing. They are also scored apart, with the texts read on the instances and wi
 from __future__ import annotations
 
 import re
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,10 +24,8 @@ from perception.language.shape_words import singular
 from perception.query import QueryMap, load_map
 from perception.query.ranking import Answer, Ranker, answering
 from perception.query.text_ranking import TextRanking
-
-sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
-from score.instances import read_scene, read_truth_cloud  # noqa: E402
-from score.reliability import SCORED, finish_reliability, parse_pairs  # noqa: E402
+from score.instances import read_scene, read_truth_cloud
+from score.reliability import SCORED, finish_reliability, parse_pairs
 
 PRINTED = re.compile(r"\b[A-Z]{2,}\b")
 PRINTED_FIGURES = "top1", "top3", "returned_precision", "returned_recall", "false_positive_prompts", "failed_prompts"

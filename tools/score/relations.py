@@ -1,6 +1,6 @@
 """Precision and recall of the scene graph's relations on generated scenes, whose placements are known.
 
-    python tests/query/relations_run.py [--scenes 20] [--first 100]
+    python tools score.relations [--scenes 20] [--first 100]
 
 Instances are the points of the truth that two photos see, without training. "on" is what the generator placed on what;
 "next to" is `Places`' measure on the true boxes, of things that stand on the same; "in" is a fruit in an open box that
@@ -11,19 +11,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
-
-from perception.io.cloud import read_cloud  # noqa: E402
-from perception.query.relations import Places  # noqa: E402
-from perception.query.scene_graph import MATCH, holders  # noqa: E402
-from worlds import make_photos  # noqa: E402
+from perception.io.cloud import read_cloud
+from perception.query.relations import Places
+from perception.query.scene_graph import MATCH, holders
+from worlds import make_photos
 
 LEAST = 30  # points of an instance that is asked about
 

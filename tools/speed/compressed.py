@@ -1,12 +1,11 @@
 """Compressed exports of a map: size as a share of the PLY's, and PSNR of what is read back to renders of the map.
 
-python -m tools speed.compressed MAP
+python tools speed.compressed MAP
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -14,9 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-HOMES = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(HOMES))
-from support.compressed import read_sog, read_spz  # noqa: E402
+from support.compressed import read_sog, read_spz
 
 AXES = np.array([1, -1, -1])
 """Of spz, whose y and z point the other way."""

@@ -1,21 +1,17 @@
 """Levels of detail of a map: PSNR to renders of all its Gaussians, and time and memory for millions.
 
-python -m tools speed.levels MAP [--millions 5]
+python tools speed.levels MAP [--millions 5]
 """
 
 from __future__ import annotations
 
 import argparse
 import resource
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
-
-HOMES = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(HOMES))
 
 
 def render(

@@ -1,4 +1,4 @@
-"""`python tests/launch/load_run.py [QUERIES]`: two lifecycle nodes with two maps on one network, one of them restarted
+"""`python tools speed.node_load [QUERIES]`: two lifecycle nodes with two maps on one network, one of them restarted
 four times while both answer.
 
 Half of the queries go to each node. After 20 and 40 % of the answers the first node is killed, after 60 and 80 % it is
@@ -18,11 +18,9 @@ import tempfile
 import time
 from pathlib import Path
 
-TESTS = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(TESTS), str(TESTS.parent)]
-
-from perception import load_map  # noqa: E402
-from support.node_maps import encoders, write_small_map  # noqa: E402
+from perception import load_map
+from support.node_maps import encoders, write_small_map
+from support.paths import REPOSITORY, TESTS
 
 PROMPTS = ["red mug", "laptop", "banana"]
 STOPS = ((0.2, signal.SIGKILL), (0.4, signal.SIGKILL), (0.6, signal.SIGTERM), (0.8, signal.SIGTERM))
@@ -31,7 +29,7 @@ SETTLE = 6.0  # seconds until a started node has loaded its map and answers
 
 def started(script: str, *words: object, log: Path) -> subprocess.Popen[str]:
     """A script of tests/support in the Python with rclpy, its output read by the caller, its errors in `log`."""
-    paths, prefix = [TESTS.parent, TESTS, TESTS.parent / "launch/perception"], os.environ.get("PERCEPTION_MSGS_PREFIX")
+    paths, prefix = [REPOSITORY, TESTS, REPOSITORY / "launch/perception"], os.environ.get("PERCEPTION_MSGS_PREFIX")
     environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": str(os.getpid() % 200)}
     if prefix:
         paths += Path(prefix).glob("lib/python3*/site-packages")

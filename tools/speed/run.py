@@ -1,8 +1,8 @@
 """Speed and peak memory of model files of real size with random weights, on this machine.
 
-    python -m tools speed.run sam PHOTO...           masks, prompts that lie in an earlier mask skipped (the default)
-    python -m tools speed.run sam PHOTO... --full    masks, the full grid of 1,024 prompts
-    python -m tools speed.run words                  1,500 crops, as 100 instances of 15, through a CLIP ViT-B/32
+    python tools speed.run sam PHOTO...           masks, prompts that lie in an earlier mask skipped (the default)
+    python tools speed.run sam PHOTO... --full    masks, the full grid of 1,024 prompts
+    python tools speed.run words                  1,500 crops, as 100 instances of 15, through a CLIP ViT-B/32
 
 SAM is a decoder of real size behind an encoder as expensive as MobileSAM's; its masks gather round the prompt, as a
 trained one's do. The models are exported to ONNX into a temporary folder first, which is not timed.
@@ -20,8 +20,6 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
-
 PHOTO, INSTANCES, CROPS = 800, 100, 15
 """Long side of the photos that SAM reads; instances and crops of each for the words."""
 
@@ -32,8 +30,9 @@ def sam(photos: list[Path], full: bool) -> None:
 
     from perception.config import SamConfig
     from perception.masks.sam import SamSource, automatic_masks
+    from support.paths import SUPPORT
 
-    exporter = Path(__file__).resolve().parents[1] / "support" / "sam_exports.py"
+    exporter = SUPPORT / "sam_exports.py"
     with tempfile.TemporaryDirectory() as folder:  # by another process, whose memory does not count
         subprocess.run([sys.executable, exporter, "mobile", folder], check=True)
         source = SamSource(folder, SamConfig(skip_covered=not full))

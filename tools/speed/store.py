@@ -1,8 +1,8 @@
 """One store of many maps: time to make, open and ask it, peak memory, and its answers against those of the maps.
 
-    python -m tools speed.store                                       1,000 maps of 60 instances, about 15 minutes
-    python -m tools speed.store --maps 50 --prompts 20
-    pip install lancedb qdrant-edge-py && python -m tools speed.store --compare
+    python tools speed.store                                       1,000 maps of 60 instances, about 15 minutes
+    python tools speed.store --maps 50 --prompts 20
+    pip install lancedb qdrant-edge-py && python tools speed.store --compare
 
 The maps are made: an instance is a ball of points whose embedding is that of a random word of the offline encoder with
 noise, of a random colour. A third of the prompts are such words, a third have a colour, a third are of other things.
@@ -17,7 +17,6 @@ import argparse
 import json
 import resource
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -27,8 +26,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
 
 NOISE = 0.02  # standard deviation per dimension; words then match their instances with cosines as photos' do
 TOP = 1000

@@ -1,4 +1,4 @@
-"""Trains the merge model of the built-in masks on rendered worlds: `python -m tools training.masks WORK`.
+"""Trains the merge model of the built-in masks on rendered worlds: `python tools training.masks WORK`.
 
 Worlds are clutter, rooms, tabletops and patchwork by seed, in sets of six: 24 sets train, two choose the cost and the
 calibration, two are for testing. Each world is read twice, as maps with and without depth images see its surface. A
@@ -15,7 +15,6 @@ import json
 import os
 import pickle
 import shutil
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -24,8 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from perception.bench.output import Column, table
 from perception.masks.boundaries import WEIGHTS as BORDERS

@@ -1,6 +1,6 @@
 """Writes a building: furnished rooms in a row, joined by openings in their walls, with exact truth.
 
-python tests/support/building.py FOLDER [--rooms 6] [--photos 1200] [--size 480x360] [--seed 0]
+python tools worlds.building FOLDER [--rooms 6] [--photos 1200] [--size 480x360] [--seed 0]
 
 The walk goes round each room and on through the opening. FOLDER then holds what tools/worlds/make.py writes.
 """
@@ -10,20 +10,17 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-HOMES = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(HOMES))
-from support.aimed import look_at  # noqa: E402
-from worlds import room, scene  # noqa: E402
-from worlds.cameras import UP, Camera, intrinsics, walk  # noqa: E402
-from worlds.light import Body, Part, Scene, corners  # noqa: E402
-from worlds.shapes import Sheet, to_world  # noqa: E402
+from support.aimed import look_at
+from worlds import room, scene
+from worlds.cameras import UP, Camera, intrinsics, walk
+from worlds.light import Body, Part, Scene, corners
+from worlds.shapes import Sheet, to_world
 
 VIEWS, FOCAL_35MM, POINTS = 1200, 26, 600_000
 OPENING, HIGH, CORNER = 0.95, 2.1, 0.12

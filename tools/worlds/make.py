@@ -1,21 +1,18 @@
 """Writes a made scene with exact truth, or the scene that the package ships for `perception demo`:
 
-python -m tools worlds.make tabletop|room FOLDER [--seed N]
-python -m tools worlds.make shipped perception/demo_scene
+python tools worlds.make tabletop|room FOLDER [--seed N]
+python tools worlds.make shipped perception/demo_scene
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 
-HOMES = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(HOMES))
-from worlds import DemoTruth, make_photos  # noqa: E402
+from worlds import DemoTruth, make_photos
 
 
 def main() -> None:

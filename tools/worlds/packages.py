@@ -1,8 +1,8 @@
-"""Writes a scene of printed words: python tests/support/packages.py FOLDER [SEED] [VIEWS]
+"""Writes a scene of printed words: python tools worlds.packages FOLDER [SEED] [VIEWS]
 
 A table with packages, tins and books that bear words: across, downwards, around a tin, on a spine, partly hidden. Seeds
 select places and turns. The folder then holds what tools/worlds/make.py writes; scene.json has 20 prompts
-with a word in capitals, and as `absent` six whose words are on nothing. `python -m tools score.queries MAP FOLDER`
+with a word in capitals, and as `absent` six whose words are on nothing. `python tools score.queries MAP FOLDER`
 scores them on a map of FOLDER/transforms.json.
 """
 
@@ -16,13 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-HOMES = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(HOMES))
-from worlds import scene, things  # noqa: E402
-from worlds.cameras import orbit  # noqa: E402
-from worlds.light import Body, Scene, bake_all  # noqa: E402
-from worlds.shapes import placed, spin  # noqa: E402
-from worlds.tabletop import FOCAL_35MM, LIGHTING, POINTS, VIEWS, room_around, spots  # noqa: E402
+from worlds import scene, things
+from worlds.cameras import orbit
+from worlds.light import Body, Scene, bake_all
+from worlds.shapes import placed, spin
+from worlds.tabletop import FOCAL_35MM, LIGHTING, POINTS, VIEWS, room_around, spots
 
 __all__ = ["FOCAL_35MM", "POINTS", "VIEWS", "build"]
 

@@ -1,0 +1,44 @@
+"""Runs a script of this folder: `python tools NAME ARGUMENTS`, for example `python tools score.instances SCENE MAP`.
+Without a name it lists them."""
+
+from __future__ import annotations
+
+import ast
+import os
+import runpy
+import sys
+from pathlib import Path
+
+HOME = Path(__file__).resolve().parent
+HELPERS = HOME.parent / "tests"
+"""Some scripts use the tests' helpers, `support`."""
+
+
+def scripts() -> dict[str, str]:
+    """Name -> first sentence of what it says of itself, of every file that can be run."""
+    found = {}
+    for file in sorted(HOME.glob("*/*.py")):
+        text = file.read_text(encoding="utf-8")
+        if '__name__ == "__main__"' in text:
+            words = " ".join((ast.get_docstring(ast.parse(text)) or "").split())
+            found[f"{file.parent.name}.{file.stem}"] = words.partition(". ")[0].partition(": python")[0]
+    return found
+
+
+def main() -> None:
+    known = scripts()
+    if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
+        print(*(f"{name:24} {words}" for name, words in known.items()), sep="\n")
+        return
+    name = sys.argv.pop(1)
+    if name not in known:
+        sys.exit(f"tools: no script {name}; python tools lists them")
+    homes = [str(HOME), str(HELPERS)]
+    sys.path[:1] = homes
+    os.environ["PYTHONPATH"] = os.pathsep.join([*homes, *filter(None, [os.environ.get("PYTHONPATH")])])  # of children
+    sys.argv[0] = name
+    runpy.run_module(name, run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main()
