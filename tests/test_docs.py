@@ -20,11 +20,12 @@ import perception
 from bench import run
 from perception.bench import rasterizer
 from perception.cli import build_parser, main
+from support.paths import tracked_files
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "launch/README.md", ROOT / "calib/README.md"]
 
-SCRIPT = re.compile(r"\bpython (tests/[a-z_/]+\.py)")
+SCRIPT = re.compile(r"\bpython tools ([a-z_]+\.[a-z_]+)")
 
 # Run elsewhere: servers by their own tests, calibration on rendered boards, bags on written ones, models on built ones.
 ELSEWHERE = {"demo", "serve", "mcp", "node", "view", "bench", "calibrate", "frames", "models"}
@@ -62,7 +63,7 @@ def test_documented_commands_are_understood(page: str, command: str, capsys: pyt
 @pytest.mark.parametrize("script", sorted({name for page in PAGES for name in SCRIPT.findall(page.read_text("utf-8"))}))
 def test_documented_scripts_find_what_they_import(script: str, tmp_path: Path) -> None:
     """From any folder, with the package installed and nothing set."""
-    code = f"import runpy; runpy.run_path({str(ROOT / script)!r}, run_name='imported')"
+    code = f"import runpy; runpy.run_path({str(ROOT / 'tools/__main__.py')!r})['run']({script!r}, 'imported')"
     environment = {**os.environ, "PYTHONPATH": str(Path(perception.__file__).parents[1])}
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -71,7 +72,7 @@ def test_documented_scripts_find_what_they_import(script: str, tmp_path: Path) -
 def test_no_line_installs_the_stranger_called_perception() -> None:
     """That name on the package index is another project; ours is installed from a clone, as `.`."""
     kinds = {".py", ".md", ".toml", ".sh", ".yaml", ".yml", ".service", ".txt", ".cff"}
-    files = [path for path in ROOT.rglob("*") if path.suffix in kinds and ".git" not in path.parts]
+    files = [path for path in tracked_files() if path.suffix in kinds]
     assert len(files) > 200
     found = [path for path in files if re.search(r"install\W+perception\b", path.read_text(encoding="utf-8"))]
     assert not found

@@ -21,8 +21,16 @@ def scripts() -> dict[str, str]:
         text = file.read_text(encoding="utf-8")
         if '__name__ == "__main__"' in text:
             words = " ".join((ast.get_docstring(ast.parse(text)) or "").split())
-            found[f"{file.parent.name}.{file.stem}"] = words.partition(". ")[0].partition(": python")[0]
+            found[f"{file.parent.name}.{file.stem}"] = words.partition(". ")[0]
     return found
+
+
+def run(name: str, run_name: str = "__main__") -> None:
+    """Runs script `name`, or under another `run_name` only reads it. Processes that it starts find the same modules."""
+    homes = [str(HOME), str(HELPERS)]
+    sys.path[:0] = homes
+    os.environ["PYTHONPATH"] = os.pathsep.join([*homes, *filter(None, [os.environ.get("PYTHONPATH")])])
+    runpy.run_module(name, run_name=run_name, alter_sys=True)
 
 
 def main() -> None:
@@ -33,11 +41,8 @@ def main() -> None:
     name = sys.argv.pop(1)
     if name not in known:
         sys.exit(f"tools: no script {name}; python tools lists them")
-    homes = [str(HOME), str(HELPERS)]
-    sys.path[:1] = homes
-    os.environ["PYTHONPATH"] = os.pathsep.join([*homes, *filter(None, [os.environ.get("PYTHONPATH")])])  # of children
     sys.argv[0] = name
-    runpy.run_module(name, run_name="__main__", alter_sys=True)
+    run(name)
 
 
 if __name__ == "__main__":
