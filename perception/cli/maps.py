@@ -71,16 +71,19 @@ def register(commands: Any) -> None:
 
 def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.query import load_map
-    from perception.report.text import query_text, write_hits
+    from perception.report.text import guessed_names, query_text, write_hits
 
     opened = load_map(args.map)
     answers = [(text, opened.query(text, args.top, args.min_score)) for text in args.text]
-    if args.points and any(hit.map is not None for _, hits in answers for hit in hits):
+    of_store = any(hit.map is not None for _, hits in answers for hit in hits)
+    if args.points and of_store:
         raise InputError(f"{args.map}: is a store, whose maps have their own frames; give --points with one map")
     if args.points:
         write_hits(args.points, [hit for _, hits in answers for hit in hits])
     results = [{"text": text, "present": bool(hits), "hits": [h.to_json() for h in hits]} for text, hits in answers]
-    return {"results": results, "frame": opened.frame, "metric": opened.metric}, query_text(answers, opened.metric)
+    guessed = {} if args.json or of_store else guessed_names(opened)
+    shown = query_text(answers, opened.metric, guessed)
+    return {"results": results, "frame": opened.frame, "metric": opened.metric}, shown
 
 
 def _index(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

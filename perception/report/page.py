@@ -30,7 +30,7 @@ from perception.pictures import error_map, features_to_rgb, outline, overlay, ti
 from perception.progress import Progress
 from perception.query import QueryMap, load_map
 from perception.query.hit import printed_texts
-from perception.report.text import depth_text
+from perception.report.text import depth_figures
 
 SHOWN = ("worst", "middle", "best")
 """Held-out views shown beside their photos, by PSNR."""
@@ -213,7 +213,8 @@ def _figures(gmap: Map) -> dict[str, str]:
     if "psnr" in info["quality"]:
         figures |= {"Held-out PSNR": f"{info['quality']['psnr']:.2f} dB", "SSIM": f"{info['quality']['ssim']:.3f}"}
     if info["quality"].get("depth"):
-        figures["Held-out depth"] = depth_text(info["quality"]["depth"])
+        median, share, tolerance = depth_figures(info["quality"]["depth"])
+        figures |= {"Median depth error": median, f"Depth within {tolerance}": share}
     figures["Time"] = f"{info['seconds']['total']:.0f} s"
     figures["Peak memory"] = f"{info['peak_memory_mib']:.0f} MiB"
     return figures

@@ -42,8 +42,8 @@ def world(kitchen: Path) -> Iterator[dict[str, Any]]:
     """The names after all Python snippets have run, a server at the port they speak of."""
     before = read_map(kitchen)
     patch = pytest.MonkeyPatch()
-    for module in ("text_ranking", "engine", "map_store", "indexing"):
-        patch.setattr(f"perception.query.{module}.make_encoder", encoders)
+    for module in ("query.text_ranking", "serve.engine", "query.map_store", "query.indexing"):
+        patch.setattr(f"perception.{module}.make_encoder", encoders)
     patch.chdir(kitchen.parent)
     names: dict[str, Any] = {"before": before}
     free, far = np.ones((2, 2, 5), np.uint8), np.arange(20, dtype=np.float32).reshape(2, 2, 5) / 10

@@ -207,7 +207,8 @@ def test_files_cut_in_place_while_served_do_not_end_the_process(path: Path) -> N
     """Whoever reads a mapped page behind the end of a cut file dies by SIGBUS, so answers must need none."""
     code = (
         "import sys; from pathlib import Path; from support.query_maps import NAMES, encoders\n"
-        "from perception.query import QueryEngine, Where\n"
+        "from perception.query import Where\n"
+        "from perception.serve.engine import QueryEngine\n"
         "path = Path(sys.argv[1])\n"
         "with QueryEngine(path, watch=None, encoders=encoders) as engine:\n"
         "    for file in path.iterdir():\n        file.open('r+b').truncate(0)\n"
