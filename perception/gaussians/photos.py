@@ -9,15 +9,23 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import torch
 
+from perception.config import PhotoConfig
 from perception.errors import InputError
 from perception.gaussians.train import TrainingView
 from perception.io.memory import Keep
-from perception.masks.label_images import load_labels
+from perception.masks.label_files import load_labels
 from perception.photos.decode import load_photo, scaled_K
 from perception.photos.depth import load_depth, without_edges
 from perception.photos.ignore_masks import load_weight
 from perception.progress import Progress
-from perception.types import View
+from perception.types import Scene, View
+
+
+def split_scene(scene: Scene, options: PhotoConfig) -> tuple[Scene, list[View], list[View]]:
+    """(the scene with its views sorted by name, training views, held-out views as exposed as their neighbours)."""
+    training, held_out = split_views(scene.views, options.holdout, options.held_out)
+    held_out = exposed_as_neighbours(held_out, training)
+    return replace(scene, views=sorted([*training, *held_out], key=lambda view: view.name)), training, held_out
 
 
 def split_views(views: list[View], holdout: int, listed: str | None = None) -> tuple[list[View], list[View]]:

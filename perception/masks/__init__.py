@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from perception.masks.label_images import compute_masks, load_labels
-from perception.masks.source import MaskSource, make_source
+from perception.masks.base import MaskSource
+from perception.masks.compute import compute_masks
+from perception.masks.label_files import load_labels
+from perception.masks.sources import make_source
 
 __all__ = ["MaskSource", "compute_masks", "load_labels", "make_source"]

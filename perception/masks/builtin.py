@@ -5,7 +5,6 @@ Label ids are consistent across photos, because every photo shows the same segme
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import move_points
 from perception.io.memory import Keep
+from perception.masks.base import LoadImage, MaskSource
 from perception.masks.boundaries import WEIGHTS, boundaries, read_layers
 from perception.masks.merging import Segmentation, segmentation
 from perception.masks.stereo import StereoView, make_stereo_view, measure_depths
@@ -26,8 +26,10 @@ _SMOOTH = 0.03  # relative to the depth: a pixel with a larger depth step is not
 _LEAST_VOXELS = 100
 
 
-class BuiltinSegmentation:
+class BuiltinSegmentation(MaskSource):
     """Segments whole objects in all photos jointly. Needs approximate depth of every photo, which the map renders."""
+
+    needs_depth = True
 
     def __init__(self) -> None:
         import cv2
@@ -42,25 +44,21 @@ class BuiltinSegmentation:
         self._views: dict[str, StereoView] = {}
         self._segment = np.zeros(0, np.int32)
 
-    def check(self, views: list[View]) -> list[str]:
-        """Returns no warnings: nothing is known about the views before `survey`."""
-        return []
-
-    def survey(
+    def prepare(
         self,
         views: list[View],
-        load_photo: Callable[[View], np.ndarray],
-        load_depth: Callable[[View], np.ndarray],
-        progress: Progress | None = None,
+        load_photo: LoadImage,
+        load_depth: LoadImage,
+        progress: Progress = QUIET,
         keep: Keep = np.asarray,
     ) -> Segmentation | None:
-        """Segments the surface seen by all photos jointly. load_depth: view -> [h, w] z-depth, 0 = none.
-        There are no segments, None, if fewer than two photos have depth, or if no depths agree."""
+        """Segments the surface seen by all photos jointly; None if fewer than two photos have depth, or no depths
+        agree."""
         made = [make_stereo_view(view, load_photo(view), load_depth(view), keep) for view in views]
         found = [view for view in made if view is not None]
         if len(found) < 2:
             return None
-        measure_depths(found, progress or QUIET)
+        measure_depths(found, progress)
         surface = fuse(found)
         if len(surface) < _LEAST_VOXELS:
             return None
@@ -71,7 +69,7 @@ class BuiltinSegmentation:
         return cuts
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
-        """[H, W] int32 labels of `photo` [H, W, 3], after `survey`. All 0 if the photo does not show the surface."""
+        """[H, W] int32 labels of `photo` [H, W, 3], after `prepare`. All 0 if the photo does not show the surface."""
         import cv2
         from scipy.ndimage import distance_transform_edt
 

@@ -9,13 +9,14 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.documents import safe_name
-from perception.masks.label_images import read_labels, read_png_header
+from perception.masks.base import MaskSource
+from perception.masks.label_files import read_labels, read_png_header
 from perception.types import View
 
 _COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGB with alpha"}
 
 
-class LabelFolder:
+class LabelFolder(MaskSource):
     """Label images read from a folder. The photo `a/0001.jpg` uses `a/0001.png`, or `0001.png` if stems are unique.
     Format: 8 or 16 bit grey, or an 8-bit palette whose index is the label. 0 = unlabelled."""
 

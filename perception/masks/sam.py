@@ -20,6 +20,7 @@ import numpy as np
 
 from perception.config import SamConfig
 from perception.cores import cores
+from perception.masks.base import MaskSource
 from perception.masks.sam_models import SamModel, open_sam
 from perception.types import View
 
@@ -50,8 +51,10 @@ class SamMask:
         return np.unpackbits(bits, count=self.shape[0] * self.shape[1]).reshape(self.shape).astype(bool)
 
 
-class SamSource:
+class SamSource(MaskSource):
     """The mask source of `sam:PATH`. The constructor opens the models and checks their signatures."""
+
+    remote = True
 
     def __init__(self, spec: str, settings: SamConfig) -> None:
         self.photos_at_once = min(cores(), AT_ONCE)

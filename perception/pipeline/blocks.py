@@ -1,4 +1,4 @@
-"""Large places: cut into overlapping blocks by what the cameras see, optimised block by block, joined to one model.
+"""Large scenes: cut into overlapping blocks by what the cameras see, optimised block by block, joined to one model.
 
 A block owns a box of space; the boxes tile the space. It is trained on all photos that see enough of its box or were
 taken in it, from nothing but these, so it comes out the same wherever it runs. The joined model takes from each block
@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -23,25 +23,25 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.nearby import Nearby
 from perception.gaussians.size import sized
 from perception.gaussians.train import TrainRecord
+from perception.gaussians.views import surface_depth
 from perception.geometry import camera_centres
 from perception.io.atomic import writing
-from perception.masks import make_source
+from perception.masks import MaskSource, make_source
 from perception.pipeline.checkpoint import BEFORE_MASKS, CHECKPOINT, digest, load_checkpoint, save_checkpoint
 from perception.pipeline.estimate import largest_budget, memory_limit
-from perception.pipeline.optimise import Photos, Run, optimise
-from perception.progress import Progress
-from perception.tasks.engine import Engine
+from perception.pipeline.optimise import Optimised, Photos, Run, label_by_tasks, label_photos, optimise
+from perception.progress import QUIET, Progress
 from perception.tasks.folder import has_task, read_task, write_task
 from perception.types import Scene, View
 
 SAMPLE = 20_000
-"""Sparse points by which the place is cut."""
+"""Sparse points by which the scene is cut."""
 GRID, HIDDEN = 16, 1.3
 """A point is hidden from a photo if it is HIDDEN times as far as the nearest point in its cell of GRID × GRID."""
 SEEN = 0.15
 """Least share of a photo's points in a block's box for which the block is trained on a photo from outside."""
 LEAST_GAIN = 0.85
-"""Largest share of a block's photos that either half may have after a cut; a place that all photos see stays whole."""
+"""Largest share of a block's photos that either half may have after a cut; a scene that all photos see is not cut."""
 APART = 4.0
 """Distance between the features of two blocks, which are not comparable: more than the loss's margin of 1."""
 ONES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint8)
@@ -64,7 +64,7 @@ class Block:
 
 def cut(scene: Scene, most: int) -> list[Block]:
     """Blocks of at most about `most` photos each, together all photos; one block where that is enough, with most = 0,
-    and where the cameras' view of the place cannot be cut.
+    and where what the cameras see cannot be divided.
 
     A block is halved at the plane, of those at several quantiles of its points along each axis, for which the larger
     half has the fewest photos, if that is at most LEAST_GAIN of the block's.
@@ -138,18 +138,25 @@ def _divided(
     return sides
 
 
+def optimiser(scene: Scene, most: int) -> Callable[[Run, Scene, list[View], list[View], MaskSource], Optimised]:
+    """`optimise` for a scene that is trained in one piece, `optimise_blocks` for a larger one. most: see `cut`."""
+    blocks = cut(scene, most)
+    return optimise if len(blocks) == 1 else partial(optimise_blocks, blocks)
+
+
 def optimise_blocks(
-    run: Run, scene: Scene, blocks: Sequence[Block], held_out: Sequence[View], from_geometry: bool, engine: Engine
-) -> tuple[Nearby, TrainRecord, list[dict[str, Any]]]:
-    """The joined Gaussians of all blocks, with those near each photo; their training's record, a report of each block.
+    blocks: Sequence[Block], run: Run, scene: Scene, training: list[View], held_out: list[View], source: MaskSource
+) -> Optimised:
+    """Trains all blocks and joins their Gaussians, then labels all photos.
 
     Each block is a task of the engine, in its own folder below `run.work`. A task that is finished is not run again.
-    from_geometry: masks are made from a block's own depth, and not once per photo.
+    A block makes masks of its own where they need depth; others are made once per photo.
     """
+    label_by_tasks(run, training, source)
     held = {view.name for view in held_out}
-    folders = [_task(run, scene, block, held, from_geometry) for block in blocks]
+    folders = [_task(run, scene, block, held, source.needs_depth) for block in blocks]
     with run.stage("train"):
-        engine.run(optimise_block, [str(folder.resolve()) for folder in folders], "block", run.progress)
+        run.engine.run(optimise_block, [str(folder.resolve()) for folder in folders], "block", run.progress)
     parts, records, reports = [], [], []
     for folder, block in zip(folders, blocks, strict=True):
         state = load_checkpoint(folder / RESULT, folder.name)
@@ -163,7 +170,10 @@ def optimise_blocks(
         counts = {"photos": len(block.views), "gaussians": len(own), "trained": len(gaussians)}
         reports.append({**counts, "iterations": record.iterations, "box": box})
     rows = nearby_rows(scene, blocks, [len(part) for part in parts])
-    return Nearby(joined(parts).to(run.device), rows), TrainRecord.joined(records), reports
+    nearby = Nearby(joined(parts).to(run.device), rows)
+    photos = Photos.load(run, training, held_out)
+    photos, masks = label_photos(run, photos, source, lambda view: surface_depth(nearby.of(view.name)[0], view))
+    return Optimised(nearby, photos, TrainRecord.joined(records), masks, reports)
 
 
 def nearby_rows(scene: Scene, blocks: Sequence[Block], counts: Sequence[int]) -> dict[str, list[np.ndarray]]:
@@ -194,7 +204,7 @@ def joined(parts: Sequence[Gaussians]) -> Gaussians:
     return Gaussians.concatenate(placed)
 
 
-def _task(run: Run, scene: Scene, block: Block, held: set[str], from_geometry: bool) -> Path:
+def _task(run: Run, scene: Scene, block: Block, held: set[str], own_masks: bool) -> Path:
     """Writes the task of a block: the part of the scene that it is trained on, and the settings. Returns its folder."""
     views = [scene.views[i] for i in block.views]
     names = [view.name for view in views]
@@ -211,12 +221,12 @@ def _task(run: Run, scene: Scene, block: Block, held: set[str], from_geometry: b
             config=sized(run.config, len(set(names) - held), largest_budget(memory_limit())).to_json(),  # the driver's
             held_out=sorted(held & set(names)),
             box=box,
-            masks=str((folder / "masks" if from_geometry else run.masks).resolve()),
+            masks=str((folder / "masks" if own_masks else run.masks).resolve()),
         )
     return folder
 
 
-def optimise_block(folder: str, progress: Progress | None = None) -> None:
+def optimise_block(folder: str, progress: Progress = QUIET) -> None:
     """Trains the block whose task lies in `folder`, and writes RESULT there. Goes on from its checkpoint, if any."""
     home = Path(folder)
     if load_checkpoint(home / RESULT, home.name) is not None:
@@ -225,14 +235,14 @@ def optimise_block(folder: str, progress: Progress | None = None) -> None:
     config = MapConfig.model_validate(facts["config"])
     with writing(home / RESULT):
         device = choose_device(config.device)[0]
-        run = Run(Path(facts["source"]), config, home, Path(facts["masks"]), device, progress or Progress(quiet=True))
+        run = Run(Path(facts["source"]), config, home, Path(facts["masks"]), device, progress)
         held = set(facts["held_out"])
         training = [view for view in scene.views if view.name not in held]
-        photos = Photos.load(run, training, [view for view in scene.views if view.name in held])
+        held_out = [view for view in scene.views if view.name in held]
         source, box = make_source(config.masks, config.sam), np.array(facts["box"])
-        nearby, record, _ = optimise(run, scene, photos, source, box)
-        gaussians = nearby.gaussians.to("cpu")
+        optimised = optimise(run, scene, training, held_out, source, box)
+        gaussians = optimised.nearby.gaussians.to("cpu")
         state = {"gaussians": {name: tensor.contiguous() for name, tensor in vars(gaussians).items()}}
-        save_checkpoint(home / RESULT, {**state, "record": asdict(record)}, home.name)
+        save_checkpoint(home / RESULT, {**state, "record": asdict(optimised.record)}, home.name)
         for name in (CHECKPOINT, BEFORE_MASKS):
             (home / name).unlink(missing_ok=True)

@@ -18,32 +18,26 @@ from perception.frame.place import placed_scene
 from perception.frame.recentre import recentred
 from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians
-from perception.gaussians.photos import exposed_as_neighbours, split_views
-from perception.gaussians.views import TrainingView, psnr, render_view, surface_depth
+from perception.gaussians.photos import split_scene
 from perception.inputs.load import load_saved_scene, load_scene, save_scene
 from perception.language.base import Encoder
-from perception.language.ocr import make_reader
+from perception.language.ocr import TextReader, make_reader
 from perception.map.files import read_info
 from perception.map.write import Map, read_map, write_map
-from perception.masks import make_source
-from perception.masks.builtin import BuiltinSegmentation
-from perception.masks.label_images import load_segmentation
+from perception.masks import MaskSource, make_source
+from perception.masks.compute import load_segmentation
 from perception.photos.reading import Reading
 from perception.photos.view_json import stored_view
-from perception.pipeline.blocks import cut, optimise_blocks
+from perception.pipeline.blocks import optimiser
 from perception.pipeline.checkpoint import clear_work, fingerprint, frames_folder, poses_mark, working
 from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
-from perception.pipeline.optimise import Photos, Run, label_by_tasks, label_photos, optimise
-from perception.pipeline.record import depth_errors, depth_used, finite, peak_memory_mib
+from perception.pipeline.optimise import Run
+from perception.pipeline.record import finite, run_record, score_views
 from perception.progress import QUIET, Progress
 from perception.report.text import depth_text, frame_lines
 from perception.tasks.engine import Engine
-from perception.tasks.folder import versions
 from perception.types import Scene, View
-
-FRAME_FACTS = ("map_from_input", "scale", "gravity")
-"""Entries of a scene's report that map.json holds at its top level."""
 
 
 def build_map(
@@ -71,91 +65,64 @@ def build_map(
 
     with working(source, output, resume) as work:
         # Files, models and devices are opened first, so that errors appear before hours of work.
-        device, told = choose_device(config.device)
-        if told is not None:
-            progress.log(told)
-        mask_source = make_source(config.masks, config.sam)
-        encoder = _encoder(config.language.encoder, progress)
-        reader = make_reader(config.language.texts)
-        run = Run(source, config, work, work / "masks", device, progress)
-        where = engine or Engine()
+        run = _open_run(source, config, work, progress, engine)
+        masks, encoder, reader = _open_models(run)
 
         # Posed images I_v (§3.2) and a sparse cloud.
         with run.stage("poses"):
-            scene = _scene(source, output, run, where)
-        _tell_scene(scene, progress)
-        training, held_out = split_views(scene.views, config.photos.holdout, config.photos.held_out)
-        held_out = exposed_as_neighbours(held_out, training)
-        scene = replace(scene, views=sorted([*training, *held_out], key=lambda view: view.name))
-        blocks, from_geometry = cut(scene, config.train.block_photos), isinstance(mask_source, BuiltinSegmentation)
+            scene = _posed_scene(output, run)
+        _log_scene(scene, progress)
+        scene, training, held_out = split_scene(scene, config.photos)
 
-        label_by_tasks(run, training, mask_source, where)
-
-        # Optimise Gaussians on the photos and their masks (§3.1 to 3.2.3), block by block in a large place.
-        if len(blocks) == 1:
-            photos = Photos.load(run, training, held_out)
-            nearby, trained, mask_report = optimise(run, scene, photos, mask_source)
-            of_blocks: list[dict[str, Any]] = []
-        else:
-            nearby, trained, of_blocks = optimise_blocks(run, scene, blocks, held_out, from_geometry, where)
-            photos = Photos.load(run, training, held_out)
-            mask_report = label_photos(
-                run, photos, mask_source, lambda view: surface_depth(nearby.of(view.name)[0], view)
-            )
-        del mask_source  # with the views of stereo
+        # Masks M_v,i of every photo (§3.2), and Gaussians optimised on photos and masks (§3.1 to 3.2.3).
+        optimise = optimiser(scene, config.train.block_photos)
+        optimised = optimise(run, scene, training, held_out, masks)
+        segments = load_segmentation(run.masks) if masks.needs_depth else None
+        del masks  # with its images
 
         # Group the Gaussians by their features into instances (§3.2.1), describe these from their best views (§3.2.2).
         with run.stage("instances"):
-            cuts = load_segmentation(run.masks) if from_geometry else None
-            grouped = group_gaussians(nearby, photos.views, run, cuts)
-            found = describe(nearby, grouped, photos.views, run, encoder, reader)
-        gaussians = nearby.gaussians.to("cpu")
+            grouped = group_gaussians(optimised.nearby, optimised.photos.views, run, segments)
+            found = describe(optimised.nearby, grouped, optimised.photos.views, run, encoder, reader)
 
         with run.stage("score"):
-            quality = score_views(gaussians, photos.held, scene.metric)
-        record = {
-            "frame": scene.frame,
-            "metric": scene.metric,
-            **{key: scene.report[key] for key in FRAME_FACTS if key in scene.report},
-            "source": origin or str(source),
-            "seed": config.seed,
-            "fingerprint": fingerprint(source, config),
-            "config": config.to_json(),
-            "versions": versions(),
-            "scene": {key: fact for key, fact in scene.report.items() if key not in FRAME_FACTS},
-            "masks": mask_report,
-            "depth": depth_used(photos.views),
-            "training": vars(trained),
-            **({"blocks": of_blocks} if of_blocks else {}),
-            "instances": found.report,
-            "quality": quality,
-            "seconds": {name: round(s, 2) for name, s in (*run.seconds.items(), ("total", time.monotonic() - started))},
-            "peak_memory_mib": peak_memory_mib(),
-        }
-        gmap = _assemble(gaussians, found, scene, held_out, record, output)
+            gaussians = optimised.nearby.gaussians.to("cpu")
+            quality = score_views(gaussians, optimised.photos.held, scene.metric)
+        info = run_record(run, scene, optimised, found.report, quality, time.monotonic() - started)
+        gmap = _assemble(gaussians, found, scene, held_out, {**info, "source": origin or str(source)}, output)
         write_map(output, gmap)
-    _tell_result(gmap, output, progress)
+    _log_result(gmap, output, progress)
     return gmap
 
 
 # ----------------------------------------------------------------------- stages
 
 
-def _encoder(spec: str, progress: Progress) -> Encoder | None:
-    """The image-text encoder; None if disabled, or if "auto" finds none."""
+def _open_run(source: Path, config: MapConfig, work: Path, progress: Progress, engine: Engine | None) -> Run:
+    device, line = choose_device(config.device)
+    if line is not None:
+        progress.log(line)
+    return Run(source, config, work, work / "masks", device, progress, engine or Engine())
+
+
+def _open_models(run: Run) -> tuple[MaskSource, Encoder | None, TextReader | None]:
+    """The source of masks; the image-text encoder, None if disabled or if "auto" has none; the reader of texts."""
     from perception.language.encoders import make_encoder
 
+    config, encoder = run.config, None
+    masks, spec = make_source(config.masks, config.sam), config.language.encoder
     try:
-        return make_encoder("conse" if spec == "auto" else spec)
+        encoder = make_encoder("conse" if spec == "auto" else spec)
     except InputError as error:
         if spec != "auto":
             raise
-        progress.log(f"warning: no language: {error}")
-        return None
+        run.progress.log(f"warning: no language: {error}")
+    return masks, encoder, make_reader(config.language.texts)
 
 
-def _scene(source: Path, output: Path, run: Run, engine: Engine) -> Scene:
-    config, work, progress = run.config, run.work, run.progress
+def _posed_scene(output: Path, run: Run) -> Scene:
+    """The scene of the input in the map's frame: read from the work folder, or made and kept there."""
+    source, config, work, progress = run.source, run.config, run.work, run.progress
     kept = work / f"poses-{poses_mark(source, config)}"
     scene = load_saved_scene(kept)
     if scene is None:
@@ -165,32 +132,12 @@ def _scene(source: Path, output: Path, run: Run, engine: Engine) -> Scene:
             Path(p) if p else None for p in (photos.ignore_masks, photos.camera, photos.init_points)
         )
         how = Reading(work / "sfm", config.seed, progress, photos.strict, masks, camera, poses=photos.poses)
-        how = replace(how, frames=frames_folder(output), init_points=cloud, engine=engine)
+        how = replace(how, frames=frames_folder(output), init_points=cloud, engine=run.engine)
         scene = load_scene(source, how)
         save_scene(kept, scene := placed_scene(recentred(scene), config.frame, config.seed))
     if config.losses.depth_weight == 0:
         return replace(scene, views=[replace(view, depth=None) for view in scene.views])
     return scene
-
-
-def score_views(gaussians: Gaussians, views: list[TrainingView], metric: bool = False) -> dict[str, Any]:
-    """PSNR and SSIM of each view without ignored pixels, and their means; empty without views.
-
-    Depth is compared where it was measured; metric: the unit is the metre.
-    """
-    from perception.evaluate.images import ssim
-
-    per_view = {}
-    for view in views:
-        image = render_view(gaussians, view)
-        weight = None if view.weight is None else view.weight.numpy()
-        similarity = ssim(image.numpy().astype(np.float64), view.photo.numpy().astype(np.float64) / 255, weight)
-        per_view[view.name] = {"psnr": psnr(image, view.photo, view.weight), "ssim": float(similarity)}
-    if not per_view:
-        return {"views": {}}
-    means = {name: float(np.mean([entry[name] for entry in per_view.values()])) for name in ("psnr", "ssim")}
-    depth = depth_errors(gaussians, views, metric)
-    return {**means, **({"depth": depth} if depth else {}), "views": per_view}
 
 
 def _assemble(
@@ -218,10 +165,10 @@ def _assemble(
     )
 
 
-# ----------------------------------------------------------------------- words
+# ----------------------------------------------------------------------- log
 
 
-def _tell_scene(scene: Scene, progress: Progress) -> None:
+def _log_scene(scene: Scene, progress: Progress) -> None:
     report = scene.report
     with_depth = sum(view.depth is not None for view in scene.views)
     depth = f", {with_depth} with depth" if with_depth else ""
@@ -235,7 +182,7 @@ def _tell_scene(scene: Scene, progress: Progress) -> None:
     progress.log("\n".join(lines))
 
 
-def _tell_result(gmap: Map, output: Path, progress: Progress) -> None:
+def _log_result(gmap: Map, output: Path, progress: Progress) -> None:
     info, quality = gmap.info, gmap.info["quality"]
     scored = f", held-out PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.3f}" if quality.get("psnr") else ""
     scored += f", {depth_text(quality['depth'])}" if "depth" in quality else ""

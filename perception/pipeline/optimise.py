@@ -1,11 +1,11 @@
-"""Optimises the Gaussians of a scene, or of one block of a large place, together with the masks of its photos."""
+"""Optimises the Gaussians of a scene, or of one block of a large scene, together with the masks of its photos."""
 
 from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,12 +23,10 @@ from perception.gaussians.train import Trainer, TrainingView, TrainRecord
 from perception.gaussians.views import surface_depth
 from perception.io.memory import DiskArrays, Keep, return_free_memory
 from perception.masks import MaskSource, compute_masks, make_source
-from perception.masks.builtin import BuiltinSegmentation
-from perception.masks.sam import SamSource
 from perception.photos.decode import load_photo
 from perception.pipeline.checkpoint import TrainingObserver, digest, training_mark
 from perception.pipeline.estimate import image_memory, largest_budget, memory_limit
-from perception.progress import Progress, timed
+from perception.progress import QUIET, Progress, timed
 from perception.tasks.engine import Engine
 from perception.tasks.folder import has_task, read_task, write_task
 from perception.types import Scene, View
@@ -42,7 +40,7 @@ PHOTOS_A_TASK = 8
 @dataclass
 class Run:
     """What every stage of a run needs. source: the input; work: its folder of intermediate results; masks: the folder
-    of label images; seconds: of each stage so far."""
+    of label images; engine: where tasks run; seconds: of each stage so far."""
 
     source: Path
     config: MapConfig
@@ -50,6 +48,7 @@ class Run:
     masks: Path
     device: torch.device
     progress: Progress
+    engine: Engine = field(default_factory=Engine)
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -70,7 +69,7 @@ class Run:
         return training_mark(self.source, self.config)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Photos:
     """The photos of a run: posed (training, held_out), and decoded at training size (views, held)."""
 
@@ -87,40 +86,63 @@ class Photos:
             views = load_all(training, side, run.progress, run.keep)
             return cls(training, held_out, views, load_all(held_out, side, run.progress, run.keep))
 
+    def labelled(self, folder: Path) -> Photos:
+        """The same photos, those of `views` with their label images in `folder`."""
+        pairs = zip(self.views, self.training, strict=True)
+        return replace(self, views=[with_labels(decoded, view, folder) for decoded, view in pairs])
+
+
+@dataclass(frozen=True)
+class Optimised:
+    """What training gives: the Gaussians, the photos with their labels, the training's record, the report of the masks,
+    and a report of each block of a large scene."""
+
+    nearby: Nearby
+    photos: Photos
+    record: TrainRecord
+    masks: dict[str, Any]
+    blocks: list[dict[str, Any]] = field(default_factory=list)
+
 
 def optimise(
-    run: Run, scene: Scene, photos: Photos, source: MaskSource, box: np.ndarray | None = None
-) -> tuple[Nearby, TrainRecord, dict[str, Any]]:
-    """The trained Gaussians, the training's record and the masks' report; `photos.views` then have labels.
+    run: Run,
+    scene: Scene,
+    training: list[View],
+    held_out: list[View],
+    source: MaskSource,
+    box: np.ndarray | None = None,
+) -> Optimised:
+    """Trains the Gaussians of a scene, or of the block of one that owns `box` (see `Trainer`).
 
-    Goes on from the checkpoint in `run.work`, if there is one. box: of a block, see `Trainer`.
+    Goes on from the checkpoint in `run.work`, if there is one.
     """
+    label_by_tasks(run, training, source)
+    photos = Photos.load(run, training, held_out)
     config = sized(run.config, len(photos.views), largest_budget(memory_limit()))
     start = initial_gaussians(scene, config, photos.views)
     trainer = Trainer(start, photos.views, config, photos.held, run.device, box)
     if config != run.config:
         size = f"{config.train.iterations} iterations, at most {config.train.budget} Gaussians"
         trainer.record.decisions.append(f"size: {size}, for {len(photos.views)} photos")
-    from_geometry = isinstance(source, BuiltinSegmentation)
-    masks_enter = GEOMETRY_START if from_geometry else config.losses.start
+    masks_enter = GEOMETRY_START if source.needs_depth else config.losses.start
     observer = TrainingObserver(run.work, run.mark, source.identity, masks_enter, run.progress)
     observer.take_up(trainer)
 
     # Instance masks M_v,i of every photo (§3.2). Some need the depth of the map, which is then trained first.
-    if from_geometry and trainer.progress < GEOMETRY_START:
+    if source.needs_depth and trainer.progress < GEOMETRY_START:
         with run.stage("train"):
             trainer.run(observer, until=GEOMETRY_START)
-    report = label_photos(run, photos, source, partial(surface_depth, trainer.gaussians))
+    photos, report = label_photos(run, photos, source, partial(surface_depth, trainer.gaussians))
     trainer.show(photos.views)
 
     # Optimise colours and features together: L_RGB + λ_inst2d L_inst2d + λ_var L_var (§3.1 to 3.2.3, eq. 14).
     with run.stage("train"):
         trainer.run(observer)
-    found = Nearby(trainer.gaussians), trainer.record, report
+    optimised = Optimised(Nearby(trainer.gaussians), photos, trainer.record, report)
     del trainer, observer
     gc.collect()  # a trainer and its schedule refer to each other, and to all photos
     return_free_memory()
-    return found
+    return optimised
 
 
 def initial_gaussians(scene: Scene, config: MapConfig, views: Sequence[TrainingView] = ()) -> Gaussians:
@@ -138,10 +160,9 @@ def initial_gaussians(scene: Scene, config: MapConfig, views: Sequence[TrainingV
     return from_points(points, colors, feature_dim=feature_dim, seed=seed)
 
 
-def label_by_tasks(run: Run, views: Sequence[View], source: MaskSource, engine: Engine) -> None:
-    """Has the label images of `views` made on other machines where they are slow and need nothing but the photo: by a
-    model. `label_photos` then finds them."""
-    if engine.kind == "local" or not isinstance(source, SamSource):
+def label_by_tasks(run: Run, views: Sequence[View], source: MaskSource) -> None:
+    """Has the label images of `views` made on other machines where that pays. `label_photos` then finds them."""
+    if run.engine.kind == "local" or not source.remote:
         return
     folders = []
     for start in range(0, len(views), PHOTOS_A_TASK):
@@ -151,10 +172,10 @@ def label_by_tasks(run: Run, views: Sequence[View], source: MaskSource, engine: 
             scene = Scene(some, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
             write_task(folders[-1], scene, config=run.config.to_json(), masks=str(run.masks.resolve()))
     with run.stage("masks"):
-        engine.run(label_task, [str(folder.resolve()) for folder in folders], "photo set", run.progress)
+        run.engine.run(label_task, [str(folder.resolve()) for folder in folders], "photo set", run.progress)
 
 
-def label_task(folder: str, progress: Progress | None = None) -> None:
+def label_task(folder: str, progress: Progress = QUIET) -> None:
     """Makes the label images of the photos whose task lies in `folder`, where they are missing or out of date."""
     scene, facts = read_task(Path(folder))
     config = MapConfig.model_validate(facts["config"])
@@ -165,12 +186,12 @@ def label_task(folder: str, progress: Progress | None = None) -> None:
 
 def label_photos(
     run: Run, photos: Photos, source: MaskSource, depth: Callable[[TrainingView], np.ndarray]
-) -> dict[str, Any]:
-    """Gives `photos.views` their label images, which are made where they are missing or out of date; their report.
+) -> tuple[Photos, dict[str, Any]]:
+    """The photos with their label images, which are made where they are missing or out of date, and their report.
 
-    depth: depth image of a view, for masks from geometry.
+    depth: depth image of a view, for sources that need it.
     """
-    side, from_geometry = run.config.photos.max_side, isinstance(source, BuiltinSegmentation)
+    side = run.config.photos.max_side
     by_name = {view.name: view for view in photos.views}
     with run.stage("masks"):
         report = compute_masks(
@@ -179,12 +200,10 @@ def label_photos(
             lambda view: load_photo(view, side),
             run.masks,
             run.progress,
-            load_depth=(lambda view: depth(by_name[view.name])) if from_geometry else None,
-            depth_key=f"{run.mark} at progress {GEOMETRY_START}" if from_geometry else f"{side} px",
+            load_depth=lambda view: depth(by_name[view.name]),
+            depth_key=f"{run.mark} at progress {GEOMETRY_START}" if source.needs_depth else f"{side} px",
             keep=run.keep,
         )
         for warning in report["warnings"]:
             run.progress.log(f"warning: {warning}")
-        labelled = zip(photos.views, photos.training, strict=True)
-        photos.views = [with_labels(view, of, run.masks) for view, of in labelled]
-    return report
+        return photos.labelled(run.masks), report

@@ -1,24 +1,21 @@
-"""Run record: peak memory, and what a run made of depth images: how much was measured, and
-how far rendered depth is from it.
-"""
+"""What map.json holds of a run: settings, times, memory, and how good it is in views held out of training."""
 
 from __future__ import annotations
 
 import math
-import resource
-import sys
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from perception.cores import peak_memory_mib
+from perception.evaluate.images import ssim
 from perception.gaussians.model import Gaussians
-from perception.gaussians.views import TrainingView, depth_image
-
-
-def peak_memory_mib() -> float:
-    """Largest resident memory of this process so far, MiB."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(peak / (1024 * 1024 if sys.platform == "darwin" else 1024), 1)
+from perception.gaussians.views import TrainingView, depth_image, psnr, render_view
+from perception.pipeline.checkpoint import fingerprint
+from perception.pipeline.optimise import Optimised, Run
+from perception.tasks.folder import versions
+from perception.types import Scene
 
 
 def finite(value: Any) -> Any:
@@ -32,6 +29,54 @@ def finite(value: Any) -> Any:
 
 CLOSE_METRES, CLOSE_SHARE = 0.05, 0.025
 """Errors that count as close: in metres, or relative to the depth where the unit is not known to be the metre."""
+
+
+FRAME_FACTS = ("map_from_input", "scale", "gravity")
+"""Entries of a scene's report that map.json holds at its top level."""
+
+
+def run_record(
+    run: Run, scene: Scene, optimised: Optimised, instances: dict[str, Any], quality: dict[str, Any], seconds: float
+) -> dict[str, Any]:
+    """The facts of map.json but for its views and files. instances: report of grouping and description; seconds: of
+    the run in all."""
+    facts = {
+        "frame": scene.frame,
+        "metric": scene.metric,
+        **{key: scene.report[key] for key in FRAME_FACTS if key in scene.report},
+        "source": str(run.source),
+        "seed": run.config.seed,
+        "fingerprint": fingerprint(run.source, run.config),
+        "config": run.config.to_json(),
+        "versions": versions(),
+        "scene": {key: fact for key, fact in scene.report.items() if key not in FRAME_FACTS},
+        "masks": optimised.masks,
+        "depth": depth_used(optimised.photos.views),
+        "training": asdict(optimised.record),
+        "instances": instances,
+        "quality": quality,
+        "seconds": {name: round(s, 2) for name, s in (*run.seconds.items(), ("total", seconds))},
+        "peak_memory_mib": peak_memory_mib(),
+    }
+    return facts | ({"blocks": optimised.blocks} if optimised.blocks else {})
+
+
+def score_views(gaussians: Gaussians, views: list[TrainingView], metric: bool = False) -> dict[str, Any]:
+    """PSNR and SSIM of each view without ignored pixels, and their means; empty without views.
+
+    Depth is compared where it was measured; metric: the unit is the metre.
+    """
+    per_view = {}
+    for view in views:
+        image = render_view(gaussians, view)
+        weight = None if view.weight is None else view.weight.numpy()
+        similarity = ssim(image.numpy().astype(np.float64), view.photo.numpy().astype(np.float64) / 255, weight)
+        per_view[view.name] = {"psnr": psnr(image, view.photo, view.weight), "ssim": float(similarity)}
+    if not per_view:
+        return {"views": {}}
+    means = {name: float(np.mean([entry[name] for entry in per_view.values()])) for name in ("psnr", "ssim")}
+    depth = depth_errors(gaussians, views, metric)
+    return {**means, **({"depth": depth} if depth else {}), "views": per_view}
 
 
 def depth_used(views: list[TrainingView]) -> dict[str, Any] | None:

@@ -12,7 +12,7 @@ import pytest
 from perception.errors import InputError
 from perception.export.render import render_map
 from perception.map.write import write_map
-from perception.masks.label_images import label_file
+from perception.masks.label_files import label_file
 from perception.types import View
 from support.viewer_maps import small_map
 

@@ -23,7 +23,7 @@ from perception.inputs.transforms import read_frames, read_transforms
 from perception.io.arrays import map_npy, read_npz
 from perception.io.cloud import read_cloud, write_cloud
 from perception.io.ply import read_ply
-from perception.masks.label_images import load_labels, stored_key
+from perception.masks.label_files import load_labels, stored_key
 from perception.photos.camera_file import read_camera
 from perception.photos.decode import photo_size, read_photo
 from perception.photos.reading import Reading, rigid_pose

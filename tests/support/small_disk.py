@@ -22,7 +22,7 @@ from perception.export.export_map import export_map
 from perception.export.transfer import ExportOptions
 from perception.inputs.load import save_scene
 from perception.map.write import read_map, set_labels, verify_map, write_map
-from perception.masks.label_images import write_labels
+from perception.masks.label_files import write_labels
 from perception.pipeline.checkpoint import save_checkpoint
 from perception.types import Scene
 

@@ -413,8 +413,8 @@ def repaired_png(data: bytes) -> bytes:
 def _label_png() -> Target:
     from PIL import Image
 
+    from perception.masks.label_files import load_labels, stored_key
     from perception.masks.label_folder import LabelFolder
-    from perception.masks.label_images import load_labels, stored_key
     from perception.types import View
 
     labels = np.arange(48).reshape(6, 8)

@@ -1,33 +1,13 @@
-"""The interface of mask sources, and the parser of the `--masks` option."""
+"""The parser of the `--masks` option."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Protocol
-
-import numpy as np
 
 from perception.config import SamConfig
 from perception.errors import InputError
-from perception.types import View
-
-
-class MaskSource(Protocol):
-    """Gives each photo a label image. Ids need not be consistent across photos.
-
-    name: short, for messages. identity: cache key; it changes whenever the label images could change.
-    A source may have `photos_at_once`, the number of threads in which `label_image` is called; else it is one.
-    """
-
-    name: str
-    identity: str
-
-    def check(self, views: list[View]) -> list[str]:
-        """Validates everything that can be checked before any work. Returns warnings. Raises InputError."""
-
-    def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
-        """photo: [h, w, 3] uint8 RGB, undistorted. Returns [h, w] int32, 0 = unlabelled."""
+from perception.masks.base import MaskSource
 
 
 def make_source(spec: str, sam: SamConfig | None = None) -> MaskSource:

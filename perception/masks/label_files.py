@@ -1,0 +1,99 @@
+"""Label images on disk: one compressed 16-bit PNG per photo, written atomically, each with the key of its inputs."""
+
+from __future__ import annotations
+
+import os
+import struct
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.documents import brief, safe_name
+from perception.types import View
+
+_KEY = "perception-masks"
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def label_file(folder: Path, view: View) -> Path:
+    """Path of a view's label image. The photo's suffix is kept, because `a.jpg` and `a.png` may both exist."""
+    return folder / f"{safe_name(view.name, view.photo)}.png"
+
+
+def load_labels(folder: Path, view: View) -> np.ndarray:
+    """[h, w] int32 as written by compute_masks, 0 = unlabelled."""
+    file = label_file(folder, view)
+    if not file.is_file():
+        raise InputError(f"{file}: no label image for photo {view.name}; run the masks stage again")
+    width, height, *_ = read_png_header(file)  # a corrupt size field must not allocate gigabytes
+    if width * height > 4 * view.width * view.height:
+        raise InputError(f"{file}: {width}×{height} pixels of a smaller photo; the PNG is damaged")
+    return read_labels(file)
+
+
+def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
+    """labels: [h, w] integers ≥ 0. Ids that exceed 16 bit are renumbered from 1."""
+    from PIL import Image, PngImagePlugin
+
+    if labels.max(initial=0) > 65535:
+        unique, inverse = np.unique(labels, return_inverse=True)
+        labels = inverse.reshape(labels.shape) + int(unique[0] != 0)
+    if labels.min(initial=0) < 0 or labels.max(initial=0) > 65535:
+        raise ValueError(f"{file}: labels must lie in 0..65535, found {labels.min()}..{labels.max()}")
+    info = PngImagePlugin.PngInfo()
+    info.add_text(_KEY, key)
+    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            Image.fromarray(labels.astype(np.uint16)).save(temporary, "PNG", compress_level=4, pnginfo=info)
+            temporary.replace(file)
+        finally:
+            with suppress(OSError):  # on a read-only disk the first error is the one to report
+                temporary.unlink()
+    except OSError as error:
+        raise InputError(f"{file}: cannot be written ({error.strerror or error})") from error
+
+
+def stored_key(file: Path) -> str | None:
+    """The key that a label image was written with; None if the file or the key cannot be read."""
+    from PIL import Image
+
+    from perception.photos.decode import DECODE_ERRORS
+
+    if not file.is_file():
+        return None
+    try:
+        with Image.open(file) as image:
+            image.load()
+            return str(image.info.get(_KEY))
+    except DECODE_ERRORS:
+        return None
+
+
+def read_png_header(file: Path) -> tuple[int, int, int, int]:
+    """Width and height in pixels, bits per sample, colour type (PNG's numbers), from the first 26 bytes of the file."""
+    with file.open("rb") as stream:
+        head = stream.read(26)
+    if len(head) < 26 or not head.startswith(_SIGNATURE):
+        raise InputError(f"{file}: not a PNG; label images are PNG, 8 or 16 bit, one channel")
+    width, height, bits, colour_type = struct.unpack(">IIBB", head[16:26])
+    return width, height, bits, colour_type
+
+
+def read_labels(file: Path) -> np.ndarray:
+    """[H, W] int32. Pillow keeps palette indices, whereas OpenCV converts them to colours."""
+    from PIL import Image
+
+    from perception.photos.decode import DECODE_ERRORS
+
+    try:
+        with Image.open(file, formats=["PNG"]) as image:
+            labels = np.asarray(image)
+    except DECODE_ERRORS as error:
+        raise InputError(f"{file}: cannot be read ({brief(error)}); the PNG is damaged or cut short") from error
+    if labels.ndim != 2 or labels.dtype.kind not in "biu":
+        raise InputError(f"{file}: {labels.dtype} of shape {list(labels.shape)}; a label image has one channel")
+    return labels.astype(np.int32)
