@@ -1,4 +1,4 @@
-"""Maps on local Ray clusters of 1, 2 and 4 nodes; workers and the driver are killed on the way:
+"""Builds maps on local Ray clusters of 1, 2 and 4 nodes, whose workers and driver are killed on the way.
 
 python tools kills.ray_cluster        # a quarter of an hour on two cores
 

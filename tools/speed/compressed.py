@@ -1,4 +1,4 @@
-"""Compressed exports of a map: size as a share of the PLY's, and PSNR of what is read back to renders of the map.
+"""Measures compressed exports of a map: their size, and PSNR of what is read back to renders of the map.
 
 python tools speed.compressed MAP
 """

@@ -1,4 +1,4 @@
-"""What NVRTC makes of the CUDA kernels, without a GPU: instructions, registers of a thread, shared memory of a block.
+"""Compiles the CUDA kernels without a GPU: instructions, registers and shared memory of each.
 
 pip install nvidia-cuda-nvrtc-cu12
 python tools speed.cuda_statics

@@ -1,6 +1,7 @@
-"""Structure from motion place by place, as `map` uses it for many photos, incremental in one piece, and global
-(pycolmap.global_mapping), from the same matches: seconds, photos with a pose, and the distance of their cameras from
-given ones after alignment.
+"""Compares structure from motion in submodels, in one piece, and global, from the same matches.
+
+In submodels is what `map` does with many photos; global is pycolmap.global_mapping. Printed are seconds, photos with a
+pose, and the distance of their cameras from given ones after alignment.
 
 python tools speed.global_sfm SCENE --first 300
 """

@@ -1,4 +1,4 @@
-"""Levels of detail of a map: PSNR to renders of all its Gaussians, and time and memory for millions.
+"""Measures the levels of detail of a map: PSNR to renders of all its Gaussians, time and memory for millions.
 
 python tools speed.levels MAP [--millions 5]
 """

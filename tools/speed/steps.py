@@ -1,4 +1,4 @@
-"""Where the time of a training step goes, by kind of step and number of threads, on this machine.
+"""Measures the stages of a training step, by kind of step and number of threads.
 
     python tools speed.steps SCENE [--masks labels:FOLDER] [--at 300 1200] [--set KEY=VALUE ...]
 
