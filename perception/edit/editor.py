@@ -53,7 +53,20 @@ def _step(method: F) -> F:
 
 
 class Editor:
-    """A map and its edit history. Instances are named by their `id`, which never changes; merged ones get a new id."""
+    """A map and its edit history. Instances are named by their `id`, which never changes; merged ones get a new id.
+
+    Edits raise InputError for an id that the map does not have.
+
+    >>> editor = Editor(Path("kitchen.gsmap"))
+    >>> editor.rename(1, "breakfast")
+    >>> editor.merge([2, 3])
+    9
+    >>> editor.undo()
+    'merged 2, 3 into 9'
+    >>> editor.save()
+    >>> perception.load_map("kitchen.gsmap").get(1).label
+    'breakfast'
+    """
 
     def __init__(self, path: Path):
         self.path = Path(path)

@@ -95,6 +95,12 @@ def export_map(
     color: of the written points, "original" or "instance". place: `points` lie in a frame of their own: True registers
     them (`export.align`), a path names a file with map_from_scan [4, 4]. The result keeps that frame; the sidecar and
     the facts hold `map_from_scan`. granularity: see `at_granularity`.
+
+    InputError for a kind of file that is not written, and for a scan that does not overlap the map or is not aligned.
+
+    >>> facts, table = export_map(Path("kitchen.gsmap"), Path("labelled.ply"), Path("scan.ply"), ExportOptions())
+    >>> facts["points"], facts["labelled"], sorted(facts["instances"])[:3]
+    (900, 900, ['0', '1', '2'])
     """
     if output.suffix.lower() in COMPRESSED:
         return _export_compressed(map_path, output, points)

@@ -29,6 +29,9 @@ class ExportOptions:
     max_distance: in map units, beyond which points stay unlabelled; None = no limit.
     smooth: superpoint vote, on or off. segments: a ScanNet *.segs.json to use instead of our own segmentation, or
     SCANNET for the one that ScanNet's segmentator makes of a mesh.
+
+    >>> ExportOptions(max_distance=0.05, smooth=False)
+    ExportOptions(max_distance=0.05, smooth=False, segments=None)
     """
 
     max_distance: float | None = None

@@ -323,6 +323,16 @@ def rasterize(
     variance=False and depth=False save time: `feature_variance` and `depths` are not computed (None).
     threads: 0 takes torch.get_num_threads(). The result is the same, bit for bit, for any number of threads.
     Finite inputs up to 1e15 in magnitude give finite images and gradients. InputError names a non-finite input.
+
+    >>> means = torch.tensor([[0.0, 0.0, 2.0]], requires_grad=True)
+    >>> quats, scales = torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.1)
+    >>> K = torch.tensor([[64.0, 0, 32], [0, 64, 32], [0, 0, 1]])
+    >>> out = rasterize(means, quats, scales, torch.ones(1), torch.rand(1, 3), torch.eye(4)[None], K[None], 64, 64)
+    >>> out.colors.shape, out.depths.shape, out.visible.tolist()
+    (torch.Size([1, 64, 64, 3]), torch.Size([1, 64, 64]), [[True]])
+    >>> out.alphas[0, 34, 34].backward()
+    >>> bool((means.grad[0, :2] > 0).all())  # alpha grows there as the Gaussian comes nearer
+    True
     """
     tensors = {
         "means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors,

@@ -79,6 +79,10 @@ class Map:
     of each instance. Reading a field raises InputError naming the file when it is damaged. The folder may be replaced
     by another map meanwhile. This type needs no torch; training uses `gaussians.model.Gaussians`, which holds the same
     values as torch tensors.
+
+    >>> gmap = Map.open(Path("kitchen.gsmap"))
+    >>> gmap.means.shape, gmap.means.dtype, gmap.instance_ids.min()
+    ((3000, 3), dtype('float32'), np.int32(-1))
     """
 
     means: np.ndarray

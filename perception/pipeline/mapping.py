@@ -56,6 +56,12 @@ def build_map(
     `resume` a run continues from them and repeats only what has changed (see `pipeline.checkpoint`). A run that fails
     before training leaves no files. Resuming a finished run returns its map. engine: where features, masks and the
     blocks of a large place are made; None: here. origin: the input's name in map.json, where `source` is a copy of it.
+
+    >>> from perception.config import load_config
+    >>> config = load_config(pairs=["masks=labels:table/labels", "train.iterations=20", "language.encoder=none"])
+    >>> gmap = build_map(Path("table"), Path("table.gsmap"), config)
+    >>> len(gmap.views), gmap.means.shape == (len(gmap), 3)
+    (12, True)
     """
     started = time.monotonic()
     if resume and output.exists() and read_info(output).get("fingerprint") == fingerprint(source, config):

@@ -37,6 +37,12 @@ def index_maps(
     interrupted run has prepared is used by the next one. InputError, and no change, for a folder that is no map, a map
     without embeddings or of another encoder than the store's, a path to remove that the store does not hold, a folder
     that is no store, and while another process writes the store.
+
+    >>> counts = index_maps(Path("all.store"), [Path("kitchen.gsmap")])
+    >>> counts["added"], counts["instances"]
+    (1, 9)
+    >>> perception.load_map("all.store").query("red mug")[0].map_id == load_map("kitchen.gsmap").map_id
+    True
     """
     encoders = lru_cache(encoders or make_encoder)
     with writing(store):

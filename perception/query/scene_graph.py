@@ -55,6 +55,10 @@ def scene_graph(gmap: Map) -> networkx.DiGraph:
     it has one its label, score, centroid [3], box (`obb`) and lengths in the map's frame. Edges as above, with
     `relation` and `score`. Graph attributes: frame, metric, map_id. Rooms need a metric map with gravity and a floor;
     otherwise there is one. InputError when it is not known which way is up.
+
+    >>> graph = scene_graph(perception.load_map("room.gsmap"))
+    >>> graph.nodes[4]["kind"], graph.edges[4, "room 0"]["relation"]
+    ('object', 'in')
     """
     import networkx
 

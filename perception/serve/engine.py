@@ -43,6 +43,11 @@ class QueryEngine:
     map, or changed labels, is loaded beside the current map and then swapped in atomically: each answer comes from one
     map only. When a new map cannot be read, `health` reports it and the current map stays in use. The directory may be
     deleted meanwhile: queries use only data in memory. Thread-safe; a context manager.
+
+    >>> with QueryEngine("kitchen.gsmap", workers=2, timeout=30.0) as engine:
+    ...     reply = engine.ask(Request("red mug", top_k=1))
+    >>> [hit.instance_id for hit in reply.hits]
+    [0]
     """
 
     def __init__(
@@ -52,7 +57,8 @@ class QueryEngine:
         encoders: Callable[[str], Encoder | None] | None = None,
         **settings: Any,
     ) -> None:
-        """settings: the fields of `EngineSettings`; InputError when one is unknown or out of range."""
+        """settings: the fields of `EngineSettings`; InputError when one is unknown or out of range, or for a folder
+        that is no map."""
         chosen = settings_from(EngineSettings, {name: (value, "engine") for name, value in settings.items()})
         self.path, self.timeout = Path(path), chosen.timeout
         self._encoders = lru_cache(encoders or make_encoder)  # shared by the current map and a reloaded one
