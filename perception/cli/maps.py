@@ -31,7 +31,7 @@ def register(commands: Any) -> None:
     place.add_argument(
         "--transform", type=Path, metavar="FILE", help="as --align, by a known 4 x 4 map_from_scan (text or JSON)"
     )
-    p.add_argument("-o", "--output", type=Path, metavar="OUT", help=".ply, .pcd or .npz; .spz or .sog: Gaussians")
+    p.add_argument("-o", "--output", type=Path, metavar="OUT", help=".ply, .pcd or .npz; .spz: Gaussians")
     p.add_argument("--smooth", action=argparse.BooleanOptionalAction, default=True)
     p.add_argument("--max-distance", type=float, metavar="D", help="points farther from any Gaussian stay -1")
     p.add_argument("--segments", type=Path, metavar="X.segs.json", help="ScanNet's segments, or scannet: by its rules")
