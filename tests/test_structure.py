@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "perception"
 # Bottom to top; a module may import from its own layer and those below.
 LAYERS = [
     {
-        "cores",
+        "machine",
         "errors",
         "types",
         "config",

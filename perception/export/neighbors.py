@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 
 from perception import _core
-from perception.cores import cores
 from perception.errors import InputError
+from perception.machine import cores
 
 CHUNK = 1 << 20  # points at a time: 24 MiB of working memory
 

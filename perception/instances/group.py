@@ -21,7 +21,7 @@ from perception.instances.consensus import (
 )
 from perception.instances.segments import over_segment, touching
 from perception.instances.votes import MaskVotes
-from perception.io.memory import return_free_memory
+from perception.machine import return_free_memory
 
 PER_SEGMENT = 16  # Gaussians; smaller segments have too little evidence in the photos
 MAX_SEGMENTS, PER_SEGMENT_BEYOND = 1000, 300  # a larger map has one segment per 300 Gaussians instead

@@ -1,11 +1,9 @@
-"""Memory and cores of the machine; arrays of which a bounded part is in memory: photos and labels of a large place."""
+"""Arrays of which a bounded part is in memory: photos and labels of a large place."""
 
 from __future__ import annotations
 
-import ctypes
 import mmap
 import os
-import sys
 import tempfile
 import threading
 import time
@@ -14,8 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-
-from perception.errors import InputError
 
 CHUNK = 64 << 20  # bytes of a file; a larger array has a file of its own
 PIECE = 1 << 20  # numbers of an array that are copied between two looks at what is resident
@@ -93,28 +89,3 @@ def mapped_bytes() -> int:
         return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[2]) * mmap.PAGESIZE
     except OSError:
         return 1 << 62
-
-
-def return_free_memory() -> None:
-    """Returns what was freed to the system, where the C library can (glibc)."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
-    if trim is not None:
-        trim(0)
-
-
-def available_memory() -> int:
-    """Bytes that can be allocated without swapping (Linux kernel's estimate); on other systems the total memory."""
-    try:
-        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-    except OSError:
-        pass
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
-def require_memory(needed: float, what: str, advice: str) -> None:
-    """InputError naming `what` and `advice` when `needed` bytes exceed 90 % of the available memory."""
-    free = available_memory()
-    if needed > 0.9 * free:
-        raise InputError(f"{what}: needs about {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; {advice}")

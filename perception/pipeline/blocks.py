@@ -25,9 +25,10 @@ from perception.gaussians.size import sized
 from perception.gaussians.train import TrainRecord
 from perception.geometry import camera_centres
 from perception.io.atomic import writing
+from perception.machine import memory_limit
 from perception.masks import make_source
 from perception.pipeline.checkpoint import BEFORE_MASKS, CHECKPOINT, digest, load_checkpoint, save_checkpoint
-from perception.pipeline.estimate import largest_budget, memory_limit
+from perception.pipeline.estimate import largest_budget
 from perception.pipeline.optimise import Photos, Run, optimise
 from perception.progress import Progress
 from perception.tasks.engine import Engine

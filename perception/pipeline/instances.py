@@ -22,10 +22,10 @@ from perception.instances.levels import with_levels
 from perception.instances.silhouettes import Silhouettes, render_silhouettes
 from perception.instances.texts import read_texts, store_texts
 from perception.instances.votes import mask_votes
-from perception.io.memory import return_free_memory
 from perception.language.base import Encoder, reading_of
 from perception.language.description import to_arrays
 from perception.language.ocr import TextReader
+from perception.machine import return_free_memory
 from perception.map.map import prefixed
 from perception.masks.merging import Segmentation
 from perception.pipeline.optimise import Run
