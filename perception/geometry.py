@@ -34,6 +34,14 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
 
+def rotations(quats: np.ndarray) -> np.ndarray:
+    """[N, 3, 3] float64 of quaternions [N, 4] wxyz; one of zeros is the identity."""
+    from scipy.spatial.transform import Rotation
+
+    xyzw = np.add(quats[:, [1, 2, 3, 0]], [0, 0, 0, 1e-30], dtype=np.float64)
+    return np.asarray(Rotation.from_quat(xyzw).as_matrix())
+
+
 def interpolated_pose(times: np.ndarray, poses: np.ndarray, time: float, gap: float) -> np.ndarray | None:
     """Pose [4, 4] at `time` between the samples poses [N, 4, 4] at ascending times [N]; rotations by slerp.
 
