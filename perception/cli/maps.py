@@ -31,7 +31,7 @@ def register(commands: Any) -> None:
     place.add_argument(
         "--transform", type=Path, metavar="FILE", help="as --align, by a known 4 x 4 map_from_scan (text or JSON)"
     )
-    p.add_argument("-o", "--output", type=Path, metavar="OUT", help=".ply, .pcd or .npz; .spz or .sog: Gaussians")
+    p.add_argument("-o", "--output", type=Path, metavar="OUT", help=".ply, .pcd or .npz; .spz: Gaussians")
     p.add_argument("--smooth", action=argparse.BooleanOptionalAction, default=True)
     p.add_argument("--max-distance", type=float, metavar="D", help="points farther from any Gaussian stay -1")
     p.add_argument("--segments", type=Path, metavar="X.segs.json", help="ScanNet's segments, or scannet: by its rules")
@@ -56,7 +56,7 @@ def register(commands: Any) -> None:
     p.add_argument("--clear", action="store_true", help="take the name away")
     p = map_command(commands, "relink", _relink, "tell a map where its photos lie now")
     p.add_argument("folder", type=Path, metavar="DIR", help="the folder that holds the photos")
-    p = map_command(commands, "upgrade", _upgrade, "bring an older map to the newest format and encoder")
+    p = map_command(commands, "upgrade", _upgrade, "embed the instances with the current encoder, read printed texts")
     p.add_argument("-o", "--output", type=Path, metavar="OUT.gsmap", help="default: in place")
     p = map_command(commands, "scale", _scale, "give a finished map metres, by a length, tags, a board or GPS")
     p.add_argument("-o", "--output", type=Path, metavar="OUT.gsmap", help="default: in place")
@@ -144,9 +144,9 @@ def _upgrade(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.progress import Progress
 
     facts = upgrade_map(args.map, args.output, progress=Progress(quiet=args.json))
-    (old, new), (before, after) = facts["format_version"], facts["encoder"]
+    before, after = facts["encoder"]
     said = f"embeddings by {after}, before by {before}" if before != after else "embeddings as they were"
-    return facts, f"{facts['map']}: format version {new}, before {old}; {said}"
+    return facts, f"{facts['map']}: {said}"
 
 
 def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:

@@ -17,7 +17,6 @@ from perception.errors import InputError
 from perception.export.align import align
 from perception.export.depth_views import DepthView, depth_views
 from perception.export.render import as_gaussians, map_views
-from perception.export.sog import write_sog
 from perception.export.spz import write_spz
 from perception.export.transfer import ExportOptions, check_overlap, export_labels, write_export
 from perception.frame.recentre import map_from_input
@@ -71,8 +70,7 @@ def read_transform(path: Path) -> np.ndarray:
     return check_similarity(rows, str(path))
 
 
-COMPRESSED = {".spz": write_spz, ".sog": write_sog}
-SUFFIXES = (".ply", ".pcd", ".npz", *COMPRESSED)
+SUFFIXES = (".ply", ".pcd", ".npz", ".spz")
 SURFACE_OPACITY = 0.5
 """Gaussians of at least this opacity are the surface points of a map."""
 
@@ -96,8 +94,8 @@ def export_map(
     them (`export.align`), a path names a file with map_from_scan [4, 4]. The result keeps that frame; the sidecar and
     the facts hold `map_from_scan`. granularity: see `at_granularity`.
     """
-    if output.suffix.lower() in COMPRESSED:
-        return _export_compressed(map_path, output, points)
+    if output.suffix.lower() == ".spz":
+        return _export_spz(map_path, output, points)
     if output.suffix.lower() not in SUFFIXES:
         raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected one of {', '.join(SUFFIXES)}")
     if place and points is None:
@@ -142,17 +140,16 @@ def export_map(
     return result, _table(result)
 
 
-def _export_compressed(map_path: Path, output: Path, points: Path | None) -> tuple[dict[str, Any], str]:
+def _export_spz(map_path: Path, output: Path, points: Path | None) -> tuple[dict[str, Any], str]:
     """All Gaussians of the map, for viewers in the browser."""
-    kind = output.suffix.lower()
     if points is not None:
-        raise InputError(f"{output}: {kind} holds the map's Gaussians; labels of a scan go to .ply, .pcd or .npz")
+        raise InputError(f"{output}: .spz holds the map's Gaussians; labels of a scan go to .ply, .pcd or .npz")
     gmap = read_map(map_path)
-    COMPRESSED[kind](output, gmap)
+    write_spz(output, gmap)
     size, ids = output.stat().st_size, output.with_suffix(".npy")
     share = size / max((map_path / "gaussians.ply").stat().st_size, 1)
     told = f"{output}: {len(gmap)} Gaussians, {share:.0%} of the PLY's size; instance ids in {ids}"
-    return {kind[1:]: str(output), "gaussians": len(gmap), "bytes": size, "instance_ids": str(ids)}, told
+    return {"spz": str(output), "gaussians": len(gmap), "bytes": size, "instance_ids": str(ids)}, told
 
 
 def at_granularity(gmap: Map, granularity: str) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:

@@ -12,6 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from perception.geometry import sums_by
+
 PALETTE = 24  # colours kept per instance
 BIN = 8.0  # CIELAB units per histogram cell
 SIGMA = 15.0  # CIELAB distance at which a colour counts 60 %
@@ -94,7 +96,7 @@ def palette(pixels: np.ndarray) -> np.ndarray:
     lab = lab_of(pixels)
     cells = np.floor(lab / BIN).astype(np.int64) @ np.array([1 << 20, 1 << 10, 1])  # a and b lie within ±2^9 cells
     _, inverse, counts = np.unique(cells, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(inverse, lab[:, c], minlength=len(counts)) for c in range(3)], axis=1)
+    sums = sums_by(inverse, lab, len(counts))
     top = np.argsort(-counts, kind="stable")[:PALETTE]
     out[: len(top), :3] = sums[top] / counts[top, None]
     out[: len(top), 3] = counts[top] / counts[top].sum()

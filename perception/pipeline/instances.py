@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
 from scipy import sparse
 
 from perception import _core
 from perception.boxes import instance_entry
 from perception.gaussians.model import Gaussians
 from perception.gaussians.nearby import Nearby
-from perception.gaussians.train import TrainingView
+from perception.gaussians.views import TrainingView, half_camera
 from perception.instances.crops import choose_views, view_scores
 from perception.instances.describe import describe_instances
 from perception.instances.group import Grouping, group
@@ -22,10 +21,10 @@ from perception.instances.levels import with_levels
 from perception.instances.silhouettes import Silhouettes, render_silhouettes
 from perception.instances.texts import read_texts, store_texts
 from perception.instances.votes import mask_votes
-from perception.io.memory import return_free_memory
 from perception.language.base import Encoder, reading_of
 from perception.language.description import to_arrays
 from perception.language.ocr import TextReader
+from perception.machine import return_free_memory
 from perception.map.map import prefixed
 from perception.masks.merging import Segmentation
 from perception.pipeline.optimise import Run
@@ -133,11 +132,9 @@ def _silhouettes(
     """Of each level, the silhouettes of all views."""
     seen = []
     for done, view in enumerate(views, start=1):
-        height, width = view.photo.shape[:2]
-        K, eps2d = view.K, view.eps2d
-        if max(height, width) >= HALVED_FROM:  # as in `TrainingView.halved`
-            height, width, eps2d = height // 2, width // 2, (eps2d + 0.25) / 4
-            K = K * torch.tensor([[0.5], [0.5], [1.0]])
+        K, (height, width), eps2d = view.K, view.photo.shape[:2], view.eps2d
+        if max(height, width) >= HALVED_FROM:
+            K, (height, width), eps2d = half_camera(K, (height, width), eps2d)
         gaussians, rows = nearby.of(view.name)
         owners = [ids[rows] for ids in levels]
         seen.append(render_silhouettes(gaussians, owners, view.camera_from_world, K, width, height, eps2d=eps2d))

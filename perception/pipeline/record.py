@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from perception.cores import peak_memory_mib
 from perception.evaluate.images import ssim
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, depth_image, psnr, render_view
+from perception.machine import peak_memory_mib
 from perception.pipeline.checkpoint import fingerprint
 from perception.pipeline.optimise import Optimised, Run
 from perception.tasks.folder import versions

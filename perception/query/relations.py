@@ -17,6 +17,7 @@ import numpy as np
 
 from perception.language.printed import quoted_text
 from perception.query.ranking import PRESENT
+from perception.query.shapes import ramp
 
 if TYPE_CHECKING:
     from perception.map.map import Map
@@ -134,21 +135,21 @@ class Places:
         slack = 0.25 * np.minimum(tall, other_tall) + 0.02 * np.median(size.max(axis=1))
         below, top = low[..., 2] - other_high[..., 2], other_low[..., 2] + 0.2 * other_tall
         if kind == "on":
-            return covered * _ramp(below, 2 * slack, slack) * _ramp(top - low[..., 2], slack, 0 * slack)
+            return covered * ramp(below, 2 * slack, slack) * ramp(top - low[..., 2], slack, 0 * slack)
         area = size[:, 0] * size[:, 1]
         stacked = np.minimum(1, covered * area[:, None] / np.minimum(area[:, None], area[None]))  # of the smaller one's
         if kind == "above":
-            return stacked * _ramp(-below, 2 * slack, slack)
+            return stacked * ramp(-below, 2 * slack, slack)
         if kind == "under":
             middle = (self.lows + self.highs)[:, None, 2] / 2
-            return stacked * _ramp(middle - other_high[..., 2], 0 * slack, -slack)
+            return stacked * ramp(middle - other_high[..., 2], 0 * slack, -slack)
         if kind == "in":
             return covered * shared[..., 2]
         gaps = np.clip(np.maximum(other_low - high, low - other_high), 0, None)
         gap, reach = np.linalg.norm(gaps, axis=2), (size.max(axis=1)[:, None] + size.max(axis=1)[None]) / 2
         if kind == "beside":
-            return _ramp(gap, 1.5 * reach, 0.25 * reach) * (1 - stacked)
-        return _ramp(gap, 6 * reach, reach) * np.clip(2 * self._seen(kind) - 1, 0, 1)
+            return ramp(gap, 1.5 * reach, 0.25 * reach) * (1 - stacked)
+        return ramp(gap, 6 * reach, reach) * np.clip(2 * self._seen(kind) - 1, 0, 1)
 
     def _seen(self, kind: str) -> np.ndarray:
         """[I, I]: share of the photos showing both in which the row's instance is left, right, in front or behind."""
@@ -163,8 +164,3 @@ class Places:
             yes += both & (value[:, None] > value[None])
             all_ += both
         return (yes + 0.5) / (all_ + 1)
-
-
-def _ramp(x: np.ndarray, zero: np.ndarray, one: np.ndarray) -> np.ndarray:
-    """Linear from 0 at `zero` to 1 at `one`."""
-    return np.clip((x - zero) / np.where(one == zero, 1e-9, one - zero), 0, 1)
