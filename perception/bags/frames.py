@@ -66,7 +66,7 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
             raise InputError(f"{source}: {topic} holds no images")
         chosen = chooser.chosen(options.max_frames)
         poses = read_poses(bag)
-        with atomic_directory(output) as aside:
+        with atomic_directory(output, fresh=True) as aside:
             lens = _write_camera(aside / "camera.yaml", options.camera, info, topic, size, source)
             stamps, frame = _write_images(bag, topic, chosen, aside / "images")
             depth, told = dict[str, str](), None

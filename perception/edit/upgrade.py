@@ -59,7 +59,7 @@ def upgrade_map(
             else stored_view(view, target, view.held_out)
             for view in gmap.views
         ]
-        write_map(target, gmap, keep_report=True)
+        write_map(target, gmap, keep_report=True, fresh=output is not None)
     new = str(gmap.language["encoder"]) if gmap.language else None
     return {"map": str(target), "format_version": [before, FORMAT_VERSION], "encoder": [old, new]}
 

@@ -133,7 +133,7 @@ def build_map(
             "peak_memory_mib": peak_memory_mib(),
         }
         gmap = _assemble(gaussians, found, scene, held_out, record, output)
-        write_map(output, gmap)
+        write_map(output, gmap, fresh=True)
     _tell_result(gmap, output, progress)
     return gmap
 

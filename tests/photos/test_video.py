@@ -97,4 +97,4 @@ def test_a_refused_run_leaves_only_frames_that_were_there(tmp_path: Path, earlie
     with pytest.raises(InputError, match="later"), working(video, output, resume=False):
         frames_folder(output).mkdir(exist_ok=True)
         raise InputError("found later")
-    assert {path.name for path in tmp_path.iterdir()} == {"v.mp4", *(["v.frames"] if earlier else [])}
+    assert {path.name for path in tmp_path.iterdir()} == {"v.mp4", *(["v.gsmap.frames"] if earlier else [])}
