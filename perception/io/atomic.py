@@ -32,7 +32,8 @@ from perception.map.checksums import FACTS, is_map, own_files
 
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # from Linux fcntl.h and fs.h
-_REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EISDIR, errno.ENOTDIR, errno.ELOOP}
+_REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.ELOOP, errno.ENAMETOOLONG}
+_REFUSED |= {errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY}
 _TAKEN = {errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR}
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
 _held: set[tuple[Path, int]] = set()
