@@ -46,7 +46,7 @@ def check_empty(output: Path) -> None:
 
 
 def check_side_file(side: Path, output: Path, key: str = "") -> None:
-    """InputError if `side`, to be written beside `output`, holds something else: JSON without `key`, .npy without ids."""
+    """InputError if `side`, to be written beside `output`, is something else: JSON without `key`, .npy without ids."""
     if not os.path.lexists(side):
         return
     try:
