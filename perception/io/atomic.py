@@ -95,8 +95,8 @@ def _aside(path: Path, make: Callable[[Path], Any], put: Callable[[Path, Path], 
 
 
 def pointed(path: Path) -> Path:
-    """Where `path` leads if it is a symbolic link, else `path` itself."""
-    return Path(os.path.realpath(path)) if path.is_symlink() else path
+    """Where `path` leads if it is a symbolic link, or ends without a name, else `path` itself."""
+    return Path(os.path.realpath(path)) if path.is_symlink() or path.name in ("", "..") else path
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from perception.gaussians.views import TrainingView, psnr, render_view, surface_
 from perception.inputs.load import load_saved_scene, load_scene, save_scene
 from perception.language.base import Encoder
 from perception.language.ocr import make_reader
+from perception.map.checksums import is_map
 from perception.map.files import read_info
 from perception.map.write import Map, read_map, write_map
 from perception.masks import make_source
@@ -64,7 +65,7 @@ def build_map(
     blocks of a large place are made; None: here. origin: the input's name in map.json, where `source` is a copy of it.
     """
     started = time.monotonic()
-    if resume and output.exists() and read_info(output).get("fingerprint") == fingerprint(source, config):
+    if resume and is_map(output) and read_info(output).get("fingerprint") == fingerprint(source, config):
         progress.log(f"{output}: this run is finished")
         clear_work(output)
         return read_map(output)

@@ -242,22 +242,23 @@ class Keeping(Case):
         (path / ".hidden").touch()
         (path / "empty").mkdir()
         (path / "elsewhere").symlink_to("/no/such/place")
+        self.kept = users(path)
 
     def work(self, place: Path, trial: int) -> int:
         return KEPT[self.name](place / "m.gsmap")
 
     def after_kill(self, place: Path, trial: int) -> str:
         path = place / "m.gsmap"
-        assert users(path) == self.whole[0][0], "something of the user's is gone or has changed"
+        assert users(path) == self.kept, "something of the user's is gone or has changed"
         now = contents(path)
-        assert now in (contents(self.gmap), self.whole[0][1]), "neither the map from before nor the new one"
+        assert now in (contents(self.gmap), self.whole[0][0]), "neither the map from before nor the new one"
         return "before" if now == contents(self.gmap) else "after"
 
     def result(self, place: Path, trial: int) -> Any:
         assert names(place) == ["m.gsmap"], names(place)
         path = place / "m.gsmap"
-        exported = {name: digest for name, digest in tree(path).items() if name.startswith("labelled")}
-        return users(path), contents(path), exported
+        assert users(path) == self.kept, "something of the user's is gone or has changed"
+        return contents(path), {name: digest for name, digest in tree(path).items() if name.startswith("labelled")}
 
 
 def users(path: Path) -> dict[str, str]:
