@@ -33,7 +33,7 @@ from perception.map.checksums import FACTS, is_map, own_files
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # from Linux fcntl.h and fs.h
 _REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.ELOOP, errno.ENAMETOOLONG}
-_REFUSED |= {errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY}
+_REFUSED |= {errno.EXDEV, errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY}
 _TAKEN = {errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR}
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
 _held: set[tuple[Path, int]] = set()
@@ -237,11 +237,12 @@ def _discard(old: Path, path: Path) -> None:
         own = own_files(old) or set()
         _merge(old, path, own)
         for name in sorted(own, key=FACTS.__eq__):  # map.json last, as it tells that this is a map
-            (old / name).unlink()
+            (old / name).unlink(missing_ok=True)
         _merge(old, path)  # what came meanwhile
         old.rmdir()
     except OSError as error:
-        warnings.warn(f"{old}: holds files that were beside the map and cannot be moved ({error})", stacklevel=2)
+        if old.exists():
+            warnings.warn(f"{old}: holds files from beside the map that cannot be moved to it ({error})", stacklevel=2)
 
 
 def _merge(old: Path, path: Path, own: Collection[str] = ()) -> None:
@@ -323,7 +324,8 @@ def writing(path: Path) -> Iterator[None]:
 
     The lock is an advisory flock on the sibling `.NAME.lock`, which the system releases when the process ends in any
     way. The file holds the process id and is deleted on release. The lock is re-entrant per thread. Readers need none.
-    Leftovers of killed writers are first restored or deleted (see `atomic.recover`).
+    Leftovers of killed writers are first restored or deleted (see `atomic.recover`). A file system without locks gets a
+    warning, and is written to.
     """
     path = Path(os.path.realpath(path))
     mine = (path, threading.get_ident())
