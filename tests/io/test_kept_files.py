@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from kills import children
 from perception.cli import main
 from perception.edit.editor import Editor
 from perception.errors import InputError
@@ -80,6 +81,43 @@ def test_a_new_map_takes_over_what_lies_beside_the_old_one(
         assert things(gmap) == before
     assert [item.name for item in gmap.parent.iterdir()] == ["a.gsmap"]
     assert read_map(gmap).instances[0]["label"] == "saved" and "notes.txt" not in verify_map(gmap)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="the harness needs Linux")
+@pytest.mark.parametrize("links", [True, False])
+@pytest.mark.parametrize("exchange", [True, False])
+def test_a_writer_is_killed_at_every_change(
+    gmap: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchange: bool, links: bool
+) -> None:
+    """With hard links and exchanges nothing is ever away; else the next writer puts it back."""
+
+    def none(*_: object, **__: object) -> None:
+        raise OSError(errno.EPERM, "no hard links")
+
+    def work(place: Path) -> int:
+        write_map(place / "a.gsmap", read_map(place / "a.gsmap"), keep_report=True)
+        return 0
+
+    def laid_out(name: str) -> Path:
+        shutil.copytree(gmap, tmp_path / name / "a.gsmap", symlinks=True)
+        return tmp_path / name
+
+    if not exchange:
+        monkeypatch.setattr(atomic, "_exchange", lambda a, b: False)
+    if not links:
+        monkeypatch.setattr(os, "link", none)
+    keep_things(gmap)
+    before, place = things(gmap), laid_out("whole")
+    _, changes = children.watch(lambda: work(place), place)
+    for number in range(1, len(changes) + 1):
+        place = laid_out(str(number))
+        assert children.run(lambda place=place: work(place), place, children.Moment(0, number)).killed
+        if exchange and links:
+            assert things(place / "a.gsmap") == before
+        set_labels(place / "a.gsmap", {0: "named"})
+        assert things(place / "a.gsmap") == before and len(read_map(place / "a.gsmap")) == 300
+        assert [item.name for item in place.iterdir()] == ["a.gsmap"]
 
 
 def test_what_a_killed_writer_did_not_take_over_comes_with_the_next(gmap: Path) -> None:
