@@ -179,9 +179,11 @@ def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _report(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.io.outputs import refuse_inputs
     from perception.query import load_map
     from perception.report.page import write_map_report
 
+    refuse_inputs([args.output], [args.map])
     page = write_map_report(load_map(args.map), args.output, args.ask)
     return {"report": str(page)}, str(page)
 

@@ -70,9 +70,11 @@ def register(commands: Any) -> None:
 
 
 def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.io.outputs import refuse_inputs
     from perception.query import load_map
     from perception.report.text import guessed_names, query_text, write_hits
 
+    refuse_inputs([args.points], [args.map])
     opened = load_map(args.map)
     answers = [(text, opened.query(text, args.top, args.min_score)) for text in args.text]
     of_store = any(hit.map is not None for _, hits in answers for hit in hits)
@@ -150,9 +152,10 @@ def _upgrade(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.export.export_map import export_map
+    from perception.export.export_map import export_map, side_file
     from perception.export.mesh import check_outputs, export_mesh, export_voxels
     from perception.export.transfer import ExportOptions
+    from perception.io.outputs import check_side_file, refuse_inputs
     from perception.map.write import read_map
     from perception.query.query_map import load_map
     from perception.query.scene_graph import write_graph
@@ -164,6 +167,11 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if args.instance is not None and args.mesh is None:
         raise InputError("export: --instance selects what --mesh writes; give --mesh OUT")
     check_outputs(args.mesh, args.voxels, args.voxel_size)
+    side = None if args.output is None else side_file(args.output)
+    inputs = [args.map, args.points, args.transform, args.segments]
+    refuse_inputs([args.output, side, args.mesh, args.voxels, args.graph], inputs)
+    if side is not None:
+        check_side_file(side, args.output, "instances")
     facts: dict[str, Any] = {}
     lines = []
     if args.graph is not None:

@@ -51,7 +51,7 @@ def upgrade_map(
         if encoder is not None and encoder.identity != old:
             _embed_again(gmap, encoder, progress)
         _read_again(gmap, make_reader(gmap.info.get("config", {}).get("language", {}).get("texts", "auto")), progress)
-        write_map(target, gmap, keep_report=True)
+        write_map(target, gmap, keep_report=True, fresh=output is not None)
     new = str(gmap.language["encoder"]) if gmap.language else None
     return {"map": str(target), "encoder": [old, new]}
 

@@ -75,6 +75,11 @@ SURFACE_OPACITY = 0.5
 """Gaussians of at least this opacity are the surface points of a map."""
 
 
+def side_file(output: Path) -> Path:
+    """The file that `export_map` writes beside `output`: ids of compressed Gaussians, or facts of the instances."""
+    return output.with_suffix(".npy" if output.suffix.lower() == ".spz" else ".json")
+
+
 def export_map(
     map_path: Path,
     output: Path,
@@ -146,7 +151,7 @@ def _export_spz(map_path: Path, output: Path, points: Path | None) -> tuple[dict
         raise InputError(f"{output}: .spz holds the map's Gaussians; labels of a scan go to .ply, .pcd or .npz")
     gmap = read_map(map_path)
     write_spz(output, gmap)
-    size, ids = output.stat().st_size, output.with_suffix(".npy")
+    size, ids = output.stat().st_size, side_file(output)
     share = size / max((map_path / "gaussians.ply").stat().st_size, 1)
     told = f"{output}: {len(gmap)} Gaussians, {share:.0%} of the PLY's size; instance ids in {ids}"
     return {"spz": str(output), "gaussians": len(gmap), "bytes": size, "instance_ids": str(ids)}, told

@@ -108,7 +108,7 @@ def video_frames(video: Path, folder: Path, progress: Progress) -> dict[str, obj
     if not chosen:
         raise InputError(f"{video}: not a readable video; expected .mp4, .mov or another that OpenCV's FFmpeg decodes")
     record |= {"frames": numbers[-1] + 1, "chosen": len(chosen)}
-    with atomic_directory(folder) as aside:
+    with atomic_directory(folder, fresh=True) as aside:
         for number, share, frame in frames(video, set(chosen)):
             cv2.imwrite(str(aside / f"{number:06d}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
             progress.update("poses: writing frames", round(100 * share), 100)

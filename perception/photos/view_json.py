@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.atomic import pointed
 from perception.io.documents import safe_name
 from perception.types import DepthImage, Lens, View
 
@@ -43,9 +44,9 @@ def stored_view(view: View, folder: Path, held_out: bool = False) -> StoredView:
 
 def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
     """The record of a map at `before`, for a map at `after`: the relative photo path is adapted."""
-    if view.photo_beside is None or absolute(before) == absolute(after):
+    if view.photo_beside is None or absolute(pointed(before)) == absolute(pointed(after)):
         return view
-    return replace(view, photo_beside=_relative(absolute(before / view.photo_beside), after))
+    return replace(view, photo_beside=_relative(absolute(pointed(before) / view.photo_beside), after))
 
 
 def locate_photo(view: View, folder: Path | None) -> Path:
@@ -56,7 +57,7 @@ def locate_photo(view: View, folder: Path | None) -> Path:
     if isinstance(view, StoredView):
         size = view.photo_bytes
         if folder is not None and view.photo_beside is not None:
-            places.insert(0, absolute(folder / view.photo_beside))
+            places.insert(0, absolute(pointed(folder) / view.photo_beside))
     other = None
     for place in places:
         try:
@@ -75,7 +76,7 @@ def absolute(path: Path) -> Path:
 
 
 def _relative(photo: Path, folder: Path) -> str:
-    return os.path.relpath(photo, absolute(folder))
+    return os.path.relpath(photo, absolute(pointed(folder)))
 
 
 def view_json(view: View) -> dict[str, Any]:

@@ -197,7 +197,7 @@ def work_folder(output: Path) -> Path:
 
 def frames_folder(output: Path) -> Path:
     """Folder for the frames of a video, a sibling of the map; it is kept, as the frames are the map's photos."""
-    return output.with_suffix(".frames")
+    return output.with_name(output.name + ".frames")
 
 
 @contextmanager
@@ -218,7 +218,7 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
                 raise
             raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
         except InputError:
-            if fresh and not (work / CHECKPOINT).exists():
+            if fresh and not any(work.rglob(CHECKPOINT)):  # of the whole, or of a block
                 shutil.rmtree(work, ignore_errors=True)
                 if not had_frames:
                     shutil.rmtree(frames_folder(output), ignore_errors=True)

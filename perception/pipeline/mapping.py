@@ -22,6 +22,7 @@ from perception.gaussians.photos import split_scene
 from perception.inputs.load import load_saved_scene, load_scene, save_scene
 from perception.language.base import Encoder
 from perception.language.ocr import TextReader, make_reader
+from perception.map.checksums import is_map
 from perception.map.files import read_info
 from perception.map.write import Map, read_map, write_map
 from perception.masks import MaskSource, make_source
@@ -58,7 +59,7 @@ def build_map(
     blocks of a large place are made; None: here. origin: the input's name in map.json, where `source` is a copy of it.
     """
     started = time.monotonic()
-    if resume and output.exists() and read_info(output).get("fingerprint") == fingerprint(source, config):
+    if resume and is_map(output) and read_info(output).get("fingerprint") == fingerprint(source, config):
         progress.log(f"{output}: this run is finished")
         clear_work(output)
         return read_map(output)
@@ -90,7 +91,7 @@ def build_map(
             quality = score_views(gaussians, optimised.photos.held, scene.metric)
         info = run_record(run, scene, optimised, found.report, quality, time.monotonic() - started)
         gmap = _assemble(gaussians, found, scene, held_out, {**info, "source": origin or str(source)}, output)
-        write_map(output, gmap)
+        write_map(output, gmap, fresh=True)
     _log_result(gmap, output, progress)
     return gmap
 
