@@ -9,9 +9,11 @@ repeats only what has changed.
     group      optimise, instances.*                                      nothing: it takes seconds
     describe   group, language.*                                          nothing
 
-train.time_limit is not part of the dependencies, so that a stopped run can be continued with more
-time. If other optimisation settings have changed, the checkpoint is an error and not discarded, as it may be hours of
-work. With changed masks, training restarts at the point where masks are first used.
+A run goes on only with the files that it began with (`pipeline.changes`): photos, masks, models and what else settings
+name, by size and time of change. train.time_limit is not part of the dependencies, so that a stopped run can be
+continued with more time. If other optimisation settings have changed, the checkpoint is an error and not discarded, as
+it may be hours of work. With other masks (another labels:DIR), training restarts at the point where masks are first
+used.
 """
 
 from __future__ import annotations

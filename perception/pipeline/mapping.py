@@ -31,6 +31,7 @@ from perception.masks.label_images import load_segmentation
 from perception.photos.reading import Reading
 from perception.photos.view_json import stored_view
 from perception.pipeline.blocks import cut, optimise_blocks
+from perception.pipeline.changes import hold_inputs, inputs_of, refuse_changed
 from perception.pipeline.checkpoint import clear_work, fingerprint, frames_folder, poses_mark, working
 from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
@@ -54,22 +55,27 @@ def build_map(
     resume: bool = False,
     progress: Progress = QUIET,
     engine: Engine | None = None,
-    origin: str | None = None,
 ) -> Map:
     """Builds a map from photos, a video, a COLMAP workspace or a transforms.json, and writes it to `output`.
 
     Raises InputError for bad input. Intermediate results are kept beside `output` until the map is written; with
     `resume` a run continues from them and repeats only what has changed (see `pipeline.checkpoint`). A run that fails
     before training leaves no files. Resuming a finished run returns its map. engine: where features, masks and the
-    blocks of a large place are made; None: here. origin: the input's name in map.json, where `source` is a copy of it.
+    blocks of a large place are made; None: here.
     """
     started = time.monotonic()
-    if resume and output.exists() and read_info(output).get("fingerprint") == fingerprint(source, config):
+    try:
+        there = output.exists()
+    except OSError as error:
+        raise InputError(f"{output}: no map can lie there ({error.strerror}); choose another -o") from error
+    if resume and there and (info := read_info(output)).get("fingerprint") == fingerprint(source, config):
+        refuse_changed(output, info, inputs_of(source, config, output))
         progress.log(f"{output}: this run is finished")
         clear_work(output)
         return read_map(output)
 
     with working(source, output, resume) as work:
+        hold_inputs(work, source, config, output)
         # Files, models and devices are opened first, so that errors appear before hours of work.
         device, told = choose_device(config.device)
         if told is not None:
@@ -83,6 +89,7 @@ def build_map(
         # Posed images I_v (§3.2) and a sparse cloud.
         with run.stage("poses"):
             scene = _scene(source, output, run, where)
+        inputs = hold_inputs(work, source, config, output)  # the frames of a video among them
         _tell_scene(scene, progress)
         training, held_out = split_views(scene.views, config.photos.holdout, config.photos.held_out)
         held_out = exposed_as_neighbours(held_out, training)
@@ -117,9 +124,10 @@ def build_map(
             "frame": scene.frame,
             "metric": scene.metric,
             **{key: scene.report[key] for key in FRAME_FACTS if key in scene.report},
-            "source": origin or str(source),
+            "source": str(source),
             "seed": config.seed,
             "fingerprint": fingerprint(source, config),
+            "inputs": inputs,
             "config": config.to_json(),
             "versions": versions(),
             "scene": {key: fact for key, fact in scene.report.items() if key not in FRAME_FACTS},

@@ -70,5 +70,5 @@ def test_a_wrong_job_is_found_before_any_work(jobs: object, told: str, tmp_path:
 
 def test_a_list_that_is_no_yaml(tmp_path: Path) -> None:
     (tmp_path / "jobs.yaml").write_text("a: [")
-    with pytest.raises(InputError, match="cannot be read as YAML"):
+    with pytest.raises(InputError, match="not readable YAML"):
         read_jobs(tmp_path / "jobs.yaml")
