@@ -30,8 +30,8 @@ CONFIGURATIONS = (
 """Files that are read in the folder of a model, or above it."""
 SHOWN = 3
 
-Inputs = dict[str, dict[str, list[int]]]
-"""By "SETTING=PATH", of each file that PATH names: [bytes, time of change in nanoseconds]."""
+Inputs = dict[str, dict[str, str]]
+"""By "SETTING=PATH", of each file that PATH names: "BYTES NANOSECONDS", its size and time of change."""
 
 
 def inputs_of(source: Path, config: MapConfig, output: Path) -> Inputs:
@@ -39,13 +39,16 @@ def inputs_of(source: Path, config: MapConfig, output: Path) -> Inputs:
     InputError where `source` is no input, or tells its photos in a file that cannot be read."""
     own = {folder.resolve() for folder in (output, work_folder(output), frames_folder(output))}
     found: Inputs = {}
-    for setting, path, files in _named(source.absolute(), config, frames_folder(output).absolute()):
-        base, others = path if path.is_dir() else path.parent, own - {path.resolve()}
-        folders = {folder: folder.resolve() for folder in {file.parent for file in files}}
-        written = {folder for folder, real in folders.items() if others & {real, *real.parents}}
-        stats = {file: file.stat() for file in files if file.parent not in written}
-        facts = {os.path.relpath(file, base): [stat.st_size, stat.st_mtime_ns] for file, stat in stats.items()}
-        found.setdefault(f"{setting}={path.resolve()}", {}).update(facts)
+    try:
+        for setting, path, files in _named(source.absolute(), config, frames_folder(output).absolute()):
+            base, others = path if path.is_dir() else path.parent, own - {path.resolve()}
+            folders = {folder: folder.resolve() for folder in {file.parent for file in files}}
+            written = {folder for folder, real in folders.items() if others & {real, *real.parents}}
+            stats = {file: file.stat() for file in files if file.parent not in written}
+            facts = {os.path.relpath(file, base): f"{stat.st_size} {stat.st_mtime_ns}" for file, stat in stats.items()}
+            found.setdefault(f"{setting}={path.resolve()}", {}).update(facts)
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror}); allow it, or remove it") from error
     return found
 
 
