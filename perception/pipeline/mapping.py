@@ -32,7 +32,7 @@ from perception.photos.reading import Reading
 from perception.photos.view_json import stored_view
 from perception.pipeline.blocks import cut, optimise_blocks
 from perception.pipeline.changes import hold_inputs, inputs_of, refuse_changed
-from perception.pipeline.checkpoint import clear_work, fingerprint, frames_folder, poses_mark, working
+from perception.pipeline.checkpoint import clear_work, fingerprint, frames_folder, poses_mark, work_folder, working
 from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
 from perception.pipeline.optimise import Photos, Run, label_by_tasks, label_photos, optimise
@@ -65,6 +65,7 @@ def build_map(
     """
     started = time.monotonic()
     try:
+        work_folder(output).exists()  # raises first where a name is too long
         there = output.exists()
     except OSError as error:
         raise InputError(f"{output}: no map can lie there ({error.strerror}); choose another -o") from error

@@ -144,6 +144,14 @@ def test_a_wrong_job_is_found_before_any_work(jobs: object, told: str, tmp_path:
         read_jobs(written(tmp_path, jobs))
 
 
+@pytest.mark.parametrize("length", [252, 300])
+def test_an_output_whose_name_is_too_long_is_one_line(
+    length: int, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    assert main(["map", str(tmp_path), "-o", str(tmp_path / ("x" * length))]) == 2
+    assert "no map can lie there (File name too long)" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
 def test_a_key_that_is_no_text(tmp_path: Path) -> None:
     (tmp_path / "jobs.yaml").write_text("- {1: x, input: ., output: a}")
     with pytest.raises(InputError, match="job 1: unknown setting '1'"):
