@@ -9,9 +9,11 @@ repeats only what has changed.
     group      optimise, instances.*                                      nothing: it takes seconds
     describe   group, language.*                                          nothing
 
-train.time_limit is not part of the dependencies, so that a stopped run can be continued with more
-time. If other optimisation settings have changed, the checkpoint is an error and not discarded, as it may be hours of
-work. With changed masks, training restarts at the point where masks are first used.
+A run goes on only with the files that it began with (`pipeline.changes`): photos, masks, models and what else settings
+name, by size and time of change. train.time_limit is not part of the dependencies, so that a stopped run can be
+continued with more time. If other optimisation settings have changed, the checkpoint is an error and not discarded, as
+it may be hours of work. With other masks (another labels:DIR), training restarts at the point where masks are first
+used.
 """
 
 from __future__ import annotations
@@ -188,6 +190,14 @@ def load_checkpoint(path: Path, mark: str) -> dict[str, Any] | None:
 WORK_SUFFIX = ".work"
 LEAST_DISK = 256 << 20
 """Least free disk space in bytes, as a small run needs it for features, masks, checkpoint and map."""
+
+
+def check_name(output: Path) -> None:
+    """InputError where no map can lie at `output`, as its name is too long."""
+    try:
+        work_folder(output).exists()
+    except OSError as error:
+        raise InputError(f"{output}: no map can lie there ({error.strerror}); choose another -o") from error
 
 
 def work_folder(output: Path) -> Path:

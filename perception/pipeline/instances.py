@@ -27,7 +27,7 @@ from perception.language.ocr import TextReader
 from perception.machine import return_free_memory
 from perception.map.map import prefixed
 from perception.masks.merging import Segmentation
-from perception.pipeline.optimise import Run
+from perception.pipeline.optimise import Optimised, Run
 from perception.progress import Progress
 
 HALVED_FROM = 480
@@ -48,9 +48,14 @@ class FoundInstances:
     groups: dict[str, np.ndarray] = field(default_factory=dict)
 
 
-def group_gaussians(nearby: Nearby, views: list[TrainingView], run: Run, cuts: Segmentation | None) -> Grouping | None:
+def group_gaussians(optimised: Optimised, run: Run, segments: Segmentation | None) -> Grouping | None:
     """Groups Gaussians into instances by features and votes of all masks (§3.2.1); None if no photo has masks.
-    cuts: of the surface, if the masks come from one."""
+    segments: of the surface, if the masks come from one."""
+    with run.stage("instances"):
+        return _group(optimised.nearby, optimised.photos.views, run, segments)
+
+
+def _group(nearby: Nearby, views: list[TrainingView], run: Run, segments: Segmentation | None) -> Grouping | None:
     if not any(view.labels is not None and bool((view.labels > 0).any()) for view in views):
         return None
     config = run.config
@@ -69,10 +74,19 @@ def group_gaussians(nearby: Nearby, views: list[TrainingView], run: Run, cuts: S
         margin=config.losses.margin,
         seed=config.seed,
     )
-    return found if cuts is None else with_levels(found, gaussians.means.detach().numpy(), votes, cuts)
+    return found if segments is None else with_levels(found, gaussians.means.detach().numpy(), votes, segments)
 
 
 def describe(
+    optimised: Optimised, grouped: Grouping | None, run: Run, encoder: Encoder | None, reader: TextReader | None
+) -> FoundInstances:
+    """Geometry, score and views of each instance; with an encoder its language embeddings (§3.2.2), with a reader its
+    printed texts."""
+    with run.stage("instances"):
+        return _describe(optimised.nearby, grouped, optimised.photos.views, run, encoder, reader)
+
+
+def _describe(
     nearby: Nearby,
     grouped: Grouping | None,
     views: list[TrainingView],
@@ -80,8 +94,6 @@ def describe(
     encoder: Encoder | None,
     reader: TextReader | None,
 ) -> FoundInstances:
-    """Geometry, score and views of each instance; with an encoder its language embeddings (§3.2.2), with a reader its
-    printed texts."""
     count, words, progress = len(nearby.gaussians), run.config.language, run.progress
     if grouped is None:
         report = {"warnings": ["no photo has masks"]}

@@ -61,6 +61,13 @@ def run_record(
     return facts | ({"blocks": optimised.blocks} if optimised.blocks else {})
 
 
+def scored(run: Run, optimised: Optimised, metric: bool) -> tuple[Gaussians, dict[str, Any]]:
+    """The Gaussians on the CPU, and how good they are in the held-out views."""
+    with run.stage("score"):
+        gaussians = optimised.nearby.gaussians.to("cpu")
+        return gaussians, score_views(gaussians, optimised.photos.held, metric)
+
+
 def score_views(gaussians: Gaussians, views: list[TrainingView], metric: bool = False) -> dict[str, Any]:
     """PSNR and SSIM of each view without ignored pixels, and their means; empty without views.
 

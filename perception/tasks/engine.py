@@ -107,6 +107,9 @@ class Engine:
                 ray.shutdown()
 
 
+LOCAL = Engine()
+
+
 class _Stoppable(Progress):
     """Shows nothing. Once `stop` is set, the next update ends the task."""
 
