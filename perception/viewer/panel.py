@@ -151,7 +151,8 @@ class Panel:
             if named != self._named:  # else keep what a user is typing there
                 self._named = named
                 self._name.value = entry.get("label") or ""
-            photo = session.crop(entry["id"])
+            photo, why = session.crop(entry["id"])
+            self._words.content += f"  \n{escaped(why)}" if why else ""
         self._show_photo(photo)
         wanted = f"click end {len(session.ends) + 1} of 2" if session.measuring else session.length
         lines = [wanted, *frame_lines(editor.original.info), *session.notes]
