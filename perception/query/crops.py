@@ -13,7 +13,7 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.map.map import Map
-from perception.photos.view_json import StoredView, absolute
+from perception.photos.view_json import StoredView, absolute, locate_photo
 from perception.query.query_map import QueryMap
 from perception.types import View
 
@@ -67,8 +67,11 @@ def readable_view(gmap: Map, view: View, photos: Path | None = None) -> View:
     allowed = _allowed(gmap, view, photos)
     if not allowed:
         raise PhotoOutside(f"{view.name}: {OUTSIDE}")
-    view = replace(view, photo=next((place for place in allowed if place.is_file()), allowed[0]))
-    return gmap.with_photo(replace(view, photo_beside=None) if isinstance(view, StoredView) else view)
+    view = replace(view, photo_beside=None) if isinstance(view, StoredView) else view
+    for place in allowed[:-1]:
+        with suppress(InputError):  # missing, or another file
+            return replace(view, photo=locate_photo(replace(view, photo=place), None))
+    return gmap.with_photo(replace(view, photo=allowed[-1]))
 
 
 def photos_outside(gmap: Map, photos: Path | None = None) -> str | None:

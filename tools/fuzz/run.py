@@ -107,7 +107,8 @@ class Session:
         seconds = time.perf_counter() - self.started
         return (
             f"{self.runs} inputs in {seconds:.0f} s ({self.runs / seconds:.0f}/s), {self.read} read, "
-            f"{self.runs - self.read} refused, {len(self.defects)} defects, the longest answer {1e3 * self.longest:.0f} ms"
+            f"{self.runs - self.read} refused, {len(self.defects)} defects, "
+            f"the longest took {1e3 * self.longest:.0f} ms"
         )
 
 

@@ -128,14 +128,14 @@ class HttpTarget:
 
 
 class PromptTarget:
-    """A prompt, asked on every way there is (`support.query_paths`) and over HTTP: answered, or refused by an InputError
-    of one line. run.py prints the longest time."""
+    """A prompt, asked on every way there is (`support.query_paths`) and over HTTP: answered, or refused in one line."""
 
     decides = False
     memory = 1024
     words = (
         " on ", " in ", " next to ", " left of ", " that says ", " with the words ", " labelled ", " reads ", " and ",
-        "a", "mug", "red ", "tomato ", "grandma's drum", '"', "\xe9", ",", " ", "\t", "{", '{"text":', '"want":"points"',
+        "a", "mug", "red ", "tomato ", "grandma's drum", '"', "\xe9", ",", " ", "\t", "{", '{"text":',
+        '"want":"points"',
     )  # fmt: skip
 
     def __init__(self) -> None:
