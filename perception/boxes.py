@@ -82,8 +82,8 @@ def _along(points: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.svd((points - points.mean(axis=0)).T @ (points - points.mean(axis=0)))[2])
 
 
-def _hull_directions(plane: np.ndarray, most: int = 64) -> np.ndarray:
-    """Unit directions [D, 2] of the convex hull's longest sides; none when the points lie on a line."""
+def _hull_directions(plane: np.ndarray) -> np.ndarray:
+    """Unit directions [D, 2] of the convex hull's 64 longest sides; none when the points lie on a line."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
@@ -92,7 +92,7 @@ def _hull_directions(plane: np.ndarray, most: int = 64) -> np.ndarray:
         return np.empty((0, 2))
     sides = np.roll(corners, -1, axis=0) - corners
     length = np.linalg.norm(sides, axis=1)
-    longest = np.argsort(-length, kind="stable")[:most]
+    longest = np.argsort(-length, kind="stable")[:64]
     return sides[longest] / length[longest, None]
 
 

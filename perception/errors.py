@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from unicodedata import category
+
+_URL = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)
 
 
 class InputError(ValueError):
@@ -26,6 +29,16 @@ class InputError(ValueError):
 def missing_extra(package: str, extra: str) -> InputError:
     """The error for a missing optional dependency, with the exact install command."""
     return InputError(f"the package '{package}' is not installed; run in its clone: pip install \".[{extra}]\"")
+
+
+def local_path(text: str) -> Path:
+    """The path that `text` names. InputError for a URL, of which only the scheme is told: URLs hold passwords."""
+    if found := _URL.match(text):
+        what = "is a URL, expected a path on this machine"
+        raise InputError(f"{found.group()}…: {what}; copy it with `aws s3 sync` or `rclone`, or mount the store")
+    if "\0" in text:
+        raise InputError(f"{text}: holds a NUL character; expected a path")
+    return Path(text)
 
 
 def refuse_named_pipe(file: Path) -> None:

@@ -1,7 +1,8 @@
-"""Rigid and similarity transforms in float64. Transforms are named a_from_b; quaternions are wxyz."""
+"""Rigid and similarity transforms in float64, named a_from_b; sums of rows by group."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,14 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     """The rotation [3, 3] closest to `matrix` [3, 3] in the Frobenius norm (polar decomposition)."""
     u, _, vt = np.linalg.svd(matrix)
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+
+
+def rotations(quats: np.ndarray) -> np.ndarray:
+    """[N, 3, 3] float64 of quaternions [N, 4] wxyz; one of zeros is the identity."""
+    from scipy.spatial.transform import Rotation
+
+    xyzw = np.add(quats[:, [1, 2, 3, 0]], [0, 0, 0, 1e-30], dtype=np.float64)
+    return np.asarray(Rotation.from_quat(xyzw).as_matrix())
 
 
 def interpolated_pose(times: np.ndarray, poses: np.ndarray, time: float, gap: float) -> np.ndarray | None:
@@ -102,3 +111,10 @@ def move_points(a_from_b: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Transforms points [..., 3] from frame b to a in float64; returns their own float dtype, else float64."""
     moved = np.asarray(points, np.float64) @ a_from_b[:3, :3].T + a_from_b[:3, 3]
     return moved.astype(points.dtype if np.issubdtype(np.asarray(points).dtype, np.floating) else np.float64)
+
+
+def sums_by(index: np.ndarray, values: np.ndarray, count: int, weights: np.ndarray | None = None) -> np.ndarray:
+    """Sums [count, ...] float64 of values [P, ...] with the same index [P], in their order, times weights [P]."""
+    columns = values.reshape(len(values), math.prod(values.shape[1:])).T
+    sums = [np.bincount(index, column if weights is None else weights * column, count) for column in columns]
+    return np.stack(sums, axis=1).reshape(count, *values.shape[1:])

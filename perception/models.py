@@ -207,7 +207,12 @@ def _install(name: str, files: Sequence[tuple[str, Path, str]]) -> StoredModel:
         raise InputError(f"models add {name}: two files are called {', '.join(sorted(twice))}; rename one")
     if not any(n.endswith(".onnx") for n in names):
         raise InputError(f"models add {name}: no .onnx file among {', '.join(names) or 'nothing'}")
-    with atomic_directory(models_folder() / name) as folder:
+    target, known = models_folder() / name, find_model(name)
+    made = {RECORD, *(file["name"] for file in ([] if known is None else known.files))}
+    for file in target.rglob("*"):
+        if not file.is_dir() and str(file.relative_to(target)) not in made:
+            raise InputError(f"{file}: was not added as a part of '{name}', and would be lost; move it elsewhere")
+    with atomic_directory(target) as folder:
         entries = []
         for file_name, path, source in files:
             target = folder / file_name

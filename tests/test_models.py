@@ -121,6 +121,16 @@ def test_what_is_no_model_is_not_stored(tmp_path: Path, sam: tuple[Path, Path]) 
         add_model("gone", [str(tmp_path / "gone.onnx")])
 
 
+def test_files_that_were_not_added_are_not_replaced(sam: tuple[Path, Path]) -> None:
+    for _ in range(2):
+        add_model("mine", [str(file) for file in sam])
+    notes = models_folder() / "mine" / "notes.txt"
+    notes.write_text("where it came from")
+    with pytest.raises(InputError, match=r"notes\.txt: was not added"):
+        add_model("mine", [str(sam[0])])
+    assert notes.read_text() == "where it came from" and (notes.parent / sam[1].name).is_file()
+
+
 # ----------------------------------------------------------------------- the catalogue
 
 

@@ -17,6 +17,7 @@ from perception.bags.read import CAMERA_INFO, IMAGES, Bag, camera_of, decode_ima
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
 from perception.io.atomic import atomic_directory
+from perception.io.outputs import check_empty
 from perception.photos.camera_file import read_camera, write_camera_info
 from perception.photos.lens import FISHEYE, PERSPECTIVE
 from perception.photos.video import Chooser
@@ -45,8 +46,7 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
     """Writes `output`/images, camera.yaml, depth of the images, and, with poses, transforms.json: (JSON result, text).
     Map `output` if there are poses. Otherwise map `output`/images with --camera `output`/camera.yaml."""
     options = options or FrameOptions()
-    if output.exists() and any(output.iterdir()):
-        raise InputError(f"{output}: is not empty; choose another -o or remove it first")
+    check_empty(output)
     if options.max_frames < 2 or not options.spacing > 0:
         raise InputError(f"--max-frames {options.max_frames}, --spacing {options.spacing}: expected 2 or more, above 0")
     with open_bag(source) as bag:
@@ -66,7 +66,7 @@ def run_frames(source: Path, output: Path, options: FrameOptions | None = None) 
             raise InputError(f"{source}: {topic} holds no images")
         chosen = chooser.chosen(options.max_frames)
         poses = read_poses(bag)
-        with atomic_directory(output) as aside:
+        with atomic_directory(output, fresh=True) as aside:
             lens = _write_camera(aside / "camera.yaml", options.camera, info, topic, size, source)
             stamps, frame = _write_images(bag, topic, chosen, aside / "images")
             depth, told = dict[str, str](), None

@@ -16,6 +16,7 @@ from perception.calibration.board import Board, Detection
 from perception.calibration.solve import NAMES, Solution, solve
 from perception.errors import InputError
 from perception.io.atomic import atomic_file
+from perception.io.outputs import check_side_file, refuse_inputs
 from perception.photos.camera_file import write_camera
 from perception.photos.decode import SUFFIXES, read_grey
 from perception.photos.video import frames
@@ -38,9 +39,13 @@ SAME_VIEW = 0.03
 def run_calibration(source: Path, output: Path, board: Board, model: str = "auto") -> tuple[dict[str, Any], str]:
     """Calibrates a camera from a folder of photos or a video of a board: (JSON-serialisable result, table).
 
-    Writes `output` (ROS camera_info YAML) and next to it a .json with all figures. Photos are rotated according to
+    Writes `output` (ROS camera_info YAML) and a .json with all figures beside it, of the same stem where `output` is a
+    .yaml or .yml. Photos are rotated according to
     EXIF, as in mapping. Raises InputError if no board is found, or if the views are too few or too similar.
     """
+    report = output.with_suffix(".json") if output.suffix.lower() in (".yaml", ".yml") else Path(f"{output}.json")
+    refuse_inputs([output, report], _photos(source) if source.is_dir() else [source])
+    check_side_file(report, output, "distortion_model")
     found, size, looked_at = _detect(source, board)
     views = distinct_views(found, size[0])
     check_count(views, len(found), looked_at, str(board), str(source))
@@ -49,7 +54,7 @@ def run_calibration(source: Path, output: Path, board: Board, model: str = "auto
     notes = check_solution(solution, str(source))
     result = _facts(solution, looked_at, len(found), board, notes)
     write_camera(output, output.stem, solution.model, solution.size, solution.values)
-    with atomic_file(output.with_suffix(".json")) as aside:
+    with atomic_file(report) as aside:
         aside.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     result["camera"] = str(output)
     return result, _table(result)
@@ -70,10 +75,14 @@ def best_model(views: list[Detection], size: tuple[int, int], model: str = "auto
     return solved[-1]
 
 
+def _photos(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+
+
 def _pictures(source: Path) -> Iterator[tuple[str, np.ndarray]]:
     """(name, grey image [H, W] uint8) of a folder's photos in order of name, or of a video's frames."""
     if source.is_dir():
-        files = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
+        files = _photos(source)
         if not files:
             raise InputError(f"{source}: holds no photos; expected pictures of a calibration board")
         for file in files:

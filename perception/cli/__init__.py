@@ -13,8 +13,8 @@ from importlib import import_module
 
 from perception import __version__
 from perception.cli.parser import Parser
-from perception.cores import limit_threads
 from perception.errors import InputError
+from perception.machine import limit_threads
 
 _MODULES = ("mapping", "maps", "scoring", "serving", "models")
 """Files of this package that add subcommands, in the order of --help."""

@@ -11,7 +11,6 @@ from typing import Any
 from perception.cli.parser import command, map_command
 from perception.errors import InputError
 from perception.interrupts import handled
-from perception.io.object_store import place
 
 
 def register(commands: Any) -> None:
@@ -60,8 +59,8 @@ def _add_map(commands: Any) -> None:
         commands, "map", _map, "build a map from photos, a video, a COLMAP workspace, a transforms.json or RGB-D"
     )
     p.formatter_class, p.late_epilog = argparse.RawDescriptionHelpFormatter, _settings
-    p.add_argument("input", type=place, metavar="INPUT", help="a path, or the URL of a copy in an object store")
-    p.add_argument("-o", "--output", type=place, required=True, metavar="MAP", help="a path or URL")
+    p.add_argument("input", type=Path, metavar="INPUT")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="MAP")
     p.add_argument("--config", type=Path, metavar="FILE.toml")
     p.add_argument("--preset", default="default", help="fast, default, quality or paper")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="pairs")
@@ -120,23 +119,16 @@ def _map(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
     config = load_config(args.config, settings_given(args), args.preset)
     from perception.pipeline.mapping import build_map
-    from perception.pipeline.remote import local_places
     from perception.progress import Progress
+    from perception.report.page import write_own_report
     from perception.report.text import map_facts
     from perception.tasks.engine import Engine
 
     engine = Engine(args.engine, args.address)
-    with (
-        _sigterm_as_interrupt(),
-        Progress() as progress,
-        local_places(args.input, args.output, config, args.resume, progress) as at,
-    ):
-        if at.info is None:
-            build_map(
-                at.source, at.output, config, resume=at.resume, progress=progress, engine=engine, origin=at.origin
-            )
-    assert at.info is not None
-    return map_facts(args.output, at.info), ""
+    with _sigterm_as_interrupt(), Progress() as progress:
+        build_map(args.input, args.output, config, resume=args.resume, progress=progress, engine=engine)
+        info = write_own_report(args.output, progress)
+    return map_facts(args.output, info), ""
 
 
 def _fleet(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -179,9 +171,11 @@ def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _report(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.io.outputs import refuse_inputs
     from perception.query import load_map
     from perception.report.page import write_map_report
 
+    refuse_inputs([args.output], [args.map])
     page = write_map_report(load_map(args.map), args.output, args.ask)
     return {"report": str(page)}, str(page)
 

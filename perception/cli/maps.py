@@ -31,7 +31,7 @@ def register(commands: Any) -> None:
     place.add_argument(
         "--transform", type=Path, metavar="FILE", help="as --align, by a known 4 x 4 map_from_scan (text or JSON)"
     )
-    p.add_argument("-o", "--output", type=Path, metavar="OUT", help=".ply, .pcd or .npz; .spz or .sog: Gaussians")
+    p.add_argument("-o", "--output", type=Path, metavar="OUT", help=".ply, .pcd or .npz; .spz: Gaussians")
     p.add_argument("--smooth", action=argparse.BooleanOptionalAction, default=True)
     p.add_argument("--max-distance", type=float, metavar="D", help="points farther from any Gaussian stay -1")
     p.add_argument("--segments", type=Path, metavar="X.segs.json", help="ScanNet's segments, or scannet: by its rules")
@@ -56,7 +56,7 @@ def register(commands: Any) -> None:
     p.add_argument("--clear", action="store_true", help="take the name away")
     p = map_command(commands, "relink", _relink, "tell a map where its photos lie now")
     p.add_argument("folder", type=Path, metavar="DIR", help="the folder that holds the photos")
-    p = map_command(commands, "upgrade", _upgrade, "bring an older map to the newest format and encoder")
+    p = map_command(commands, "upgrade", _upgrade, "embed the instances with the current encoder, read printed texts")
     p.add_argument("-o", "--output", type=Path, metavar="OUT.gsmap", help="default: in place")
     p = map_command(commands, "scale", _scale, "give a finished map metres, by a length, tags, a board or GPS")
     p.add_argument("-o", "--output", type=Path, metavar="OUT.gsmap", help="default: in place")
@@ -70,9 +70,11 @@ def register(commands: Any) -> None:
 
 
 def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    from perception.io.outputs import refuse_inputs
     from perception.query import load_map
     from perception.report.text import guessed_names, query_text, write_hits
 
+    refuse_inputs([args.points], [args.map])
     opened = load_map(args.map)
     answers = [(text, opened.query(text, args.top, args.min_score)) for text in args.text]
     of_store = any(hit.map is not None for _, hits in answers for hit in hits)
@@ -144,15 +146,16 @@ def _upgrade(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.progress import Progress
 
     facts = upgrade_map(args.map, args.output, progress=Progress(quiet=args.json))
-    (old, new), (before, after) = facts["format_version"], facts["encoder"]
+    before, after = facts["encoder"]
     said = f"embeddings by {after}, before by {before}" if before != after else "embeddings as they were"
-    return facts, f"{facts['map']}: format version {new}, before {old}; {said}"
+    return facts, f"{facts['map']}: {said}"
 
 
 def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.export.export_map import export_map
+    from perception.export.export_map import export_map, side_file
     from perception.export.mesh import check_outputs, export_mesh, export_voxels
     from perception.export.transfer import ExportOptions
+    from perception.io.outputs import check_side_file, refuse_inputs
     from perception.map.write import read_map
     from perception.query.query_map import load_map
     from perception.query.scene_graph import write_graph
@@ -164,6 +167,11 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     if args.instance is not None and args.mesh is None:
         raise InputError("export: --instance selects what --mesh writes; give --mesh OUT")
     check_outputs(args.mesh, args.voxels, args.voxel_size)
+    side = None if args.output is None else side_file(args.output)
+    inputs = [args.map, args.points, args.transform, args.segments]
+    refuse_inputs([args.output, side, args.mesh, args.voxels, args.graph], inputs)
+    if side is not None:
+        check_side_file(side, args.output, "instances")
     facts: dict[str, Any] = {}
     lines = []
     if args.graph is not None:

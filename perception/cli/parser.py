@@ -7,13 +7,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from perception.errors import InputError
+from perception.errors import InputError, local_path
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse with a one-line error and exit code 2 on bad usage. late_epilog makes the epilog, when help is shown."""
+    """argparse with a one-line error and exit code 2 on bad usage. late_epilog makes the epilog, when help is shown.
+    Arguments of type Path are refused where they are URLs."""
 
     late_epilog: Callable[[], str] | None = None
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.register("type", Path, _path)
 
     def error(self, message: str) -> Any:  # type: ignore[override]
         raise InputError(f"{self.prog}: {message} (see {self.prog} --help)")
@@ -22,6 +27,13 @@ class Parser(argparse.ArgumentParser):
         if self.late_epilog is not None:
             self.epilog = self.late_epilog()
         return super().format_help()
+
+
+def _path(text: str) -> Path:
+    try:
+        return local_path(text)
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 Run = Callable[[argparse.Namespace], tuple[dict[str, Any], str]]

@@ -45,7 +45,7 @@ def scale_map(path: Path, output: Path | None, options: FrameConfig, improve: bo
             raise InputError(f"{path}: {found}; `perception scale` replaces the unit all the same")
         entry = Measurement(1.0, error, scale.source).to_json()
         info = {**gmap.info, "metric": True, "scale": entry}
-        write_map(target, scaled(Map.of(gmap, info=info), scale.metres))
+        write_map(target, scaled(Map.of(gmap, info=info), scale.metres), fresh=output is not None)
     gravity = info.get("gravity")
     return {"map": str(target), "factor": scale.metres, "scale": entry, "gravity": gravity, "notes": notes}
 

@@ -1,4 +1,4 @@
-"""`perception upgrade`: converts a map to the newest format and embeds its instances with the current encoder."""
+"""`perception upgrade`: embeds the instances of a map with the current encoder and reads printed texts."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ from perception.language.base import Encoder, reading_of
 from perception.language.description import from_arrays, to_arrays
 from perception.language.encoders import make_encoder
 from perception.language.ocr import TextReader, make_reader
-from perception.map.files import read_info
 from perception.map.map import Map, language_in, prefixed
-from perception.map.write import FORMAT_VERSION, read_map, write_map
-from perception.photos.view_json import StoredView, locate_photo, stored_view
+from perception.map.write import read_map, write_map
+from perception.photos.view_json import locate_photo
 from perception.progress import QUIET, Progress
 
 
@@ -34,18 +33,17 @@ def upgrade_map(
     encoders: Callable[[str], Encoder | None] = make_encoder,
     progress: Progress = QUIET,
 ) -> dict[str, Any]:
-    """Writes the map at `path` in the newest format, to `output` or in place; Gaussians, instances, labels are kept.
+    """Writes the map at `path` anew, to `output` or in place; Gaussians, instances and labels are kept.
 
     If the embeddings are from another encoder than the one its settings now select, all instances are embedded again,
     from their recorded photos and rendered silhouettes; InputError names the first missing photo. Printed texts are
     read if the extra ocr is installed, the map has none from this reader, and its photos are there.
-    Returns {"map", "format_version": [before, after], "encoder": [before, after]}.
+    Returns {"map", "encoder": [before, after]}.
     """
     target = output or path
     if output is not None and output.exists():
         raise InputError(f"{output}: exists already; choose another -o or remove it first")
     with writing(target):
-        before = int(read_info(path)["format_version"])
         gmap = read_map(path)
         old = str(gmap.language["encoder"]) if gmap.language else None
         spec = gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
@@ -53,15 +51,9 @@ def upgrade_map(
         if encoder is not None and encoder.identity != old:
             _embed_again(gmap, encoder, progress)
         _read_again(gmap, make_reader(gmap.info.get("config", {}).get("language", {}).get("texts", "auto")), progress)
-        gmap.views = [  # version 1 has neither photo sizes nor relative paths
-            view
-            if isinstance(view, StoredView) and view.photo_bytes is not None
-            else stored_view(view, target, view.held_out)
-            for view in gmap.views
-        ]
-        write_map(target, gmap, keep_report=True)
+        write_map(target, gmap, keep_report=True, fresh=output is not None)
     new = str(gmap.language["encoder"]) if gmap.language else None
-    return {"map": str(target), "format_version": [before, FORMAT_VERSION], "encoder": [old, new]}
+    return {"map": str(target), "encoder": [old, new]}
 
 
 def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:

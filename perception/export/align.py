@@ -24,8 +24,9 @@ from scipy.ndimage import binary_dilation, map_coordinates
 
 from perception.errors import InputError
 from perception.export.align_steps import Images, Place, gray_images, jacobian, likely_rotations, robust_gain
-from perception.export.depth_views import DepthView, cell_means, fused_surface, grid_cells, observe
+from perception.export.depth_views import DepthView, fused_surface, grid_cells, observe
 from perception.export.neighbors import Neighbors, list_normals, neighbor_lists
+from perception.geometry import sums_by
 from perception.types import PointCloud
 
 SCALES = 2.0 ** np.arange(-2, 1.51, 1 / 9)
@@ -328,7 +329,7 @@ def _extent(points: np.ndarray) -> float:
 def _thinned(points: np.ndarray, colors: np.ndarray | None, width: float) -> tuple[np.ndarray, np.ndarray | None]:
     """Mean point, and mean brightness in [0, 1] if there are colours, of each cell of a grid."""
     cell, count = grid_cells(points, width)
-    mean = cell_means(points, cell, count)
+    mean = sums_by(cell, points, len(count)) / count[:, None]
     if colors is None or colors.min() == colors.max():
         return mean, None
     return mean, np.bincount(cell, colors.mean(axis=1) / 255) / count

@@ -11,6 +11,7 @@ import torch
 
 from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
+from perception.geometry import sums_by
 from perception.photos.decode import scaled_K, scaled_size
 from perception.photos.depth import without_edges
 from perception.types import View
@@ -93,8 +94,7 @@ def fused_surface(views: Sequence[DepthView]) -> tuple[np.ndarray, np.ndarray]:
     points, normals = (np.concatenate(parts) for parts in zip(*map(_backprojected, views), strict=True))
     low, high = np.percentile(points, [2, 98], axis=0)
     cell, count = grid_cells(points, float(np.linalg.norm(high - low)) / 80)
-    mean = cell_means(points, cell, count)
-    turned = cell_means(normals, cell, count)
+    mean, turned = (sums_by(cell, values, len(count)) / count[:, None] for values in (points, normals))
     length = np.linalg.norm(turned, axis=1)
     kept = (count >= 3) & (length > 0.3)
     return mean[kept], turned[kept] / length[kept, None]
@@ -107,11 +107,6 @@ def grid_cells(points: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray
     flat = (keys[:, 0] * sizes[1] + keys[:, 1]) * sizes[2] + keys[:, 2]
     _, cell, count = np.unique(flat, return_inverse=True, return_counts=True)
     return cell.reshape(-1), count
-
-
-def cell_means(values: np.ndarray, cell: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Mean [C, D] of values [P, D] in each cell of `grid_cells`."""
-    return np.stack([np.bincount(cell, column) for column in values.T], axis=1) / count[:, None]
 
 
 def _backprojected(view: DepthView) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,6 @@ from perception.errors import InputError
 from perception.export.align import align
 from perception.export.depth_views import DepthView, depth_views
 from perception.export.render import as_gaussians, map_views
-from perception.export.sog import write_sog
 from perception.export.spz import write_spz
 from perception.export.transfer import ExportOptions, check_overlap, export_labels, write_export
 from perception.frame.recentre import map_from_input
@@ -71,10 +70,14 @@ def read_transform(path: Path) -> np.ndarray:
     return check_similarity(rows, str(path))
 
 
-COMPRESSED = {".spz": write_spz, ".sog": write_sog}
-SUFFIXES = (".ply", ".pcd", ".npz", *COMPRESSED)
+SUFFIXES = (".ply", ".pcd", ".npz", ".spz")
 SURFACE_OPACITY = 0.5
 """Gaussians of at least this opacity are the surface points of a map."""
+
+
+def side_file(output: Path) -> Path:
+    """The file that `export_map` writes beside `output`: ids of compressed Gaussians, or facts of the instances."""
+    return output.with_suffix(".npy" if output.suffix.lower() == ".spz" else ".json")
 
 
 def export_map(
@@ -102,8 +105,8 @@ def export_map(
     >>> facts["points"], facts["labelled"], sorted(facts["instances"])[:3]
     (900, 900, ['0', '1', '2'])
     """
-    if output.suffix.lower() in COMPRESSED:
-        return _export_compressed(map_path, output, points)
+    if output.suffix.lower() == ".spz":
+        return _export_spz(map_path, output, points)
     if output.suffix.lower() not in SUFFIXES:
         raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected one of {', '.join(SUFFIXES)}")
     if place and points is None:
@@ -148,17 +151,16 @@ def export_map(
     return result, _table(result)
 
 
-def _export_compressed(map_path: Path, output: Path, points: Path | None) -> tuple[dict[str, Any], str]:
+def _export_spz(map_path: Path, output: Path, points: Path | None) -> tuple[dict[str, Any], str]:
     """All Gaussians of the map, for viewers in the browser."""
-    kind = output.suffix.lower()
     if points is not None:
-        raise InputError(f"{output}: {kind} holds the map's Gaussians; labels of a scan go to .ply, .pcd or .npz")
+        raise InputError(f"{output}: .spz holds the map's Gaussians; labels of a scan go to .ply, .pcd or .npz")
     gmap = read_map(map_path)
-    COMPRESSED[kind](output, gmap)
-    size, ids = output.stat().st_size, output.with_suffix(".npy")
+    write_spz(output, gmap)
+    size, ids = output.stat().st_size, side_file(output)
     share = size / max((map_path / "gaussians.ply").stat().st_size, 1)
     told = f"{output}: {len(gmap)} Gaussians, {share:.0%} of the PLY's size; instance ids in {ids}"
-    return {kind[1:]: str(output), "gaussians": len(gmap), "bytes": size, "instance_ids": str(ids)}, told
+    return {"spz": str(output), "gaussians": len(gmap), "bytes": size, "instance_ids": str(ids)}, told
 
 
 def at_granularity(gmap: Map, granularity: str) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:

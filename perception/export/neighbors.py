@@ -1,5 +1,10 @@
 """Nearest neighbours in 3D with the compiled k-d tree, exact in float32 relative to a common centre; the Gaussian with
 the nearest mean (OpenSplat3D), in chunks for clouds of any size; neighbourhoods of a cloud's points, and normals.
+
+It stands beside SciPy's for its speed and its ties: of equal distances the smaller index, on any number of threads.
+CPU seconds of `python tools speed.neighbors`, one thread, in turns: the nearest of 500,000 means for 1 M points 0.55
+(SciPy's cKDTree 2.8, small_gicp 2.1, pykdtree 2.1); 25 neighbours of each of 300,000 points 0.76 (2.1, 1.8, 2.2).
+NumPy takes 3.7 times as long for the normals, and 40 times for the edges of neighbour lists.
 """
 
 from __future__ import annotations
@@ -7,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from perception import _core
-from perception.cores import cores
 from perception.errors import InputError
+from perception.machine import cores
 
 CHUNK = 1 << 20  # points at a time: 24 MiB of working memory
 

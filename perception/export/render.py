@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -16,8 +17,11 @@ from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
 from perception.gaussians.views import depth_image
 from perception.instances.silhouettes import render_silhouettes
+from perception.io.atomic import atomic_file
 from perception.io.documents import safe_name
+from perception.io.outputs import refuse_inputs
 from perception.map.write import Map, read_map
+from perception.photos.decode import SUFFIXES
 from perception.query.crops import cut_out
 from perception.query.query_map import QueryMap
 from perception.types import View
@@ -26,13 +30,15 @@ KINDS = ("rgb", "depth", "instances", "features")
 
 
 def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[str]) -> tuple[dict[str, Any], str]:
-    """Writes one image per camera and kind: `NAME.png` for a single kind, `KIND/NAME.png` for several.
+    """Writes one image per camera and kind: `NAME.png` for a single kind, `KIND/NAME.png` for several. NAME is that of
+    the photo without its suffix, or with it where another photo has the same otherwise.
 
     rgb: 8-bit PNG. depth: 16-bit PNG, thousandths of the map's unit along the optical axis, 0 = nothing. instances:
     16-bit PNG of id + 1, 0 = none. features: 8-bit PNG of the three main components.
     cameras: a transforms.json in the coordinates of the map's input; None takes the map's held-out views (all views if
     none were held out). A camera with lens distortion is rendered with that distortion, so that the image aligns with
-    its photo. InputError for a name that points outside `output`.
+    its photo. InputError for a name that points outside `output`, and for an image
+    that would replace a photo.
     """
     for kind in what:
         if kind not in KINDS:
@@ -43,14 +49,31 @@ def render_map(map_path: Path, output: Path, cameras: Path | None, what: list[st
     else:
         placed = map_from_input(map_path, gmap.info)
         views = [moved(view, placed) for view in _cameras(cameras)]
-    names = [safe_name(view.name, cameras or map_path) for view in views]  # no path outside `output`
+    files = _picture_names([safe_name(view.name, cameras or map_path) for view in views])  # no path outside `output`
+    folders = {kind: output if len(what) == 1 else output / kind for kind in what}
+    refuse_inputs((folder / file for folder in folders.values() for file in files), [map_path, *_listed(cameras)])
     gaussians = as_gaussians(gmap)
-    for kind in what:
-        folder = output if len(what) == 1 else output / kind
-        for name, view in zip(names, views, strict=True):
-            write_picture((folder / name).with_suffix(".png"), _through_lens(kind, gaussians, gmap, view))
+    for kind, folder in folders.items():
+        for file, view in zip(files, views, strict=True):
+            write_picture(folder / file, _through_lens(kind, gaussians, gmap, view))
     facts = {"output": str(output), "views": len(views), "what": what}
     return facts, f"{output}: {len(views)} views of {', '.join(what)}"
+
+
+def _picture_names(names: list[str]) -> list[str]:
+    short = [str(Path(name).with_suffix("")) if Path(name).suffix.lower() in SUFFIXES else name for name in names]
+    many = Counter(short)
+    return [f"{name if many[stem] > 1 else stem}.png" for name, stem in zip(names, short, strict=True)]
+
+
+def _listed(cameras: Path | None) -> list[Path]:
+    """A transforms.json and the photos it lists, whether they exist or not."""
+    from perception.inputs.transforms import read_frames
+
+    if cameras is None:
+        return []
+    photos = [cameras.parent / name for name, _, _ in read_frames(cameras)]
+    return [cameras, *photos, *(photo.with_name(f"{photo.name}.png") for photo in photos)]
 
 
 def as_gaussians(gmap: Map) -> Gaussians:
@@ -144,8 +167,7 @@ def write_picture(path: Path, image: np.ndarray) -> None:
     """Writes an image [H, W] or [H, W, 3] RGB; folders are made. InputError when that fails."""
     import cv2
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     if image.ndim == 3:
         image = np.ascontiguousarray(image[..., ::-1])
-    if not cv2.imwrite(str(path), image):
-        raise InputError(f"{path}: cannot be written; choose a writable -o")
+    with atomic_file(path) as aside:
+        aside.write_bytes(cv2.imencode(".png", image)[1].tobytes())

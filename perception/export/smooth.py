@@ -13,7 +13,7 @@ from perception import _core
 from perception.errors import InputError
 from perception.export.neighbors import list_normals, neighbor_lists
 from perception.io.documents import read_json
-from perception.io.memory import require_memory
+from perception.machine import require_memory
 from perception.types import PointCloud
 
 K_THRESHOLD, MIN_SIZE = 0.01, 20  # ScanNet's kThresh and segMinVerts

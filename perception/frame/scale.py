@@ -111,22 +111,22 @@ class KnownLength:
 
 _NUMBER = r"[-+.\deE]+"
 _POINTS = re.compile(rf"({_NUMBER},{_NUMBER},{_NUMBER})\s+({_NUMBER},{_NUMBER},{_NUMBER})")
-_PIXELS = re.compile(rf"(.+?)\s+({_NUMBER},{_NUMBER})\s+({_NUMBER},{_NUMBER})")
+_PIXEL = re.compile(f"{_NUMBER},{_NUMBER}")
 
 
 def known_length(text: str) -> KnownLength:
     """Reads "METRES: A, B" (labels or ids), "METRES: X,Y,Z X,Y,Z" or "METRES: PHOTO X,Y X,Y; PHOTO X,Y X,Y"."""
     expected = 'expected "METRES: LABEL, LABEL", "METRES: X,Y,Z X,Y,Z" or "METRES: PHOTO X,Y X,Y; PHOTO X,Y X,Y"'
     length, _, rest = (part.strip() for part in text.partition(":"))
-    entries = [_PIXELS.fullmatch(entry.strip()) for entry in rest.split(";") if entry.strip()]
+    entries = [entry.rsplit(maxsplit=2) for entry in rest.split(";") if entry.strip()]
     names = [name.strip() for name in rest.split(",")]
     try:
         if np.isnan(metres := float(length)):
             raise ValueError("its length is no number")
         if places := _POINTS.fullmatch(rest):
             found = KnownLength(metres, points=_finite([places[1], places[2]]))
-        elif entries and all(entries):
-            found = KnownLength(metres, pixels={e[1]: _finite([e[2], e[3]]) for e in entries if e})
+        elif entries and all(len(e) == 3 and all(map(_PIXEL.fullmatch, e[1:])) for e in entries):
+            found = KnownLength(metres, pixels={photo.strip(): _finite(ends) for photo, *ends in entries})
         elif len(names) == 2 and all(names) and ";" not in rest:
             found = KnownLength(metres, names=(names[0], names[1]))
         else:

@@ -15,6 +15,7 @@ import torch
 
 from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.views import TrainingView, unprojected
+from perception.geometry import sums_by
 from perception.masks.surface import voxel_keys
 
 SAMPLES = 1_500_000
@@ -130,9 +131,8 @@ def _voxels(
 ) -> DepthCloud:
     """Weighted means of the samples in each voxel of LEAST_PIXELS or more that no majority of views looks through."""
     _, index, count = np.unique(voxel_keys(points, side), return_inverse=True, return_counts=True)
-    total = np.bincount(index, weights)
     values = np.concatenate([points, colors], axis=1)
-    means = np.stack([np.bincount(index, weights * column) for column in values.T], axis=1) / total[:, None]
+    means = sums_by(index, values, len(count), weights) / np.bincount(index, weights)[:, None]
     means = means[count >= LEAST_PIXELS]
     means = means[_consistent(means[:, :3], side, views)]
     return DepthCloud(side, means[:, :3], np.rint(means[:, 3:]).astype(np.uint8))

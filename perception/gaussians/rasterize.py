@@ -7,9 +7,7 @@ transmittance falls under 1e-4. Tensors on a CUDA device go to perception/gaussi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +17,7 @@ from torch import Tensor
 
 from perception import _core
 from perception.errors import InputError
+from perception.machine import threads_before
 
 
 @dataclass
@@ -79,26 +78,6 @@ simd_levels = _core.simd_levels
 """The SIMD levels this processor supports, best first."""
 
 
-_threads: ContextVar[int] = ContextVar("threads", default=0)
-
-
-@contextmanager
-def torch_on_one_thread() -> Iterator[None]:
-    """Within it torch computes on one thread, and the rasterizer by default on as many as torch had before.
-
-    Idle workers of torch's OpenMP pool busy-wait for milliseconds, on processors that the rasterizer's threads need.
-    With two threads on two processors that others use as well, a training step took four times the CPU time.
-    """
-    before = torch.get_num_threads()
-    token = _threads.set(_threads.get() or before)
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-        _threads.reset(token)
-
-
 def _core_function(name: str, tensor: Tensor) -> Any:
     return getattr(_core, f"{name}_{'f64' if tensor.dtype == torch.float64 else 'f32'}")
 
@@ -153,7 +132,7 @@ def _core_inputs(inputs: tuple[Tensor | None, ...], background: Tensor | None, s
         settings.sh_degree,
         settings.near_plane,
         settings.eps2d,
-        settings.threads or _threads.get() or torch.get_num_threads(),
+        settings.threads or threads_before.get() or torch.get_num_threads(),
         settings.depth,
         settings.variance,
         settings.max_records,

@@ -33,12 +33,13 @@ from perception.gaussians.losses import (
 )
 from perception.gaussians.model import Gaussians
 from perception.gaussians.optimiser import SparseAdam
-from perception.gaussians.rasterize import Forward, Settings, passes, torch_on_one_thread
+from perception.gaussians.rasterize import Forward, Settings, passes
 from perception.gaussians.rates import learning_rates
 from perception.gaussians.schedule import Schedule
 from perception.gaussians.size import sized
 from perception.gaussians.views import TrainingView, scene_extent, target_photo
 from perception.interrupts import uninterrupted
+from perception.machine import torch_on_one_thread
 from perception.progress import timed
 
 __all__ = ["TrainRecord", "Trainer", "TrainingView", "scene_extent"]

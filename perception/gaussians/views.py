@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,11 +55,8 @@ class TrainingView:
         """The same view at half the resolution: photo averaged 2 × 2, labels taken at every other pixel. A pixel is
         ignored if one of the four is. Depth is averaged over the measured pixels of 2 × 2: it has no edges, so pixels
         of two surfaces are never averaged.
-
-        Averaging adds a blur of (2² − 1) / 12 px² at full resolution, so eps2d is changed. With an unchanged eps2d
-        Gaussians become too thin for full resolution (−0.33 dB on tabletop_a at half length).
         """
-        height, width = self.photo.shape[0] // 2, self.photo.shape[1] // 2
+        K, (height, width), eps2d = half_camera(self.K, self.photo.shape, self.eps2d)
         # In numpy: torch's aligned temporary arrays do not fit where they were freed, which took 6 MB a view.
         blocks = self.photo.numpy()[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3)
         photo = torch.from_numpy(((blocks.sum(axis=(1, 3), dtype=np.uint16) + 2) // 4).astype(np.uint8))
@@ -74,13 +72,20 @@ class TrainingView:
             measured = (four(depth) > 0).sum(axis=(1, 3), dtype=np.float32)
             depth = torch.from_numpy(four(depth).sum(axis=(1, 3)) / np.maximum(measured, 1))
         weight = None if self.weight is None else torch.from_numpy(four(self.weight).min(axis=(1, 3)))
-        K = self.K * torch.tensor([[0.5], [0.5], [1.0]])
-        eps2d = (self.eps2d + 0.25) / 4
         return replace(self, photo=photo, labels=labels, K=K, eps2d=eps2d, weight=weight, depth=depth)
 
     def exposed(self, image: torch.Tensor) -> torch.Tensor:
         """`image` [H, W, 3] of the scene as this photo is exposed."""
         return image if self.gain is None else image * self.gain
+
+
+def half_camera(K: torch.Tensor, shape: Sequence[int], eps2d: float) -> tuple[torch.Tensor, tuple[int, int], float]:
+    """K [3, 3], (height, width) and eps2d at half the resolution; shape: (height, width, …).
+
+    Averaging 2 × 2 pixels adds a blur of (2² − 1) / 12 px² at full resolution, so eps2d is changed. With an unchanged
+    eps2d Gaussians become too thin for full resolution (−0.33 dB on tabletop_a at half length).
+    """
+    return K * torch.tensor([[0.5], [0.5], [1.0]]), (shape[0] // 2, shape[1] // 2), (eps2d + 0.25) / 4
 
 
 def target_photo(view: TrainingView, image: torch.Tensor) -> torch.Tensor:

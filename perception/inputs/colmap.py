@@ -112,6 +112,12 @@ def _models(folder: Path) -> list[Path]:
     return [path for path in [sparse, *inside] if any((path / f"images.{kind}").is_file() for kind in ("bin", "txt"))]
 
 
+def model_files(folder: Path) -> list[Path]:
+    """The files of all sparse models of a workspace."""
+    files = (file for model in _models(folder) for file in model.iterdir())
+    return [file for file in files if file.suffix in (".bin", ".txt") and file.is_file()]
+
+
 def _read_model(path: Path) -> Any:
     pycolmap = load_pycolmap()
     suffix = ".bin" if (path / "images.bin").is_file() else ".txt"

@@ -29,6 +29,10 @@ _TUM_LENSES = {  # fx fy cx cy k1 k2 p1 p2 k3, from the data set's page on calib
 _PRIMESENSE = (525.0, 525.0, 319.5, 239.5)  # the intrinsics that Redwood and Open3D assume for 640 × 480 pixels
 _KINECT_DEPTH, _KINECT_COLOR = (585.0, 585.0, 320.0, 240.0), (525.0, 525.0, 320.0, 240.0)
 _SIZE = (640, 480)
+_TEXTS = (
+    *("rgb.txt", "depth.txt", "groundtruth.txt", "pose/*.txt", "intrinsic/*.txt", "frame-*.pose.txt"),
+    *("seq*/frame-*.pose.txt", "camera-intrinsics.txt", "*.log", "*intrinsic*.json", "camera*.json"),
+)
 _COLOR_FOLDERS = ("color", "image", "rgb")
 
 
@@ -44,6 +48,12 @@ def find_recording(source: Path) -> Recording | None:
     if color is not None and (source / "depth").is_dir() and any(source.glob("*.log")):
         return _redwood(source, color)
     return None
+
+
+def text_files(source: Path) -> list[Path]:
+    """The files with poses, cameras and lists of photos in folder `source`, or of 3DMatch above it."""
+    found = [file for pattern in _TEXTS for file in source.glob(pattern)]
+    return [file for file in [*found, source.parent / "camera-intrinsics.txt"] if file.is_file()]
 
 
 def refuse_depth_without_poses(source: Path) -> None:

@@ -40,8 +40,6 @@ def load_scene(source: Path, how: Reading) -> Scene:
     from perception.sfm.reconstruct import reconstruct
 
     started = time.perf_counter()
-    if not source.exists():
-        raise InputError(f"{source}: no such file or folder; expected {EXPECTED}")
     kind = _kind(source)
     unposed = kind in ("photos", "video")
     if how.camera is not None and not unposed and not isinstance(kind, Recording):
@@ -79,6 +77,8 @@ def _kind(source: Path) -> Any:
     from perception.inputs.layouts import find_recording
     from perception.photos.folder import VIDEO_SUFFIXES
 
+    if not source.exists():
+        raise InputError(f"{source}: no such file or folder; expected {EXPECTED}")
     if source.is_dir():
         if is_workspace(source):
             return "workspace"
@@ -89,6 +89,26 @@ def _kind(source: Path) -> Any:
     if source.suffix.lower() != ".json":
         raise InputError(f"{source}: expected {EXPECTED}")
     return source
+
+
+def input_files(source: Path) -> list[Path]:
+    """The files of `source` that a scene may come from: photos, depth images, masks, poses, cameras, models, clouds.
+    InputError as `load_scene`."""
+    from perception.inputs.colmap import model_files
+    from perception.inputs.layouts import text_files
+    from perception.inputs.recordings import Recording
+    from perception.inputs.transforms import listed_files
+    from perception.photos.folder import list_photos
+
+    kind = _kind(source)
+    if kind == "photos":
+        return list_photos(source)
+    if kind == "workspace":
+        return [*list_photos(source / "images"), *model_files(source)]
+    if isinstance(kind, Recording):
+        images = (image for frame in kind.frames for image in (frame.photo, frame.depth))
+        return [*text_files(source), *(image for image in images if image is not None)]
+    return listed_files(kind) if isinstance(kind, Path) else [source]
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,14 @@ def listed_photos(file: Path) -> tuple[list[Path], bool]:
     return [photo for photo in found if photo is not None], any("depth_file_path" in frame for frame in frames)
 
 
+def listed_files(file: Path) -> list[Path]:
+    """A transforms.json, and the photos, masks, depth images and cloud that it lists and that exist."""
+    data, keys = _load(file), ("file_path", "mask_path", "depth_file_path", "depth_path")
+    listed = [data.get("ply_file_path"), *(frame.get(key) for frame in data["frames"] for key in keys)]
+    found = (_find(file.parent, str(name)) for name in listed if name)
+    return [file, *(path for path in found if path is not None)]
+
+
 def _views(
     file: Path, data: dict[str, Any], photos: dict[int, Path], masks: Path | None
 ) -> tuple[list[View], list[str]]:

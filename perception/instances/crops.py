@@ -49,13 +49,13 @@ def expand_box(box: Box, ratio: float, width: int, height: int) -> Box:
     return max(0, x0 - dx), max(0, y0 - dy), min(width, x1 + dx), min(height, y1 + dy)
 
 
-def letterbox(image: np.ndarray, fill: int = FILL) -> np.ndarray:
+def letterbox(image: np.ndarray) -> np.ndarray:
     """Pads an image [H, W, 3] to a square of side max(H, W), centred, without scaling."""
     height, width = image.shape[:2]
     side = max(height, width)
     top, left = (side - height) // 2, (side - width) // 2
     bottom, right = side - height - top, side - width - left
-    return cv2.copyMakeBorder(image, top, bottom, left, right, cv2.BORDER_CONSTANT, value=(fill,) * 3)
+    return cv2.copyMakeBorder(image, top, bottom, left, right, cv2.BORDER_CONSTANT, value=(FILL,) * 3)
 
 
 def crop_levels(photo: np.ndarray, mask: np.ndarray, levels: int = 3) -> list[np.ndarray]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from perception.config import InstanceConfig
+from perception.geometry import sums_by
 from perception.instances.assign import memberships, reassign
 from perception.instances.cluster import MIN_OPACITY, by_falling_size, cluster_gaussians
 from perception.instances.confidence import calibrated, raw_scores
@@ -21,7 +22,7 @@ from perception.instances.consensus import (
 )
 from perception.instances.segments import over_segment, touching
 from perception.instances.votes import MaskVotes
-from perception.io.memory import return_free_memory
+from perception.machine import return_free_memory
 
 PER_SEGMENT = 16  # Gaussians; smaller segments have too little evidence in the photos
 MAX_SEGMENTS, PER_SEGMENT_BEYOND = 1000, 300  # a larger map has one segment per 300 Gaussians instead
@@ -98,9 +99,9 @@ def _by_consensus(
     everywhere[solid] = segments
     table = votes.table(everywhere, count)
     sizes = np.bincount(segments, minlength=count)
-    sums = [np.bincount(segments, column, minlength=count) for column in features[solid].T]
+    sums = sums_by(segments, features[solid], count)
     near = touching(means[solid], segments, count)
-    tree = merge_tree(table, np.stack(sums, axis=1) / sizes[:, None], sizes, near)
+    tree = merge_tree(table, sums / sizes[:, None], sizes, near)
     return_free_memory()  # tables grow with the photos; without this, those of each step lie beside the next one's
     found = node_evidence(tree, table)
     return_free_memory()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
+from perception.geometry import sums_by
+
 ROUNDS = 12  # iterations of Lloyd's algorithm; groups are merged later, so convergence is not needed
 SAMPLE = 50_000  # rows from which the centres are computed; all rows are then assigned to the nearest centre
 TOGETHER = 1000  # groups of one k-means
@@ -35,7 +37,7 @@ def over_segment(means: np.ndarray, features: np.ndarray, count: int, seed: int 
     for _ in range(ROUNDS):
         owner = nearest_centres(sample, centres)
         sizes = np.bincount(owner, minlength=len(centres))
-        sums = np.stack([np.bincount(owner, column, minlength=len(centres)) for column in sample.T], axis=1)
+        sums = sums_by(owner, sample, len(centres))
         centres = (sums[sizes > 0] / sizes[sizes > 0, None]).astype(np.float32)
     return np.unique(nearest_centres(rows, centres), return_inverse=True)[1].reshape(-1)
 

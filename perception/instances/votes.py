@@ -15,9 +15,10 @@ import torch
 from scipy import sparse
 
 from perception.gaussians.nearby import Nearby
-from perception.gaussians.rasterize import Settings, passes, torch_on_one_thread
+from perception.gaussians.rasterize import Settings, passes
 from perception.gaussians.train import TrainingView
-from perception.io.memory import Keep, return_free_memory
+from perception.io.memory import Keep
+from perception.machine import return_free_memory, torch_on_one_thread
 from perception.progress import Progress
 
 BLOCK = 16  # masks per pass: a feature width that the kernel is specialised for

@@ -15,8 +15,8 @@ import numpy as np
 from perception.errors import InputError
 from perception.io.arrays import read_npz
 from perception.io.atomic import replacing
-from perception.io.memory import require_memory
 from perception.io.ply import read_ply, write_ply
+from perception.machine import require_memory
 from perception.types import PointCloud
 
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))

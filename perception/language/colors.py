@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import dropwhile
 
 import numpy as np
+
+from perception.geometry import sums_by
 
 PALETTE = 24  # colours kept per instance
 BIN = 8.0  # CIELAB units per histogram cell
@@ -77,9 +80,7 @@ def without_color_words(text: str) -> str:
         name = "many" if bare in _MANY else _SYNONYMS.get(bare, bare)
         return name not in drop
 
-    words = [word for word in text.split() if keep(word)]
-    while words and words[0].lower() == "and":
-        words = words[1:]
+    words = dropwhile(lambda word: word.lower() == "and", filter(keep, text.split()))
     return " ".join(words) or text
 
 
@@ -94,7 +95,7 @@ def palette(pixels: np.ndarray) -> np.ndarray:
     lab = lab_of(pixels)
     cells = np.floor(lab / BIN).astype(np.int64) @ np.array([1 << 20, 1 << 10, 1])  # a and b lie within ±2^9 cells
     _, inverse, counts = np.unique(cells, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(inverse, lab[:, c], minlength=len(counts)) for c in range(3)], axis=1)
+    sums = sums_by(inverse, lab, len(counts))
     top = np.argsort(-counts, kind="stable")[:PALETTE]
     out[: len(top), :3] = sums[top] / counts[top, None]
     out[: len(top), 3] = counts[top] / counts[top].sum()

@@ -29,6 +29,7 @@ from perception.language import minilm
 from perception.language.base import Part, Reading, check_images, check_texts, packaged_file, unit_rows
 from perception.language.household import household_thing
 from perception.language.minilm import MiniLM
+from perception.machine import torch_on_one_thread
 from perception.onnx.store import cache_folder
 
 TOP = 20  # number of classes T in the sentence-space embedding
@@ -58,8 +59,6 @@ class ConseEncoder:
     def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """RGB uint8 [H, W, 3] images → float32 [n, 1384], unit rows. Images are resized to 260², so use square ones."""
         import torch
-
-        from perception.gaussians.rasterize import torch_on_one_thread
 
         check_images(images)
         if not images:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,8 +25,8 @@ class MiniLM:
 
     dim = 384
 
-    def __init__(self, folder: Path | None = None) -> None:
-        folder = folder or packaged_file(*WEIGHTS).parent
+    def __init__(self) -> None:
+        folder = packaged_file(*WEIGHTS).parent
         try:
             from safetensors.torch import load_file
             from tokenizers import Tokenizer

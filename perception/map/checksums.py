@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,12 @@ STORE = "store.json"
 """In the folder of a store of many maps, the list of its maps."""
 EDITABLE = "instances.json"
 """Users may edit labels in this file by hand, so a changed checksum is reported and not an error."""
+DATA = (
+    *("gaussians.ply", "features.npy", "instance_ids.npy", "membership.npy"),
+    *("cameras.npz", "index.npz", "language.npz", "parts.npz", "groups.npz"),
+)
+"""Names of a map's other files, in all format versions."""
+_UNFINISHED = re.compile(r"^\.(.+)\.new-\d+-\w{8}$")
 
 
 def damaged(file: Path, what: str) -> InputError:
@@ -27,10 +34,36 @@ def facts_of(file: Path) -> dict[str, Any]:
     return {"bytes": file.stat().st_size, "sha256": sha256(file)}
 
 
+def is_map(folder: Path) -> bool:
+    """Whether `folder` holds the facts of a map of any version."""
+    return "format_version" in (_facts_in(folder) or {})
+
+
+def own_files(folder: Path) -> set[str] | None:
+    """Names of the files in `folder` that a map wrote; what else lies there is its user's. None without a map.json."""
+    facts = _facts_in(folder)
+    if facts is None:
+        return None
+    listed = facts.get("files")
+    own = {FACTS, EDITABLE, REPORT, *(set(DATA).intersection(listed) if isinstance(listed, dict) else DATA)}
+    files = (item.name for item in folder.iterdir() if item.is_symlink() or item.is_file())
+    return {name for name in files if _UNFINISHED.sub(r"\1", name) in own}
+
+
+def _facts_in(folder: Path) -> dict[str, Any] | None:
+    """The content of map.json, {} where that is damaged, None where there is none."""
+    if not (folder / FACTS).is_file():
+        return None
+    try:
+        facts = json.loads((folder / FACTS).read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return facts if isinstance(facts, dict) else {}
+
+
 def listed_files(folder: Path) -> list[Path]:
-    """The files that map.json lists: all but itself, the report, and hidden ones, such as temporary files."""
-    files = (file for file in folder.iterdir() if file.is_file() and file.name not in (FACTS, REPORT))
-    return sorted(file for file in files if not file.name.startswith("."))
+    """The files of a map that its map.json lists: all but itself and the report."""
+    return sorted(folder / name for name in (EDITABLE, *DATA) if (folder / name).is_file())
 
 
 def sha256(file: Path) -> str:

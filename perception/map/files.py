@@ -20,10 +20,8 @@ from perception.map.checksums import EDITABLE, FACTS, STORE, check_file, check_s
 from perception.photos.view_json import check_names, views_of_facts
 
 FORMAT_VERSION = 2
-READABLE = (1, 2)
-"""Readable format versions. 1 stores the views in map.json and as arrays in cameras.npz, 2 in map.json only."""
 _ARRAYS = {"features": 2, "instance_ids": 1, "membership": 1}
-ARCHIVES = ("cameras", "language", "parts", "groups")
+ARCHIVES = ("language", "parts", "groups")
 _TRIES = 5
 
 Signature = tuple[tuple[int, int, int], ...]
@@ -94,7 +92,7 @@ class MapFiles:
         if name in ("info", "instances"):
             return getattr(self, name)
         if name == "views":
-            return views_of_facts(self.facts, self.path / FACTS, self._unpack("cameras"))
+            return views_of_facts(self.facts, self.path / FACTS)
         if name in ("language", "parts", "groups"):
             return self._unpack(name)
         self._check_contents()
@@ -185,14 +183,13 @@ def _read_facts(path: Path) -> tuple[dict[str, Any], bytes]:
         raise InputError(f"{file}: cannot be read as a map's facts ({error})") from error
     if isinstance(version, bool) or not isinstance(version, int):
         raise damaged(file, f"format_version is {version!r}, expected {FORMAT_VERSION}")
-    if version not in READABLE:
+    if version != FORMAT_VERSION:
         advice = (
             f"it was made by an older perception; build the map again from {info.get('source', 'its photos')}"
             if version < FORMAT_VERSION
             else "it was made by a newer perception; update this one"
         )
-        known = " and ".join(map(str, READABLE))
-        raise InputError(f"{file}: format_version is {version}, this program reads {known}: {advice}")
+        raise InputError(f"{file}: format_version is {version}, this program reads {FORMAT_VERSION}: {advice}")
     check_names(info, file)
     return info, raw
 

@@ -33,12 +33,13 @@ from perception.types import View
 LONGEST_LABEL = 200  # characters
 
 
-def write_map(path: Path, gmap: Map, keep_report: bool = False) -> None:
+def write_map(path: Path, gmap: Map, keep_report: bool = False, fresh: bool = False) -> None:
     """Writes the map to a temporary folder and exchanges it with `path`: readers see the old or the new map.
 
-    keep_report: keep the report of the replaced map, for manual corrections.
+    Files in the old map's folder that no map wrote are kept. keep_report: keep the report of the replaced map, too, for
+    manual corrections. fresh: nothing is replaced. A link at `path` stays, and its target is written.
 
-    InputError when another writer holds the map, or `path` cannot be written.
+    InputError when another writer holds the map, or `path` cannot be written, or holds something else than a map.
 
     >>> write_map(Path("copy.gsmap"), read_map(Path("kitchen.gsmap")))
     >>> len(read_map(Path("copy.gsmap")))
@@ -48,7 +49,7 @@ def write_map(path: Path, gmap: Map, keep_report: bool = False) -> None:
     info["num_instances"] = len(gmap.instances)
     info["sh_degree"] = math.isqrt(gmap.sh.shape[1]) - 1
     info["views"] = [view_json(_recorded(view, path, gmap.path)) for view in gmap.views]
-    with writing(path), atomic_directory(path) as folder:
+    with writing(path), atomic_directory(path, fresh) as folder:
         write_gaussian_ply(folder / "gaussians.ply", gmap)
         np.save(folder / "features.npy", gmap.features.astype(np.float32))
         np.save(folder / "instance_ids.npy", gmap.instance_ids.astype(np.int32))

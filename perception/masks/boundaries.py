@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from perception.machine import torch_on_one_thread
 from perception.masks.cues import DepthCues, PhotoCues
 
 if TYPE_CHECKING:
@@ -31,13 +32,9 @@ def boundaries(photo: PhotoCues, depth: DepthCues, layers: Layers) -> np.ndarray
     above and below are, and that the pixel is of a thing and not of a floor, a wall or a table."""
     import torch
 
-    inputs, threads = scaled(torch.from_numpy(inputs_of(photo, depth))[None]), torch.get_num_threads()
-    torch.set_num_threads(1)  # with more, the last bits of convolutions differ
-    try:
-        with torch.inference_mode():
-            odds = forward(layers, inputs)[0].numpy()
-    finally:
-        torch.set_num_threads(threads)
+    inputs = scaled(torch.from_numpy(inputs_of(photo, depth))[None])
+    with torch_on_one_thread(), torch.inference_mode():  # with more, the last bits of convolutions differ
+        odds = forward(layers, inputs)[0].numpy()
     for image in (odds[0], odds[1].T):  # beyond the photo nothing is known
         edge = min(REACH, (image.shape[1] - 1) // 2)
         image[:, :edge], image[:, image.shape[1] - edge :] = image[:, edge, None], image[:, -edge - 1, None]

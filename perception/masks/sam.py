@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from perception.config import SamConfig
-from perception.cores import cores
+from perception.machine import cores
 from perception.masks.base import MaskSource
 from perception.masks.sam_models import SamModel, open_sam
 from perception.types import View

@@ -260,7 +260,7 @@ def open_sam(spec: str, threads: int = 0) -> SamModel:
     """spec: a folder with both graphs, an encoder file next to its decoder, `ENCODER,DECODER`, or a stored name.
     threads: of one run; 0: all cores."""
     spec = resolve(spec)
-    paths = [Path(part.strip()) for part in spec.split(",")] if "," in spec else _candidates(Path(spec).expanduser())
+    paths = [Path(part.strip()) for part in spec.split(",")] if "," in spec else sam_graphs(Path(spec).expanduser())
     graphs = [open_graph(path, threads) for path in paths]
     encoders, decoders = [g for g in graphs if g.is_encoder], [g for g in graphs if g.is_decoder]
     if len(encoders) == 1 and len(decoders) == 1:
@@ -290,7 +290,8 @@ def _outputs(names: list[str]) -> dict[str, str]:
     return outputs
 
 
-def _candidates(path: Path) -> list[Path]:
+def sam_graphs(path: Path) -> list[Path]:
+    """The ONNX files of a folder, or a file and the partner beside it. InputError where there are none."""
     if path.is_dir():
         return model_graphs(path)[0]
     if not path.is_file():

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from perception.geometry import move_points
+from perception.geometry import move_points, sums_by
 from perception.masks.cues import DepthCues, PhotoCues
 
 FOOTPRINTS = 4.0  # voxel side in pixel footprints at the median depth; above the noise of the depth
@@ -63,7 +63,7 @@ class SurfaceBuilder:
         """Adds values [P, C] to the sums of voxels keys [P]; too many voxels are made eight times as large."""
         every, index = np.unique(np.concatenate([self._keys, keys]), return_inverse=True)
         old, new = np.split(index, [len(self._keys)])
-        total = np.stack([np.bincount(new, column, len(every)) for column in values.T], axis=1)
+        total = sums_by(new, values, len(every))
         total[old] += self._sums
         self._keys, self._sums = every, total
         if len(every) > 2 * _MOST:

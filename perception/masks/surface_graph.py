@@ -12,6 +12,7 @@ import copy
 import numpy as np
 
 from perception import _core
+from perception.geometry import sums_by
 from perception.masks.cues import COLOUR_BINS, DepthCues, PhotoCues
 from perception.masks.surface import Surface
 
@@ -72,7 +73,7 @@ class SurfaceGraph:
         squares = np.stack([local[:, i] * local[:, j] for i, j in zip(*_UPPER, strict=True)], axis=1)
         maps = [np.ones((len(patch), 1)), surface.normals, local, squares]
         self.sums = np.zeros((count, _THING + 1))
-        self.sums[:, _VOXELS : _COLOURS.start] = _sum_by(patch, np.concatenate(maps, axis=1), count)
+        self.sums[:, _VOXELS : _COLOURS.start] = sums_by(patch, np.concatenate(maps, axis=1), count)
         ends = patch[edges]
         ends = np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1).astype(np.int64)
         self._keys, contact = np.unique(ends[:, 0] * count + ends[:, 1], return_counts=True)
@@ -87,7 +88,7 @@ class SurfaceGraph:
         flat = regions[inside]
         z = depth.points[..., 2]
         maps = [np.ones(len(flat)), *photo.lab[inside].T, photo.texture[inside], z[inside]]
-        self.sums[:, :_VOXELS] += _sum_by(flat, np.stack(maps, axis=1), self.count)
+        self.sums[:, :_VOXELS] += sums_by(flat, np.stack(maps, axis=1), self.count)
         words = flat.astype(np.int64) * COLOUR_BINS + photo.colour_bin[inside]
         words = np.bincount(words, minlength=self.count * COLOUR_BINS)
         self.sums[:, _COLOURS] += words.reshape(self.count, COLOUR_BINS)
@@ -104,7 +105,7 @@ class SurfaceGraph:
             columns += [np.clip(-bend, 0, 1), np.clip(bend, 0, 1), odds]
             touching = self._keys[place] == keys
             values = np.stack(columns, axis=1)[touching]
-            self._border[:, :_CONTACT] += _sum_by(place[touching], values, len(self._keys))
+            self._border[:, :_CONTACT] += sums_by(place[touching], values, len(self._keys))
 
     def link(self) -> None:
         """Builds `borders`. Call it after all photos are added."""
@@ -297,8 +298,3 @@ def _extents(shape: np.ndarray) -> np.ndarray:
     """[M, 3] standard deviations of the voxels of each patch along its principal axes, ascending. The first is the
     thickness across the patch's plane."""
     return np.sqrt(np.maximum(np.linalg.eigvalsh(_covariance(shape)), 0))
-
-
-def _sum_by(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """[count, C] sums of the rows of `values` [P, C], grouped by `index` [P]."""
-    return np.stack([np.bincount(index, weights=column, minlength=count) for column in values.T], axis=1)

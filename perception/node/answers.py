@@ -173,8 +173,7 @@ def point_cloud2(columns: Mapping[str, np.ndarray], frame: str, stamp: Stamp) ->
 
 def pose(box: OrientedBox) -> dict[str, Any]:
     """geometry_msgs/Pose of a box, frame_from_box (box axes are the rows of `rotation`); quaternion xyzw."""
-    turn = Rotation.from_matrix(box.rotation.T).as_quat(canonical=True)
-    return {"position": _xyz(box.center), "orientation": dict(zip("xyzw", map(float, turn), strict=True))}
+    return {"position": xyz(box.center), "orientation": xyzw(box.rotation.T)}
 
 
 def detection(
@@ -188,7 +187,7 @@ def detection(
     return {
         "header": head,
         "results": [{"hypothesis": hypothesis, "pose": {"pose": at, "covariance": covariance.reshape(-1)}}],
-        "bbox": {"center": at, "size": _xyz(box.extent)},
+        "bbox": {"center": at, "size": xyz(box.extent)},
         "id": identity,
     }
 
@@ -200,7 +199,7 @@ def box_markers(boxes: Iterable[tuple[int, OrientedBox, str]], namespace: str, h
     markers: list[dict[str, Any]] = [{"header": head, "action": _DELETE_ALL}]
     for i, (instance, box, words) in enumerate(boxes):
         at, common = pose(box), {"header": head, "ns": namespace}
-        size = {axis: max(side, LEAST_SIDE) for axis, side in _xyz(box.extent).items()}
+        size = {axis: max(side, LEAST_SIDE) for axis, side in xyz(box.extent).items()}
         tint = dict(zip("rgb", (instance_palette([instance])[0] / 255).tolist(), strict=True)) | {"a": 0.4}
         markers.append({**common, "id": 2 * i, "type": _CUBE, "pose": at, "scale": size, "color": tint})
         upright = {"position": at["position"], "orientation": {"w": 1.0}}
@@ -211,5 +210,11 @@ def box_markers(boxes: Iterable[tuple[int, OrientedBox, str]], namespace: str, h
     return {"markers": markers}
 
 
-def _xyz(vector: np.ndarray) -> dict[str, float]:
-    return dict(zip("xyz", (float(v) for v in vector), strict=True))
+def xyz(vector: Sequence[float] | np.ndarray) -> dict[str, float]:
+    """geometry_msgs/Vector3 or Point of a vector [3]."""
+    return dict(zip("xyz", map(float, vector), strict=True))
+
+
+def xyzw(rotation: np.ndarray) -> dict[str, float]:
+    """geometry_msgs/Quaternion of a rotation [3, 3]."""
+    return dict(zip("xyzw", map(float, Rotation.from_matrix(rotation).as_quat(canonical=True)), strict=True))

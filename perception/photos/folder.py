@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from perception.cores import cores
 from perception.errors import InputError
+from perception.machine import cores
 from perception.photos.decode import SUFFIXES, decode, open_photo, photo_size, upright
 from perception.photos.video import FRAMES_RECORD, THUMBNAIL, motion_between
 from perception.progress import Progress

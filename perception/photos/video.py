@@ -18,7 +18,7 @@ from perception.io.documents import read_json
 from perception.progress import Progress
 
 THUMBNAIL = 320  # long side in pixels at which motion and sharpness are measured
-_MIN_TRACKS = 20
+_MIN_TRACKS, SHARP_SHARE = 20, 0.3
 
 
 @dataclass
@@ -26,11 +26,10 @@ class Chooser:
     """Selects keyframes: pass all frames in order to `show`, then call `chosen`.
 
     spacing: motion between kept frames as a share of the image width (median motion of tracked corners, summed over
-    frames). sharp_share: a segment is left out if its sharpest frame is below this share of the median sharpness.
+    frames). A segment is left out if its sharpest frame is below SHARP_SHARE of the median sharpness.
     """
 
     spacing: float = 0.08
-    sharp_share: float = 0.3
     motion: list[float] = field(default_factory=list)
     sharpness: list[float] = field(default_factory=list)
     _last: np.ndarray | None = None
@@ -54,7 +53,7 @@ class Chooser:
         spacing = max(self.spacing, float(way[-1]) / max(most - 1, 1))
         stretch = np.floor(way / spacing + 1e-9).astype(int)
         sharpness = np.array(self.sharpness)
-        least = self.sharp_share * float(np.median(sharpness))
+        least = SHARP_SHARE * float(np.median(sharpness))
         kept = []
         for number in np.unique(stretch):
             rows = np.flatnonzero(stretch == number)
@@ -109,7 +108,7 @@ def video_frames(video: Path, folder: Path, progress: Progress) -> dict[str, obj
     if not chosen:
         raise InputError(f"{video}: not a readable video; expected .mp4, .mov or another that OpenCV's FFmpeg decodes")
     record |= {"frames": numbers[-1] + 1, "chosen": len(chosen)}
-    with atomic_directory(folder) as aside:
+    with atomic_directory(folder, fresh=True) as aside:
         for number, share, frame in frames(video, set(chosen)):
             cv2.imwrite(str(aside / f"{number:06d}.jpg"), frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
             progress.update("poses: writing frames", round(100 * share), 100)

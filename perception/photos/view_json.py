@@ -1,8 +1,8 @@
 """The views of a map as stored in map.json, one JSON object per view, and how their photos are located.
 
 name, K, width, height, camera_from_world, lens, held_out: as in `types.View`. photo: absolute path of the photo.
-photo_beside: its path relative to the map's folder. photo_bytes: its size in bytes; a
-file of another size is not accepted. The last two may be null; format version 1 has none of the last three.
+photo_beside: its path relative to the map's folder. photo_bytes: its size in bytes; a file of another size is not
+accepted. The last two may be null.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.atomic import pointed
 from perception.io.documents import safe_name
 from perception.types import DepthImage, Lens, View
 
@@ -43,9 +44,9 @@ def stored_view(view: View, folder: Path, held_out: bool = False) -> StoredView:
 
 def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
     """The record of a map at `before`, for a map at `after`: the relative photo path is adapted."""
-    if view.photo_beside is None or absolute(before) == absolute(after):
+    if view.photo_beside is None or absolute(pointed(before)) == absolute(pointed(after)):
         return view
-    return replace(view, photo_beside=_relative(absolute(before / view.photo_beside), after))
+    return replace(view, photo_beside=_relative(absolute(pointed(before) / view.photo_beside), after))
 
 
 def locate_photo(view: View, folder: Path | None) -> Path:
@@ -56,7 +57,7 @@ def locate_photo(view: View, folder: Path | None) -> Path:
     if isinstance(view, StoredView):
         size = view.photo_bytes
         if folder is not None and view.photo_beside is not None:
-            places.insert(0, absolute(folder / view.photo_beside))
+            places.insert(0, absolute(pointed(folder) / view.photo_beside))
     other = None
     for place in places:
         try:
@@ -75,7 +76,7 @@ def absolute(path: Path) -> Path:
 
 
 def _relative(photo: Path, folder: Path) -> str:
-    return os.path.relpath(photo, absolute(folder))
+    return os.path.relpath(photo, absolute(pointed(folder)))
 
 
 def view_json(view: View) -> dict[str, Any]:
@@ -136,17 +137,11 @@ def _lens_of(entry: list[Any] | None) -> Lens | None:
     return None if entry is None else Lens(str(entry[0]), tuple(map(float, entry[1])), int(entry[2]), int(entry[3]))
 
 
-def views_of_facts(info: dict[str, Any], file: Path, cameras: dict[str, np.ndarray]) -> list[StoredView]:
+def views_of_facts(info: dict[str, Any], file: Path) -> list[StoredView]:
     """The views that map.json records, `info` being its content and `file` its name for messages.
-
-    cameras: the arrays of cameras.npz. Format version 1 stores there which views were held out; the oldest maps store
-    all views there. InputError when the record is malformed.
-    """
+    InputError when the record is malformed."""
     try:
-        entries = info.get("views") or _entries_of_arrays(cameras)
-        names, out = cameras.get("names", ()), cameras.get("held_out", ())
-        held = {str(name) for name, is_out in zip(names, out, strict=False) if is_out}
-        return [view_from_json({"held_out": entry["name"] in held, **entry}) for entry in entries]
+        return [view_from_json(entry) for entry in info.get("views", [])]
     except (ValueError, TypeError, KeyError, IndexError, OverflowError, AttributeError) as error:
         raise InputError(f"{file}: its views cannot be understood ({error}); the map is damaged") from error
 
@@ -156,15 +151,3 @@ def check_names(info: dict[str, Any], file: Path) -> None:
     views = info.get("views", [])
     for entry in views if isinstance(views, list) else []:
         safe_name(entry.get("name") if isinstance(entry, dict) else entry, file)
-
-
-def _entries_of_arrays(cameras: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    fields = ("names", "photos", "K", "sizes", "camera_from_world")
-    if not all(name in cameras for name in fields):
-        return []
-    entries = []
-    for name, photo, K, (width, height), pose in zip(*(cameras[field] for field in fields), strict=True):
-        safe_name(str(name), "cameras.npz")
-        entry = {"name": str(name), "photo": str(photo), "K": K, "width": width, "height": height}
-        entries.append({**entry, "camera_from_world": pose})
-    return entries

@@ -26,9 +26,10 @@ from perception.gaussians.train import TrainRecord
 from perception.gaussians.views import surface_depth
 from perception.geometry import camera_centres
 from perception.io.atomic import writing
+from perception.machine import memory_limit
 from perception.masks import MaskSource, make_source
 from perception.pipeline.checkpoint import BEFORE_MASKS, CHECKPOINT, digest, load_checkpoint, save_checkpoint
-from perception.pipeline.estimate import largest_budget, memory_limit
+from perception.pipeline.estimate import largest_budget
 from perception.pipeline.optimise import Optimised, Photos, Run, label_by_tasks, label_photos, optimise
 from perception.progress import QUIET, Progress
 from perception.tasks.folder import has_task, read_task, write_task

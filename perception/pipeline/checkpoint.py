@@ -9,9 +9,11 @@ repeats only what has changed.
     group      optimise, instances.*                                      nothing: it takes seconds
     describe   group, language.*                                          nothing
 
-train.time_limit is not part of the dependencies, so that a stopped run can be continued with more
-time. If other optimisation settings have changed, the checkpoint is an error and not discarded, as it may be hours of
-work. With changed masks, training restarts at the point where masks are first used.
+A run goes on only with the files that it began with (`pipeline.changes`): photos, masks, models and what else settings
+name, by size and time of change. train.time_limit is not part of the dependencies, so that a stopped run can be
+continued with more time. If other optimisation settings have changed, the checkpoint is an error and not discarded, as
+it may be hours of work. With other masks (another labels:DIR), training restarts at the point where masks are first
+used.
 """
 
 from __future__ import annotations
@@ -28,11 +30,11 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 from perception.config import MapConfig
-from perception.cores import peak_memory_mib
 from perception.errors import InputError
 from perception.gaussians.train import Trainer
 from perception.inputs.load import EXPECTED
 from perception.io.atomic import atomic_file, writing
+from perception.machine import peak_memory_mib
 from perception.progress import Progress
 
 CHECKPOINT = "checkpoint.pt"
@@ -190,6 +192,14 @@ LEAST_DISK = 256 << 20
 """Least free disk space in bytes, as a small run needs it for features, masks, checkpoint and map."""
 
 
+def check_name(output: Path) -> None:
+    """InputError where no map can lie at `output`, as its name is too long."""
+    try:
+        work_folder(output).exists()
+    except OSError as error:
+        raise InputError(f"{output}: no map can lie there ({error.strerror}); choose another -o") from error
+
+
 def work_folder(output: Path) -> Path:
     """Path of the work folder, a sibling of the map."""
     return output.with_name(output.name + WORK_SUFFIX)
@@ -197,7 +207,7 @@ def work_folder(output: Path) -> Path:
 
 def frames_folder(output: Path) -> Path:
     """Folder for the frames of a video, a sibling of the map; it is kept, as the frames are the map's photos."""
-    return output.with_suffix(".frames")
+    return output.with_name(output.name + ".frames")
 
 
 @contextmanager
@@ -218,7 +228,7 @@ def working(source: Path, output: Path, resume: bool) -> Iterator[Path]:
                 raise
             raise InputError(f"{work}: the disk is full; free some space and go on with --resume") from error
         except InputError:
-            if fresh and not (work / CHECKPOINT).exists():
+            if fresh and not any(work.rglob(CHECKPOINT)):  # of the whole, or of a block
                 shutil.rmtree(work, ignore_errors=True)
                 if not had_frames:
                     shutil.rmtree(frames_folder(output), ignore_errors=True)

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from perception.config import MapConfig, load_config
-from perception.errors import InputError
 from perception.evaluate.instances import evaluate
 from perception.export.transfer import export_labels, write_export
 from perception.geometry import align_similarity, camera_centres
+from perception.io.outputs import check_empty
 from perception.map.write import Map
 from perception.pipeline.mapping import build_map
 from perception.progress import Progress
@@ -59,8 +59,7 @@ class DemoTruth:
 def run_demo(output: Path, progress: Progress) -> tuple[dict[str, Any], str]:
     """Photos → SfM → masks → map → export → queries, all in `output`; returns figures and a text."""
     started = time.monotonic()
-    if output.exists() and any(output.iterdir()):
-        raise InputError(f"{output}: is not empty; choose another folder or remove it first")
+    check_empty(output)
     photos, map_path = output / "photos", output / "demo.gsmap"
     shutil.copytree(SCENE / "photos", photos)
     truth = DemoTruth.read()

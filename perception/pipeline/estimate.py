@@ -6,7 +6,6 @@ tabletop_a (62 of 640×480) 1.4 GiB. Estimates are accurate to about 20 %.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.size import sized
 from perception.inputs.load import PhotoSizes, photo_sizes
+from perception.machine import memory_limit
 
 BASE_BYTES, BYTES_PER_GAUSSIAN, BYTES_PER_PIXEL, DEPTH_BYTES = 900 << 20, 2400, 7, 5
 """Program and libraries; parameters, gradients and moments of a Gaussian; a decoded photo (3), its
@@ -71,17 +71,3 @@ def check_memory(photos: PhotoSizes, config: MapConfig, limit: int | None = None
         f"{photos.what} need about {needed / 2**30:.1f} GiB with --max-side {side} --budget {budget}, and there are "
         f"{limit / 2**30:.1f}; " + (f"give --max-side {fitting[0]} --budget {fitting[1]}" if fitting else advice)
     )
-
-
-def memory_limit() -> int | None:
-    """Bytes of memory available to this process: that of the machine, or the limit of its control group."""
-    try:
-        limit = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (ValueError, OSError, AttributeError):
-        return None
-    for file in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
-        try:
-            limit = min(limit, int(Path(file).read_text()))
-        except (OSError, ValueError):  # no control group, or "max"
-            continue
-    return limit

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import json
+import os
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from perception.config import MapConfig, Settings, load_config, settings_from
-from perception.errors import InputError, refuse_named_pipe
-from perception.io.object_store import is_url, place
+from perception.errors import InputError, local_path, refuse_named_pipe
+from perception.io.documents import brief, read_yaml
 from perception.pipeline.mapping import build_map
-from perception.pipeline.remote import local_places
 from perception.progress import QUIET, Progress
+from perception.report.page import write_own_report
 from perception.tasks.engine import Engine
 
 
 class Job(Settings):
-    """One map: its input and output, URLs or paths relative to the list; its settings as `perception map` has them."""
+    """One map: its input and output, paths relative to the list; its settings as `perception map` has them."""
 
     input: str
     output: str
@@ -34,16 +36,12 @@ def run_fleet(file: Path, engine: Engine, progress: Progress) -> list[dict[str, 
 
 def read_jobs(file: Path) -> list[dict[str, Any]]:
     """The checked jobs of a YAML list of {input, output, preset, config, set: {KEY: VALUE}}, with absolute paths."""
-    import yaml
-
     refuse_named_pipe(file)
-    try:
-        listed = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{file}: cannot be read as YAML ({' '.join(str(error).split())})") from error
+    expected = "a list of jobs, '- input: PHOTOS' and 'output: MAP.gsmap' each"
+    listed = read_yaml(file, expected)
     if not isinstance(listed, list) or not listed:
-        raise InputError(f"{file}: expected a list of jobs, '- input: PHOTOS' and 'output: MAP.gsmap' each")
-    jobs, outputs = [], dict[str, int]()
+        raise InputError(f"{file}: expected {expected}")
+    jobs, outputs = list[dict[str, Any]](), dict[tuple[int, int, str], dict[str, int]]()
     for number, entry in enumerate(listed, start=1):
         where = f"{file}, job {number}"
         if not isinstance(entry, dict) or not isinstance(entry.get("set", {}), Mapping):
@@ -51,35 +49,54 @@ def read_jobs(file: Path) -> list[dict[str, Any]]:
                 f"{where}: expected 'input: PHOTOS' and 'output: MAP.gsmap', and maybe 'set: {{KEY: VALUE}}'"
             )
         pairs = [f"{key}={value}" for key, value in entry.get("set", {}).items()]
-        given = {key: (value, where) for key, value in entry.items() if key != "set"}
+        given = {str(key): (value, where) for key, value in entry.items() if key != "set"}
         for key in ("input", "output"):
             if key not in given:
                 raise InputError(f"{where}: has no {key}")
         job = settings_from(Job, given)
-        paths = {key: _place(getattr(job, key), file.parent) for key in ("input", "output")}
-        if not is_url(paths["input"]) and not Path(paths["input"]).exists():
-            raise InputError(f"{where}: {paths['input']} does not exist")
-        if (other := outputs.setdefault(paths["output"], number)) != number:
-            raise InputError(f"{where}: has the output of job {other}, {paths['output']}")
-        config = load_config(file.parent / job.config if job.config else None, pairs, job.preset)
-        jobs.append({**paths, "settings": config.to_json()})
+        try:
+            source, output = ((file.parent / local_path(text)).resolve() for text in (job.input, job.output))
+            settings = file.parent / local_path(job.config) if job.config else None
+        except ValueError as error:  # characters that no path can have, and URLs
+            raise InputError(f"{where}: {error}") from error
+        if not os.path.exists(source):  # noqa: PTH110 - Path.exists raises for a long name
+            raise InputError(f"{where}: {source} does not exist")
+        # One folder has one inode, whatever its spelling or mount. Names that differ in case may be one name there.
+        above, name = _standing(output)
+        known = outputs.setdefault((above.stat().st_dev, above.stat().st_ino, name.casefold()), {})
+        if other := known.get(name) or next((known[one] for one in known if _ignores_case(above)), None):
+            raise InputError(f"{where}: has the output of job {other}, {output}")
+        known[name] = number
+        config = load_config(settings, pairs, job.preset)
+        jobs.append({"input": str(source), "output": str(output), "settings": config.to_json()})
     return jobs
 
 
-def _place(text: str, folder: Path) -> str:
-    return text if is_url(text) else str((folder / text).resolve())
+def _standing(path: Path) -> tuple[Path, str]:
+    """The nearest place above `path` that exists, or itself, and the names below it."""
+    there = next(place for place in (path, *path.parents) if os.path.exists(place))  # noqa: PTH110
+    return there, path.relative_to(there).as_posix()
+
+
+def _ignores_case(folder: Path) -> bool:
+    try:
+        with tempfile.TemporaryDirectory(dir=folder) as probe:
+            (Path(probe) / "a").touch()
+            return (Path(probe) / "A").exists()
+    except OSError:  # no map can be written there
+        return False
 
 
 def map_one(task: str, progress: Progress = QUIET) -> dict[str, Any]:
-    """Makes the map of one job. An InputError is in its result, so that the other maps are made."""
+    """Makes the map of one job. An error of any class is in its result, so that the other maps are made."""
     job = json.loads(task)
     told = {"input": job["input"], "output": job["output"]}
     try:
         config = MapConfig.model_validate(job["settings"])
-        with local_places(place(job["input"]), place(job["output"]), config, True, progress) as at:
-            if at.info is None:
-                build_map(at.source, at.output, config, resume=at.resume, progress=progress, origin=at.origin)
+        build_map(Path(job["input"]), Path(job["output"]), config, resume=True, progress=progress)
+        info = write_own_report(Path(job["output"]), progress)
+        return {**told, "seconds": info["seconds"]["total"], "instances": info["num_instances"]}
     except InputError as error:
         return {**told, "error": " ".join(str(error).split())}
-    assert at.info is not None
-    return {**told, "seconds": at.info["seconds"]["total"], "instances": at.info["num_instances"]}
+    except Exception as error:
+        return {**told, "error": f"{type(error).__name__}: {brief(error, 400)}"}

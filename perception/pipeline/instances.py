@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
 from scipy import sparse
 
 from perception import _core
 from perception.boxes import instance_entry
 from perception.gaussians.model import Gaussians
 from perception.gaussians.nearby import Nearby
-from perception.gaussians.train import TrainingView
+from perception.gaussians.views import TrainingView, half_camera
 from perception.instances.crops import choose_views, view_scores
 from perception.instances.describe import describe_instances
 from perception.instances.group import Grouping, group
@@ -22,13 +21,13 @@ from perception.instances.levels import with_levels
 from perception.instances.silhouettes import Silhouettes, render_silhouettes
 from perception.instances.texts import read_texts, store_texts
 from perception.instances.votes import mask_votes
-from perception.io.memory import return_free_memory
 from perception.language.base import Encoder, reading_of
 from perception.language.description import to_arrays
 from perception.language.ocr import TextReader
+from perception.machine import return_free_memory
 from perception.map.map import prefixed
 from perception.masks.merging import Segmentation
-from perception.pipeline.optimise import Run
+from perception.pipeline.optimise import Optimised, Run
 from perception.progress import Progress
 
 HALVED_FROM = 480
@@ -49,9 +48,14 @@ class FoundInstances:
     groups: dict[str, np.ndarray] = field(default_factory=dict)
 
 
-def group_gaussians(nearby: Nearby, views: list[TrainingView], run: Run, cuts: Segmentation | None) -> Grouping | None:
+def group_gaussians(optimised: Optimised, run: Run, segments: Segmentation | None) -> Grouping | None:
     """Groups Gaussians into instances by features and votes of all masks (§3.2.1); None if no photo has masks.
-    cuts: of the surface, if the masks come from one."""
+    segments: of the surface, if the masks come from one."""
+    with run.stage("instances"):
+        return _group(optimised.nearby, optimised.photos.views, run, segments)
+
+
+def _group(nearby: Nearby, views: list[TrainingView], run: Run, segments: Segmentation | None) -> Grouping | None:
     if not any(view.labels is not None and bool((view.labels > 0).any()) for view in views):
         return None
     config = run.config
@@ -70,10 +74,19 @@ def group_gaussians(nearby: Nearby, views: list[TrainingView], run: Run, cuts: S
         margin=config.losses.margin,
         seed=config.seed,
     )
-    return found if cuts is None else with_levels(found, gaussians.means.detach().numpy(), votes, cuts)
+    return found if segments is None else with_levels(found, gaussians.means.detach().numpy(), votes, segments)
 
 
 def describe(
+    optimised: Optimised, grouped: Grouping | None, run: Run, encoder: Encoder | None, reader: TextReader | None
+) -> FoundInstances:
+    """Geometry, score and views of each instance; with an encoder its language embeddings (§3.2.2), with a reader its
+    printed texts."""
+    with run.stage("instances"):
+        return _describe(optimised.nearby, grouped, optimised.photos.views, run, encoder, reader)
+
+
+def _describe(
     nearby: Nearby,
     grouped: Grouping | None,
     views: list[TrainingView],
@@ -81,8 +94,6 @@ def describe(
     encoder: Encoder | None,
     reader: TextReader | None,
 ) -> FoundInstances:
-    """Geometry, score and views of each instance; with an encoder its language embeddings (§3.2.2), with a reader its
-    printed texts."""
     count, words, progress = len(nearby.gaussians), run.config.language, run.progress
     if grouped is None:
         report = {"warnings": ["no photo has masks"]}
@@ -133,11 +144,9 @@ def _silhouettes(
     """Of each level, the silhouettes of all views."""
     seen = []
     for done, view in enumerate(views, start=1):
-        height, width = view.photo.shape[:2]
-        K, eps2d = view.K, view.eps2d
-        if max(height, width) >= HALVED_FROM:  # as in `TrainingView.halved`
-            height, width, eps2d = height // 2, width // 2, (eps2d + 0.25) / 4
-            K = K * torch.tensor([[0.5], [0.5], [1.0]])
+        K, (height, width), eps2d = view.K, view.photo.shape[:2], view.eps2d
+        if max(height, width) >= HALVED_FROM:
+            K, (height, width), eps2d = half_camera(K, (height, width), eps2d)
         gaussians, rows = nearby.of(view.name)
         owners = [ids[rows] for ids in levels]
         seen.append(render_silhouettes(gaussians, owners, view.camera_from_world, K, width, height, eps2d=eps2d))

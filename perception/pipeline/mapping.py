@@ -22,6 +22,7 @@ from perception.gaussians.photos import split_scene
 from perception.inputs.load import load_saved_scene, load_scene, save_scene
 from perception.language.base import Encoder
 from perception.language.ocr import TextReader, make_reader
+from perception.map.checksums import is_map
 from perception.map.files import read_info
 from perception.map.write import Map, read_map, write_map
 from perception.masks import MaskSource, make_source
@@ -29,14 +30,15 @@ from perception.masks.compute import load_segmentation
 from perception.photos.reading import Reading
 from perception.photos.view_json import stored_view
 from perception.pipeline.blocks import optimiser
-from perception.pipeline.checkpoint import clear_work, fingerprint, frames_folder, poses_mark, working
+from perception.pipeline.changes import hold_inputs, inputs_of, refuse_changed
+from perception.pipeline.checkpoint import check_name, clear_work, fingerprint, frames_folder, poses_mark, working
 from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import FoundInstances, describe, group_gaussians
 from perception.pipeline.optimise import Run
-from perception.pipeline.record import finite, run_record, score_views
+from perception.pipeline.record import finite, run_record, scored
 from perception.progress import QUIET, Progress
 from perception.report.text import depth_text, frame_lines
-from perception.tasks.engine import Engine
+from perception.tasks.engine import LOCAL, Engine
 from perception.types import Scene, View
 
 
@@ -47,15 +49,12 @@ def build_map(
     *,
     resume: bool = False,
     progress: Progress = QUIET,
-    engine: Engine | None = None,
-    origin: str | None = None,
+    engine: Engine = LOCAL,
 ) -> Map:
     """Builds a map from photos, a video, a COLMAP workspace or a transforms.json, and writes it to `output`.
 
-    Raises InputError for bad input. Intermediate results are kept beside `output` until the map is written; with
-    `resume` a run continues from them and repeats only what has changed (see `pipeline.checkpoint`). A run that fails
-    before training leaves no files. Resuming a finished run returns its map. engine: where features, masks and the
-    blocks of a large place are made; None: here. origin: the input's name in map.json, where `source` is a copy of it.
+    Raises InputError for bad input. What a run has made is kept beside `output` until the map is written; `resume` goes
+    on from there (see `pipeline.checkpoint`), or returns a finished map. engine: where tasks run.
 
     >>> from perception.config import load_config
     >>> config = load_config(pairs=["masks=labels:table/labels", "train.iterations=20", "language.encoder=none"])
@@ -64,39 +63,34 @@ def build_map(
     (12, True)
     """
     started = time.monotonic()
-    if resume and output.exists() and read_info(output).get("fingerprint") == fingerprint(source, config):
-        progress.log(f"{output}: this run is finished")
-        clear_work(output)
-        return read_map(output)
+    check_name(output)
+    if resume and _is_finished(source, output, config):
+        return _finished(output, progress)
 
     with working(source, output, resume) as work:
         # Files, models and devices are opened first, so that errors appear before hours of work.
+        hold_inputs(work, source, config, output)
         run = _open_run(source, config, work, progress, engine)
         masks, encoder, reader = _open_models(run)
 
         # Posed images I_v (§3.2) and a sparse cloud.
-        with run.stage("poses"):
-            scene = _posed_scene(output, run)
-        _log_scene(scene, progress)
+        scene = _posed_scene(output, run)
+        inputs = hold_inputs(work, source, config, output)  # the frames of a video among them
         scene, training, held_out = split_scene(scene, config.photos)
 
         # Masks M_v,i of every photo (§3.2), and Gaussians optimised on photos and masks (§3.1 to 3.2.3).
-        optimise = optimiser(scene, config.train.block_photos)
-        optimised = optimise(run, scene, training, held_out, masks)
+        optimised = optimiser(scene, config.train.block_photos)(run, scene, training, held_out, masks)
         segments = load_segmentation(run.masks) if masks.needs_depth else None
         del masks  # with its images
 
         # Group the Gaussians by their features into instances (§3.2.1), describe these from their best views (§3.2.2).
-        with run.stage("instances"):
-            grouped = group_gaussians(optimised.nearby, optimised.photos.views, run, segments)
-            found = describe(optimised.nearby, grouped, optimised.photos.views, run, encoder, reader)
+        grouped = group_gaussians(optimised, run, segments)
+        found = describe(optimised, grouped, run, encoder, reader)
 
-        with run.stage("score"):
-            gaussians = optimised.nearby.gaussians.to("cpu")
-            quality = score_views(gaussians, optimised.photos.held, scene.metric)
+        gaussians, quality = scored(run, optimised, scene.metric)
         info = run_record(run, scene, optimised, found.report, quality, time.monotonic() - started)
-        gmap = _assemble(gaussians, found, scene, held_out, {**info, "source": origin or str(source)}, output)
-        write_map(output, gmap)
+        gmap = _assemble(gaussians, found, scene, held_out, {**info, "inputs": inputs}, output)
+        write_map(output, gmap, fresh=True)
     _log_result(gmap, output, progress)
     return gmap
 
@@ -104,11 +98,25 @@ def build_map(
 # ----------------------------------------------------------------------- stages
 
 
-def _open_run(source: Path, config: MapConfig, work: Path, progress: Progress, engine: Engine | None) -> Run:
+def _is_finished(source: Path, output: Path, config: MapConfig) -> bool:
+    """Whether a map of this input and these settings lies at `output`. InputError when the input has changed since."""
+    if not is_map(output) or (info := read_info(output)).get("fingerprint") != fingerprint(source, config):
+        return False
+    refuse_changed(output, info, inputs_of(source, config, output))
+    return True
+
+
+def _finished(output: Path, progress: Progress) -> Map:
+    progress.log(f"{output}: this run is finished")
+    clear_work(output)
+    return read_map(output)
+
+
+def _open_run(source: Path, config: MapConfig, work: Path, progress: Progress, engine: Engine) -> Run:
     device, line = choose_device(config.device)
     if line is not None:
         progress.log(line)
-    return Run(source, config, work, work / "masks", device, progress, engine or Engine())
+    return Run(source, config, work, work / "masks", device, progress, engine)
 
 
 def _open_models(run: Run) -> tuple[MaskSource, Encoder | None, TextReader | None]:
@@ -130,19 +138,21 @@ def _posed_scene(output: Path, run: Run) -> Scene:
     """The scene of the input in the map's frame: read from the work folder, or made and kept there."""
     source, config, work, progress = run.source, run.config, run.work, run.progress
     kept = work / f"poses-{poses_mark(source, config)}"
-    scene = load_saved_scene(kept)
-    if scene is None:
-        log_estimate(source, config, progress.log)
-        photos = config.photos
-        masks, camera, cloud = (
-            Path(p) if p else None for p in (photos.ignore_masks, photos.camera, photos.init_points)
-        )
-        how = Reading(work / "sfm", config.seed, progress, photos.strict, masks, camera, poses=photos.poses)
-        how = replace(how, frames=frames_folder(output), init_points=cloud, engine=run.engine)
-        scene = load_scene(source, how)
-        save_scene(kept, scene := placed_scene(recentred(scene), config.frame, config.seed))
-    if config.losses.depth_weight == 0:
-        return replace(scene, views=[replace(view, depth=None) for view in scene.views])
+    with run.stage("poses"):
+        scene = load_saved_scene(kept)
+        if scene is None:
+            log_estimate(source, config, progress.log)
+            photos = config.photos
+            masks, camera, cloud = (
+                Path(p) if p else None for p in (photos.ignore_masks, photos.camera, photos.init_points)
+            )
+            how = Reading(work / "sfm", config.seed, progress, photos.strict, masks, camera, poses=photos.poses)
+            how = replace(how, frames=frames_folder(output), init_points=cloud, engine=run.engine)
+            scene = load_scene(source, how)
+            save_scene(kept, scene := placed_scene(recentred(scene), config.frame, config.seed))
+        if config.losses.depth_weight == 0:
+            scene = replace(scene, views=[replace(view, depth=None) for view in scene.views])
+    _log_scene(scene, progress)
     return scene
 
 

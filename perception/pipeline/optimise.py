@@ -21,11 +21,12 @@ from perception.gaussians.photos import load_all, with_labels
 from perception.gaussians.size import sized
 from perception.gaussians.train import Trainer, TrainingView, TrainRecord
 from perception.gaussians.views import surface_depth
-from perception.io.memory import DiskArrays, Keep, return_free_memory
+from perception.io.memory import DiskArrays, Keep
+from perception.machine import memory_limit, return_free_memory
 from perception.masks import MaskSource, compute_masks, make_source
 from perception.photos.decode import load_photo
 from perception.pipeline.checkpoint import TrainingObserver, digest, training_mark
-from perception.pipeline.estimate import image_memory, largest_budget, memory_limit
+from perception.pipeline.estimate import image_memory, largest_budget
 from perception.progress import QUIET, Progress, timed
 from perception.tasks.engine import Engine
 from perception.tasks.folder import has_task, read_task, write_task

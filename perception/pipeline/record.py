@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from perception.cores import peak_memory_mib
 from perception.evaluate.images import ssim
 from perception.gaussians.model import Gaussians
 from perception.gaussians.views import TrainingView, depth_image, psnr, render_view
+from perception.machine import peak_memory_mib
 from perception.pipeline.checkpoint import fingerprint
 from perception.pipeline.optimise import Optimised, Run
 from perception.tasks.folder import versions
@@ -59,6 +59,13 @@ def run_record(
         "peak_memory_mib": peak_memory_mib(),
     }
     return facts | ({"blocks": optimised.blocks} if optimised.blocks else {})
+
+
+def scored(run: Run, optimised: Optimised, metric: bool) -> tuple[Gaussians, dict[str, Any]]:
+    """The Gaussians on the CPU, and how good they are in the held-out views."""
+    with run.stage("score"):
+        gaussians = optimised.nearby.gaussians.to("cpu")
+        return gaussians, score_views(gaussians, optimised.photos.held, metric)
 
 
 def score_views(gaussians: Gaussians, views: list[TrainingView], metric: bool = False) -> dict[str, Any]:

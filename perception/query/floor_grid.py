@@ -7,11 +7,10 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from perception.errors import InputError
 from perception.frame.gravity import floor_height
-from perception.geometry import camera_centres
+from perception.geometry import camera_centres, rotations
 from perception.map.map import Map
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1  # nav_msgs/OccupancyGrid
@@ -63,7 +62,7 @@ def level_surface(gmap: Map) -> Surface:
     x = np.cross(np.cross(up, np.eye(3)[int(abs(up[0]) > 0.9)]), up)
     axes = np.stack([x, np.cross(up, x), up], axis=1) / [np.linalg.norm(x), np.linalg.norm(x), 1]  # map_from_level
     solid = gmap.opacities >= OPAQUE
-    sides = Rotation.from_quat(gmap.quats[solid][:, [1, 2, 3, 0]]).as_matrix() * gmap.scales[solid][:, None]
+    sides = rotations(gmap.quats[solid]) * gmap.scales[solid][:, None]
     longest = np.argsort(gmap.scales[solid], axis=1)[:, None, :0:-1]
     first, second = np.moveaxis(np.take_along_axis(sides, longest, axis=2), 2, 0) @ axes
     means = gmap.means[solid] @ axes

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import re
+import zipfile
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from functools import lru_cache
@@ -13,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import atomic_file, writing
+from perception.io.atomic import atomic_file, recover, writing
 from perception.language.encoders import make_encoder
 from perception.map.checksums import FACTS, STORE
 from perception.progress import QUIET, Progress
@@ -21,6 +24,8 @@ from perception.query.map_store import FORMAT_VERSION, TOLD, read_store
 from perception.query.query_map import QueryMap, load_map
 from perception.query.relations import Places
 from perception.query.text_ranking import Encoders, printed_on
+
+_NAME = re.compile(r"\.?[0-9a-f]{32}\.npz(?P<unfinished>\.new-\d+-\w{8})?")
 
 
 def index_maps(
@@ -71,18 +76,36 @@ def index_maps(
             aside.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
         listed = {entry["file"] for entry in facts["maps"]}
         for file in (store / "maps").iterdir():  # of other maps, and of writers that were killed
-            if file.name not in listed:
+            if file.name not in listed and _is_ours(file):
                 file.unlink(missing_ok=True)
     return {**counts, "maps": len(entries), "instances": sum(entry["instances"] for entry in entries.values())}
 
 
 def _facts(store: Path) -> dict[str, Any]:
     """What store.json holds, or will hold in a new store."""
+    maps = store / "maps"
     if (store / STORE).is_file():
         return read_store(store)[0]
-    if store.exists() and (not store.is_dir() or {item.name for item in store.iterdir()} - {"maps"}):
+    recover(store / STORE)
+    if store.exists() and not (store.is_dir() and all(item == maps for item in store.iterdir())):
         raise InputError(f"{store}: is no store, and something lies there; give a new folder with -o")
+    if os.path.lexists(maps) and not (maps.is_dir() and all(map(_is_ours, maps.iterdir()))):
+        raise InputError(f"{maps}: holds what is not of a store; give a new folder with -o")
     return {"format_version": FORMAT_VERSION, "encoder": None, "maps": []}
+
+
+def _is_ours(file: Path) -> bool:
+    """Whether a file in the folder maps/ was written here, completely or not: by its name, and by what it holds."""
+    found = _NAME.fullmatch(file.name)
+    if found is None or file.is_symlink() or not file.is_file():
+        return False
+    if found["unfinished"]:
+        return True
+    try:
+        with zipfile.ZipFile(file) as archive:
+            return "told.npy" in archive.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False
 
 
 def _indexed(store: Path, gmap: QueryMap, facts: dict[str, Any]) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from perception.io.arrays import read_npz
 from perception.language.description import check_encoder
 from perception.language.encoders import make_encoder
 from perception.language.printed import Printed, quoted_text
+from perception.machine import torch_on_one_thread
 from perception.map.checksums import STORE
 from perception.map.map import Map
 from perception.query.hit import Hit
@@ -27,7 +28,7 @@ from perception.query.query_map import QueryMap
 from perception.query.ranking import THING, Ranker, least_score
 from perception.query.relations import WEIGHT, Places, parse, standing
 from perception.query.requests import MAX_TOP, TOP, Request
-from perception.query.text_ranking import REMEMBERED, one_thread
+from perception.query.text_ranking import REMEMBERED
 from perception.query.where import Frame, Where, tidy
 from perception.types import OrientedBox
 
@@ -144,7 +145,7 @@ class MapStore(QueryMap):
 
     def _answering(self, text: str, min_score: float | None) -> list[tuple[int, float]]:
         """(index, score) of at most MAX_TOP instances that answer, best first."""
-        with one_thread():
+        with torch_on_one_thread():
             scores = self._scores(text)
         best = np.zeros(len(self.maps))
         np.maximum.at(best, self._groups, scores)

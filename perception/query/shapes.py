@@ -167,9 +167,9 @@ def boxiness(points: np.ndarray) -> float:
     return ramp(float(nearest.mean()), 0.11, 0.06) * ramp(float(corners.mean()), 0.02, 0.08)
 
 
-def ramp(x: Any, zero: float, one: float) -> Any:
-    """0 at `zero`, 1 at `one`, linear between, clamped outside. x: a number or an array."""
-    return np.clip((x - zero) / (one - zero), 0.0, 1.0)
+def ramp(x: Any, zero: Any, one: Any) -> Any:
+    """0 at `zero`, 1 at `one`, linear between, clamped outside; a step where they are equal. Numbers or arrays."""
+    return np.clip((x - zero) / np.where(one == zero, 1e-9, one - zero), 0.0, 1.0)
 
 
 def room_scores(bodies: list[Body], e: float) -> dict[str, np.ndarray]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -14,6 +12,7 @@ from perception.errors import InputError
 from perception.language.base import Encoder
 from perception.language.encoders import make_encoder
 from perception.language.printed import Printed
+from perception.machine import torch_on_one_thread
 from perception.map.map import Map
 from perception.query.ranking import Answer, Ranker
 from perception.query.relations import Places, ranked
@@ -48,7 +47,7 @@ class TextRanking:
         return self._remembered(" ".join(text.split()))
 
     def _ranked(self, text: str) -> Answer:
-        with one_thread():
+        with torch_on_one_thread():
             named = self._by_label(text) is not None
             return self.ranker.rank(text) if named else ranked(self.ranker, self.places, text)
 
@@ -125,19 +124,3 @@ def printed_on(gmap: Map) -> Printed | None:
     """The texts printed on the map's instances; None if the map was made without reading texts."""
     read = gmap.info.get("instances", {}).get("texts") is not None
     return Printed([entry.get("texts", []) for entry in gmap.instances]) if read else None
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Limits torch to one thread. A prompt has a few tokens, so a second thread costs more than it saves: 10 ms on one
-    core against 24 on two, far more on a busy machine. Servers run several prompts in parallel instead."""
-    torch = sys.modules.get("torch")
-    before = 1 if torch is None else torch.get_num_threads()
-    if torch is None or before == 1:
-        yield
-        return
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -24,6 +24,7 @@ from perception.gaussians.views import TrainingView, render_view
 from perception.instances.crops import expand_box, mask_box
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.atomic import atomic_file
+from perception.map.files import read_info
 from perception.map.write import REPORT, Map
 from perception.photos.decode import load_photo, scaled_K
 from perception.pictures import error_map, features_to_rgb, outline, overlay, titled_row
@@ -40,12 +41,14 @@ SIZES = ((460, 82), (360, 74), (260, 66), (180, 55), (120, 45))
 """(longest side, quality) of the images, tried in this order."""
 
 
-def write_own_report(path: Path, progress: Progress) -> None:
-    """Writes report.html into the map. A failure is only a warning: `perception report` can be run later."""
+def write_own_report(path: Path, progress: Progress) -> dict[str, Any]:
+    """Writes report.html into the map; the content of its map.json. A failure to write is only a warning:
+    `perception report` can be run later."""
     try:
         write_map_report(load_map(path), path / REPORT, [])
     except InputError as error:
         progress.log(f"warning: no report: {error}")
+    return read_info(path)
 
 
 def write_map_report(opened: QueryMap, path: Path, queries: list[str]) -> Path:

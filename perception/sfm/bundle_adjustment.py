@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from perception.geometry import sums_by
 from perception.sfm.tracks import Tracks
 
 ROUNDS, STEPS, GAIN = 4, 12, 1e-3
@@ -59,8 +60,8 @@ def starting_points(tracks: Tracks, poses: Poses) -> np.ndarray:
     across = np.eye(3) - along[:, :, None] * along[:, None, :]
     # Σ A_o (x − e_o) = 0, where A_o is the projection across the ray, or with depth nearly the identity.
     weight = np.where(tracks.depth[:, None, None] > 0, np.eye(3), across)
-    system = _sums(weight, tracks.point, tracks.size)
-    right = _sums(np.einsum("oij,oj->oi", weight, ends), tracks.point, tracks.size)
+    system = sums_by(tracks.point, weight, tracks.size)
+    right = sums_by(tracks.point, np.einsum("oij,oj->oi", weight, ends), tracks.size)
     system += 1e-9 * np.trace(system, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     return np.asarray(np.linalg.solve(system, right[..., None])[..., 0] + origin)
 
@@ -145,10 +146,10 @@ def _step(problem: _Problem, poses: Poses, points: np.ndarray, damping: float) -
 
     tracks, count, size = problem.tracks, len(poses.center), problem.tracks.size
     residual, J_pose, J_point = _linearised(problem, poses, points)
-    U = _sums(np.einsum("orv,orw->ovw", J_pose, J_pose), tracks.view, count)
-    V = _sums(np.einsum("orv,orw->ovw", J_point, J_point), tracks.point, size)
-    g_pose = -_sums(np.einsum("orv,or->ov", J_pose, residual), tracks.view, count)
-    g_point = -_sums(np.einsum("orv,or->ov", J_point, residual), tracks.point, size)
+    U = sums_by(tracks.view, np.einsum("orv,orw->ovw", J_pose, J_pose), count)
+    V = sums_by(tracks.point, np.einsum("orv,orw->ovw", J_point, J_point), size)
+    g_pose = -sums_by(tracks.view, np.einsum("orv,or->ov", J_pose, residual), count)
+    g_point = -sums_by(tracks.point, np.einsum("orv,or->ov", J_point, residual), size)
     V += np.eye(3) * (damping * np.einsum("pii->pi", V)[:, None, :] + 1e-12)
     V_inverse = np.linalg.inv(V)
     order = np.argsort(tracks.view, kind="stable")
@@ -207,10 +208,3 @@ def _solved(A: Any, b: np.ndarray) -> np.ndarray:
     blocks = np.stack([A[i : i + 6, i : i + 6].toarray() for i in range(0, len(b), 6)])
     inverse = bsr_matrix((np.linalg.inv(blocks), np.arange(len(blocks)), np.arange(len(blocks) + 1)), shape=A.shape)
     return np.asarray(cg(A, b, rtol=1e-6, M=inverse, maxiter=10 * len(b))[0])
-
-
-def _sums(values: np.ndarray, index: np.ndarray, count: int) -> np.ndarray:
-    """Sums [count, ...] of values [O, ...] by index [O]."""
-    flat = values.reshape(len(values), -1)
-    summed = [np.bincount(index, flat[:, i], minlength=count) for i in range(flat.shape[1])]
-    return np.stack(summed, axis=1).reshape(count, *values.shape[1:])

@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from perception.geometry import sums_by
 from perception.photos.decode import load_photo, scaled_K
 from perception.sfm.tracks import Tracks
 from perception.types import View
@@ -65,8 +66,8 @@ def photo_gains(logs: np.ndarray, usable: np.ndarray, tracks: Tracks, count: int
         W = csr_matrix((weight, (tracks.view, tracks.point)), shape=(count, tracks.size))
         total = np.maximum(np.asarray(W.sum(axis=0)).ravel(), 1e-12)
         system = diags(np.asarray(W.sum(axis=1)).ravel() + TIED) - W @ diags(1 / total) @ W.T
-        means = np.stack([np.bincount(tracks.point, weight * c, tracks.size) for c in logs.T], axis=1) / total[:, None]
-        right = np.stack([np.bincount(tracks.view, weight * c, count) for c in logs.T], axis=1) - W @ means
+        means = sums_by(tracks.point, logs, tracks.size, weight) / total[:, None]
+        right = sums_by(tracks.view, logs, count, weight) - W @ means
         gains = spsolve(system.tocsc(), right).reshape(count, 3)
         albedo = means - W.T @ gains / total[:, None]
         distance = np.linalg.norm(logs - albedo[tracks.point] - gains[tracks.view], axis=1)

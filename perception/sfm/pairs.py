@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
-from perception.cores import cores
+from perception.machine import cores
 from perception.photos.lens import load_pycolmap
 from perception.progress import Progress
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from perception.cores import cores
+from perception.machine import cores
 from perception.photos.decode import LARGE_PIXELS, exif_of, open_photo, read_photo
 from perception.progress import Progress
 

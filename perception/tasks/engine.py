@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from perception.cores import cores
 from perception.errors import InputError, missing_extra
+from perception.machine import cores
 from perception.progress import Progress
 
 ENGINES = ("local", "ray")
@@ -105,6 +105,9 @@ class Engine:
         finally:
             if started:
                 ray.shutdown()
+
+
+LOCAL = Engine()
 
 
 class _Stoppable(Progress):

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from perception.geometry import sums_by
+
 MOST = 1_000_000
 """Gaussians that a page shows; browsers sort them anew for every change of the view."""
 STEPS = 24  # halvings of the interval in which the cells' side is searched
@@ -52,7 +54,7 @@ def level(
     middles = _means(owner, weights, means, count)
     away = means - middles[owner]
     spreads = covariances + away[:, :, None] * away[:, None, :]
-    merged = _means(owner, weights, spreads.reshape(-1, 9), count).reshape(-1, 3, 3)
+    merged = _means(owner, weights, spreads, count)
     area = np.cbrt(np.maximum(np.linalg.det(merged), 1e-36))
     return Level(owner, weights.astype(np.float32), *(array.astype(np.float32) for array in (middles, merged, area)))
 
@@ -81,7 +83,6 @@ def _cells(means: np.ndarray, ids: np.ndarray, most: int) -> tuple[np.ndarray, i
 
 
 def _means(owner: np.ndarray, weights: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """[count, K] weighted means of values [N, K]."""
+    """[count, ...] weighted means of values [N, ...]."""
     total = np.bincount(owner, weights, count)
-    columns = [np.bincount(owner, weights * column, count) / total for column in values.T]
-    return np.stack(columns, axis=1)
+    return sums_by(owner, values, count, weights) / total.reshape(-1, *[1] * (values.ndim - 1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from perception.geometry import rotations
 from perception.map.write import Map
 
 PIXEL = 0.0015
@@ -34,7 +35,7 @@ def pick_point(gmap: Map, shown: np.ndarray, origin: np.ndarray, direction: np.n
     if weights.sum() < SEEN:
         return None
     rows, weights = rows[weights > 0], weights[weights > 0]
-    turns = _rotations(gmap.quats[rows])
+    turns = rotations(gmap.quats[rows])
     inverse = np.exp(-gmap.log_scales[rows].astype(np.float64))  # Σ⁻¹ = A Aᵀ with A = R S⁻¹
     along = np.einsum("nij,i->nj", turns, direction) * inverse
     away = np.einsum("nij,ni->nj", turns, gmap.means[rows] - np.asarray(origin)) * inverse
@@ -76,13 +77,5 @@ def _weights(gmap: Map, shown: np.ndarray, origin: np.ndarray, direction: np.nda
 
 def covariances(gmap: Map) -> np.ndarray:
     """[N, 3, 3] float32 covariance matrices R S Sᵀ Rᵀ of the Gaussians."""
-    axes = _rotations(gmap.quats) * gmap.scales[:, None]
+    axes = rotations(gmap.quats) * gmap.scales[:, None]
     return (axes @ axes.transpose(0, 2, 1)).astype(np.float32)
-
-
-def _rotations(quats: np.ndarray) -> np.ndarray:
-    """[N, 3, 3] float64 of quaternions [N, 4] wxyz; one of zeros is the identity."""
-    from scipy.spatial.transform import Rotation
-
-    xyzw = np.add(quats[:, [1, 2, 3, 0]], [0, 0, 0, 1e-30], dtype=np.float64)
-    return np.asarray(Rotation.from_quat(xyzw).as_matrix())

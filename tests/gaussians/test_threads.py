@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from perception.gaussians import rasterize as module
+from perception.machine import torch_on_one_thread
 
 
 @pytest.fixture
@@ -37,9 +38,9 @@ def asked(monkeypatch: pytest.MonkeyPatch):
 def test_the_rasterizer_keeps_the_threads_that_torch_gives_up(asked) -> None:
     torch.set_num_threads(3)
     assert asked() == 3
-    with module.torch_on_one_thread():
+    with torch_on_one_thread():
         assert (torch.get_num_threads(), asked(), asked(threads=2)) == (1, 3, 2)
-        with module.torch_on_one_thread():
+        with torch_on_one_thread():
             assert (torch.get_num_threads(), asked()) == (1, 3)
         assert (torch.get_num_threads(), asked()) == (1, 3)
     assert (torch.get_num_threads(), asked()) == (3, 3)
@@ -47,6 +48,6 @@ def test_the_rasterizer_keeps_the_threads_that_torch_gives_up(asked) -> None:
 
 def test_torch_gets_its_threads_back_after_an_error(asked) -> None:
     torch.set_num_threads(2)
-    with pytest.raises(KeyError), module.torch_on_one_thread():
+    with pytest.raises(KeyError), torch_on_one_thread():
         raise KeyError
     assert (torch.get_num_threads(), asked()) == (2, 2)

@@ -178,7 +178,7 @@ def test_bad_files_are_told_in_one_line(tmp_path, name, data, word):
 
 def test_a_file_that_cannot_fit_is_refused_before_it_is_read(tmp_path, monkeypatch):
     write_cloud(tmp_path / "c.ply", sample(1000))
-    monkeypatch.setattr("perception.io.memory.available_memory", lambda: 10_000)
+    monkeypatch.setattr("perception.machine.available_memory", lambda: 10_000)
     with pytest.raises(InputError, match=r"c\.ply: needs about .* GiB are free; split"):
         read_cloud(tmp_path / "c.ply")
 

@@ -18,8 +18,10 @@ from perception.cli import main
 from perception.config import load_config
 from perception.edit.editor import Editor
 from perception.errors import InputError
+from perception.gaussians.train import Trainer
 from perception.io.atomic import lock_file, writing
-from perception.map.write import read_map, set_labels, verify_map
+from perception.map.write import read_map, set_labels, verify_map, write_map
+from perception.pipeline import mapping
 from perception.pipeline.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint, work_folder
 from perception.pipeline.mapping import build_map
 from support.paths import SUPPORT
@@ -230,6 +232,30 @@ def test_a_second_mapper_is_refused_and_harms_nothing(small_scene: Path, tmp_pat
 
 def config(scene: Path, *more: str):
     return load_config(None, [*QUICK, f"masks=labels:{scene / 'labels'}", *more])
+
+
+def test_a_folder_that_comes_to_the_output_is_kept_and_so_is_the_work(
+    small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The training is not done again once the folder has been moved away."""
+    out, source = tmp_path / "m.gsmap", small_scene / "transforms.json"
+
+    def late(path: Path, *arguments: object, **options: object) -> None:
+        path.mkdir()
+        (path / "notes.txt").write_text("field notes")
+        write_map(path, *arguments, **options)
+
+    with monkeypatch.context() as patch, pytest.raises(InputError, match=r"m\.gsmap: was put there.*--resume"):
+        patch.setattr(mapping, "write_map", late)
+        build_map(source, out, config(small_scene))
+    assert [(file.name, file.read_text()) for file in out.iterdir()] == [("notes.txt", "field notes")]
+    with pytest.raises(InputError, match="exists already"):
+        build_map(source, out, config(small_scene), resume=True)
+    out.rename(tmp_path / "notes")
+    steps: list[int] = []
+    monkeypatch.setattr(Trainer, "step", lambda *_: steps.append(1))
+    build_map(source, out, config(small_scene), resume=True)
+    assert not steps and len(read_map(out)) > 0 and not work_folder(out).exists()
 
 
 def test_resuming_a_finished_run_tidies_up_and_changes_nothing(small_scene: Path, tmp_path: Path) -> None:

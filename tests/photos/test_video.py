@@ -79,6 +79,10 @@ def test_a_video_that_cannot_be_posed_leaves_no_frames(tmp_path: Path) -> None:
     assert not (tmp_path / "v.frames").exists()
 
 
+def test_frames_of_maps_with_points_in_their_names_lie_apart() -> None:
+    assert [frames_folder(Path(f"floor.{n}")).name for n in (1, 2)] == ["floor.1.frames", "floor.2.frames"]
+
+
 def test_a_record_that_is_none_is_no_record(tmp_path: Path) -> None:
     video = write_video(tmp_path / "v.mp4", pan(20))
     (tmp_path / "frames").mkdir()
@@ -97,4 +101,4 @@ def test_a_refused_run_leaves_only_frames_that_were_there(tmp_path: Path, earlie
     with pytest.raises(InputError, match="later"), working(video, output, resume=False):
         frames_folder(output).mkdir(exist_ok=True)
         raise InputError("found later")
-    assert {path.name for path in tmp_path.iterdir()} == {"v.mp4", *(["v.frames"] if earlier else [])}
+    assert {path.name for path in tmp_path.iterdir()} == {"v.mp4", *(["v.gsmap.frames"] if earlier else [])}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import math
+import os
 import re
 import shutil
 import signal
@@ -23,6 +24,7 @@ from perception.errors import InputError
 from perception.gaussians import train
 from perception.gaussians.views import psnr
 from perception.map.write import read_map
+from perception.photos.reading import Reading
 from perception.pipeline import checkpoint, mapping
 from perception.pipeline.checkpoint import (
     BEFORE_MASKS,
@@ -34,6 +36,7 @@ from perception.pipeline.checkpoint import (
 )
 from perception.pipeline.mapping import build_map
 from perception.pipeline.record import finite
+from perception.types import Scene
 from support.interrupts import interrupt_at
 from support.progress import Told
 
@@ -127,6 +130,67 @@ def test_other_settings_of_the_training_are_refused(small_scene: Path, tmp_path:
         with pytest.raises(InputError, match="other settings"):
             build_map(source, out, settings(small_scene, pair), resume=True)
     assert kept == {name: (work_folder(out) / name).read_bytes() for name in kept}
+
+
+@pytest.mark.parametrize("name", ["images/003.jpg", "labels/003.png", "transforms.json"])
+def test_other_files_under_the_same_names_are_refused(name: str, small_scene: Path, tmp_path: Path) -> None:
+    """Finished or not: what was made is of the files that were there."""
+    scene = tmp_path / "scene"
+    shutil.copytree(small_scene, scene)
+    source, done, cut = scene / "transforms.json", tmp_path / "done.gsmap", tmp_path / "cut.gsmap"
+    config = settings(scene)
+    build_map(source, done, config)
+    interrupted(source, cut, config, 30)
+    build_map(source, done, config, resume=True)
+    stat = (scene / name).stat()
+    os.utime(scene / name, ns=(stat.st_atime_ns, stat.st_mtime_ns + 1))
+    before = {path: path.read_bytes() for path in tmp_path.glob("*.gsmap*/*") if path.is_file()}
+    for out in (done, cut):
+        with pytest.raises(InputError, match=f"1 in all: .*{Path(name).name} .changed.;"):
+            build_map(source, out, config, resume=True)
+    assert before == {path: path.read_bytes() for path in tmp_path.glob("*.gsmap*/*") if path.is_file()}
+    os.utime(scene / name, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    assert np.array_equal(build_map(source, cut, config, resume=True).means, read_map(done).means)
+
+
+def test_a_finished_map_that_tells_no_input_files_is_kept_and_refused(small_scene: Path, tmp_path: Path) -> None:
+    out, config = tmp_path / "m.gsmap", settings(small_scene, "train.iterations=10")
+    build_map(small_scene / "transforms.json", out, config)
+    facts = json.loads((out / "map.json").read_text())
+    del facts["inputs"]
+    (out / "map.json").write_text(json.dumps(facts))
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    with pytest.raises(InputError, match="an older version made this map"):
+        build_map(small_scene / "transforms.json", out, config, resume=True)
+    assert before == {path.name: path.read_bytes() for path in out.iterdir()} and len(read_map(out)) > 0
+
+
+def test_changed_frames_of_a_video_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def load_scene(source: Path, how: Reading) -> Any:
+        """Frames are written and poses found, then the run is stopped."""
+        assert how.frames is not None
+        how.frames.mkdir(exist_ok=True)
+        (how.frames / "frames.json").write_text("{}")
+        (how.frames / "0.jpg").write_bytes(b"x")
+        return Scene([], np.zeros((0, 3)), np.zeros((0, 3), np.uint8), report={})
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    video, out = tmp_path / "v.mp4", tmp_path / "m.gsmap"
+    video.write_bytes(b"x")
+    monkeypatch.setattr(mapping, "load_scene", load_scene)
+    monkeypatch.setattr(mapping, "placed_scene", lambda scene, *_: scene)
+    monkeypatch.setattr(mapping, "recentred", lambda scene: scene)
+    monkeypatch.setattr(mapping, "log_estimate", lambda *_: None)
+    monkeypatch.setattr(mapping, "_tell_scene", stop)
+    config = load_config(None, [*SETTINGS, "masks=builtin"])
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            build_map(video, out, config, resume=True)
+    (checkpoint.frames_folder(out) / "0.jpg").write_bytes(b"other")
+    with pytest.raises(InputError, match=r"1 in all: 0\.jpg \(changed\)"):
+        build_map(video, out, config, resume=True)
 
 
 def test_when_to_stop_is_no_part_of_the_fingerprint(small_scene: Path, tmp_path: Path) -> None:

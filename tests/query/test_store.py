@@ -226,6 +226,26 @@ def test_what_lies_there_is_not_taken_for_a_store(maps: list[Path], tmp_path: Pa
         with pytest.raises(InputError, match="is no store"):
             index_maps(place, maps[1:], encoders=encoders)
     assert [item.name for item in (tmp_path / "mine").iterdir()] == ["notes.txt"]
+    inside = tmp_path / "project" / "maps"
+    shutil.copytree(maps[1], inside / "a.gsmap")
+    with pytest.raises(InputError, match="maps: holds what is not of a store"):
+        index_maps(inside.parent, [inside / "a.gsmap"], encoders=encoders)
+    assert [item.name for item in inside.iterdir()] == ["a.gsmap"]
+
+
+def test_only_files_of_the_store_are_removed_from_it(maps: list[Path], tmp_path: Path) -> None:
+    store, inside = tmp_path / "s", tmp_path / "s" / "maps"
+    index_maps(store, maps[1:3], encoders=encoders)
+    kept = [store / "notes.txt", inside / "plan.pdf", inside / f"{'0' * 32}.npz"]
+    for file in kept:
+        file.write_text("mine")
+    unfinished = inside / f".{'0' * 32}.npz.new-999999999-0a1b2c3d"
+    unfinished.touch()
+    shutil.copy(next(file for file in inside.iterdir() if file.stat().st_size > 100), inside / f"{'a' * 32}.npz")
+    (inside / "photos").symlink_to(tmp_path)
+    index_maps(store, [maps[3]], maps[1:2], encoders=encoders)
+    assert all(file.read_text() == "mine" for file in kept) and (inside / "photos").is_symlink()
+    assert len(list(inside.iterdir())) == 2 + 3 and not unfinished.exists()
 
 
 def test_without_the_maps_folder_all_but_points_is_answered(maps: list[Path], tmp_path: Path) -> None:

@@ -24,5 +24,5 @@ def test_nothing_is_lost_to_a_few_kills(small_scene: Path, tmp_path: Path) -> No
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     cases = {case["what"]: case for case in json.loads(facts.read_text())["cases"]}
-    assert set(cases) == {"mapping", "exporting", "editing"}
+    assert set(cases) == {"mapping", "exporting", "editing", "save", "upgrade", "export"}
     assert all(case["survived"] == case["kills"] == 3 and not case["lost"] for case in cases.values())

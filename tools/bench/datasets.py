@@ -111,8 +111,10 @@ class DatasetBench(ABC):
         more = list(settings)
         if held_out is not None:
             listed = self.work / "held_out" / f"{scene}.txt"
-            with atomic_file(listed) as aside:
-                aside.write_text("".join(f"{name}\n" for name in held_out), encoding="utf-8")
+            text = "".join(f"{name}\n" for name in held_out)
+            if not listed.is_file() or listed.read_text(encoding="utf-8") != text:  # a new file would be another input
+                with atomic_file(listed) as aside:
+                    aside.write_text(text, encoding="utf-8")
             more.append(f"photos.held_out={listed}")
         path.parent.mkdir(parents=True, exist_ok=True)
         self.progress.log(f"{scene}: mapping {source}")

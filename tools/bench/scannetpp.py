@@ -118,7 +118,8 @@ class ScanNetPP(DatasetBench):
             rows = np.sort(np.random.default_rng(0).choice(len(mesh.points), POINTS, replace=False))
             start = self.work / "points" / f"{name}.ply"
             start.parent.mkdir(parents=True, exist_ok=True)
-            write_cloud(start, PointCloud(mesh.points[rows], None if mesh.colors is None else mesh.colors[rows]))
+            if not start.is_file():  # a new file would be another input
+                write_cloud(start, PointCloud(mesh.points[rows], None if mesh.colors is None else mesh.colors[rows]))
         masks = scene / "dslr" / "resized_anon_masks"
         given = [f"photos.ignore_masks={masks}"] if any(masks.glob("*.png")) else []
         return [*given, f"photos.max_side={max(photo_size(photo)) // 2}", f"photos.init_points={start}"]

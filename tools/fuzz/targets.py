@@ -19,7 +19,6 @@ from unittest.mock import patch
 import numpy as np
 
 from perception.errors import InputError
-from support.paths import MAPS
 from support.views_at import views_at
 
 Data = bytes
@@ -525,21 +524,14 @@ def map_store() -> Target:
     loose = json.dumps({key: value for key, value in info.items() if key not in ("files", "sha256")}).encode()
     files = {f"sealed/{k}": v for k, v in sealed.items()} | {f"loose/{k}": v for k, v in sealed.items()}
     files["loose/map.json"] = loose
-    # Format version 1 without `views` in map.json: cameras.npz alone has them.
-    old = {file.name: file.read_bytes() for file in (MAPS / "v1.gsmap").iterdir()}
-    left_out = ("files", "sha256", "views")
-    facts = {key: value for key, value in json.loads(old["map.json"]).items() if key not in left_out}
-    old["map.json"] = json.dumps(facts).encode()
-    files |= {f"old/{name}": raw for name, raw in old.items()}
     variants: list[tuple[str, Callable[[bytes], bytes], bytes]] = [
         (f"loose/{name}", same, files[f"loose/{name}"]) for name in sealed
     ]
     variants += [("sealed/map.json", same, sealed["map.json"]), ("sealed/features.npy", same, sealed["features.npy"])]
-    variants += [("old/map.json", same, old["map.json"])]
-    for folder, name in (("loose", "language"), ("loose", "parts"), ("old", "cameras")):
-        with np.load(io.BytesIO(files[f"{folder}/{name}.npz"])) as arrays:
+    for name in ("language", "parts"):
+        with np.load(io.BytesIO(files[f"loose/{name}.npz"])) as arrays:
             held = {key: arrays[key] for key in arrays.files}
-        variants += [(f"{folder}/{name}.npz", member(key, held), npy(value)) for key, value in held.items()]
+        variants += [(f"loose/{name}.npz", member(key, held), npy(value)) for key, value in held.items()]
 
     def read(folder: Path, name: str) -> None:
         path = (folder / name).parent

@@ -1,4 +1,4 @@
-"""What is killed: mapping, exporting and label editing, and what must hold afterwards."""
+"""What is killed: mapping, exporting, editing, upgrading, and what must hold afterwards."""
 
 from __future__ import annotations
 
@@ -219,6 +219,74 @@ class Editing(Case):
     def result(self, place: Path, trial: int) -> Any:
         assert names(place) == ["m.gsmap"], names(place)
         return contents(place / "m.gsmap"), names(place / "m.gsmap")
+
+
+class Keeping(Case):
+    """One of `KEPT`, on a map in whose folder its user keeps photos, notes, a link and folders of his own.
+
+    They must lie there after every kill, before anything has put the map in order.
+    """
+
+    def __init__(self, name: str, gmap: Path):
+        self.name, self.gmap = name, gmap
+
+    def lay_out(self, place: Path, trial: int) -> None:
+        path = place / "m.gsmap"
+        shutil.copytree(self.gmap, path)
+        (path / "photos" / "raw").mkdir(parents=True)
+        for n in range(12):
+            (path / "photos" / f"{n}.jpg").write_bytes(bytes([n]) * 5000)
+        (path / "photos" / "raw" / "0.dng").write_text("raw")
+        (path / "notes.txt").write_text("where the key lies")
+        (path / "notes.txt").chmod(0o444)
+        (path / ".hidden").touch()
+        (path / "empty").mkdir()
+        (path / "elsewhere").symlink_to("/no/such/place")
+        self.kept = users(path)
+
+    def work(self, place: Path, trial: int) -> int:
+        return KEPT[self.name](place / "m.gsmap")
+
+    def after_kill(self, place: Path, trial: int) -> str:
+        path = place / "m.gsmap"
+        assert users(path) == self.kept, "something of the user's is gone or has changed"
+        now = contents(path)
+        assert now in (contents(self.gmap), self.whole[0][0]), "neither the map from before nor the new one"
+        return "before" if now == contents(self.gmap) else "after"
+
+    def result(self, place: Path, trial: int) -> Any:
+        assert names(place) == ["m.gsmap"], names(place)
+        path = place / "m.gsmap"
+        assert users(path) == self.kept, "something of the user's is gone or has changed"
+        return contents(path), {name: digest for name, digest in tree(path).items() if name.startswith("labelled")}
+
+
+def users(path: Path) -> dict[str, str]:
+    """{path below a map's folder: what it is} of all that `Keeping` laid there."""
+    found = {}
+    for item in sorted(path.rglob("*")):
+        name = str(item.relative_to(path))
+        if name.split("/")[0] in ("photos", "notes.txt", ".hidden", "empty", "elsewhere"):
+            kind = f"link {item.readlink()}" if item.is_symlink() else "folder" if item.is_dir() else item.read_text()
+            found[name] = f"{item.lstat().st_mode:o} {kind}"
+    return found
+
+
+def _save(path: Path) -> int:
+    from perception.edit.editor import Editor
+
+    editor = Editor(path)
+    editor.rename(editor.instances[0]["id"], "the table")
+    editor.save()
+    return 0
+
+
+KEPT: dict[str, Callable[[Path], int]] = {
+    "save": _save,
+    "upgrade": lambda path: command("upgrade", path),
+    "export": lambda path: command("export", path, "-o", path / "labelled.ply"),
+}
+"""Work on a map whose folder holds more than the map."""
 
 
 def corrections(path: Path) -> int:

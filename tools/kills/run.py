@@ -1,6 +1,7 @@
 """Kills mapping, exporting and label editing at random moments; afterwards nothing may be lost.
 
     python tools kills.run                     # 100 kills of each, about 20 minutes on two cores
+    python tools kills.run save upgrade export # in a map's folder that holds photos and notes, too
     python tools kills.run editing --kills 1000 --seed 7
     python tools kills.run --signal TERM       # SIGTERM instead of SIGKILL
 
@@ -27,12 +28,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import children
 import numpy as np
-from cases import Case, Editing, Exporting, Mapping, command
+from cases import KEPT, Case, Editing, Exporting, Keeping, Mapping, command
 from children import Moment
 
-NAMES = ("mapping", "exporting", "editing")
+NAMES = ("mapping", "exporting", "editing", *KEPT)
 FINAL = 40
 """Changes to the file system that count as the end of a run."""
 RESUME_KILLED = 0.25
@@ -89,16 +92,14 @@ def _warm() -> None:
     import torch  # noqa: F401
 
     import perception.edit.editor
-    import perception.export
-    import perception.export.export_map
-    import perception.pipeline.mapping  # noqa: F401
+    import perception.edit.upgrade  # noqa: F401
     from perception.photos.lens import load_pycolmap
 
     load_pycolmap()
 
 
 def _cases(folder: Path, args: argparse.Namespace) -> dict[str, Case]:
-    """The scene, a finished map of it, and the three cases around them."""
+    """The scene, a finished map of it, and the cases around them."""
     scene = args.scene
     if scene is None:
         scene = folder / "scene"
@@ -112,7 +113,8 @@ def _cases(folder: Path, args: argparse.Namespace) -> dict[str, Case]:
     (first / "out").mkdir()
     exporting = Exporting(gmap, scene / "truth" / "gt_points.ply", first / "out")
     _do(lambda: exporting.export(first, "--no-smooth", "--color", "original"), folder)
-    return {"mapping": mapping, "exporting": exporting, "editing": Editing(gmap)}
+    kept = {name: Keeping(name, gmap) for name in KEPT}
+    return {"mapping": mapping, "exporting": exporting, "editing": Editing(gmap), **kept}
 
 
 def _do(work: Callable[[], int], folder: Path) -> float:

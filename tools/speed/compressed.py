@@ -1,4 +1,4 @@
-"""Measures compressed exports of a map: their size, and PSNR of what is read back to renders of the map.
+"""Measures the `.spz` of a map: its share of the PLY's size, and PSNR of what is read back.
 
 python tools speed.compressed MAP
 """
@@ -6,14 +6,13 @@ python tools speed.compressed MAP
 from __future__ import annotations
 
 import argparse
-import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from support.compressed import read_sog, read_spz
+from support.compressed import read_spz
 
 AXES = np.array([1, -1, -1])
 """Of spz, whose y and z point the other way."""
@@ -40,27 +39,22 @@ def main() -> None:
     parser.add_argument("map", type=Path)
     options = parser.parse_args()
     from perception import load_map
-    from perception.export.export_map import COMPRESSED
-    from perception.export.spz import FLIPS
+    from perception.export.spz import FLIPS, spz_bytes
 
     gmap = load_map(options.map)
     own = {name: getattr(gmap, name) for name in ("means", "quats", "opacities", "sh")}
     whole = render(gmap, {**own, "scales": np.exp(gmap.log_scales)})
     size = (options.map / "gaussians.ply").stat().st_size
-    for kind, write in COMPRESSED.items():
-        with tempfile.TemporaryDirectory() as folder:
-            start = time.perf_counter()
-            write(Path(folder) / f"x{kind}", gmap)
-            seconds = time.perf_counter() - start
-            data = (Path(folder) / f"x{kind}").read_bytes()
-        read = read_spz(data) if kind == ".spz" else read_sog(data)
-        if kind == ".spz":
-            read["means"], read["quats"] = read["means"] * AXES, read["quats"] * [1, *AXES]
-            read["sh"] = read["sh"] * FLIPS[: read["sh"].shape[1], None]
-        sh = np.concatenate([read["dc"][:, None], read["sh"]], axis=1)
-        shown = render(gmap, {**read, "sh": sh, "scales": np.exp(read["log_scales"])})
-        error = np.mean([np.square(a - b).mean() for a, b in zip(whole, shown, strict=True)])
-        print(f"{kind}: {len(data) / size:.1%} of the PLY, {-10 * np.log10(error):.1f} dB, {seconds:.1f} s")
+    start = time.perf_counter()
+    data = spz_bytes(gmap)
+    seconds = time.perf_counter() - start
+    read = read_spz(data)
+    read["means"], read["quats"] = read["means"] * AXES, read["quats"] * [1, *AXES]
+    read["sh"] = read["sh"] * FLIPS[: read["sh"].shape[1], None]
+    sh = np.concatenate([read["dc"][:, None], read["sh"]], axis=1)
+    shown = render(gmap, {**read, "sh": sh, "scales": np.exp(read["log_scales"])})
+    error = np.mean([np.square(a - b).mean() for a, b in zip(whole, shown, strict=True)])
+    print(f".spz: {len(data) / size:.1%} of the PLY, {-10 * np.log10(error):.1f} dB, {seconds:.1f} s")
 
 
 if __name__ == "__main__":

@@ -110,7 +110,7 @@ def build(folder: Path, store: Path) -> dict[str, Any]:
 
 def ask(store: Path, texts: list[str]) -> dict[str, Any]:
     from perception import load_map
-    from perception.query.text_ranking import one_thread
+    from perception.machine import torch_on_one_thread
 
     started = time.perf_counter()
     opened = load_map(store)
@@ -123,7 +123,7 @@ def ask(store: Path, texts: list[str]) -> dict[str, Any]:
         hits = opened.query(text, TOP)
         seconds.append(time.perf_counter() - began)
         began = time.perf_counter()
-        with one_thread():
+        with torch_on_one_thread():
             opened.ranker._encode([f"{text} thing"])  # the encoder may keep what it has seen
         encoding.append(time.perf_counter() - began)
         answers.append([(hit.map, hit.instance_id, hit.score) for hit in hits])

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from perception.cores import cores
+from perception.machine import cores
 from worlds.cameras import Camera
 from worlds.shapes import Box, Shape, placed, spin, to_local, to_world
 

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from perception.node.answers import Channel, Stamp, box_markers, header, pose
+from perception.node.answers import Channel, Stamp, box_markers, header, pose, xyz, xyzw
 from perception.query import Frame, Hit, QueryMap
 from perception.query.standing import Stand
 
@@ -39,9 +38,9 @@ def instance(hit: Hit) -> Message:
         "label": hit.label or "",
         "score": float(hit.score),
         "num_points": len(hit.points),
-        "centroid": _xyz(hit.centroid),
+        "centroid": xyz(hit.centroid),
         "pose": pose(hit.obb),
-        "size": _xyz(hit.obb.extent),
+        "size": xyz(hit.obb.extent),
         "covariance": np.asarray(hit.covariance, np.float64).reshape(-1),
     }
 
@@ -60,7 +59,7 @@ def map_info(gmap: QueryMap, path: Path, stamp: Stamp) -> Message:
         "path": str(path),
         "metric": gmap.metric,
         "gravity_known": down is not None,
-        "gravity": _xyz([0.0, 0.0, 0.0] if down is None else down),
+        "gravity": xyz([0.0, 0.0, 0.0] if down is None else down),
         "num_instances": len(gmap.instances),
         "num_gaussians": len(gmap),
     }
@@ -101,7 +100,6 @@ def occupancy_grid(
     up; planners such as Nav2 expect that.
     """
     head = header(frame, stamp)
-    turn = Rotation.from_matrix(frame_from_grid[:3, :3]).as_quat(canonical=True)
     return {
         "header": head,
         "info": {
@@ -109,10 +107,7 @@ def occupancy_grid(
             "resolution": resolution,
             "width": cells.shape[1],
             "height": cells.shape[0],
-            "origin": {
-                "position": _xyz(frame_from_grid[:3, 3]),
-                "orientation": dict(zip("xyzw", map(float, turn), strict=True)),
-            },
+            "origin": {"position": xyz(frame_from_grid[:3, 3]), "orientation": xyzw(frame_from_grid[:3, :3])},
         },
         "data": cells.reshape(-1),
     }
@@ -120,20 +115,11 @@ def occupancy_grid(
 
 def stand_pose(stand: Stand, stamp: Stamp) -> Message:
     """geometry_msgs/PoseStamped of a robot that stands there: on the floor, x forward, z up (REP 103); a goal."""
-    turn = Rotation.from_matrix(stand.map_from_robot[:3, :3]).as_quat(canonical=True)
-    at = {"position": _xyz(stand.position), "orientation": dict(zip("xyzw", map(float, turn), strict=True))}
+    at = {"position": xyz(stand.position), "orientation": xyzw(stand.map_from_robot[:3, :3])}
     return {"header": header(stand.frame, stamp), "pose": at}
 
 
 def static_transform(parent: Frame, child: str, stamp: Stamp) -> Message:
     """tf2_msgs/TFMessage with parent_from_child, given the parent as a frame of the child's map."""
-    turn = Rotation.from_matrix(parent.from_map[:3, :3]).as_quat(canonical=True)
-    transform = {
-        "translation": _xyz(parent.from_map[:3, 3]),
-        "rotation": dict(zip("xyzw", map(float, turn), strict=True)),
-    }
+    transform = {"translation": xyz(parent.from_map[:3, 3]), "rotation": xyzw(parent.from_map[:3, :3])}
     return {"transforms": [{"header": header(parent.name, stamp), "child_frame_id": child, "transform": transform}]}
-
-
-def _xyz(vector: Any) -> dict[str, float]:
-    return dict(zip("xyz", (float(v) for v in vector), strict=True))

@@ -1,0 +1,94 @@
+"""Checks before work that no command writes over what it reads, or over a file that the user did not name."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.atomic import pointed
+from perception.map.checksums import DATA, EDITABLE, FACTS, STORE, is_map
+from perception.photos.view_json import absolute
+
+MAP_FILES = (FACTS, EDITABLE, *DATA)
+
+
+def refuse_inputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
+    """InputError if a file to write is an input, a map's own or written twice: by its path, by links or by hard links.
+
+    outputs: files. inputs: files, and maps or stores, of which their own files and the photos are meant. None is
+    skipped.
+    """
+    read: dict[Any, Path] = {}
+    for file in (file for source in inputs if source is not None for file in _files(source)):
+        read.update(dict.fromkeys(_identities(file), file))
+    written: dict[Any, Path] = {}
+    for output in (output for output in outputs if output is not None):
+        if output.name in MAP_FILES and is_map(output.parent):
+            raise InputError(f"{output}: is the name of a file of that map; write to another file")
+        for identity in _identities(output):
+            if identity in read:
+                raise InputError(f"{output}: is {read[identity]}, which this command reads; write to another file")
+            if written.setdefault(identity, output) is not output:
+                raise InputError(f"{output}: would be written twice, also as {written[identity]}; choose another name")
+
+
+def check_empty(output: Path) -> None:
+    """InputError unless `output` is an empty folder, or nothing is there."""
+    if os.path.lexists(output) and not (output.is_dir() and not any(output.iterdir())):
+        raise InputError(f"{output}: is not empty, or no folder; choose another -o or remove it first")
+
+
+def check_side_file(side: Path, output: Path, key: str = "") -> None:
+    """InputError if `side`, to be written beside `output`, is something else: JSON without `key`, .npy without ids."""
+    if not os.path.lexists(side):
+        return
+    try:
+        if side.suffix == ".npy":
+            ids = np.load(side, mmap_mode="r")
+            good = ids.dtype == np.int32 and ids.ndim == 1
+        else:
+            good = key in json.loads(side.read_bytes())
+    except (OSError, ValueError, TypeError, EOFError, RecursionError):
+        good = False
+    if not good:
+        found = f"lies there, and is not of a file such as {output.name}, beside which it would be replaced"
+        raise InputError(f"{side}: {found}; choose another name for the output")
+
+
+def _identities(file: Path) -> list[Any]:
+    """The path without links and, where there is a file, its device and inode."""
+    found: list[Any] = []
+    with contextlib.suppress(OSError, ValueError):  # nothing is there, or a NUL is in the name
+        found.append(os.path.realpath(file))
+        stat = file.stat()
+        found.append((stat.st_dev, stat.st_ino))
+    return found
+
+
+def _files(source: Path) -> Iterator[Path]:
+    """The file itself, or the files of a map with the photos of its views, or those of a store."""
+    if not source.is_dir():
+        yield source
+    elif (source / STORE).is_file():
+        yield from (file for file in source.rglob("*") if file.is_file())
+    else:
+        yield from (source / name for name in MAP_FILES)
+        yield from _photos(source)
+
+
+def _photos(folder: Path) -> Iterator[Path]:
+    try:
+        views = json.loads((folder / FACTS).read_bytes())["views"]
+        for view in views:
+            yield Path(view["photo"])
+            if view.get("photo_beside") is not None:
+                yield absolute(pointed(folder) / view["photo_beside"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return  # the command itself tells what is wrong with its map

@@ -1,0 +1,147 @@
+"""What this process may use of the machine, in a container less than there is: cores, memory, torch's threads."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import os
+import resource
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+
+from perception.errors import InputError
+
+_CGROUPS, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+threads_before: ContextVar[int] = ContextVar("threads_before", default=0)
+"""Threads that torch had outside `torch_on_one_thread`; 0 outside of it."""
+
+
+def cores() -> int:
+    """CPU cores of this process: those it may be scheduled on, and of its quota, rounded up."""
+    quota = min((_cores_of(folder) for folder in _control_groups("cpu")), default=math.inf)
+    return max(1, math.ceil(min(_scheduled(), quota)))
+
+
+def limit_threads() -> None:
+    """Where control groups grant fewer cores than there are, the libraries and the compiled core start no more threads.
+
+    Call it before they are loaded. Threads beyond the quota would all be halted for most of every period of 100 ms.
+    """
+    granted = cores()
+    if granted == _scheduled():
+        return
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, str(granted))
+    from perception import _core
+
+    _core.training.set_threads(granted)
+
+
+@contextmanager
+def torch_on_one_thread() -> Iterator[None]:
+    """Within it torch computes on one thread, and the rasterizer by default on as many as torch had before.
+
+    Idle workers of torch's OpenMP pool busy-wait for milliseconds, on processors that other threads need: with two
+    threads on two busy processors, a training step took four times the CPU time. A short prompt takes 10 ms on one
+    thread, 24 on two. Where torch is not loaded or has one thread already, nothing is done.
+    """
+    torch = sys.modules.get("torch")
+    before = 1 if torch is None else torch.get_num_threads()
+    if torch is None or before == 1:
+        yield
+        return
+    token = threads_before.set(threads_before.get() or before)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        threads_before.reset(token)
+
+
+def memory_limit() -> int | None:
+    """Bytes of memory that this process may ever have: the machine's, or its control groups'; None if unknown."""
+    try:
+        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (ValueError, OSError, AttributeError):
+        return None
+    return int(min([total, *(_memory_of(folder) for folder in _control_groups("memory"))]))
+
+
+def require_memory(needed: float, what: str, advice: str) -> None:
+    """InputError naming `what` and `advice` when `needed` bytes exceed 90 % of the available memory."""
+    free = available_memory()
+    if needed > 0.9 * free:
+        raise InputError(f"{what}: needs about {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; {advice}")
+
+
+def available_memory() -> float:
+    """Bytes that can be allocated without swapping (Linux kernel's estimate), at most `memory_limit`."""
+    limit = memory_limit() or math.inf
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return min(limit, int(line.split()[1]) * 1024)
+    except OSError:
+        pass
+    return limit
+
+
+def return_free_memory() -> None:
+    """Returns what was freed to the system, where the C library can (glibc)."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)
+
+
+def _scheduled() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _control_groups(controller: str) -> Iterator[Path]:
+    """Folders of this process's control group and of those above it that limit "cpu" or "memory", versions 1 and 2.
+    In a container the group's own path does not exist, and its folder is the root."""
+    try:
+        lines = [line.split(":", 2) for line in _OWN.read_text(encoding="utf-8").splitlines()]
+    except OSError:
+        return
+    for _, controllers, path in lines:
+        if controllers and controller not in controllers.split(","):
+            continue
+        top = _CGROUPS / controller if controllers else _CGROUPS
+        group = top / path.lstrip("/")
+        yield from (folder for folder in (group, *group.parents) if folder.is_relative_to(top))
+
+
+def _cores_of(folder: Path) -> float:
+    """Cores that one control group grants: cpu.max ("150000 100000", or "max 100000"), or in version 1
+    cpu.cfs_quota_us (−1: none) and cpu.cfs_period_us; infinity without a limit."""
+    try:
+        if (folder / "cpu.max").is_file():
+            quota, period = (folder / "cpu.max").read_text(encoding="ascii").split()
+        else:
+            quota, period = (
+                (folder / f"cpu.cfs_{name}_us").read_text(encoding="ascii") for name in ("quota", "period")
+            )
+        return int(quota) / int(period) if quota.strip() != "max" and int(quota) > 0 else math.inf
+    except (OSError, ValueError, ZeroDivisionError):
+        return math.inf
+
+
+def _memory_of(folder: Path) -> float:
+    """Bytes that one control group grants: memory.max, or in version 1 memory.limit_in_bytes; infinity without."""
+    for name in ("memory.max", "memory.limit_in_bytes"):
+        try:
+            return int((folder / name).read_text(encoding="ascii"))
+        except (OSError, ValueError):  # not there, or "max"
+            continue
+    return math.inf
+
+
+def peak_memory_mib() -> float:
+    """Largest resident memory of this process so far, MiB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (1024 * 1024 if sys.platform == "darwin" else 1024), 1)

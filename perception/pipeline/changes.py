@@ -1,0 +1,127 @@
+"""What a run is made from: its input files by name, size and time of change.
+
+The work folder of an unfinished run lists them, and map.json of a finished one. `--resume` compares them with today's.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from perception.config import MapConfig
+from perception.errors import InputError
+from perception.inputs.load import input_files
+from perception.io.atomic import atomic_file
+from perception.io.documents import read_json
+from perception.masks.sam_models import sam_graphs
+from perception.onnx.sessions import side_files
+from perception.onnx.store import resolve
+from perception.photos.folder import list_photos
+from perception.pipeline.checkpoint import frames_folder, work_folder
+
+INPUTS = "inputs.json"
+CONFIGURATIONS = (
+    *("config.json", "tokenizer.json", "tokenizer_config.json"),
+    *("preprocessor_config.json", "preprocess_cfg.json", "open_clip_config.json"),
+)
+"""Files that are read in the folder of a model, or above it."""
+SHOWN = 3
+
+Inputs = dict[str, dict[str, str]]
+"""By "SETTING=PATH", of each file that PATH names: "BYTES NANOSECONDS", its size and time of change."""
+
+
+def inputs_of(source: Path, config: MapConfig, output: Path) -> Inputs:
+    """The files that the map of `source` at `output` is made from, without those that its run writes.
+    InputError where `source` is no input, or tells its photos in a file that cannot be read."""
+    own = {folder.resolve() for folder in (output, work_folder(output), frames_folder(output))}
+    found: Inputs = {}
+    try:
+        for setting, path, files in _named(source.absolute(), config, frames_folder(output).absolute()):
+            base, others = path if path.is_dir() else path.parent, own - {path.resolve()}
+            folders = {folder: folder.resolve() for folder in {file.parent for file in files}}
+            written = {folder for folder, real in folders.items() if others & {real, *real.parents}}
+            stats = {file: file.stat() for file in files if file.parent not in written}
+            facts = {os.path.relpath(file, base): f"{stat.st_size} {stat.st_mtime_ns}" for file, stat in stats.items()}
+            found.setdefault(f"{setting}={path.resolve()}", {}).update(facts)
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror}); allow it, or remove it") from error
+    return found
+
+
+def _named(source: Path, config: MapConfig, frames: Path) -> Iterator[tuple[str, Path, list[Path]]]:
+    """(setting, absolute path that it names, the files there)."""
+    photos, (kind, _, masks) = config.photos, config.masks.partition(":")
+    yield "input", source, input_files(source)
+    if source.is_file() and frames.is_dir():
+        yield "frames", frames, list_photos(frames)
+    for setting in ("camera", "init_points", "held_out"):
+        if name := getattr(photos, setting):
+            file = Path(name).absolute()
+            yield f"photos.{setting}", file, [file] if file.is_file() else []
+    for setting, name in (("photos.ignore_masks", photos.ignore_masks), ("masks", masks if kind == "labels" else "")):
+        if name:
+            folder = Path(name).absolute()
+            yield setting, folder, list_photos(folder, frozenset({".png"})) if folder.is_dir() else []
+    sam = os.environ.get("PERCEPTION_SAM", "").strip() if kind == "auto" else masks if kind == "sam" else ""
+    encoder, _, clip = config.language.encoder.partition(":")
+    for setting, model in (("masks", sam), ("language.encoder", clip if encoder == "clip" else "")):
+        for part in resolve(model).split(",") if model else ():
+            path = Path(part.strip()).expanduser().absolute()
+            yield setting, path, _model_files(path)
+
+
+def _model_files(path: Path) -> list[Path]:
+    """The ONNX files at `path`, and those that hold their weights and configurations."""
+    graphs = sam_graphs(path) if path.exists() else []
+    folders = dict.fromkeys(folder for graph in graphs for folder in list(graph.parents)[:2])
+    files = [file for graph in graphs for file in (graph, *side_files(graph))]
+    files += [folder / name for folder in folders for name in CONFIGURATIONS]
+    return [file for file in files if file.is_file()]
+
+
+def hold_inputs(work: Path, source: Path, config: MapConfig, output: Path) -> Inputs:
+    """The run's input files, kept in `work`. InputError where they have changed since they were kept first: poses and
+    training are not of them. Files of a setting that has another value now are not compared."""
+    now, file = inputs_of(source, config, output), work / INPUTS
+    before: Any = {}
+    if file.is_file():
+        before = read_json(file)
+    elif any(not path.name.startswith(".") for path in work.iterdir()):
+        what = "an older version began this run and recorded no input files, which may have changed since"
+        raise InputError(f"{work}: {what}; remove the folder to start over")
+    todo = f"choose another -o, or remove {work} to start over"
+    if not isinstance(before, dict):
+        raise InputError(f"{file}: is damaged; {todo}")
+    both = before.keys() & now.keys()
+    _compare(work, {key: before[key] for key in both}, {key: now[key] for key in both}, "since this run began", todo)
+    with atomic_file(file) as aside:
+        aside.write_text(json.dumps({**before, **now}), encoding="utf-8")
+    return now
+
+
+def refuse_changed(output: Path, info: dict[str, Any], now: Inputs) -> None:
+    """InputError where the finished map with `info` in its map.json was made from other files, or does not tell."""
+    todo = "choose another -o, or remove this map first"
+    if "inputs" not in info:
+        what = "an older version made this map and recorded no input files, which may have changed since"
+        raise InputError(f"{output}: {what}; {todo}")
+    _compare(output, info["inputs"], now, "since this map was made", todo)
+
+
+def _compare(told_by: Path, before: Any, now: Inputs, since: str, todo: str) -> None:
+    """InputError with the first files that differ."""
+    try:
+        old, new = ({(key, name): stat for key in one for name, stat in one[key].items()} for one in (before, now))
+    except (AttributeError, LookupError, TypeError) as error:
+        raise InputError(f"{told_by}: its list of input files is damaged; {todo}") from error
+    changed = sorted(key for key in old.keys() | new.keys() if old.get(key) != new.get(key))
+    if not changed:
+        return
+    states = ("new" if key not in old else "gone" if key not in new else "changed" for key in changed)
+    names = [f"{name} ({state})" for (_, name), state in zip(changed, states, strict=True)]
+    shown = ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
+    raise InputError(f"{told_by}: input files are others {since}, {len(names)} in all: {shown}; {todo}")

@@ -1,0 +1,73 @@
+"""Cores and memory that control groups grant, versions 1 and 2, on folders as the kernel shows them."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from perception import machine as module
+from perception.errors import InputError
+
+MACHINE = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+@pytest.fixture
+def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, dict[str, str]], None]:
+    """Writes the process's own groups and files of groups, on a machine of 16 cores."""
+    monkeypatch.setattr(module, "_CGROUPS", tmp_path)
+    monkeypatch.setattr(module, "_OWN", tmp_path / "own")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
+
+    def write(own: str, files: dict[str, str]) -> None:
+        for name, text in files.items():
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).write_text(text)
+        (tmp_path / "own").write_text(own)
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("own", "files", "expected"),
+    [
+        ("0::/\n", {"cpu.max": "150000 100000\n"}, 2),  # 1.5 cores are two threads
+        ("0::/\n", {"cpu.max": "1000 100000\n"}, 1),
+        ("0::/\n", {"cpu.max": "max 100000\n"}, 16),
+        ("0::/\n", {"cpu.max": "9900000 100000\n"}, 16),
+        ("0::/a/b\n", {"a/cpu.max": "300000 100000\n", "a/b/cpu.max": "max 100000\n"}, 3),  # of the group above
+        ("0::/not/shown/in/a/container\n", {"cpu.max": "50000 100000\n"}, 1),
+        (
+            "4:cpu,cpuacct:/x\n3:memory:/\n",
+            {"cpu/cpu.cfs_quota_us": "250000\n", "cpu/cpu.cfs_period_us": "100000\n"},
+            3,
+        ),
+        ("4:cpu:/\n", {"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, 16),
+        ("3:memory:/\n", {"cpu.max": "150000 100000\n"}, 16),
+        ("0::/\n", {"cpu.max": "what\n"}, 16),
+        ("", {}, 16),
+    ],
+)
+def test_cores(groups: Callable, own: str, files: dict[str, str], expected: int) -> None:
+    groups(own, files)
+    assert module.cores() == expected
+
+
+@pytest.mark.parametrize(
+    ("own", "files", "expected"),
+    [
+        ("0::/\n", {"memory.max": "1000000\n"}, 1_000_000),
+        ("0::/\n", {"memory.max": "max\n"}, MACHINE),
+        ("0::/a/b\n", {"memory.max": "max\n", "a/memory.max": "2000000\n", "a/b/memory.max": "3000000\n"}, 2_000_000),
+        ("0::/not/shown/in/a/container\n", {"memory.max": "1000000\n"}, 1_000_000),
+        ("4:cpu:/\n3:memory:/x\n", {"memory/memory.limit_in_bytes": "1000000\n"}, 1_000_000),
+        ("0::/\n", {"memory.max": f"{2 * MACHINE}\n"}, MACHINE),
+        ("", {}, MACHINE),
+    ],
+)
+def test_memory(groups: Callable, own: str, files: dict[str, str], expected: int) -> None:
+    groups(own, files)
+    assert module.memory_limit() == expected
+    assert 0 < module.available_memory() <= expected
+    with pytest.raises(InputError, match=r"cloud: needs about .* are free; split it"):
+        module.require_memory(expected, "cloud", "split it")
