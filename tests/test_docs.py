@@ -86,14 +86,18 @@ def runnable() -> list[str]:
 
 
 def test_documented_options_and_settings_exist() -> None:
-    """Every `--option` in running text is one of some command, every `--set KEY=VALUE` can be set."""
+    """Every `--option` in running text is one of some command or its script, every `--set KEY=VALUE` can be set."""
     from perception.config import load_config
 
     options, settings = set(), set()
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
+        for name, rest in re.findall(r"python tools ([a-z_]+\.[a-z_]+)([^`\n#]*)", text):
+            source = (ROOT / "tools" / f"{name.replace('.', '/')}.py").read_text(encoding="utf-8")
+            if name != "bench.run":  # whose options are those of the benches below
+                assert [o for o in re.findall(r"(?<![\w-])--[a-z][\w-]+", rest) if o not in source] == [], name
         for code in re.findall(r"`([^`\n]*)`", text):
-            if not code.startswith(("pip", "cmake", "ros2")):
+            if not code.startswith(("pip", "cmake", "ros2", "python tools", "ray")):
                 options |= set(re.findall(r"(?<![\w-])--[a-z][\w-]+", code))
             settings |= set(re.findall(r"--set ([a-z][\w.]*=[\w:.]+)", code))
     assert len(options) > 15 and settings
