@@ -17,11 +17,13 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.arrays import read_npz
+from perception.io.documents import brief
 from perception.language.description import check_encoder
 from perception.language.encoders import make_encoder
 from perception.language.printed import Printed, quoted_text
 from perception.map.checksums import STORE
 from perception.map.map import Map
+from perception.map.model import STORED, check, parsed
 from perception.query.hit import Hit
 from perception.query.query_map import QueryMap
 from perception.query.ranking import THING, Ranker, least_score
@@ -237,23 +239,14 @@ def read_store(path: Path) -> tuple[dict[str, Any], bytes]:
     file = path / STORE
     try:
         raw = file.read_bytes()
-        facts = json.loads(raw)
-        if facts["format_version"] != FORMAT_VERSION:
-            raise InputError(
-                f"{file}: format_version is {facts['format_version']!r}, this program reads {FORMAT_VERSION}; "
-                "index the maps into a new store"
-            )
-        _ = facts["encoder"]["name"], facts["encoder"]["identity"]
-        if not facts["maps"]:
-            raise ValueError("it holds no map")
-        for entry in facts["maps"]:
-            kinds = {"map": str, "map_id": str, "frame": str, "metric": bool, "instances": int, "file": str}
-            wrong = [key for key, kind in kinds.items() if not isinstance(entry[key], kind)]
-            if wrong or Path(entry["file"]).name != entry["file"] or entry["instances"] < 0:
-                raise ValueError(f"an entry of maps has a wrong {', '.join(wrong) or 'file or count'}")
+        facts = parsed(raw)
+        if isinstance(facts, dict) and (version := facts.get("format_version")) != FORMAT_VERSION:
+            found = f"format_version is {brief(version)}, this program reads {FORMAT_VERSION}"
+            raise InputError(f"{file}: {found}; index the maps into a new store")
+        check(STORED, facts)
     except InputError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise _damaged(file, error) from error
     return facts, raw
 
