@@ -21,7 +21,7 @@ from perception.language.description import from_arrays, to_arrays
 from perception.language.encoders import make_encoder
 from perception.language.ocr import TextReader, make_reader
 from perception.map.files import read_info
-from perception.map.map import Map, language_in, prefixed
+from perception.map.map import MAX_SIDE, Map, language_in, prefixed
 from perception.map.write import FORMAT_VERSION, read_map, write_map
 from perception.photos.view_json import StoredView, locate_photo, stored_view
 from perception.progress import QUIET, Progress
@@ -48,11 +48,11 @@ def upgrade_map(
         before = int(read_info(path)["format_version"])
         gmap = read_map(path)
         old = str(gmap.language["encoder"]) if gmap.language else None
-        spec = gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
+        spec = gmap.setting("language", "encoder", "auto")
         encoder = encoders("conse" if spec == "auto" else spec) if gmap.language else None
         if encoder is not None and encoder.identity != old:
             _embed_again(gmap, encoder, progress)
-        _read_again(gmap, make_reader(gmap.info.get("config", {}).get("language", {}).get("texts", "auto")), progress)
+        _read_again(gmap, make_reader(gmap.setting("language", "texts", "auto")), progress)
         gmap.views = [  # version 1 has neither photo sizes nor relative paths
             view
             if isinstance(view, StoredView) and view.photo_bytes is not None
@@ -75,7 +75,7 @@ def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:
         choices, load = _shown(gmap, stored, owners, ids)
         return to_arrays(describe_instances(encoder, choices, load, names, zooms, progress), encoder.identity)
 
-    zooms = int(gmap.info.get("config", {}).get("language", {}).get("zooms") or reading_of(encoder).zooms)
+    zooms = gmap.setting("language", "zooms", 0) or reading_of(encoder).zooms
     gmap.language = described(gmap.language, gmap.instance_ids, [entry["id"] for entry in gmap.instances], zooms)
     if stored := language_in(gmap.parts):
         owners = gmap.parts["ids"]
@@ -115,7 +115,7 @@ def _shown(
         )
     wanted = sorted({number[name] for d in descriptions for name in d.views})
     located = {n: replace(gmap.views[n], photo=locate_photo(gmap.views[n], gmap.path)) for n in wanted}
-    gaussians, side = as_gaussians(gmap), int(gmap.info["config"]["photos"]["max_side"])
+    gaussians, side = as_gaussians(gmap), gmap.setting("photos", "max_side", MAX_SIDE)
     rank = {instance: n for n, instance in enumerate(ids)}
     positions = np.array([rank.get(int(i), -1) for i in owners], np.int32)
 

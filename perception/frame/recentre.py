@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from perception.errors import InputError
 from perception.geometry import camera_centres, check_similarity, move_points, scale_of
 from perception.types import Scene, View
 
@@ -58,12 +57,6 @@ def map_from_input(path: Path, info: dict[str, Any]) -> np.ndarray:
     matrix = info.get("map_from_input")
     if matrix is not None:
         return check_similarity(matrix, f"{path / 'map.json'}: map_from_input")
-    try:
-        origin = np.asarray(info.get("scene", {}).get("origin", (0, 0, 0)), np.float64)
-        if origin.shape != (3,) or not np.isfinite(origin).all():
-            raise ValueError(f"found {origin.tolist()}")
-    except (AttributeError, TypeError, ValueError) as error:
-        raise InputError(f"{path / 'map.json'}: scene.origin is no place ({error}); the map is damaged") from error
     shift = np.eye(4)
-    shift[:3, 3] = -origin
+    shift[:3, 3] = -np.asarray(info.get("scene", {}).get("origin", (0, 0, 0)), np.float64)
     return shift

@@ -62,6 +62,10 @@ def prefixed(language: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {PREFIX + name: array for name, array in language.items()}
 
 
+MAX_SIDE = 800
+"""Pixels of the long side of photos, for maps that do not record at which size they were trained."""
+
+
 class PhotosMoved(UserWarning):
     """Warning: photos of a map are missing, or their files have changed since the map was made."""
 
@@ -163,6 +167,11 @@ class Map:
     def map_id(self) -> str:
         """Short identifier of the map and its labels; it changes when either changes."""
         return "unsaved" if self._files is None else self._files.map_id
+
+    def setting(self, group: str, name: str, default: Any) -> Any:
+        """The setting GROUP.NAME that the map was made with; `default` where it is not recorded, or is none."""
+        value = self.info.get("config", {}).get(group, {}).get(name)
+        return default if value is None else value
 
     @property
     def frame(self) -> str:

@@ -23,6 +23,8 @@ LARGEST = 2**31 - 1
 """Of ids and counts: they are int32 in arrays and clouds."""
 FARTHEST = 1e15
 """Of numbers, so that products of a few stay finite."""
+MOST_PIXELS = 4 * 10**8
+"""Of a view: no photo with more is read."""
 PREFIX = "language_"
 """Of the arrays of parts.npz and groups.npz that correspond to those of language.npz."""
 Arrays = dict[str, np.ndarray]
@@ -78,6 +80,12 @@ def _intrinsics(value: list[list[float]]) -> list[list[float]]:
     if not (value[0][0] > 0 and value[1][1] > 0 and value[1][0] == 0 and value[2] == [0, 0, 1]):
         raise ValueError("expected focal lengths above 0 and a last row 0 0 1")
     return value
+
+
+def _pixels(view: dict[str, Any]) -> dict[str, Any]:
+    if view["width"] * view["height"] > MOST_PIXELS:
+        raise ValueError(f"expected at most {MOST_PIXELS} pixels")
+    return view
 
 
 def _direction(value: list[float]) -> list[float]:
@@ -139,7 +147,7 @@ _TRAINING = {
 _DEPTH_USE = _typed({"views": Count, "measured": Share})
 _SCALE = _typed({"metres_per_unit": Positive, "standard_error": Length | None, "source": PathText})
 _GRAVITY = _typed({"direction": Direction, "standard_error_deg": Length, "source": PathText})
-VIEW = _typed(_VIEW)
+VIEW = Annotated[_typed(_VIEW), AfterValidator(_pixels)]  # type: ignore[misc]
 FACTS = _typed({
     "format_version": int, "num_gaussians": Count, "num_instances": Count, "sh_degree": Count,
     "frame?": Text, "metric?": bool, "source?": PathText, "seed?": Bytes,
@@ -156,19 +164,22 @@ FACTS = _typed({
     "quality?": _QUALITY, "training?": _TRAINING, "seconds?": dict[str, Length], "peak_memory_mib?": Length,
     "depth?": _DEPTH_USE | None, "scale?": _SCALE | None, "gravity?": _GRAVITY | None, "map_from_input?": Similarity,
     "files?": dict[FileName, _typed({"bytes": Bytes, "sha256": Text})],  # type: ignore[misc]
-    "sha256?": Text, "views?": [_VIEW],
+    "sha256?": Text, "views?": [VIEW],
 })  # fmt: skip
 """map.json. Maps of earlier releases lack some keys."""
+_PRINTED = _typed({"text": Text, "score": Share})
 _PART = {
     "id": Count, "label?": Text | None, "score": Share, "num_gaussians": Count, "centroid": Point,
     "obb": {"center": Point, "rotation": Matrix3, "extent": Sides}, "aabb?": {"min": Point, "max": Point},
-    "views?": Count, "texts?": [{"text": Text, "score": Share}], "hidden?": bool, "parent?": Count,
+    "views?": Count, "texts?": [_PRINTED], "hidden?": bool, "parent?": Count,
 }  # fmt: skip
 INSTANCES = _typed({"instances": [{**_PART, "parts?": [_PART]}]})
 _KNOWN = {key.rstrip("?") for key in (*_PART, "parts")}
 _STORED = {"map": PathText, "map_id": Text, "frame": Text, "metric": bool, "instances": Count, "file": FileName}
 STORED = _typed({"encoder": {"name": Text, "identity": Text}, "maps": [_STORED]})
 """store.json."""
+NAMES = _typed({"labels": list[Text | None], "texts": list[list[_PRINTED]] | None})
+"""Of a map in a store."""
 
 
 # ------------------------------------------------------------------ checks

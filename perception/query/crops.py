@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from perception.errors import InputError
-from perception.map.map import Map
+from perception.map.map import MAX_SIDE, Map
 from perception.query.query_map import QueryMap
 from perception.query.requests import UnknownInstance
 from perception.types import View
@@ -31,7 +31,7 @@ def best_crop(gmap: QueryMap, instance_id: int, side: int = 320, inside: Path | 
     if found is None:
         return None
     try:
-        photo = load_photo(readable_view(gmap, found[0], inside), int(gmap.info["config"]["photos"]["max_side"]))
+        photo = load_photo(readable_view(gmap, found[0], inside), gmap.setting("photos", "max_side", MAX_SIDE))
     except UnknownInstance:
         raise
     except (InputError, OSError, ValueError, KeyError):

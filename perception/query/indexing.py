@@ -84,7 +84,7 @@ def _indexed(store: Path, gmap: QueryMap, facts: dict[str, Any]) -> dict[str, An
     path = Path(str(gmap.path))
     if (problem := gmap.problem) is not None:
         raise InputError(problem if str(path) in problem else f"{path}: {problem}")
-    spec = gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
+    spec = gmap.setting("language", "encoder", "auto")
     identity = str(gmap.language["encoder"])
     known = facts["encoder"] = facts["encoder"] or {"name": "conse" if spec == "auto" else spec, "identity": identity}
     if known["identity"] != identity:

@@ -23,7 +23,7 @@ from perception.language.encoders import make_encoder
 from perception.language.printed import Printed, quoted_text
 from perception.map.checksums import STORE
 from perception.map.map import Map
-from perception.map.model import STORED, check, parsed
+from perception.map.model import NAMES, STORED, check, parsed
 from perception.query.hit import Hit
 from perception.query.query_map import QueryMap
 from perception.query.ranking import THING, Ranker, least_score
@@ -202,6 +202,11 @@ class MapStore(QueryMap):
 
     def _read(self) -> None:
         """Reads all arrays; those with a row per instance are put after each other."""
+        for entry in self.maps:  # before memory is taken for so many
+            file = self.path / "maps" / entry["file"]
+            if file.is_file() and entry["instances"] * TOLD.itemsize > file.stat().st_size:
+                found = f"maps: {file.name} is too small for its {entry['instances']} instances"
+                raise _damaged(self.path / STORE, ValueError(found))
         counts = [entry["instances"] for entry in self.maps]
         self._groups = np.repeat(np.arange(len(counts)), counts)
         stops = np.cumsum(counts).tolist()
@@ -215,6 +220,8 @@ class MapStore(QueryMap):
                 for name, many in ragged.items():
                     many.append(arrays.pop(name, None))
                 for name, array in arrays.items():
+                    if len(array) != entry["instances"]:
+                        raise ValueError(f"{name}: {len(array)} rows, {STORE} says {entry['instances']} instances")
                     if name not in rows:
                         rows[name] = np.empty((sum(counts), *array.shape[1:]), array.dtype)
                     rows[name][own] = array
@@ -225,8 +232,12 @@ class MapStore(QueryMap):
             self._told = records["told"]
             labels = {name: np.concatenate(ragged[name]) for name in ("label_rows", "label_null")}
             self._arrays = {**rows, **labels, "things": records["things"]}
-            self._names = [json.loads(names.tobytes()) for names in ragged["names"]]
-        except (ValueError, TypeError, KeyError) as error:
+            self._names = [parsed(names.tobytes()) for names in ragged["names"]]
+            for names, count in zip(self._names, counts, strict=True):
+                check(NAMES, names)
+                if not len(names["labels"]) == count == len(names["texts"] or names["labels"]):
+                    raise ValueError(f"names: expected those of {count} instances")
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise _damaged(self.path / STORE, error) from error
         self._photos, poses = ragged["views"], ragged["poses"]
         self._places_of = [

@@ -78,7 +78,7 @@ class TextRanking:
                 f"{self._gmap.path}: holds no language embeddings; map again with an encoder (language.encoder=…)"
             )
         descriptions, identity = from_arrays(self._gmap.language)
-        spec = self._gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
+        spec = self._gmap.setting("language", "encoder", "auto")
         encoder = self._encoders("conse" if spec == "auto" else spec)
         if encoder is None:
             raise InputError(f"{self._gmap.path}: was mapped without an encoder; map again with language.encoder=conse")

@@ -50,10 +50,9 @@ def info_text(path: Path, info: dict[str, Any], texts: dict[int, list[dict[str, 
     lines += frame_lines(info)
     if training.get("profile"):
         lines.append("of training: " + ", ".join(f"{name} {share:.0%}" for name, share in shares(training).items()))
-    if quality.get("psnr") is not None:
-        lines.append(
-            f"held-out views: PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.4f} over {len(quality['views'])}"
-        )
+    if None not in (psnr := quality.get("psnr"), similarity := quality.get("ssim")):
+        count = len(quality.get("views", {}))
+        lines.append(f"held-out views: PSNR {psnr:.2f} dB, SSIM {similarity:.4f} over {count}")
     if info.get("depth"):
         lines.append(
             f"depth images: {info['depth']['views']}, measured in {info['depth']['measured']:.0%} of their pixels"

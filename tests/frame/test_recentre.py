@@ -59,12 +59,6 @@ def test_one_camera_or_many_in_one_place_stay() -> None:
     assert recentred(scene) is scene
 
 
-@pytest.mark.parametrize("origin", [[1, 2], "x", [1, 2, float("nan")], None, {}])
-def test_an_origin_that_is_none_is_told(origin: object) -> None:
-    with pytest.raises(InputError, match=r"scene\.origin is no place"):
-        map_from_input(Path("m.gsmap"), {"scene": {"origin": origin}})
-
-
 def test_an_offset_of_an_earlier_release_and_a_matrix_that_is_none() -> None:
     old = map_from_input(Path("m.gsmap"), {"scene": {"origin": [1.0, 2.0, 3.0]}})
     assert np.array_equal(old @ [1, 2, 3, 1], [0, 0, 0, 1])

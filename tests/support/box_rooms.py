@@ -115,7 +115,12 @@ def map_of(
         instance_ids=owner,
         membership=np.ones(count, np.float32),
         instances=instances,
-        info={"metric": True, "frame": "home", "gravity": {"direction": (-move[:3, 2]).tolist()}, **info},
+        info={
+            "metric": True,
+            "frame": "home",
+            "gravity": {**down, "standard_error_deg": 1.0, "source": "truth"},
+            **info,
+        },
         views=[View("a.jpg", Path("a.jpg"), np.eye(3), 64, 48, look_at(eye, eye + move[:3, 0], move[:3, 2]))],
         path=Path("room.gsmap"),
     )
