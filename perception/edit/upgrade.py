@@ -25,6 +25,7 @@ from perception.map.map import MAX_SIDE, Map, language_in, prefixed
 from perception.map.write import FORMAT_VERSION, read_map, write_map
 from perception.photos.view_json import StoredView, locate_photo, stored_view
 from perception.progress import QUIET, Progress
+from perception.query.text_ranking import encoder_of
 
 
 def upgrade_map(
@@ -48,8 +49,7 @@ def upgrade_map(
         before = int(read_info(path)["format_version"])
         gmap = read_map(path)
         old = str(gmap.language["encoder"]) if gmap.language else None
-        spec = gmap.setting("language", "encoder", "auto")
-        encoder = encoders("conse" if spec == "auto" else spec) if gmap.language else None
+        encoder = encoder_of(gmap, encoders) if gmap.language else None
         if encoder is not None and encoder.identity != old:
             _embed_again(gmap, encoder, progress)
         _read_again(gmap, make_reader(gmap.setting("language", "texts", "auto")), progress)

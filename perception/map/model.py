@@ -12,12 +12,12 @@ from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Len
-from pydantic import AfterValidator, ConfigDict, FailFast, Field, Strict, TypeAdapter, ValidationError, with_config
+from pydantic import AfterValidator, ConfigDict, Field, Strict, TypeAdapter, ValidationError, with_config
 from pydantic_core import from_json
 from typing_extensions import NotRequired, TypedDict
 
 from perception.geometry import check_similarity, scale_of
-from perception.io.documents import brief, safe_name
+from perception.io.documents import brief, what_is_wrong
 
 LARGEST = 2**31 - 1
 """Of ids and counts: they are int32 in arrays and clouds."""
@@ -62,7 +62,9 @@ def _plain_name(value: str) -> str:
 
 
 def _photo_name(value: Any) -> str:
-    return safe_name(value, "its photo")
+    if (wrong := what_is_wrong(value)) is not None:
+        raise ValueError(f"the photo name {wrong}, expected a relative path inside the photo folder")
+    return str(value)
 
 
 def _similarity(value: list[list[float]]) -> list[list[float]]:
@@ -119,7 +121,7 @@ def _typed(shape: Any) -> Any:
     """The type that a shape below describes: {key: shape}, a key with "?" may be missing; [shape]: a list; or a type.
     Typed dictionaries are checked several times faster than models, and a map has many instances."""
     if isinstance(shape, list):
-        return Annotated[list[_typed(shape[0])], FailFast()]  # type: ignore[misc]
+        return list[_typed(shape[0])]  # type: ignore[misc]
     if not isinstance(shape, dict):
         return shape
     keys = {key.rstrip("?"): NotRequired[_typed(of)] if key[-1] == "?" else _typed(of) for key, of in shape.items()}
@@ -147,7 +149,7 @@ _TRAINING = {
 _DEPTH_USE = _typed({"views": Count, "measured": Share})
 _SCALE = _typed({"metres_per_unit": Positive, "standard_error": Length | None, "source": PathText})
 _GRAVITY = _typed({"direction": Direction, "standard_error_deg": Length, "source": PathText})
-VIEW = Annotated[_typed(_VIEW), AfterValidator(_pixels)]  # type: ignore[misc]
+VIEW: Any = Annotated[_typed(_VIEW), AfterValidator(_pixels)]
 FACTS = _typed({
     "format_version": int, "num_gaussians": Count, "num_instances": Count, "sh_degree": Count,
     "frame?": Text, "metric?": bool, "source?": PathText, "seed?": Bytes,
@@ -167,18 +169,19 @@ FACTS = _typed({
     "sha256?": Text, "views?": [VIEW],
 })  # fmt: skip
 """map.json. Maps of earlier releases lack some keys."""
-_PRINTED = _typed({"text": Text, "score": Share})
+_TEXTS = _typed([{"text": Text, "score": Share}])
 _PART = {
     "id": Count, "label?": Text | None, "score": Share, "num_gaussians": Count, "centroid": Point,
     "obb": {"center": Point, "rotation": Matrix3, "extent": Sides}, "aabb?": {"min": Point, "max": Point},
-    "views?": Count, "texts?": [_PRINTED], "hidden?": bool, "parent?": Count,
+    "views?": Count, "texts?": _TEXTS, "hidden?": bool, "parent?": Count,
 }  # fmt: skip
 INSTANCES = _typed({"instances": [{**_PART, "parts?": [_PART]}]})
 _KNOWN = {key.rstrip("?") for key in (*_PART, "parts")}
 _STORED = {"map": PathText, "map_id": Text, "frame": Text, "metric": bool, "instances": Count, "file": FileName}
 STORED = _typed({"encoder": {"name": Text, "identity": Text}, "maps": [_STORED]})
 """store.json."""
-NAMES = _typed({"labels": list[Text | None], "texts": list[list[_PRINTED]] | None})
+_READ = _typed([_TEXTS])
+NAMES = _typed({"labels": list[Text | None], "texts": _READ | None})
 """Of a map in a store."""
 
 

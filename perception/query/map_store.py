@@ -133,7 +133,10 @@ class MapStore(QueryMap):
     @cached_property
     def ranker(self) -> Ranker:  # type: ignore[override]
         name, identity = self._facts["encoder"]["name"], self._facts["encoder"]["identity"]
-        encoder = (self.encoders or make_encoder)(name)
+        try:
+            encoder = (self.encoders or make_encoder)(name)
+        except InputError as error:
+            raise InputError(f"{self.path / STORE}: encoder.name: {error}") from error
         if encoder is None:
             raise InputError(f"{self.path}: names no encoder; index its maps anew")
         check_encoder(identity, encoder.identity)

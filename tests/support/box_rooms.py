@@ -9,6 +9,7 @@ import numpy as np
 
 from perception.boxes import oriented_box
 from perception.export.depth_views import DepthView
+from perception.frame.gravity import Gravity
 from perception.query import QueryMap
 from perception.types import View
 from support.aimed import look_at
@@ -99,6 +100,7 @@ def map_of(
             "id": i,
             "label": None,
             "score": 1.0,
+            "num_gaussians": len(own),
             "centroid": own.mean(axis=0).tolist(),
             "obb": oriented_box(own).to_json(),
         }
@@ -118,7 +120,7 @@ def map_of(
         info={
             "metric": True,
             "frame": "home",
-            "gravity": {**down, "standard_error_deg": 1.0, "source": "truth"},
+            "gravity": Gravity(-move[:3, 2], 1.0, "truth").to_json(),
             **info,
         },
         views=[View("a.jpg", Path("a.jpg"), np.eye(3), 64, 48, look_at(eye, eye + move[:3, 0], move[:3, 2]))],

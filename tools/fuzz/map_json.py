@@ -75,7 +75,7 @@ def write_full_map(path: Path, photos: Path) -> None:
     described = InstanceDescription(row, row[None], np.zeros((24, 4), np.float32), ["0.png"], [(0, 0, 9, 9)])
     groups = {"of": np.array([0, 0, -1], np.int32), "scores": np.array([0.8], np.float32)}
     gmap.groups = {**groups, **prefixed(to_arrays([described], "color-test"))}
-    gmap.views = [stored_view(SimpleView(view, photos), path, view.held_out) for view in gmap.views]
+    gmap.views = [stored_view(with_photo(view, photos), path, view.held_out) for view in gmap.views]
     report = {"left_out": [{"name": "9.png", "why": "blurred"}], "warnings": ["few points"], "input": "photos"}
     depth = {"unit": "m", "median": 0.01, "tolerance": 0.05, "close": 0.9}
     gmap.info |= {
@@ -89,7 +89,7 @@ def write_full_map(path: Path, photos: Path) -> None:
     write_map(path, gmap)
 
 
-def SimpleView(view: Any, photos: Path) -> Any:
+def with_photo(view: Any, photos: Path) -> Any:
     """The view with its photo in `photos`, and nothing recorded of it."""
     from dataclasses import fields
 
@@ -102,16 +102,15 @@ def SimpleView(view: Any, photos: Path) -> Any:
 
 
 def _command(*words: str) -> Callable[[Path], None]:
-    """One command line; m: the map, s: the store, o: a new place."""
+    """One command line; m: the map, s: the store, new/: where new files go."""
 
     def run(folder: Path) -> None:
         from perception.cli import main
 
         names = {"m": "a.gsmap", "s": "all.store", "p": "photos", "c": "cloud.ply"}
         told, failed = io.StringIO(), io.StringIO()
-        line = [
-            str(folder / names[w]) if w in names else str(folder / "new" / w[2:]) if w[:2] == "o/" else w for w in words
-        ]
+        placed = {word: folder / names.get(word, word) for word in words if word in names or word.startswith("new/")}
+        line = [str(placed.get(word, word)) for word in words]
         with contextlib.redirect_stdout(told), contextlib.redirect_stderr(failed):
             code = main([*line, "--json"])
         if code == 2:
@@ -189,21 +188,23 @@ def _viewed(folder: Path) -> None:
 
 COMMANDS: tuple[Callable[[Path], None], ...] = (
     _command("info", "m"), _command("info", "m", "--verify"), _command("query", "m", *_PROMPTS),
-    _command("query", "m", "lime", "--min-score", "0", "--points", "o/p.ply"), _command("query", "s", *_PROMPTS),
-    _command("query", "s", "lime", "--min-score", "0"), _command("index", "m", "-o", "o/new.store"),
-    _command("index", "m", "-o", "s"), _command("export", "m", "-o", "o/a.ply"),
-    _command("export", "m", "--points", "c", "-o", "o/a.npz"), _command("export", "m", "-o", "o/a.spz"),
-    _command("export", "m", "-o", "o/a.sog"), _command("export", "m", "-o", "o/a.ply", "--granularity", "parts"),
-    _command("export", "m", "-o", "o/a.ply", "--granularity", "groups"), _command("export", "m", "--graph", "o/g.json"),
-    _command("export", "m", "--mesh", "o/m.ply", "--voxel-size", "0.1"),
-    _command("export", "m", "--mesh", "o/m.ply", "--instance", "1", "--voxel-size", "0.05"),
-    _command("export", "m", "--voxels", "o/v.npz", "--voxel-size", "0.1"),
-    _command("render", "m", "-o", "o/r", "--what", "rgb,depth,instances,features"), _command("label", "m"),
+    _command("query", "m", "lime", "--min-score", "0", "--points", "new/p.ply"), _command("query", "s", *_PROMPTS),
+    _command("query", "s", "lime", "--min-score", "0"), _command("index", "m", "-o", "new/new.store"),
+    _command("index", "m", "-o", "s"), _command("export", "m", "-o", "new/a.ply"),
+    _command("export", "m", "--points", "c", "-o", "new/a.npz"), _command("export", "m", "-o", "new/a.spz"),
+    _command("export", "m", "-o", "new/a.sog"), _command("export", "m", "-o", "new/a.ply", "--granularity", "parts"),
+    _command("export", "m", "-o", "new/a.ply", "--granularity", "groups"),
+    _command("export", "m", "--graph", "new/g.json"),
+    _command("export", "m", "--mesh", "new/m.ply", "--voxel-size", "0.1"),
+    _command("export", "m", "--mesh", "new/m.ply", "--instance", "1", "--voxel-size", "0.05"),
+    _command("export", "m", "--voxels", "new/v.npz", "--voxel-size", "0.1"),
+    _command("render", "m", "-o", "new/r", "--what", "rgb,depth,instances,features"), _command("label", "m"),
     _command("label", "m", "1", "tall cup"), _command("label", "m", "1", "--clear"), _command("relink", "m", "p"),
-    _command("upgrade", "m"), _command("upgrade", "m", "-o", "o/b.gsmap"), _command("report", "m", "-o", "o/r.html"),
-    _command("report", "m", "-o", "o/r.html", "--ask", "lime"),
+    _command("upgrade", "m"), _command("upgrade", "m", "-o", "new/b.gsmap"),
+    _command("report", "m", "-o", "new/r.html"),
+    _command("report", "m", "-o", "new/r.html", "--ask", "lime"),
     _command("scale", "m", "--known-length", "0.3: 0, grandma's cup"),
-    _command("scale", "m", "-o", "o/b.gsmap", "--known-length", "0.3: 0,0,0 0,0,1"), _served, _viewed,
+    _command("scale", "m", "-o", "new/b.gsmap", "--known-length", "0.3: 0,0,0 0,0,1"), _served, _viewed,
 )  # fmt: skip
 
 
@@ -225,7 +226,7 @@ class MapJson:
         shutil.copytree(MAPS / "photos", self._good / "photos")
         write_full_map(self._good / "a.gsmap", self._good / "photos")
         rng = np.random.default_rng(0)
-        write_cloud(self._good / "cloud.ply", PointCloud(rng.normal(0, 0.3, (50, 3)) + [0, 0, 3]))
+        write_cloud(self._good / "cloud.ply", PointCloud(rng.normal([0, 0, 3], 0.3, (50, 3))))
         with self._patched(), contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             assert main(["index", str(self._good / "a.gsmap"), "-o", str(self._good / "all.store")]) == 0
         self._usual = {command for command in range(len(COMMANDS)) if self._run(command, lambda path: None)}
@@ -237,10 +238,8 @@ class MapJson:
     def run(self, data: bytes) -> bool:
         """True when the command succeeded."""
         dice = Dice(data)
-        name, command = (
-            dice.pick(("", "map.json", "map.json", "instances.json", "store.json")),
-            dice.below(len(COMMANDS)),
-        )
+        name = dice.pick(("", "map.json", "map.json", "instances.json", "store.json"))
+        command = dice.below(len(COMMANDS))
         return self._run(command, partial(self._edit, dice, name) if name else lambda path: None)
 
     def _edit(self, dice: Dice, name: str, folder: Path) -> None:
@@ -272,7 +271,7 @@ class MapJson:
                     COMMANDS[command](folder)
             except InputError as error:
                 line = str(error)
-                where = " ".join(getattr(COMMANDS[command], "__name__", "").split())
+                where = getattr(COMMANDS[command], "__name__", "")
                 if "\n" in line or len(line) > 2000:
                     raise AssertionError(f"{where}: no short line: {line[:300]!r}") from error
                 if command in getattr(self, "_usual", ()) and str(folder) not in line:
@@ -287,24 +286,18 @@ class MapJson:
     def _patched(self) -> Iterator[None]:
         """An encoder without weights stands for all that map.json can name, but for names that there are not."""
         from perception.language import encoders
+        from perception.progress import QUIET
 
         def make(spec: str) -> Any:
             return ColorEncoder() if spec in ("conse", "auto") else encoders.make_encoder(spec)
 
+        options = {"encoders": make, "progress": QUIET}
         modules = ("query.text_ranking", "query.map_store", "query.indexing", "query.engine")
         with contextlib.ExitStack() as stack:
             for module in modules:
                 stack.enter_context(patch(f"perception.{module}.make_encoder", make))
-            stack.enter_context(
-                patch("perception.edit.upgrade.upgrade_map.__kwdefaults__", {"encoders": make, "progress": _quiet()})
-            )
+            stack.enter_context(patch("perception.edit.upgrade.upgrade_map.__kwdefaults__", options))
             stack.enter_context(patch.dict(os.environ))
             showing = sys.modules["warnings"].showwarning
             stack.callback(setattr, sys.modules["warnings"], "showwarning", showing)
             yield
-
-
-def _quiet() -> Any:
-    from perception.progress import QUIET
-
-    return QUIET
