@@ -175,7 +175,7 @@ _PART = {
     "obb": {"center": Point, "rotation": Matrix3, "extent": Sides}, "aabb?": {"min": Point, "max": Point},
     "views?": Count, "texts?": _TEXTS, "hidden?": bool, "parent?": Count,
 }  # fmt: skip
-INSTANCES = _typed({"instances": [{**_PART, "parts?": [_PART]}]})
+INSTANCES, INSTANCE = _typed({"instances": [Any]}), _typed({**_PART, "parts?": [_PART]})
 _KNOWN = {key.rstrip("?") for key in (*_PART, "parts")}
 _STORED = {"map": PathText, "map_id": Text, "frame": Text, "metric": bool, "instances": Count, "file": FileName}
 STORED = _typed({"encoder": {"name": Text, "identity": Text}, "maps": [_STORED]})
@@ -193,13 +193,14 @@ def _adapter(model: Any) -> TypeAdapter[Any]:
     return TypeAdapter(model)
 
 
-def check(model: Any, value: Any) -> None:
-    """ValueError naming the first key of `value` that does not fit `model`, what was found and what is expected."""
+def check(model: Any, value: Any, at: str = "") -> None:
+    """ValueError naming the first key of `value` that does not fit `model`, what was found and what is expected.
+    at: where in its file `value` is."""
     try:
         _adapter(model).validate_python(value)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
-        key = "".join(f"[{at}]" if isinstance(at, int) else f".{at}" for at in first["loc"]).lstrip(".")
+        key = (at + "".join(f"[{n}]" if isinstance(n, int) else f".{n}" for n in first["loc"])).lstrip(".")
         what = first["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
         found = "" if first["type"] == "missing" else f", found {brief(first['input'])}"
         raise ValueError(f"{key[:200]}: {what[:300]}{found}") from None
@@ -215,9 +216,8 @@ def check_instances(value: Any, facts: dict[str, Any]) -> None:
     """ValueError unless `value`, of instances.json, fits the model and `facts`, of map.json."""
     check(INSTANCES, value)
     entries, seen = value["instances"], set()
-    if len(entries) != facts["num_instances"]:
-        raise ValueError(f"instances: {len(entries)} are there, num_instances in map.json is {facts['num_instances']}")
-    for whole in entries:
+    for n, whole in enumerate(entries):
+        check(INSTANCE, whole, f"instances[{n}]")  # each alone: what is checked is copied, and 20,000 copies cost time
         for entry in (whole, *whole.get("parts", ())):
             if entry["id"] in seen:
                 raise ValueError(f"id: {entry['id']} occurs twice")
@@ -226,8 +226,10 @@ def check_instances(value: Any, facts: dict[str, Any]) -> None:
                 raise ValueError(f"num_gaussians: instance {entry['id']} has more than the map")
             if entry is not whole and entry.get("parent") != whole["id"]:
                 raise ValueError(f"parent: that of part {entry['id']} is not {whole['id']}")
-            if others := entry.keys() - _KNOWN:
-                json.dumps({name: entry[name] for name in others}, allow_nan=False)
+            if not entry.keys() <= _KNOWN:
+                json.dumps({name: entry[name] for name in entry.keys() - _KNOWN}, allow_nan=False)
+    if len(entries) != facts["num_instances"]:
+        raise ValueError(f"instances: {len(entries)} are there, num_instances in map.json is {facts['num_instances']}")
 
 
 _LANGUAGE = {
