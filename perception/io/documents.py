@@ -83,7 +83,7 @@ def safe_name(name: object, source: object) -> str:
     InputError if it is not a string, for an empty name, an absolute path, a drive letter, a part "..", and for control
     characters (NUL, newline) and lone surrogates, which line-based files and terminals cannot hold.
     """
-    wrong = _what_is_wrong(name)
+    wrong = what_is_wrong(name)
     if wrong is None:
         return str(name)
     raise InputError(
@@ -92,7 +92,8 @@ def safe_name(name: object, source: object) -> str:
     )
 
 
-def _what_is_wrong(name: object) -> str | None:
+def what_is_wrong(name: object) -> str | None:
+    """Why `safe_name` refuses a name; None if it does not."""
     if not isinstance(name, str):
         return f"is {type(name).__name__}, not text"
     parts = _SEPARATOR.split(name)

@@ -501,8 +501,9 @@ def _small_map() -> dict[str, bytes]:
 
     box = {"center": [0, 0, 0], "rotation": np.eye(3).tolist(), "extent": [1, 1, 1]}
     instances = [
-        {"id": i, "label": None, "score": 0.5, "num_gaussians": 2, "centroid": [0, 0, 0], "obb": box} for i in (0, 1)
+        {"id": i, "label": None, "score": 0.5, "num_gaussians": 2, "centroid": [0, 0, 0], "obb": box} for i in range(4)
     ]
+    instances[1]["parts"] = [{**instances.pop(), "parent": 1} for _ in range(2)]
     n = 4
     gmap = Map(
         *(np.zeros((n, k), np.float32) for k in (3, 4, 3)), np.zeros(n, np.float32), np.zeros((n, 4, 3), np.float32),
