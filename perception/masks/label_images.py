@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.documents import brief, safe_name
+from perception.io.arrays import read_npz
+from perception.io.documents import safe_name
 from perception.io.memory import Keep
 from perception.masks.builtin import BuiltinSegmentation
 from perception.masks.merging import Segmentation
@@ -98,8 +99,7 @@ def load_segmentation(folder: Path) -> Segmentation | None:
     file = folder / SEGMENTATION
     if not file.is_file():
         return None
-    with np.load(file) as stored:
-        return Segmentation(**stored)
+    return Segmentation(**read_npz(file, file, "remove it"))  # type: ignore[arg-type]
 
 
 def label_file(folder: Path, view: View) -> Path:
@@ -144,17 +144,13 @@ def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
 
 def stored_key(file: Path) -> str | None:
     """The key that a label image was written with; None if the file or the key cannot be read."""
-    from PIL import Image
+    from perception.photos.decode import decode, open_photo
 
-    from perception.photos.decode import DECODE_ERRORS
-
-    if not file.is_file():
-        return None
     try:
-        with Image.open(file) as image:
-            image.load()
+        with open_photo(file) as image:
+            decode(image, file)
             return str(image.info.get(_KEY))
-    except DECODE_ERRORS:
+    except InputError:
         return None
 
 
@@ -181,15 +177,11 @@ def read_png_header(file: Path) -> tuple[int, int, int, int]:
 
 def read_labels(file: Path) -> np.ndarray:
     """[H, W] int32. Pillow keeps palette indices, whereas OpenCV converts them to colours."""
-    from PIL import Image
+    from perception.photos.decode import decode, open_photo
 
-    from perception.photos.decode import DECODE_ERRORS
-
-    try:
-        with Image.open(file, formats=["PNG"]) as image:
-            labels = np.asarray(image)
-    except DECODE_ERRORS as error:
-        raise InputError(f"{file}: cannot be read ({brief(error)}); the PNG is damaged or cut short") from error
+    with open_photo(file) as image:
+        decode(image, file)
+        labels = np.asarray(image)
     if labels.ndim != 2 or labels.dtype.kind not in "biu":
         raise InputError(f"{file}: {labels.dtype} of shape {list(labels.shape)}; a label image has one channel")
     return labels.astype(np.int32)

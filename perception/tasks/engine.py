@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import socket
-import tempfile
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -26,14 +26,18 @@ RETRIES = 5
 
 
 @contextmanager
-def _elsewhere() -> Iterator[None]:
-    """Another current folder: workers import from the driver's first, which in a clone has no compiled core."""
-    before = Path.cwd()
-    os.chdir(tempfile.gettempdir())
+def _alone(ray: Any) -> Iterator[None]:
+    """How Ray is started. Its workers import from the driver's current folder first, which may be a clone without
+    compiled core, or writable for others: it is Python's own folder, which holds no modules. A cluster that is started
+    has the loopback address, and all its sockets listen there, as it is everywhere but on Linux."""
+    constants, before = ray._private.ray_constants, Path.cwd()
+    reachable, constants.ENABLE_RAY_CLUSTER = constants.ENABLE_RAY_CLUSTER, False
+    os.chdir(sys.prefix)
     try:
         yield
     finally:
         os.chdir(before)
+        constants.ENABLE_RAY_CLUSTER = reachable
 
 
 @dataclass(frozen=True)
@@ -78,9 +82,13 @@ class Engine:
             if self.address not in (None, "auto"):  # Ray itself tries for seven minutes
                 host, _, port = str(self.address).rpartition(":")
                 socket.create_connection((host, int(port)), timeout=CONNECT).close()
+            options = {"ignore_reinit_error": True, "log_to_driver": False, "logging_level": logging.ERROR}
             with _elsewhere():
-                address = self.address or "local"  # without one, Ray takes up what another run left
-                ray.init(address=address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR)
+                if self.address is None:
+                    with _on_loopback(ray):
+                        ray.init("local", include_dashboard=False, **options)
+                else:
+                    ray.init(self.address, **options)
         except (OSError, ValueError) as error:
             told = f"--address {self.address}: no Ray cluster there ({str(error).splitlines()[0]})"
             raise InputError(f"{told}; start one: ray start --head, and give its HOST:PORT") from error

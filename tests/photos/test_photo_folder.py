@@ -275,7 +275,7 @@ def test_damaged_photos_with_given_poses_are_left_out(tmp_path: Path) -> None:
     scene = load_scene(tmp_path, Reading(tmp_path / "work"))
     assert [view.name for view in scene.views] == ["0.png", "2.png"]
     assert [entry["name"] for entry in scene.report["left_out"]] == ["1.png"]
-    with pytest.raises(InputError, match=r"1\.png: the photo is truncated"):
+    with pytest.raises(InputError, match=r"1\.png: the picture is damaged"):
         load_scene(tmp_path, Reading(tmp_path / "strict", strict=True))
 
 
