@@ -64,8 +64,15 @@ def _precision(path: Path) -> str:
 
 def side_files(path: Path) -> list[Path]:
     """The files beside an ONNX file that hold its weights, as the graph names them (`external_data`).
-    What lies outside the model's folder is not among them: `open_session` refuses such a model."""
+    What lies outside the model's folder is not among them."""
     return [path.parent / name for name in _weights(path) if _lies_beside(path, name)]
+
+
+def refuse_outside_weights(path: Path) -> None:
+    """InputError for an ONNX file whose weights lie outside its folder, as no public export has them."""
+    outside = next((name for name in _weights(path) if not _lies_beside(path, name)), None)
+    if outside is not None:
+        raise InputError(f"{path}: its weights are in {outside[:200]!r}, outside its folder; expected a file beside it")
 
 
 def _weights(path: Path) -> list[str]:
@@ -107,9 +114,7 @@ def open_session(path: Path, threads: int = 0) -> Any:
         raise missing_extra("onnxruntime", "demo") from error
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected an ONNX model")
-    outside = next((name for name in _weights(path) if not _lies_beside(path, name)), None)
-    if outside is not None:
-        raise InputError(f"{path}: its weights are in {outside[:200]!r}, outside its folder; expected a file beside it")
+    refuse_outside_weights(path)
     missing = ", ".join(side.name for side in side_files(path) if not side.is_file())
     if missing:
         raise InputError(f"{path}: its weights are in {missing}, not beside it; fetch that file too, by this name")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import threading
+import warnings
 from pathlib import Path
 from stat import S_ISREG
 from typing import Any
@@ -26,7 +27,9 @@ MOST_DECODED = 400_000_000
 _DENSEST = 8 * 1032
 """Most pixels that a byte of a file in one of _BOUNDED can hold: deflate's densest code, at one bit a pixel."""
 _BOUNDED = ("PNG", "JPEG", "MPO", "BMP", "GIF")
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it says of a file, an InputError says
+# What these libraries say of a damaged file on the standard error, an InputError says.
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+warnings.filterwarnings("ignore", category=UserWarning, module="PIL")
 
 
 def photo_size(path: Path) -> tuple[int, int]:
