@@ -226,7 +226,7 @@ def _row_type(header: dict[str, list[str]], path: Path) -> tuple[np.dtype, int]:
             unique = name if name not in names[:i] and name != "_" else f"_{name}{i}"
             fields.append((unique, f"<{type_.lower()}{size}", *([(count,)] if count > 1 else [])))
         return np.dtype(fields), points
-    except (LookupError, OverflowError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, ValueError) as error:
         raise InputError(f"{path}: PCD header cannot be understood ({error})") from error
 
 
