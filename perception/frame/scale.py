@@ -12,7 +12,8 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import align_similarity, camera_centres
-from perception.photos.decode import DECODE_ERRORS, exif_of, open_photo
+from perception.io.documents import DAMAGE
+from perception.photos.decode import exif_folder, open_photo
 from perception.photos.depth import load_depth
 from perception.photos.lens import load_pycolmap
 from perception.types import View
@@ -153,7 +154,7 @@ def photo_position(photo: Path) -> np.ndarray | None:
     """Latitude and longitude in degrees and altitude in metres [3] from EXIF; None without them or out of range."""
     try:
         with open_photo(photo) as image:
-            tags = exif_of(image, photo).get_ifd(_GPS_FOLDER)
+            tags = exif_folder(image, photo, _GPS_FOLDER)
         angles = []
         for tag, negative in ((_LATITUDE, "S"), (_LONGITUDE, "W")):
             degrees, minutes, seconds = (float(x) for x in tags[tag + 1])
@@ -161,7 +162,7 @@ def photo_position(photo: Path) -> np.ndarray | None:
             angles.append(-angle if str(tags[tag]).strip("\0 ").upper() == negative else angle)
         below = tags.get(_ALTITUDE) in (1, b"\x01")
         place = np.array([*angles, float(tags[_ALTITUDE + 1]) * (-1 if below else 1)])
-    except (InputError, *DECODE_ERRORS):
+    except DAMAGE:  # InputError among them
         return None
     known = np.isfinite(place).all() and abs(place[0]) <= 90 and abs(place[1]) <= 180 and place[:2].any()
     return place if known else None

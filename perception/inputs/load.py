@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.arrays import read_npz
 from perception.io.atomic import atomic_directory
 from perception.io.documents import DAMAGE
 from perception.photos.camera_file import read_camera
@@ -188,8 +189,8 @@ def load_saved_scene(folder: Path) -> Scene | None:
         return None
     try:
         facts = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
-        with np.load(folder / "points.npz") as arrays:
-            points, colors = arrays["points"], arrays["colors"]
+        arrays = read_npz(folder / "points.npz", folder / "points.npz", "")
+        points, colors = arrays["points"], arrays["colors"]
         views: list[View] = [view_from_json(entry) for entry in facts["views"]]
         return Scene(views, points, colors, facts["metric"], facts["frame"], facts["report"])
     except DAMAGE as error:

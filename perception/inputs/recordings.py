@@ -12,6 +12,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import inverse_se3
 from perception.io.documents import safe_name
+from perception.photos.decode import read_picture
 from perception.photos.depth import read_depth
 from perception.photos.ignore_masks import mask_of
 from perception.photos.reading import NO_CLOUD, Reading, fit_lens, make_view, rigid_pose
@@ -92,10 +93,12 @@ def choose_frames(
     shown: list[Frame] = []
     damaged: list[str] = []
     for done, frame in enumerate(recording.frames, start=1):
-        picture = cv2.imdecode(np.fromfile(frame.photo, np.uint8), cv2.IMREAD_REDUCED_COLOR_2)
-        if picture is None:
+        try:
+            what = "photo; replace or remove it"
+            picture = read_picture(frame.photo, frame.photo, what, cv2.IMREAD_REDUCED_COLOR_2)
+        except InputError:
             if strict:
-                raise InputError(f"{frame.photo}: not a readable photo; replace or remove it")
+                raise
             damaged.append(frame.name)
             continue
         motion = 0.0

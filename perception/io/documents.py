@@ -10,6 +10,8 @@ import struct
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +63,18 @@ def read_yaml(file: Path, expected: str) -> Any:
         raise InputError(f"{file}: no such file; expected {expected}") from error
     except (yaml.YAMLError, *DAMAGE) as error:
         raise InputError(f"{file}: not readable YAML ({brief(error)}); expected {expected}") from error
+
+
+@contextmanager
+def refusing(message: str) -> Iterator[None]:
+    """For the calls of a library that decodes untrusted bytes: whatever it raises becomes an InputError.
+    message: of that error; "{why}" in it stands for what the library said. An InputError passes as it is."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # libraries have no common base class of errors, and raise others' too
+        raise InputError(message.replace("{why}", brief(error))) from error
 
 
 def brief(value: object, most: int = 120) -> str:

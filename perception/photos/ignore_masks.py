@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from perception.errors import InputError
-from perception.photos.decode import photo_size, warp_labels
+from perception.photos.decode import photo_size, read_picture, warp_labels
 from perception.types import Scene, View
 
 _ASPECT = 0.02
@@ -33,9 +33,7 @@ def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     Ignored are pixels that are black in all channels, or transparent. InputError for a file that is missing, no image,
     or of another aspect ratio.
     """
-    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) if path.is_file() else None
-    if image is None:
-        raise InputError(f"{path}: not a readable mask; expected a PNG in which black (0) pixels are ignored")
+    image = read_picture(path, path, "mask; expected a PNG in which black (0) pixels are ignored")
     channels = image.reshape(*image.shape[:2], -1)
     used: np.ndarray = np.any(channels[..., :3] > 0, axis=2)
     if channels.shape[2] in (2, 4):

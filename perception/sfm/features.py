@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from perception.io.atomic import atomic_directory, recover
-from perception.photos.decode import exif_of, open_photo, photo_size
+from perception.photos.decode import exif_folder, exif_of, open_photo, photo_size
 from perception.photos.ignore_masks import stage_masks
 from perception.photos.lens import load_pycolmap
 from perception.progress import Progress
@@ -177,7 +177,7 @@ def _camera_key(photo: Path) -> tuple[Any, ...]:
     """Key of photos that share one camera: size, and EXIF maker, model, focal length and zoom."""
     with open_photo(photo) as image:
         exif = exif_of(image, photo)
-        details = exif.get_ifd(0x8769)
+        details = exif_folder(image, photo, 0x8769)
     return (*photo_size(photo), exif.get(0x010F), exif.get(0x0110), details.get(0x920A), details.get(0xA404))
 
 

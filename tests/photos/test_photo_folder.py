@@ -108,7 +108,7 @@ def test_a_broken_photo_is_left_out_and_told(tmp_path: Path) -> None:
     assert chosen.names == ["0.jpg", "1.jpg", "3.jpg"]
     assert [entry["name"] for entry in chosen.left_out] == ["2.jpg"] and "damaged" in chosen.left_out[0]["why"]
     assert any(note.startswith("warning: 1 of 4 photos cannot be read") for note in chosen.notes)
-    with pytest.raises(InputError, match=r"2\.jpg: the photo is truncated"):
+    with pytest.raises(InputError, match=r"2\.jpg: the picture is damaged"):
         choose_photos(tmp_path, True, Told())
 
 
@@ -275,7 +275,7 @@ def test_damaged_photos_with_given_poses_are_left_out(tmp_path: Path) -> None:
     scene = load_scene(tmp_path, Reading(tmp_path / "work"))
     assert [view.name for view in scene.views] == ["0.png", "2.png"]
     assert [entry["name"] for entry in scene.report["left_out"]] == ["1.png"]
-    with pytest.raises(InputError, match=r"1\.png: the photo is truncated"):
+    with pytest.raises(InputError, match=r"1\.png: the picture is damaged"):
         load_scene(tmp_path, Reading(tmp_path / "strict", strict=True))
 
 
