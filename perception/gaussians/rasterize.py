@@ -189,7 +189,7 @@ def label_images(
     means = inputs[0]
     assert means is not None  # for the type checker
     if means.device.type != "cpu":
-        from perception.gaussians.cuda import rasterize as on_device
+        from perception.gaussians.rasterizer import device as on_device
 
         return on_device.label_images(inputs, labels, least, settings)
     images = np.empty((len(labels), settings.height, settings.width), np.int32)
@@ -243,7 +243,7 @@ def passes(device: torch.device) -> tuple[Callable[..., Forward], Callable[..., 
     """The forward and the backward pass for tensors on `device`."""
     if device.type == "cpu":
         return rasterize_forward, rasterize_backward
-    from perception.gaussians.cuda import rasterize as on_device
+    from perception.gaussians.rasterizer import device as on_device
 
     return on_device.rasterize_forward, on_device.rasterize_backward
 

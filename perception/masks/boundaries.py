@@ -1,6 +1,6 @@
 """Learned borders of objects: a small convolutional network sees the colours, normals, steps and creases of a photo.
 
-It tells the border of a thing from a shadow or from print by what is around it. `python -m tools training.masks` makes
+It tells the border of a thing from a shadow or from print by what is around it. `python tools training.masks` makes
 its packaged weights from rendered worlds alone, see docs/masks.md.
 """
 

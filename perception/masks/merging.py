@@ -2,7 +2,7 @@
 
 The most likely pair of neighbours is merged first, and the evidence is recomputed after every merge (Nunez-Iglesias et
 al. 2013), until nothing is left to merge. The cut maximises Σ (p − cost) over its regions, where p is the learned
-probability that a region is an object. Small neural networks tell the probabilities; `python -m tools training.masks`
+probability that a region is an object. Small neural networks tell the probabilities; `python tools training.masks`
 makes their packaged weights from rendered worlds alone, see docs/masks.md.
 """
 

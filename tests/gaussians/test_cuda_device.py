@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from perception.gaussians import rasterize as cpu
-from perception.gaussians.cuda import rasterize as on_device
+from perception.gaussians.rasterizer import device as on_device
 from support.rasterizer import cast, scene
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")

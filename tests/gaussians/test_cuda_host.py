@@ -14,8 +14,8 @@ import perception
 from perception.gaussians import rasterize as cpu
 from perception.gaussians.cuda import compile as compiling
 from perception.gaussians.cuda import launch
-from perception.gaussians.cuda import rasterize as on_device
 from perception.gaussians.cuda.compile import KernelOptions, compile_kernels, nvrtc_version
+from perception.gaussians.rasterizer import device as on_device
 from support.cuda_emulator import build
 from support.rasterizer import scene
 

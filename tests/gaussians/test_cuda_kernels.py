@@ -9,9 +9,9 @@ import torch
 
 import perception
 from perception.gaussians import rasterize as cpu
-from perception.gaussians.cuda import rasterize as on_device
 from perception.gaussians.cuda.compile import KernelOptions
 from perception.gaussians.rasterize import Settings
+from perception.gaussians.rasterizer import device as on_device
 from support.cuda_emulator import REVERSED, build, emulate, emulated, find_compiler, on_emulator, wide_scene, worst
 from support.hard_scenes import SCENES
 from support.rasterizer import cast, grads_and_images, leaves, loss_of, scene

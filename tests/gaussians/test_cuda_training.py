@@ -14,11 +14,11 @@ from perception.config import load_config
 from perception.errors import InputError
 from perception.gaussians import device as devices
 from perception.gaussians import rasterize as cpu
-from perception.gaussians.cuda import rasterize as on_device
 from perception.gaussians.cuda import training
 from perception.gaussians.losses import assign_labels, instance_loss
 from perception.gaussians.model import from_points
 from perception.gaussians.nearby import Nearby
+from perception.gaussians.rasterizer import device as on_device
 from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView, surface_depth
 from perception.instances.votes import mask_votes

@@ -18,9 +18,9 @@ import pytest
 import torch
 
 from perception.gaussians import rasterize as cpu
-from perception.gaussians.cuda import rasterize as on_device
 from perception.gaussians.cuda.compile import KernelOptions
 from perception.gaussians.cuda.launch import Kernels
+from perception.gaussians.rasterizer import device as on_device
 from support.rasterizer import grads_and_images, scene
 
 CSRC = Path(__file__).resolve().parents[2] / "csrc"

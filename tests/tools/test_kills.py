@@ -1,4 +1,4 @@
-"""A short run of the harness that kills mapping, exporting and editing; `python -m tools kills.run` is the long one."""
+"""A short run of the harness that kills mapping, exporting and editing; `python tools kills.run` is the long one."""
 
 from __future__ import annotations
 

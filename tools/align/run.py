@@ -1,6 +1,6 @@
 """Random scans of a scene with exact truth, aligned to a map of it: right, refused and wrong ones.
 
-    python -m tools align.run room.gsmap scenes/room --cases 50 [--plain] [--metric]
+    python tools align.run room.gsmap scenes/room --cases 50 [--plain] [--metric]
 
 A scan is gt_points.ply, cut to 60 % by a random plane, with 5 mm of noise, turned, moved and scaled by 0.01 to 100.
 Right: within 0.3° and 1 cm (root mean square) of the truth. For the others, the stage that lost the place is told.

@@ -28,7 +28,7 @@ HELD_OUT = "held out of training, unless the map was brought along"
 
 
 class DatasetBench(ABC):
-    """One dataset benchmark, `python -m tools bench.run NAME DIR -o WORK`: a subclass says how the download is read.
+    """One dataset benchmark, `python tools bench.run NAME DIR -o WORK`: a subclass says how the download is read.
 
     What is finished is kept in WORK, so that a second run goes on. args: the parsed arguments.
     """
@@ -67,7 +67,7 @@ class DatasetBench(ABC):
     def main(cls, arguments: Sequence[str] | None = None) -> None:
         """Command line entry point; prints the table or JSON, and writes WORK/NAME.json."""
         parser = bench_parser(cls.name, cls.__doc__)
-        parser.prog = f"python -m tools bench.run {cls.name}"
+        parser.prog = f"python tools bench.run {cls.name}"
         parser.add_argument("dataset", type=Path, metavar="DIR", help="the dataset as downloaded")
         parser.add_argument("--maps", type=Path, metavar="DIR", help="finished maps <scene>.gsmap (default WORK/maps)")
         parser.add_argument("--scenes", type=lambda text: text.split(","), metavar="A,B", help="only these")

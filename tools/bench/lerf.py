@@ -1,4 +1,4 @@
-"""LERF-mask (Gaussian Grouping) and LERF-OVS, 3D selection by OpenGaussian's protocol: `python -m tools bench.run
+"""LERF-mask (Gaussian Grouping) and LERF-OVS, 3D selection by OpenGaussian's protocol: `python tools bench.run
 lerf-mask` and `lerf-ovs DIR -o WORK`."""
 
 from __future__ import annotations

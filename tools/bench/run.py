@@ -1,4 +1,4 @@
-"""The benches of public data sets, from the download to the table: python -m tools bench.run NAME DIR -o WORK
+"""The benches of public data sets, from the download to the table: python tools bench.run NAME DIR -o WORK
 
 NAME: lerf-mask, lerf-ovs or scannetpp; NAME --help lists the options.
 """

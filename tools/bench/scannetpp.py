@@ -1,4 +1,4 @@
-"""ScanNet++ instance segmentation of mesh vertices: `python -m tools bench.run scannetpp DIR -o WORK`."""
+"""ScanNet++ instance segmentation of mesh vertices: `python tools bench.run scannetpp DIR -o WORK`."""
 
 from __future__ import annotations
 

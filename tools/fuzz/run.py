@@ -1,4 +1,4 @@
-"""Fuzzes one reader, a server or the compiled module: python -m tools fuzz.run TARGET [--runs N] (--list names them).
+"""Fuzzes one reader, a server or the compiled module: python tools fuzz.run TARGET [--runs N] (--list names them).
 
 Coverage-guided by atheris where it is installed (pip install atheris), else seeded mutation of the same seeds. A defect
 is everything but a clean refusal: another exception, a signal, a hang, or memory beyond --memory. Its input is kept.

@@ -1,6 +1,6 @@
 """Maps on local Ray clusters of 1, 2 and 4 nodes; workers and the driver are killed on the way:
 
-python -m tools kills.ray_cluster        # a quarter of an hour on two cores
+python tools kills.ray_cluster        # a quarter of an hour on two cores
 
 A row of things with given poses is mapped in blocks, a tabletop from photos alone, with features, matches and places by
 tasks. Every map must be that of the local engine. Of every kind of task a worker must have been killed, and the driver

@@ -1,8 +1,8 @@
 """SIGKILL (or SIGTERM) at random moments of mapping, exporting and label editing; afterwards nothing may be lost.
 
-    python -m tools kills.run                     # 100 kills of each, about 20 minutes on two cores
-    python -m tools kills.run editing --kills 1000 --seed 7
-    python -m tools kills.run --signal TERM
+    python tools kills.run                     # 100 kills of each, about 20 minutes on two cores
+    python tools kills.run editing --kills 1000 --seed 7
+    python tools kills.run --signal TERM
 
 After every kill the map from before must open with all its checksums, no half-written file may lie under a final name,
 and the same command again (`perception map --resume`) must end with, bit for bit, what the undisturbed run ended with,

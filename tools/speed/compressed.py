@@ -1,6 +1,6 @@
 """Compressed exports of a map: size as a share of the PLY's, and PSNR of what is read back to renders of the map.
 
-python -m tools speed.compressed MAP
+python tools speed.compressed MAP
 """
 
 from __future__ import annotations

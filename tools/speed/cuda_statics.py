@@ -1,7 +1,7 @@
 """What NVRTC makes of the CUDA kernels, without a GPU: instructions, registers of a thread, shared memory of a block.
 
 pip install nvidia-cuda-nvrtc-cu12
-python -m tools speed.cuda_statics
+python tools speed.cuda_statics
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Minutes against quality: the Pareto front over presets, budget, resolution, iterations, harmonics, features.
 
-python -m tools speed.fronts SCENE [--set KEY=VALUE] [--only TEXT] [-o OUTPUT]
+python tools speed.fronts SCENE [--set KEY=VALUE] [--only TEXT] [-o OUTPUT]
 
 `perception map` runs in a process of its own for each variant. A finished map stays in OUTPUT/maps with its row, named
 by a key of the scene, the settings and the source code, so a stopped sweep goes on. Held-out views are scored at each

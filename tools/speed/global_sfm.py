@@ -2,7 +2,7 @@
 (pycolmap.global_mapping), from the same matches: seconds, photos with a pose, and the distance of their cameras from
 given ones after alignment.
 
-python -m tools speed.global_sfm SCENE --first 300
+python tools speed.global_sfm SCENE --first 300
 """
 
 from __future__ import annotations

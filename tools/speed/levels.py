@@ -1,6 +1,6 @@
 """Levels of detail of a map: PSNR to renders of all its Gaussians, and time and memory for millions.
 
-python -m tools speed.levels MAP [--millions 5]
+python tools speed.levels MAP [--millions 5]
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Speed and peak memory of model files of real size with random weights, on this machine.
 
-    python -m tools speed.run sam PHOTO...           masks, prompts that lie in an earlier mask skipped (the default)
-    python -m tools speed.run sam PHOTO... --full    masks, the full grid of 1,024 prompts
-    python -m tools speed.run words                  1,500 crops, as 100 instances of 15, through a CLIP ViT-B/32
+    python tools speed.run sam PHOTO...           masks, prompts that lie in an earlier mask skipped (the default)
+    python tools speed.run sam PHOTO... --full    masks, the full grid of 1,024 prompts
+    python tools speed.run words                  1,500 crops, as 100 instances of 15, through a CLIP ViT-B/32
 
 SAM is a decoder of real size behind an encoder as expensive as MobileSAM's; its masks gather round the prompt, as a
 trained one's do. The models are exported to ONNX into a temporary folder first, which is not timed.

@@ -1,6 +1,6 @@
 """Where the time of a training step goes, by kind of step and number of threads, on this machine.
 
-    python -m tools speed.steps SCENE [--masks labels:FOLDER] [--at 300 1200] [--set KEY=VALUE ...]
+    python tools speed.steps SCENE [--masks labels:FOLDER] [--at 300 1200] [--set KEY=VALUE ...]
 
 Maps SCENE once with one thread and once with two, in processes of their own, and prints the median milliseconds of
 every stage over the 120 steps around each iteration: steps of half the size, of the full size, and with features. A

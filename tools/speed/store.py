@@ -1,8 +1,8 @@
 """One store of many maps: time to make, open and ask it, peak memory, and its answers against those of the maps.
 
-    python -m tools speed.store                                       1,000 maps of 60 instances, about 15 minutes
-    python -m tools speed.store --maps 50 --prompts 20
-    pip install lancedb qdrant-edge-py && python -m tools speed.store --compare
+    python tools speed.store                                       1,000 maps of 60 instances, about 15 minutes
+    python tools speed.store --maps 50 --prompts 20
+    pip install lancedb qdrant-edge-py && python tools speed.store --compare
 
 The maps are made: an instance is a ball of points whose embedding is that of a random word of the offline encoder with
 noise, of a random colour. A third of the prompts are such words, a third have a colour, a third are of other things.

@@ -1,4 +1,4 @@
-"""Trains the network of object borders of `perception.masks.boundaries`; `python -m tools training.masks` calls it."""
+"""Trains the network of object borders of `perception.masks.boundaries`; `python tools training.masks` calls it."""
 
 from __future__ import annotations
 

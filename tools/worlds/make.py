@@ -1,7 +1,7 @@
 """Writes a made scene with exact truth, or the scene that the package ships for `perception demo`:
 
-python -m tools worlds.make tabletop|room FOLDER [--seed N]
-python -m tools worlds.make shipped perception/demo_scene
+python tools worlds.make tabletop|room FOLDER [--seed N]
+python tools worlds.make shipped perception/demo_scene
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A table with packages, tins and books that bear words: across, downwards, around a tin, on a spine, partly hidden. Seeds
 select places and turns. The folder then holds what tools/worlds/make.py writes; scene.json has 20 prompts
-with a word in capitals, and as `absent` six whose words are on nothing. `python -m tools score.queries MAP FOLDER`
+with a word in capitals, and as `absent` six whose words are on nothing. `python tools score.queries MAP FOLDER`
 scores them on a map of FOLDER/transforms.json.
 """
 
