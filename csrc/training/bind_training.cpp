@@ -68,13 +68,13 @@ auto photometric(In<T, 3> render, In<Target, 3> target, std::optional<In<T, 2>> 
   return nb::make_tuple(result.loss, result.l1, result.ssim);
 }
 
-auto assign(In<int32_t, 1> labels, double fraction, uint64_t seed, Out<int32_t, 1> slots) {
+auto assign(In<int32_t, 1> labels, Out<int32_t, 1> slots) {
   require_aligned("labels", labels, "slots", slots);
   require(same_shape(labels, slots), "slots: expected the shape of labels");
   pt::Assignment out;
   {
     nb::gil_scoped_release release;
-    out = pt::assign(labels.data(), static_cast<int64_t>(labels.size()), fraction, seed, slots.data());
+    out = pt::assign(labels.data(), static_cast<int64_t>(labels.size()), slots.data());
   }
   return nb::make_tuple(out.ids, out.counts, out.first);
 }
@@ -82,6 +82,12 @@ auto assign(In<int32_t, 1> labels, double fraction, uint64_t seed, Out<int32_t, 
 void check_slots(const int32_t *slots, size_t pixels, size_t labels) {
   for (size_t p = 0; p < pixels; ++p)
     require(slots[p] < static_cast<int64_t>(labels), "slots: an index lies outside the labels");
+}
+
+template <class T>
+pt::LabelledFeatures<T> labelled(const In<T, 2> &features, const In<int32_t, 1> &slots) {
+  return {features.data(), slots.data(), static_cast<int64_t>(features.shape(0)),
+          static_cast<int64_t>(features.shape(1))};
 }
 
 template <class T>
@@ -99,8 +105,9 @@ void prototypes(In<T, 2> features, In<int32_t, 1> slots, In<int64_t, 1> counts, 
   for (size_t i = 0; i < labels; ++i)
     require(first.data()[i] >= 0 && first.data()[i] < static_cast<int64_t>(features.shape(0)) && counts.data()[i] > 0,
             "first, counts: every label needs a pixel");
-  pt::prototypes(features.data(), slots.data(), features.shape(0), features.shape(1), counts.data(), first.data(),
-                 labels, means.data(), scatter.data(), {threads, parse_level(level)});
+  pt::prototypes(labelled(features, slots),
+                 {static_cast<int64_t>(labels), counts.data(), first.data(), means.data(), scatter.data()},
+                 {threads, parse_level(level)});
 }
 
 template <class T>
@@ -113,8 +120,8 @@ void spread(In<T, 2> features, In<int32_t, 1> slots, In<double, 2> means, In<dou
           "pull, push: expected [L] and [L, D] of means [L, D], with D of features [P, D]");
   nb::gil_scoped_release release;
   check_slots(slots.data(), slots.shape(0), means.shape(0));
-  pt::spread(features.data(), slots.data(), features.shape(0), features.shape(1), means.data(), pull.data(),
-             push.data(), out.data(), {threads, parse_level(level)});
+  pt::spread(labelled(features, slots), means.data(), pull.data(), push.data(), out.data(),
+             {threads, parse_level(level)});
 }
 
 double separation(In<double, 2> points, double margin, Out<double, 2> gradient) {
@@ -199,7 +206,7 @@ void bind_training(nb::module_ &parent) {
   nb::module_ m = parent.def_submodule("training", "Fused losses and the optimiser; float32 and float64.");
   m.def("set_threads", &perception::set_default_threads, "threads"_a,
         "Threads of calls that name none; 0 means all processors. Results do not depend on it.");
-  m.def("assign", &assign, nb::arg("labels").noconvert(), "fraction"_a, "seed"_a, nb::arg("slots").noconvert(),
+  m.def("assign", &assign, nb::arg("labels").noconvert(), nb::arg("slots").noconvert(),
         "(ids, counts, first pixel) of the labels in use; slots gets each pixel's index into ids, or -1.");
   m.def("separation", &separation, nb::arg("points").noconvert(), "margin"_a, nb::arg("gradient").noconvert(),
         "Mean relu(margin - squared distance) over the pairs of points [M, D], and its gradient.");

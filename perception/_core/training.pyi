@@ -11,7 +11,7 @@ def set_threads(threads: int) -> None:
     Threads of calls that name none; 0 means all processors. Results do not depend on it.
     """
 
-def assign(labels: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu', writable=False)], fraction: float, seed: int, slots: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu')]) -> tuple:
+def assign(labels: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu', writable=False)], slots: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu')]) -> tuple:
     """
     (ids, counts, first pixel) of the labels in use; slots gets each pixel's index into ids, or -1.
     """

@@ -41,6 +41,10 @@ class Statistics:
     def zeros(count: int, device: torch.device | None = None) -> Statistics:
         return Statistics(*(torch.zeros(count, device=device) for _ in range(3)))
 
+    def named(self) -> dict[str, torch.Tensor]:
+        """The sums by name, for a checkpoint."""
+        return {"gradient": self.gradient, "seen": self.seen, "radius": self.radius}
+
     def add(self, gradient_px: torch.Tensor, radius_px: torch.Tensor, visible: torch.Tensor, long_side: int) -> None:
         """Adds one view: gradient_px [N, 2] of the 2D mean per pixel, radius_px [N] pixels, visible [N] uint8,
         long_side in pixels. Rows that are not visible are not looked at."""

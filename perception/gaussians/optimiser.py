@@ -48,7 +48,7 @@ class SparseAdam:
         """N, the number of rows."""
         return len(next(iter(self.params.values()))) if self.params else 0
 
-    def step(self, visible: Tensor | None = None, grads: Mapping[str, Tensor] | None = None) -> dict[str, int]:
+    def step(self, visible: Tensor | None = None, grads: Mapping[str, Tensor | None] | None = None) -> dict[str, int]:
         """One step. visible: [N] bool or uint8, None for all. grads: name -> [N, ...], by default each .grad.
 
         Tensors without a gradient are not updated; the global step count increases by one for all. Returns how many

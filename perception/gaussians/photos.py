@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from perception.errors import InputError
-from perception.gaussians.train import TrainingView
+from perception.gaussians.views import TrainingView
 from perception.io.memory import Keep
 from perception.masks.label_images import load_labels
 from perception.photos.decode import load_photo, scaled_K

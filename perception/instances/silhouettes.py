@@ -10,7 +10,8 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.rasterize import Settings, label_images
+from perception.gaussians.rasterize import rasterizer_for
+from perception.gaussians.rasterizer.types import Settings
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ def render_silhouettes(
     """
     inputs = gaussians.inputs(camera_from_world, K)
     owners = np.stack([np.asarray(ids, np.int32) for ids in levels])
+    label_images = rasterizer_for(gaussians.means.device).label_images
     images, visible = label_images(inputs, owners, threshold, Settings(width, height, depth=False, eps2d=eps2d))
     found = []
     for ids, image in zip(owners, images, strict=True):

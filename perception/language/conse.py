@@ -59,7 +59,7 @@ class ConseEncoder:
         """RGB uint8 [H, W, 3] images → float32 [n, 1384], unit rows. Images are resized to 260², so use square ones."""
         import torch
 
-        from perception.gaussians.rasterize import torch_on_one_thread
+        from perception.gaussians.rasterizer.cpu import torch_on_one_thread
 
         check_images(images)
         if not images:

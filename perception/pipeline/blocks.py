@@ -22,7 +22,7 @@ from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians
 from perception.gaussians.nearby import Nearby
 from perception.gaussians.size import sized
-from perception.gaussians.train import TrainRecord
+from perception.gaussians.state import TrainRecord
 from perception.geometry import camera_centres
 from perception.io.atomic import writing
 from perception.masks import make_source

@@ -14,7 +14,7 @@ from perception import _core
 from perception.boxes import instance_entry
 from perception.gaussians.model import Gaussians
 from perception.gaussians.nearby import Nearby
-from perception.gaussians.train import TrainingView
+from perception.gaussians.views import TrainingView
 from perception.instances.crops import choose_views, view_scores
 from perception.instances.describe import describe_instances
 from perception.instances.group import Grouping, group

@@ -1,0 +1,139 @@
+"""Both passes on the CPU: the torch side of the compiled kernels (csrc/rasterizer). No autograd."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from perception import _core
+from perception.errors import InputError
+from perception.gaussians.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
+
+simd_levels = _core.simd_levels
+"""The SIMD levels this processor supports, best first."""
+
+_threads: ContextVar[int] = ContextVar("threads", default=0)
+
+
+@contextmanager
+def torch_on_one_thread() -> Iterator[None]:
+    """Within it torch computes on one thread, and the rasterizer by default on as many as torch had before.
+
+    Idle workers of torch's OpenMP pool busy-wait for milliseconds, on processors that the rasterizer's threads need.
+    With two threads on two processors that others use as well, a training step took four times the CPU time.
+    """
+    before = torch.get_num_threads()
+    token = _threads.set(_threads.get() or before)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        _threads.reset(token)
+
+
+def _compiled(name: str, tensor: Tensor) -> Any:
+    """The compiled function or struct for the tensor's dtype."""
+    return getattr(_core, f"{name}_{'f64' if tensor.dtype == torch.float64 else 'f32'}")
+
+
+def _numpy(tensor: Tensor | None) -> Any:
+    """The tensor's memory as numpy, without a copy; None stays None."""
+    return None if tensor is None else tensor.detach().numpy()
+
+
+def _inputs(inputs: Inputs, settings: Settings) -> Any:
+    return _compiled("RasterizerInputs", inputs.means)(
+        means=_numpy(inputs.means),
+        quats=_numpy(inputs.quats),
+        scales=_numpy(inputs.scales),
+        opacities=_numpy(inputs.opacities),
+        colors=_numpy(inputs.colors),
+        features=_numpy(inputs.features),
+        viewmats=_numpy(inputs.viewmats),
+        Ks=_numpy(inputs.Ks),
+        background=_numpy(inputs.background),
+        width=settings.width,
+        height=settings.height,
+        sh_degree=settings.sh_degree,
+        near_plane=settings.near_plane,
+        eps2d=settings.eps2d,
+        threads=settings.threads or _threads.get() or torch.get_num_threads(),
+        depth=settings.depth,
+        variance=settings.variance,
+        max_records=settings.max_records,
+    )
+
+
+def _images(kind: str, of: Forward | Cotangents, like: Tensor) -> Any:
+    return _compiled(kind, like)(
+        colors=_numpy(of.colors),
+        alphas=_numpy(of.alphas),
+        depths=_numpy(of.depths),
+        features=_numpy(of.features),
+        variance=_numpy(of.feature_variance),
+    )
+
+
+def rasterize_forward(inputs: Inputs, settings: Settings) -> Forward:
+    """One forward pass. InputError names a value that is not finite."""
+    out = Forward.empty(inputs, settings)
+    images = _images("RasterizerImages", out, out.colors)
+    run = _compiled("rasterize_forward", out.colors)
+    try:
+        out.frames = run(_inputs(inputs, settings), images, _numpy(out.visible), _numpy(out.radii), settings.simd)
+    except ValueError as error:
+        raise InputError(f"rasterize: {error}") from None
+    return out
+
+
+def rasterize_backward(
+    inputs: Inputs,
+    settings: Settings,
+    forward: Forward,
+    cotangents: Cotangents,
+    gradients: Gradients,
+    stored: bool = False,
+) -> None:
+    """One backward pass: adds to `gradients`, where they are wanted. That of features alone takes less time.
+
+    stored: for one camera, `gradients` are written instead, for visible Gaussians only. Those of scales and opacities
+    are then with respect to their logarithms and logits.
+    """
+    means = inputs.means
+    of_inputs = _compiled("RasterizerGradients", means)(
+        means=_numpy(gradients.means),
+        quats=_numpy(gradients.quats),
+        scales=_numpy(gradients.scales),
+        opacities=_numpy(gradients.opacities),
+        colors=_numpy(gradients.colors),
+        features=_numpy(gradients.features),
+        viewmats=_numpy(gradients.viewmats),
+        mean2d=_numpy(gradients.mean2d),
+    )
+    images, of_images = _images("RasterizerImages", forward, means), _images("RasterizerCotangents", cotangents, means)
+    run = _compiled("rasterize_backward", means)
+    run(_inputs(inputs, settings), forward.frames, images, of_images, of_inputs, stored)
+
+
+def label_images(inputs: Inputs, labels: np.ndarray, least: float, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
+    """For each of up to 8 labellings, the label with the largest weight in every pixel of one camera (C = 1).
+
+    labels [L, N] int32, −1 = none, < 2^24. A label's weight in a pixel is the sum of alpha · transmittance over its
+    Gaussians. Of equal weights the smaller label wins. Returns images [L, H, W] int32, −1 where no weight exceeds
+    `least`, and [N] bool: whether each Gaussian contributes to some pixel.
+    """
+    images = np.empty((len(labels), settings.height, settings.width), np.int32)
+    visible = np.zeros(len(inputs.means), np.uint8)
+    run = _compiled("rasterize_labels", inputs.means)
+    try:
+        run(_inputs(inputs, settings), np.ascontiguousarray(labels), least, images, visible, settings.simd)
+    except ValueError as error:
+        raise InputError(f"rasterize: {error}") from None
+    return images, visible.view(bool)
