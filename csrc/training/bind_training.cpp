@@ -131,16 +131,15 @@ double separation(In<double, 2> points, double margin, Out<double, 2> gradient) 
   return pt::separation(points.data(), points.shape(0), points.shape(1), margin, gradient.data());
 }
 
-void add_statistics(In<float, 2> mean2d, In<float, 1> radii, In<uint8_t, 1> visible, Out<float, 1> gradient,
-                    Out<float, 1> seen, Out<float, 1> radius, double gradient_scale, double radius_scale,
-                    int threads) {
-  require_aligned("mean2d", mean2d, "radii", radii, "gradient", gradient, "seen", seen, "radius", radius);
-  require(mean2d.shape(0) == radii.shape(0) && mean2d.shape(1) == 2 && same_shape(radii, visible) &&
-              same_shape(radii, gradient) && same_shape(radii, seen) && same_shape(radii, radius),
-          "mean2d, visible, gradient, seen, radius: expected [N, 2] and [N] of radii [N]");
+void add_statistics(In<float, 2> mean2d, In<uint8_t, 1> visible, Out<float, 1> gradient, Out<float, 1> seen,
+                    double scale, int threads) {
+  require_aligned("mean2d", mean2d, "gradient", gradient, "seen", seen);
+  require(mean2d.shape(0) == visible.shape(0) && mean2d.shape(1) == 2 && same_shape(visible, gradient) &&
+              same_shape(visible, seen),
+          "mean2d, gradient, seen: expected [N, 2] and [N] of visible [N]");
   nb::gil_scoped_release release;
-  pt::add_statistics({mean2d.data(), radii.data(), visible.data(), gradient.data(), seen.data(), radius.data(),
-                      static_cast<int64_t>(radii.size()), float(gradient_scale), float(radius_scale)},
+  pt::add_statistics({mean2d.data(), visible.data(), gradient.data(), seen.data(), static_cast<int64_t>(seen.size()),
+                      static_cast<float>(scale)},
                      threads);
 }
 
@@ -160,7 +159,7 @@ void scale(In<T, 1> values, double factor, Out<T, 1> out, int threads) {
 }
 
 template <class T>
-auto adam(Out<T, 2> param, In<T, 2> grad, Out<T, 2> first, Out<T, 2> second, std::optional<In<uint8_t, 1>> visible,
+int64_t adam(Out<T, 2> param, In<T, 2> grad, Out<T, 2> first, Out<T, 2> second, std::optional<In<uint8_t, 1>> visible,
           In<double, 1> rate, int64_t step, double beta1, double beta2, double eps, int threads,
           const std::string &level) {
   require_aligned("param", param, "grad", grad, "first", first, "second", second, "rate", rate);
@@ -168,16 +167,12 @@ auto adam(Out<T, 2> param, In<T, 2> grad, Out<T, 2> first, Out<T, 2> second, std
           "grad, first, second: expected the shape of param");
   require(!visible || visible->shape(0) == param.shape(0), "visible: expected [N] of param [N, K]");
   require(rate.shape(0) == param.shape(1) && step >= 1, "rate, step: expected [K] of param [N, K], and 1 or more");
-  pt::AdamResult result;
-  {
-    nb::gil_scoped_release release;
-    result = pt::adam(
-        pt::AdamArguments<T>{param.data(), first.data(), second.data(), grad.data(),
-                             visible ? visible->data() : nullptr, rate.data(), static_cast<int64_t>(param.shape(0)),
-                             static_cast<int64_t>(param.shape(1)), step, beta1, beta2, eps},
-        {threads, parse_level(level)});
-  }
-  return nb::make_tuple(result.updated, result.skipped);
+  nb::gil_scoped_release release;
+  return pt::adam(
+      pt::AdamArguments<T>{param.data(), first.data(), second.data(), grad.data(),
+                           visible ? visible->data() : nullptr, rate.data(), static_cast<int64_t>(param.shape(0)),
+                           static_cast<int64_t>(param.shape(1)), step, beta1, beta2, eps},
+      {threads, parse_level(level)});
 }
 
 template <class T>
@@ -197,7 +192,7 @@ void bind_precision(nb::module_ &m) {
   m.def("scale", &scale<T>, arg("values"), "factor"_a, arg("out"), "threads"_a = 0, "out = factor * values.");
   m.def("adam", &adam<T>, arg("param"), arg("grad"), arg("first"), arg("second"), arg("visible").none(), arg("rate"),
         "step"_a, "beta1"_a, "beta2"_a, "eps"_a, "threads"_a = 0, "level"_a = "auto",
-        "One Adam step in place on the visible rows; (rows updated, rows skipped for a non-finite gradient).");
+        "One Adam step in place on the visible rows; the number of rows skipped for a non-finite gradient.");
 }
 
 }  // namespace
@@ -210,10 +205,9 @@ void bind_training(nb::module_ &parent) {
         "(ids, counts, first pixel) of the labels in use; slots gets each pixel's index into ids, or -1.");
   m.def("separation", &separation, nb::arg("points").noconvert(), "margin"_a, nb::arg("gradient").noconvert(),
         "Mean relu(margin - squared distance) over the pairs of points [M, D], and its gradient.");
-  m.def("add_statistics", &add_statistics, nb::arg("mean2d").noconvert(), nb::arg("radii").noconvert(),
-        nb::arg("visible").noconvert(), nb::arg("gradient").noconvert(), nb::arg("seen").noconvert(),
-        nb::arg("radius").noconvert(), "gradient_scale"_a, "radius_scale"_a, "threads"_a = 0,
-        "Adds one view, where visible: |mean2d| to gradient, 1 to seen; radius becomes the larger one.");
+  m.def("add_statistics", &add_statistics, nb::arg("mean2d").noconvert(), nb::arg("visible").noconvert(),
+        nb::arg("gradient").noconvert(), nb::arg("seen").noconvert(), "scale"_a, "threads"_a = 0,
+        "Adds one view, where visible: scale |mean2d| to gradient, 1 to seen.");
   bind_precision<float>(m);
   bind_precision<double>(m);
 }

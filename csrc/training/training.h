@@ -64,14 +64,14 @@ void spread(const LabelledFeatures<T> &, const double *means, const double *pull
 // Mean over pairs i < j of relu(margin - |p_i - p_j|^2) of points [rows, width]; its gradient is written. No pair: 0.
 double separation(const double *points, int64_t rows, int64_t width, double margin, double *gradient);
 
-// Adds one view to the statistics of `rows` Gaussians, where visible: gradient += gradient_scale |mean2d|, seen += 1,
-// radius = max(radius, radius_scale radii). mean2d [rows, 2], all others [rows].
+// Adds one view to the statistics of `rows` Gaussians, where visible: gradient += scale |mean2d|, seen += 1.
+// mean2d [rows, 2], all others [rows].
 struct StatisticsArguments {
-  const float *mean2d, *radii;
+  const float *mean2d;
   const uint8_t *visible;
-  float *gradient, *seen, *radius;
+  float *gradient, *seen;
   int64_t rows;
-  float gradient_scale, radius_scale;
+  float scale;
 };
 void add_statistics(const StatisticsArguments &, int threads);
 
@@ -81,10 +81,6 @@ double sum(const T *values, int64_t n, bool squared, const Execution &);
 // out = factor values; out may be values.
 template <class T>
 void scale(const T *values, int64_t n, double factor, T *out, const Execution &);
-
-struct AdamResult {
-  int64_t updated, skipped;  // rows
-};
 
 template <class T>
 struct AdamArguments {
@@ -96,7 +92,8 @@ struct AdamArguments {
   double beta1, beta2, eps;
 };
 
+// Returns the number of rows skipped for a gradient that is not finite.
 template <class T>
-AdamResult adam(const AdamArguments<T> &, const Execution &);
+int64_t adam(const AdamArguments<T> &, const Execution &);
 
 }  // namespace perception::training

@@ -166,7 +166,7 @@ class TrainingState:
 
         The gradients' memory is kept from step to step: rows that a step does not see hold old values, not read.
         """
-        self.gaussians = Gaussians(**{name: tensor.detach() for name, tensor in self.optimiser.params.items()})
+        self.gaussians = Gaussians(**self.optimiser.params)
         g = self.gaussians
         self.gradients = Gradients(
             means=torch.zeros_like(g.means),
@@ -186,7 +186,7 @@ class TrainingState:
             "iteration": self.iteration,
             "initial_count": self.initial_count,
             "optimiser": self.optimiser.state_dict(copy),
-            "statistics": {name: tensor.cpu() for name, tensor in self.statistics.named().items()},
+            "statistics": {"gradient": self.statistics.gradient.cpu(), "seen": self.statistics.seen.cpu()},
             "record": asdict(self.record) | {"seconds": self.elapsed, "iterations": self.iteration},
             "stopping": asdict(self.stopping),
             "skipped": self.skipped,
@@ -199,8 +199,8 @@ class TrainingState:
         self.optimiser = SparseAdam(self.gaussians.named(), self.rates(0.0))
         self.optimiser.load_state_dict(state["optimiser"])
         self._sync()
-        sums = {name: tensor.to(self.device) for name, tensor in state["statistics"].items()}
-        self.statistics = Statistics(**sums)
+        gradient, seen = (state["statistics"][name].to(self.device) for name in ("gradient", "seen"))
+        self.statistics = Statistics(gradient, seen)
         self.record = TrainRecord(**state["record"])
         self.iteration, self.initial_count = state["iteration"], state["initial_count"]
         self.stopping = EarlyStopping(**state["stopping"])

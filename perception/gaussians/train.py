@@ -142,7 +142,7 @@ class Trainer(TrainingState):
         if schedule.grows_at(self, progress):
             with self.record.timed("densification"):
                 assert gradients.mean2d is not None  # for the type checker
-                self.statistics.add(gradients.mean2d[0], out.radii[0], out.visible[0], max(height, width))
+                self.statistics.add(gradients.mean2d[0], out.visible[0], max(height, width))
         self.record.pairs += out.frames.contributing
         self.iteration += 1
         return float(loss)

@@ -183,9 +183,8 @@ def _separation(dice: Dice) -> Call:
 def _add_statistics(dice: Dice) -> Call:
     n = dice.pick((5, 1, 0))
     return _core.training.add_statistics, {
-        "mean2d": normal(dice, (n, 2), np.float32), "radii": normal(dice, (n,), np.float32),
-        "visible": np.ones(n, np.uint8), **{name: guarded((n,), np.float32) for name in ("gradient", "seen", "radius")},
-        "gradient_scale": 2.0, "radius_scale": 0.5,
+        "mean2d": normal(dice, (n, 2), np.float32), "visible": np.ones(n, np.uint8),
+        "gradient": guarded((n,), np.float32), "seen": guarded((n,), np.float32), "scale": 2.0,
     }  # fmt: skip
 
 
