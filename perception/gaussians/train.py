@@ -23,7 +23,7 @@ from perception.gaussians import schedule
 from perception.gaussians.losses import depth_loss, instance_loss, photometric, variance_loss
 from perception.gaussians.rasterize import rasterizer_for
 from perception.gaussians.rasterizer.cpu import torch_on_one_thread
-from perception.gaussians.rasterizer.types import Cotangents, Forward, Inputs, Settings
+from perception.gaussians.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 from perception.gaussians.state import TrainingState, TrainRecord
 from perception.gaussians.views import TrainingView, target_photo
 from perception.interrupts import uninterrupted
@@ -102,26 +102,18 @@ class Trainer(TrainingState):
         chosen, with_features = schedule.next_view(self, progress)
         view = self.placed(chosen)
         height, width = view.photo.shape[:2]
-        g, measured = self.gaussians, view.depth is not None
         settings = Settings(
-            width, height, g.sh_degree, eps2d=view.eps2d, variance=with_features, depth=measured,
+            width,
+            height,
+            sh_degree=self.gaussians.sh_degree,
+            eps2d=view.eps2d,
+            variance=with_features,
+            depth=view.depth is not None,
             max_records=self._max_records,
-        )  # fmt: skip
-        # On a random background colour, so that an empty region cannot fit the photo.
-        colors = np.random.default_rng([self.config.seed, self.iteration, 1]).random((1, 3), dtype=np.float32)
+        )
         rasterizer = rasterizer_for(self.device)
         with self.record.timed("rasterizer forward"):
-            inputs = Inputs(
-                means=g.means,
-                quats=g.quats,
-                scales=g.scales,
-                opacities=g.opacities,
-                colors=g.sh,
-                viewmats=view.camera_from_world[None],
-                Ks=view.K[None],
-                features=g.features if with_features else None,
-                background=torch.from_numpy(colors).to(self.device),
-            )
+            inputs = self._inputs(view, with_features)
             out = rasterizer.rasterize_forward(inputs, settings)  # I (eq. 3), F (eq. 5) and Var F (eq. 12)
         with self.record.timed("losses"):
             loss, cotangents = self._losses(view, out)
@@ -129,16 +121,7 @@ class Trainer(TrainingState):
             gradients = self.gradients if with_features else replace(self.gradients, features=None)
             rasterizer.rasterize_backward(inputs, settings, out, cotangents, gradients, stored=True)
         with self.record.timed("Adam"):
-            self.optimiser.rates = self.rates(progress)
-            of_parameters = {
-                "means": gradients.means,
-                "quats": gradients.quats,
-                "log_scales": gradients.scales,
-                "opacity_logits": gradients.opacities,
-                "sh": gradients.colors,
-                "features": gradients.features,
-            }
-            self.record.skipped_gradients += int(sum(self.optimiser.step(out.visible[0], of_parameters).values()))
+            self._update(progress, gradients, out.visible[0])
         if schedule.grows_at(self, progress):
             with self.record.timed("densification"):
                 assert gradients.mean2d is not None  # for the type checker
@@ -146,6 +129,38 @@ class Trainer(TrainingState):
         self.record.pairs += out.frames.contributing
         self.iteration += 1
         return float(loss)
+
+    def _inputs(self, view: TrainingView, with_features: bool) -> Inputs:
+        g = self.gaussians
+        # A random background colour, so that an empty region cannot fit the photo.
+        background = np.random.default_rng([self.config.seed, self.iteration, 1]).random((1, 3), dtype=np.float32)
+        return Inputs(
+            means=g.means,
+            quats=g.quats,
+            scales=g.scales,
+            opacities=g.opacities,
+            colors=g.sh,
+            viewmats=view.camera_from_world[None],
+            Ks=view.K[None],
+            features=g.features if with_features else None,
+            background=torch.from_numpy(background).to(self.device),
+        )
+
+    def _update(self, progress: float, gradients: Gradients, visible: torch.Tensor) -> None:
+        """One step of Adam, for the visible Gaussians."""
+        self.optimiser.rates = self.rates(progress)
+        skipped = self.optimiser.step(
+            visible,
+            {
+                "means": gradients.means,
+                "quats": gradients.quats,
+                "log_scales": gradients.scales,
+                "opacity_logits": gradients.opacities,
+                "sh": gradients.colors,
+                "features": gradients.features,
+            },
+        )
+        self.record.skipped_gradients += int(sum(skipped.values()))
 
     def _losses(self, view: TrainingView, out: Forward) -> tuple[float, Cotangents]:
         """L (eq. 14) and its gradients with respect to the images."""

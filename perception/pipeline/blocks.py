@@ -232,7 +232,7 @@ def optimise_block(folder: str, progress: Progress | None = None) -> None:
         source, box = make_source(config.masks, config.sam), np.array(facts["box"])
         nearby, record, _ = optimise(run, scene, photos, source, box)
         gaussians = nearby.gaussians.to("cpu")
-        state = {"gaussians": {name: tensor.contiguous() for name, tensor in vars(gaussians).items()}}
+        state = {"gaussians": {name: tensor.contiguous() for name, tensor in gaussians.named().items()}}
         save_checkpoint(home / RESULT, {**state, "record": asdict(record)}, home.name)
         for name in (CHECKPOINT, BEFORE_MASKS):
             (home / name).unlink(missing_ok=True)
