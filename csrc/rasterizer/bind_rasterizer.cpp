@@ -255,11 +255,11 @@ void bind(nb::module_ &m, const char *suffix) {
            "eps2d"_a, "threads"_a, "depth"_a, "variance"_a, "max_records"_a);
   nb::class_<Images<T>>(m, name("RasterizerImages").c_str())
       .def(nb::init<Array<T>, Array<T>, Optional<T>, Optional<T>, Optional<T>>(), arg("colors"), arg("alphas"),
-           arg("depths").none(), arg("features").none(), arg("variance").none());
+           arg("depths").none(), arg("features").none(), arg("feature_variance").none());
   nb::class_<Cotangents<T>>(m, name("RasterizerCotangents").c_str())
       .def(nb::init<Optional<const T>, Optional<const T>, Optional<const T>, Optional<const T>, Optional<const T>>(),
            arg("colors").none(), arg("alphas").none(), arg("depths").none(), arg("features").none(),
-           arg("variance").none());
+           arg("feature_variance").none());
   nb::class_<Gradients<T>>(m, name("RasterizerGradients").c_str())
       .def(nb::init<Optional<T>, Optional<T>, Optional<T>, Optional<T>, Optional<T>, Optional<T>, Optional<T>,
                     Optional<T>>(),

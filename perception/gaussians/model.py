@@ -21,6 +21,17 @@ def sigmoid(logits: torch.Tensor) -> torch.Tensor:
     return 1 / (1 + torch.exp(-logits.clamp(-80, 80)))
 
 
+STORED = {
+    "means": "means",
+    "quats": "quats",
+    "scales": "log_scales",
+    "opacities": "opacity_logits",
+    "colors": "sh",
+    "features": "features",
+}
+"""The tensors of the rasterizer's inputs -> those of `Gaussians` that they are made of."""
+
+
 @dataclass
 class Gaussians:
     """N Gaussians in the world frame, float32.
@@ -41,14 +52,7 @@ class Gaussians:
 
     def named(self) -> dict[str, torch.Tensor]:
         """The tensors by name: what is optimised, and what a checkpoint holds."""
-        return {
-            "means": self.means,
-            "quats": self.quats,
-            "log_scales": self.log_scales,
-            "opacity_logits": self.opacity_logits,
-            "sh": self.sh,
-            "features": self.features,
-        }
+        return {name: getattr(self, name) for name in STORED.values()}
 
     def to(self, device: torch.device | str) -> Gaussians:
         """The same Gaussians on `device`; tensors that are there already are not copied."""

@@ -63,21 +63,17 @@ def rasterizer_for(device: torch.device) -> ModuleType:
     return on_device
 
 
-# The tensors of `Inputs` and the images of `Forward`, in the order in which autograd is given them.
-_INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "features", "background")
-_IMAGES = ("colors", "alphas", "depths", "features", "feature_variance")
-
-
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, settings: Settings, stats: RasterizationStats, *tensors: Tensor | None) -> Any:
+        """tensors: those of `Inputs.NAMES`, in that order, as autograd takes no names."""
         contiguous = [None if t is None else t.detach().contiguous() for t in tensors]
-        inputs = Inputs(**dict(zip(_INPUTS, contiguous, strict=True)))  # type: ignore[arg-type]
+        inputs = Inputs(**dict(zip(Inputs.NAMES, contiguous, strict=True)))  # type: ignore[arg-type]
         out = rasterizer_for(inputs.means.device).rasterize_forward(inputs, settings)
         stats.radii = out.radii
         stats.evaluated_pairs, stats.contributing_pairs = out.frames.evaluated, out.frames.contributing
         stats.seconds = out.frames.seconds
-        images = [getattr(out, name) for name in _IMAGES]
+        images = [getattr(out, name) for name in Forward.IMAGES]
         ctx.settings, ctx.stats = settings, stats
         if any(ctx.needs_input_grad):
             ctx.frames = out.frames
@@ -90,13 +86,13 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor | None) -> Any:
         saved = ctx.saved_tensors
-        inputs = Inputs(**dict(zip(_INPUTS, saved[: len(_INPUTS)], strict=True)))
-        images = dict(zip(_IMAGES, saved[len(_INPUTS) :], strict=True))
+        inputs = Inputs(**dict(zip(Inputs.NAMES, saved[: len(Inputs.NAMES)], strict=True)))
+        images = dict(zip(Forward.IMAGES, saved[len(Inputs.NAMES) :], strict=True))
         none = inputs.means.new_empty(0)
         state = Forward(**images, visible=none, radii=none, frames=ctx.frames)
-        given = [None if g is None else g.contiguous() for g in cotangents[: len(_IMAGES)]]
-        of_images = Cotangents(**dict(zip(_IMAGES, given, strict=True)))
-        wanted = {name for name, is_wanted in zip(_INPUTS, ctx.needs_input_grad[2:], strict=True) if is_wanted}
+        given = [None if g is None else g.contiguous() for g in cotangents[: len(Forward.IMAGES)]]
+        of_images = Cotangents(**dict(zip(Forward.IMAGES, given, strict=True)))
+        wanted = {name for name, is_wanted in zip(Inputs.NAMES, ctx.needs_input_grad[2:], strict=True) if is_wanted}
         of_inputs = wanted - {"background", "Ks"}
         gradients = Gradients.zeros(inputs, of_inputs if of_inputs == {"features"} else of_inputs | {"mean2d"})
         rasterizer_for(inputs.means.device).rasterize_backward(inputs, ctx.settings, state, of_images, gradients)
@@ -106,7 +102,7 @@ class _Rasterize(torch.autograd.Function):
         if "background" in wanted and of_images.colors is not None:
             shade = (of_images.colors * (1 - state.alphas)[..., None]).sum(dim=(1, 2))
         found = {name: getattr(gradients, name) for name in of_inputs} | {"background": shade}
-        return (None, None, *(found.get(name) for name in _INPUTS))
+        return (None, None, *(found.get(name) for name in Inputs.NAMES))
 
 
 def rasterize(
@@ -159,7 +155,7 @@ def rasterize(
     )  # fmt: skip
     stats = RasterizationStats(radii=means.new_zeros((0,)))
     tensors["background"] = background
-    out = _Rasterize.apply(settings, stats, *(tensors[name] for name in _INPUTS))
+    out = _Rasterize.apply(settings, stats, *(tensors[name] for name in Inputs.NAMES))
     return Rasterization(*out, stats=stats)  # type: ignore[misc]
 
 

@@ -15,7 +15,7 @@ from perception.config import MapConfig
 from perception.gaussians.densify import Statistics
 from perception.gaussians.early_stopping import EarlyStopping
 from perception.gaussians.losses import LabelAssignment, assign_labels
-from perception.gaussians.model import Gaussians
+from perception.gaussians.model import STORED, Gaussians
 from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.rasterizer.types import Gradients
 from perception.gaussians.rates import learning_rates
@@ -167,16 +167,8 @@ class TrainingState:
         The gradients' memory is kept from step to step: rows that a step does not see hold old values, not read.
         """
         self.gaussians = Gaussians(**self.optimiser.params)
-        g = self.gaussians
-        self.gradients = Gradients(
-            means=torch.zeros_like(g.means),
-            quats=torch.zeros_like(g.quats),
-            scales=torch.zeros_like(g.log_scales),
-            opacities=torch.zeros_like(g.opacity_logits),
-            colors=torch.zeros_like(g.sh),
-            features=torch.zeros_like(g.features),
-            mean2d=g.means.new_zeros(1, len(g), 2),
-        )
+        zeros = {name: torch.zeros_like(self.optimiser.params[stored]) for name, stored in STORED.items()}
+        self.gradients = Gradients(**zeros, mean2d=self.gaussians.means.new_zeros(1, len(self.gaussians), 2))
 
     # -------------------------------------------------------------- checkpoint
 

@@ -21,6 +21,7 @@ import torch
 from perception.errors import InputError
 from perception.gaussians import schedule
 from perception.gaussians.losses import depth_loss, instance_loss, photometric, variance_loss
+from perception.gaussians.model import STORED
 from perception.gaussians.rasterize import rasterizer_for
 from perception.gaussians.rasterizer.cpu import torch_on_one_thread
 from perception.gaussians.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
@@ -149,18 +150,8 @@ class Trainer(TrainingState):
     def _update(self, progress: float, gradients: Gradients, visible: torch.Tensor) -> None:
         """One step of Adam, for the visible Gaussians."""
         self.optimiser.rates = self.rates(progress)
-        skipped = self.optimiser.step(
-            visible,
-            {
-                "means": gradients.means,
-                "quats": gradients.quats,
-                "log_scales": gradients.scales,
-                "opacity_logits": gradients.opacities,
-                "sh": gradients.colors,
-                "features": gradients.features,
-            },
-        )
-        self.record.skipped_gradients += int(sum(skipped.values()))
+        of_stored = {stored: getattr(gradients, name) for name, stored in STORED.items()}
+        self.record.skipped_gradients += int(sum(self.optimiser.step(visible, of_stored).values()))
 
     def _losses(self, view: TrainingView, out: Forward) -> tuple[float, Cotangents]:
         """L (eq. 14) and its gradients with respect to the images."""

@@ -81,7 +81,7 @@ def _images(cameras: int, size: tuple[int, int], dims: int, dtype: Any) -> dict[
     return {
         "colors": guarded((*image, 3), dtype), "alphas": guarded(image, dtype), "depths": guarded(image, dtype),
         "features": guarded((*image, dims), dtype) if dims else None,
-        "variance": guarded((*image, dims), dtype) if dims else None,
+        "feature_variance": guarded((*image, dims), dtype) if dims else None,
     }  # fmt: skip
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -43,51 +44,27 @@ def _compiled(name: str, tensor: Tensor) -> Any:
     return getattr(_core, f"{name}_{'f64' if tensor.dtype == torch.float64 else 'f32'}")
 
 
-def _numpy(tensor: Tensor | None) -> Any:
-    """The tensor's memory as numpy, without a copy; None stays None."""
-    return None if tensor is None else tensor.detach().numpy()
+def _arrays(of: Any, names: Iterable[str]) -> dict[str, Any]:
+    """These tensors of `of` as numpy, without a copy; None stays None."""
+    tensors = {name: getattr(of, name) for name in names}
+    return {name: None if tensor is None else tensor.detach().numpy() for name, tensor in tensors.items()}
 
 
 def _inputs(inputs: Inputs, settings: Settings) -> Any:
-    return _compiled("RasterizerInputs", inputs.means)(
-        means=_numpy(inputs.means),
-        quats=_numpy(inputs.quats),
-        scales=_numpy(inputs.scales),
-        opacities=_numpy(inputs.opacities),
-        colors=_numpy(inputs.colors),
-        features=_numpy(inputs.features),
-        viewmats=_numpy(inputs.viewmats),
-        Ks=_numpy(inputs.Ks),
-        background=_numpy(inputs.background),
-        width=settings.width,
-        height=settings.height,
-        sh_degree=settings.sh_degree,
-        near_plane=settings.near_plane,
-        eps2d=settings.eps2d,
-        threads=settings.threads or _threads.get() or torch.get_num_threads(),
-        depth=settings.depth,
-        variance=settings.variance,
-        max_records=settings.max_records,
-    )
-
-
-def _images(kind: str, of: Forward | Cotangents, like: Tensor) -> Any:
-    return _compiled(kind, like)(
-        colors=_numpy(of.colors),
-        alphas=_numpy(of.alphas),
-        depths=_numpy(of.depths),
-        features=_numpy(of.features),
-        variance=_numpy(of.feature_variance),
-    )
+    numbers = asdict(settings)
+    del numbers["simd"]
+    numbers["threads"] = settings.threads or _threads.get() or torch.get_num_threads()
+    return _compiled("RasterizerInputs", inputs.means)(**_arrays(inputs, Inputs.NAMES), **numbers)
 
 
 def rasterize_forward(inputs: Inputs, settings: Settings) -> Forward:
     """One forward pass. InputError names a value that is not finite."""
     out = Forward.empty(inputs, settings)
-    images = _images("RasterizerImages", out, out.colors)
+    images = _compiled("RasterizerImages", out.colors)(**_arrays(out, Forward.IMAGES))
+    more = _arrays(out, ("visible", "radii"))
     run = _compiled("rasterize_forward", out.colors)
     try:
-        out.frames = run(_inputs(inputs, settings), images, _numpy(out.visible), _numpy(out.radii), settings.simd)
+        out.frames = run(_inputs(inputs, settings), images, **more, simd=settings.simd)
     except ValueError as error:
         raise InputError(f"rasterize: {error}") from None
     return out
@@ -107,17 +84,9 @@ def rasterize_backward(
     are then with respect to their logarithms and logits.
     """
     means = inputs.means
-    of_inputs = _compiled("RasterizerGradients", means)(
-        means=_numpy(gradients.means),
-        quats=_numpy(gradients.quats),
-        scales=_numpy(gradients.scales),
-        opacities=_numpy(gradients.opacities),
-        colors=_numpy(gradients.colors),
-        features=_numpy(gradients.features),
-        viewmats=_numpy(gradients.viewmats),
-        mean2d=_numpy(gradients.mean2d),
-    )
-    images, of_images = _images("RasterizerImages", forward, means), _images("RasterizerCotangents", cotangents, means)
+    images = _compiled("RasterizerImages", means)(**_arrays(forward, Forward.IMAGES))
+    of_images = _compiled("RasterizerCotangents", means)(**_arrays(cotangents, Forward.IMAGES))
+    of_inputs = _compiled("RasterizerGradients", means)(**_arrays(gradients, Gradients.NAMES))
     run = _compiled("rasterize_backward", means)
     run(_inputs(inputs, settings), forward.frames, images, of_images, of_inputs, stored)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -109,23 +109,15 @@ class _Call:
         of, s = self.inputs, self.settings
         return _filled(
             SCENES[self.means.dtype],
-            means=of.means,
-            quats=of.quats,
-            scales=of.scales,
-            opacities=of.opacities,
-            colors=of.colors,
+            **{name: getattr(of, name) for name in _OF_GAUSSIANS if name != "features"},
+            **{name: getattr(s, name) for name in ("sh_degree", "width", "height", "near_plane", "eps2d")},
             features=None if of.features is None else of.features[:, begin:],
             viewmat=of.viewmats[camera],
             K=of.Ks[camera],
             background=None if of.background is None else of.background[camera],
             n=self.n,
-            sh_degree=s.sh_degree,
             sh_stride=of.colors.shape[1] if s.sh_degree >= 0 else 0,
             dims=self.dims,
-            width=s.width,
-            height=s.height,
-            near_plane=s.near_plane,
-            eps2d=s.eps2d,
         )
 
     def project(self, camera: int, radii: Tensor) -> list[_Strip]:
@@ -214,7 +206,7 @@ def rasterize_backward(
     """As `rasterizer.cpu.rasterize_backward`, on the tensors' device; with `stored`, `gradients` are written whole."""
     frames: Frames = forward.frames
     call, count = _Call(inputs, settings, frames.kernels_for), len(frames.views)
-    given = {field.name: getattr(gradients, field.name) for field in fields(gradients)}
+    given = {name: getattr(gradients, name) for name in Gradients.NAMES}
     if stored:
         for gradient in given.values():
             if gradient is not None:

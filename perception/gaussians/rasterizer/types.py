@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -35,6 +35,8 @@ class Settings:
 class Inputs:
     """N Gaussians and C cameras, as `perception.rasterize` takes them; contiguous, of one dtype, on one device."""
 
+    NAMES: ClassVar = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "features", "background")
+
     means: Tensor  # [N, 3]
     quats: Tensor  # [N, 4]
     scales: Tensor  # [N, 3]
@@ -49,6 +51,8 @@ class Inputs:
 @dataclass
 class Forward:
     """What a forward pass returns: images as in `Rasterization`, and what the backward pass needs (frames)."""
+
+    IMAGES: ClassVar = ("colors", "alphas", "depths", "features", "feature_variance")
 
     colors: Tensor
     alphas: Tensor
@@ -91,6 +95,8 @@ class Cotangents:
 @dataclass
 class Gradients:
     """dL/d(input) for each tensor of `Inputs` that has one, and for the 2D means in pixels; None: not wanted."""
+
+    NAMES: ClassVar = ("means", "quats", "scales", "opacities", "colors", "viewmats", "features", "mean2d")
 
     means: Tensor | None = None
     quats: Tensor | None = None
