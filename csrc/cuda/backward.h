@@ -73,7 +73,8 @@ static __device__ inline T weigh(const Splat &s, const SHARED(T) * features, con
   return cg;
 }
 
-// The sums of splat `lane % kGroup` over the granule (kSums, with u = dx + k dy), in a fixed order; all lanes of the splat return them.
+// The sums of splat `lane % kGroup` over the granule (kSums, with u = dx + k dy), in a fixed order; all lanes of the
+// splat return them.
 static __device__ inline void sum_pixels(const Splat &s, bool touched, const Pixel &p, const WarpMemory &memory,
                                          T *sums) {
   const int j = p.lane % kGroup, first = p.lane / kGroup * kPixels;

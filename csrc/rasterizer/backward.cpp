@@ -8,17 +8,17 @@
 //   g        dL/d(image) of a channel, its cotangent
 //   cg       Σ_channels g x, which is dL/dw
 //   R        Σ_{j>i} w_j cg_j, over the splats behind
-//   k        what multiplies A in the loss: dL/dA, and constants of the channels (below; the background gives -g)
+//   k        what multiplies A in the loss: dL/dA, -g background of each channel (T_final = 1 - A), and see below
 // Each w_j behind has a factor 1 - alpha, and dA/dalpha = T_final / (1 - alpha), so
 //   dL/dalpha = T cg - (R - k T_final) / (1 - alpha)
 //   h = dL/d ln alpha = w (cg - (R - k T_final) / T').
 // R - k T_final is one number a pixel, `behind`, and with T all that is kept, whatever the number of channels.
 //
-// Feature channels f with the sum S = Σ w f, its variance V = Σ w f² - S², and g = dL/dS, v = dL/dV: with any constant c
+// A feature channel f has the sum S = Σ w f, the variance V = Σ w f² - S², g = dL/dS and v = dL/dV. With any constant c
 // (here the features of the tile's first splat, so that large common offsets do not cancel) and e = f - c,
 //   dL/dw = g f + v (f² - 2 S f) = (g - 2 v (S - c)) e + v e² + c g + v (c² - 2 S c).
-// The first two terms are linear in e and e², which are channels with the cotangents g - 2 v (S - c) and v. The last two
-// are the same for all splats: they belong to k.
+// The first two terms are linear in e and e²: two channels, with the cotangents g - 2 v (S - c) and v. The last two are
+// the same for all splats and belong to k.
 #include "kernels.h"
 #include "matrix.h"
 #include "records.h"
@@ -151,8 +151,8 @@ void load_tile(const Pass<T> &pass, const TileList &list, Slice slice, const T *
       transpose<16, BackwardTile<T, NF, VAR>::kRow>(tile.by_pixel[g][0], tile.by_channel[g][0]);
 }
 
-// The sums over pixels that one splat gathers, a lane a pixel: numbers [0..9] of its record (records.h). With the
-// pixel's offset (dx, dy) from the splat's mean and u = dx + k dy (k of the splat, see Projected),
+// The sums over pixels that one splat gathers, a lane a pixel: numbers [0..9] of its record (records.h). With (dx, dy)
+// from the pixel's centre to the splat's mean and u = dx + k dy (k of the splat, see Projected),
 //   ln alpha = ln opacity - (u² / var_x + dy² / var_y) / 2,
 // so the gradients of mean, var_x, k and var_y are sums of h times u, dy and their products: see picture_gradient.
 template <class T, bool DEPTH>

@@ -21,8 +21,8 @@ struct Pass {
   const Inputs<T> &in;
   const Options &opt;
   int camera;
-  const Frame<T> &frame;   // the camera's splats and tiles
-  const Outputs<T> &out;   // written by the forward pass, read by the backward pass
+  const Frame<T> &frame;    // the camera's splats and tiles
+  const Outputs<T> &out;    // written by the forward pass, read by the backward pass
   Cotangents<T> grad = {};  // of the backward pass
 };
 

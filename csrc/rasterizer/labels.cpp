@@ -1,5 +1,5 @@
-// Every pixel's label of largest weight, for several labellings of the Gaussians at once. A label's weight in a pixel is
-// the sum of the weights of its Gaussians there, so one pass serves any number of labels.
+// Every pixel's label of largest weight, for several labellings of the Gaussians at once. A label's weight in a pixel
+// is the sum of the weights of its Gaussians there, so one pass serves any number of labels.
 #include "blend_list.h"
 #include "matrix.h"
 

@@ -24,11 +24,11 @@ bool sum_records(const Scratch<T> &scratch, uint32_t i, int size, T *sum) {
 // n Gaussians, a column each, and what project_vjp takes and gives.
 template <class T>
 struct GradientBlock {
-  alignas(64) T in[10][kBlock];       // mean [3], quaternion [4], scales [3]
-  alignas(64) T picture[6][kBlock];   // dL/d(x, y, z, cov_xx, cov_xy, cov_yy)
-  alignas(64) T out[10][kBlock];      // dL/d(in)
-  alignas(64) T camera[12][kBlock];   // dL/dR [9], dL/dt [3]
-  uint32_t splat[kBlock];             // index into Frame::splats
+  alignas(64) T in[10][kBlock];      // mean [3], quaternion [4], scales [3]
+  alignas(64) T picture[6][kBlock];  // dL/d(x, y, z, cov_xx, cov_xy, cov_yy)
+  alignas(64) T out[10][kBlock];     // dL/d(in)
+  alignas(64) T camera[12][kBlock];  // dL/dR [9], dL/dt [3]
+  uint32_t splat[kBlock];            // index into Frame::splats
   int n = 0;
 };
 
