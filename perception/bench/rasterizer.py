@@ -154,7 +154,7 @@ def _gsplat(inputs: dict[str, Any]) -> list[Tensor]:
 def cases(threads: Sequence[int], dtypes: Sequence[str], device: str = "cpu") -> list[Case]:
     """Every SIMD level × precision × {RGB, rich} × number of threads; float32 on the GPU."""
     from perception.gaussians.device import choose_device
-    from perception.gaussians.rasterize import simd_levels
+    from perception.gaussians.rasterizer.cpu import simd_levels
 
     both = (False, True)
     chosen = [Case(s, d, rich, t) for d in dtypes for rich in both for s in simd_levels() for t in threads]

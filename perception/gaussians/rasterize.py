@@ -1,23 +1,22 @@
-"""Differentiable rasterization of 3D Gaussians: the torch side of the compiled kernels of the CPU.
+"""Differentiable rasterization of 3D Gaussians.
 
 Follows the 3DGS equations: 2D covariance J R Σ Rᵀ Jᵀ + 0.3 px² I, alpha = min(0.999, o·exp(−½ dᵀ Σ⁻¹ d)),
 contributions under 1/255 skipped, front to back by depth (equal depths by index), stop before the
-transmittance falls under 1e-4. Tensors on a CUDA device go to perception/gaussians/cuda.
+transmittance falls under 1e-4. rasterizer/cpu.py computes both passes on the CPU, rasterizer/device.py on a GPU.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from types import ModuleType
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from perception import _core
 from perception.errors import InputError
-from perception.machine import threads_before
+from perception.gaussians.rasterizer import cpu
+from perception.gaussians.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 
 
 @dataclass
@@ -52,198 +51,33 @@ class Rasterization:
     stats: RasterizationStats
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Rasterization settings. simd: "auto", "avx512", "avx2" or "baseline"; threads: 0 for torch's number.
-
-    max_records: most gradient records (one per Gaussian and 64 × 64-pixel tile, 4 (16 + D) bytes in float32) held at
-    once. The backward pass processes larger images in parts. 0: four per visible Gaussian, at least 2**20. On a GPU
-    tiles have 16 × 16 pixels, and 0 means 2**24.
-    """
-
-    width: int
-    height: int
-    sh_degree: int = -1
-    near_plane: float = 0.01
-    eps2d: float = 0.3
-    variance: bool = True
-    depth: bool = True
-    threads: int = 0
-    simd: str = "auto"
-    max_records: int = 0
-
-
 _DEVICES = ("cpu", "cuda")
-simd_levels = _core.simd_levels
-"""The SIMD levels this processor supports, best first."""
 
 
-def _core_function(name: str, tensor: Tensor) -> Any:
-    return getattr(_core, f"{name}_{'f64' if tensor.dtype == torch.float64 else 'f32'}")
-
-
-def _numpy(tensor: Tensor | None) -> Any:
-    """The tensor's memory as numpy, without a copy; None stays None."""
-    return None if tensor is None else tensor.detach().numpy()
-
-
-@dataclass
-class Forward:
-    """Result of `rasterize_forward`: images, and what `rasterize_backward` needs (frames)."""
-
-    colors: Tensor
-    alphas: Tensor
-    depths: Tensor | None
-    features: Tensor | None
-    feature_variance: Tensor | None
-    visible: Tensor
-    radii: Tensor
-    frames: Any
-
-    @classmethod
-    def empty(cls, inputs: tuple[Tensor | None, ...], settings: Settings) -> Forward:
-        """Images to be written; Gaussians not visible, with radius 0."""
-        means, features, viewmats = inputs[0], inputs[5], inputs[6]
-        assert means is not None and viewmats is not None  # for the type checker
-        count, n = viewmats.shape[0], means.shape[0]
-        image = (count, settings.height, settings.width)
-        new = means.new_empty
-        dims = 0 if features is None else features.shape[1]
-        return cls(
-            colors=new((*image, 3)),
-            alphas=new(image),
-            depths=new(image) if settings.depth else None,
-            features=None if features is None else new((*image, dims)),
-            feature_variance=new((*image, dims)) if features is not None and settings.variance else None,
-            visible=means.new_zeros((count, n), dtype=torch.uint8),
-            radii=means.new_zeros((count, n)),
-            frames=None,
-        )
-
-
-def _core_inputs(inputs: tuple[Tensor | None, ...], background: Tensor | None, settings: Settings) -> Any:
-    means, quats, scales, opacities, colors, features, viewmats, ks = inputs
-    assert means is not None  # for the type checker
-    arrays = [_numpy(t) for t in (means, quats, scales, opacities, colors, features, viewmats, ks, background)]
-    return _core_function("RasterizerInputs", means)(
-        *arrays,
-        settings.width,
-        settings.height,
-        settings.sh_degree,
-        settings.near_plane,
-        settings.eps2d,
-        settings.threads or threads_before.get() or torch.get_num_threads(),
-        settings.depth,
-        settings.variance,
-        settings.max_records,
-    )
-
-
-def rasterize_forward(inputs: tuple[Tensor | None, ...], background: Tensor | None, settings: Settings) -> Forward:
-    """One forward pass, no autograd.
-
-    inputs: means [N,3], quats [N,4], scales [N,3], opacities [N], colors [N,3] or [N,K,3], features [N,D] or
-    None, viewmats [C,4,4], Ks [C,3,3]: contiguous CPU tensors of one dtype. background: [C,3] or None.
-    """
-    out = Forward.empty(inputs, settings)
-    images = (out.colors, out.alphas, out.depths, out.features, out.feature_variance, out.visible, out.radii)
-    try:
-        out.frames = _core_function("rasterize_forward", out.colors)(
-            _core_inputs(inputs, background, settings), *(_numpy(t) for t in images), settings.simd
-        )
-    except ValueError as error:
-        raise InputError(f"rasterize: {error}") from None
-    return out
-
-
-def label_images(
-    inputs: tuple[Tensor | None, ...], labels: np.ndarray, least: float, settings: Settings
-) -> tuple[np.ndarray, np.ndarray]:
-    """For each of up to 8 labellings, the label with the largest weight in every pixel of one camera (C = 1).
-
-    inputs: as for `rasterize_forward`. labels [L, N] int32, −1 = none, < 2^24. A label's weight in a pixel is the sum
-    of alpha · transmittance over its Gaussians. Of equal weights the smaller label wins. Returns images [L, H, W]
-    int32, −1 where no weight exceeds `least`, and [N] bool: whether each Gaussian contributes to some pixel.
-    """
-    means = inputs[0]
-    assert means is not None  # for the type checker
-    if means.device.type != "cpu":
-        from perception.gaussians.cuda import rasterize as on_device
-
-        return on_device.label_images(inputs, labels, least, settings)
-    images = np.empty((len(labels), settings.height, settings.width), np.int32)
-    visible = np.zeros(len(means), np.uint8)
-    core = _core_function("rasterize_labels", means)
-    try:
-        core(_core_inputs(inputs, None, settings), np.ascontiguousarray(labels), least, images, visible, settings.simd)
-    except ValueError as error:
-        raise InputError(f"rasterize: {error}") from None
-    return images, visible.view(bool)
-
-
-def rasterize_backward(
-    inputs: tuple[Tensor | None, ...],
-    background: Tensor | None,
-    settings: Settings,
-    forward: Forward,
-    cotangents: tuple[Tensor | None, ...],
-    wanted: tuple[bool, ...],
-    stored: list[Tensor | None] | None = None,
-) -> list[Tensor | None]:
-    """One backward pass, no autograd.
-
-    cotangents: dL/d colors, alphas, depths, features, feature_variance; None means zero. wanted: which of the
-    first seven inputs want a gradient. Returns those gradients and dL/d(2D mean) [C, N, 2] in pixels, None if `wanted`
-    names the features alone: this takes less time.
-    stored: such a list that the gradients of one camera are written to, for visible Gaussians only. Those of scales and
-    opacities are then with respect to their logarithms and logits.
-    """
-    means, viewmats = inputs[0], inputs[6]
-    assert means is not None and viewmats is not None  # for the type checker
-    grads = stored or [
-        torch.zeros_like(t, memory_format=torch.contiguous_format) if t is not None and w else None
-        for t, w in zip(inputs[:7], wanted, strict=True)
-    ]
-    if stored is None:
-        alone = [index for index, w in enumerate(wanted) if w] == [5]
-        grads.append(None if alone else means.new_zeros((viewmats.shape[0], means.shape[0], 2)))
-    images = (forward.colors, forward.alphas, forward.depths, forward.features, forward.feature_variance)
-    contiguous = [None if g is None else g.contiguous() for g in cotangents]
-    _core_function("rasterize_backward", means)(
-        _core_inputs(inputs, background, settings),
-        forward.frames,
-        *(_numpy(t) for t in (*images, *contiguous, *grads)),
-        stored is not None,
-    )
-    return grads
-
-
-def passes(device: torch.device) -> tuple[Callable[..., Forward], Callable[..., Any]]:
-    """The forward and the backward pass for tensors on `device`."""
+def rasterizer_for(device: torch.device) -> ModuleType:
+    """The module of `rasterize_forward`, `rasterize_backward` and `label_images` for tensors on `device`."""
     if device.type == "cpu":
-        return rasterize_forward, rasterize_backward
-    from perception.gaussians.cuda import rasterize as on_device
+        return cpu
+    from perception.gaussians.rasterizer import device as on_device
 
-    return on_device.rasterize_forward, on_device.rasterize_backward
+    return on_device
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, background: Tensor | None, settings: Settings, stats: RasterizationStats, *inputs: Any
-    ) -> Any:
-        contiguous = tuple(None if t is None else t.detach().contiguous() for t in inputs)
-        shade = None if background is None else background.detach().contiguous()
-        run, _ = passes(contiguous[0].device)  # type: ignore[union-attr]
-        out = run(contiguous, shade, settings)
+    def forward(ctx: Any, settings: Settings, stats: RasterizationStats, *tensors: Tensor | None) -> Any:
+        """tensors: those of `Inputs.NAMES`, in that order, as autograd takes no names."""
+        contiguous = [None if t is None else t.detach().contiguous() for t in tensors]
+        inputs = Inputs(**dict(zip(Inputs.NAMES, contiguous, strict=True)))  # type: ignore[arg-type]
+        out = rasterizer_for(inputs.means.device).rasterize_forward(inputs, settings)
         stats.radii = out.radii
         stats.evaluated_pairs, stats.contributing_pairs = out.frames.evaluated, out.frames.contributing
         stats.seconds = out.frames.seconds
-        images = (out.colors, out.alphas, out.depths, out.features, out.feature_variance)
+        images = [getattr(out, name) for name in Forward.IMAGES]
         ctx.settings, ctx.stats = settings, stats
         if any(ctx.needs_input_grad):
             ctx.frames = out.frames
-            ctx.save_for_backward(*contiguous, shade, *images)
+            ctx.save_for_backward(*contiguous, *images)
         ctx.set_materialize_grads(False)
         visible = out.visible.view(torch.bool)
         ctx.mark_non_differentiable(visible)
@@ -252,18 +86,23 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor | None) -> Any:
         saved = ctx.saved_tensors
-        inputs, background, images = saved[:8], saved[8], saved[9:]
-        wanted = tuple(ctx.needs_input_grad[3:10])
-        none = images[0].new_empty(0)
-        state = Forward(*images, visible=none, radii=none, frames=ctx.frames)  # type: ignore[misc]
-        _, run = passes(images[0].device)
-        *grads, mean2d = run(inputs, background, ctx.settings, state, cotangents[:5], wanted)
-        ctx.stats.mean2d_grad = None if mean2d is None else mean2d.norm(dim=-1)
+        inputs = Inputs(**dict(zip(Inputs.NAMES, saved[: len(Inputs.NAMES)], strict=True)))
+        images = dict(zip(Forward.IMAGES, saved[len(Inputs.NAMES) :], strict=True))
+        none = inputs.means.new_empty(0)
+        state = Forward(**images, visible=none, radii=none, frames=ctx.frames)
+        given = [None if g is None else g.contiguous() for g in cotangents[: len(Forward.IMAGES)]]
+        of_images = Cotangents(**dict(zip(Forward.IMAGES, given, strict=True)))
+        wanted = {name for name, is_wanted in zip(Inputs.NAMES, ctx.needs_input_grad[2:], strict=True) if is_wanted}
+        of_inputs = wanted - {"background", "Ks"}
+        gradients = Gradients.zeros(inputs, of_inputs if of_inputs == {"features"} else of_inputs | {"mean2d"})
+        rasterizer_for(inputs.means.device).rasterize_backward(inputs, ctx.settings, state, of_images, gradients)
+        ctx.stats.mean2d_grad = None if gradients.mean2d is None else gradients.mean2d.norm(dim=-1)
         ctx.stats.seconds = ctx.frames.seconds
         shade = None
-        if ctx.needs_input_grad[0] and cotangents[0] is not None:
-            shade = (cotangents[0] * (1 - state.alphas)[..., None]).sum(dim=(1, 2))
-        return (shade, None, None, *grads, None)
+        if "background" in wanted and of_images.colors is not None:
+            shade = (of_images.colors * (1 - state.alphas)[..., None]).sum(dim=(1, 2))
+        found = {name: getattr(gradients, name) for name in of_inputs} | {"background": shade}
+        return (None, None, *(found.get(name) for name in Inputs.NAMES))
 
 
 def rasterize(
@@ -315,7 +154,8 @@ def rasterize(
         variance and features is not None, depth, threads, simd,
     )  # fmt: skip
     stats = RasterizationStats(radii=means.new_zeros((0,)))
-    out = _Rasterize.apply(background, settings, stats, means, quats, scales, opacities, colors, features, viewmats, Ks)
+    tensors["background"] = background
+    out = _Rasterize.apply(settings, stats, *(tensors[name] for name in Inputs.NAMES))
     return Rasterization(*out, stats=stats)  # type: ignore[misc]
 
 

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.rasterize import Settings, label_images
+from perception.gaussians.rasterize import rasterizer_for
+from perception.gaussians.rasterizer.types import Settings
 
 MOST_LABELS = 1 << 24
 """The rasterizer takes smaller ids only; larger ones are numbered anew."""
@@ -54,6 +55,7 @@ def render_silhouettes(
     if owners.max(initial=-1) >= MOST_LABELS:
         known = np.unique(owners[owners >= 0])
         owners = np.where(owners < 0, -1, np.searchsorted(known, owners)).astype(np.int32)
+    label_images = rasterizer_for(gaussians.means.device).label_images
     images, visible = label_images(inputs, owners, threshold, Settings(width, height, depth=False, eps2d=eps2d))
     found = []
     for ids, image in zip(owners, images, strict=True):

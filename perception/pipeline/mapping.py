@@ -160,7 +160,7 @@ def _assemble(
 ) -> Map:
     """The map to write; in JSON values, None replaces NaN and infinity."""
     held = {view.name: view for view in held_out}
-    arrays = {name: tensor.detach().numpy() for name, tensor in vars(gaussians).items()}
+    arrays: dict[str, Any] = {name: tensor.detach().numpy() for name, tensor in gaussians.named().items()}
     arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)
     return Map(
         **arrays,

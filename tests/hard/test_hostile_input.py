@@ -53,8 +53,16 @@ def scene(n: int, dtype: Any, size: int = 8) -> Any:
         means, *(a.astype(dtype) for a in arrays), None, np.eye(4, dtype=dtype)[None], K, None,
         size, size, -1, 0.01, 0.3, 1, True, False, 0,
     )  # fmt: skip
-    images = [np.zeros((1, size, size, 3), dtype), np.zeros((1, size, size), dtype), None, None, None]
+    images = getattr(_core, f"RasterizerImages_{kind}")(
+        np.zeros((1, size, size, 3), dtype), np.zeros((1, size, size), dtype), None, None, None
+    )
     return kind, inputs, images, (np.zeros((1, n), np.uint8), np.zeros((1, n), dtype))
+
+
+def backward(kind: str, inputs: Any, frames: Any, images: Any, depths: np.ndarray | None = None) -> None:
+    cotangents = getattr(_core, f"RasterizerCotangents_{kind}")(None, None, depths, None, None)
+    gradients = getattr(_core, f"RasterizerGradients_{kind}")(*[None] * 8)
+    getattr(_core, f"rasterize_backward_{kind}")(inputs, frames, images, cotangents, gradients, False)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -62,20 +70,19 @@ def scene(n: int, dtype: Any, size: int = 8) -> Any:
 def test_backward_refuses_the_frames_of_another_scene(dtype: Any, other: dict[str, int]) -> None:
     """It wrote gradients of 40 Gaussians into arrays of 2: heap corruption."""
     kind, inputs, images, seen = scene(40, dtype)
-    frames = getattr(_core, f"rasterize_forward_{kind}")(inputs, *images, *seen, "auto")
+    frames = getattr(_core, f"rasterize_forward_{kind}")(inputs, images, *seen, "auto")
     _, inputs, images, _ = scene(dtype=dtype, **other)
     with pytest.raises(ValueError, match="frames: not of inputs"):
-        getattr(_core, f"rasterize_backward_{kind}")(inputs, frames, *images, *[None] * 13)
+        backward(kind, inputs, frames, images)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_backward_refuses_a_gradient_of_depths_that_are_missing(dtype: Any) -> None:
     """It read them through a null pointer."""
     kind, inputs, images, seen = scene(40, dtype)
-    frames = getattr(_core, f"rasterize_forward_{kind}")(inputs, *images, *seen, "auto")
-    gradients = [None, None, np.ones((1, 8, 8), dtype), *[None] * 10]
+    frames = getattr(_core, f"rasterize_forward_{kind}")(inputs, images, *seen, "auto")
     with pytest.raises(ValueError, match="depths: missing"):
-        getattr(_core, f"rasterize_backward_{kind}")(inputs, frames, *images, *gradients)
+        backward(kind, inputs, frames, images, depths=np.ones((1, 8, 8), dtype))
 
 
 def unaligned(array: np.ndarray) -> np.ndarray:
