@@ -14,13 +14,13 @@ import numpy as np
 
 from perception.config import MapConfig
 from perception.errors import InputError
-from perception.frame.place import placed_scene
 from perception.frame.recentre import recentred
+from perception.frame.world_frame import in_world_frame
 from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians
 from perception.gaussians.photos import exposed_as_neighbours, split_views
 from perception.gaussians.views import TrainingView, psnr, render_view, surface_depth
-from perception.inputs.load import load_saved_scene, load_scene, save_scene
+from perception.inputs.load import load_scene
 from perception.language.base import Encoder
 from perception.language.ocr import make_reader
 from perception.map.files import read_info
@@ -28,7 +28,7 @@ from perception.map.write import Map, read_map, write_map
 from perception.masks import make_source
 from perception.masks.builtin import BuiltinSegmentation
 from perception.masks.label_images import load_segmentation
-from perception.photos.reading import Reading
+from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.photos.view_json import stored_view
 from perception.pipeline.blocks import cut, optimise_blocks
 from perception.pipeline.checkpoint import clear_work, fingerprint, frames_folder, poses_mark, working
@@ -38,6 +38,7 @@ from perception.pipeline.optimise import Photos, Run, label_by_tasks, label_phot
 from perception.pipeline.record import depth_errors, depth_used, finite, peak_memory_mib
 from perception.progress import QUIET, Progress
 from perception.report.text import depth_text, frame_lines
+from perception.sfm.options import ReadOptions
 from perception.tasks.engine import Engine
 from perception.tasks.folder import versions
 from perception.types import Scene, View
@@ -164,10 +165,12 @@ def _scene(source: Path, output: Path, run: Run, engine: Engine) -> Scene:
         masks, camera, cloud = (
             Path(p) if p else None for p in (photos.ignore_masks, photos.camera, photos.init_points)
         )
-        how = Reading(work / "sfm", config.seed, progress, photos.strict, masks, camera, poses=photos.poses)
-        how = replace(how, frames=frames_folder(output), init_points=cloud, engine=engine)
-        scene = load_scene(source, how)
-        save_scene(kept, scene := placed_scene(recentred(scene), config.frame, config.seed))
+        frames = frames_folder(output)
+        options = ReadOptions(
+            work / "sfm", config.seed, progress, photos.strict, masks, camera, frames, cloud, photos.poses, engine
+        )
+        scene = load_scene(source, options)
+        save_scene(kept, scene := in_world_frame(recentred(scene), config.frame, config.seed))
     if config.losses.depth_weight == 0:
         return replace(scene, views=[replace(view, depth=None) for view in scene.views])
     return scene

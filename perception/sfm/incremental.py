@@ -17,7 +17,8 @@ from scipy.spatial import cKDTree
 
 from perception.photos.lens import load_pycolmap
 from perception.progress import Progress
-from perception.sfm.features import MIN_INLIERS, FeatureStore, verified_matches
+from perception.sfm.database import FeatureStore, verified_matches
+from perception.sfm.features import MIN_INLIERS
 
 MAX_UNREGISTERED, MAX_SECOND_MODEL, MAX_CONTRADICTED, MAX_UNMATCHED = 0.15, 0.30, 0.005, 0.30
 MOST_CONTRADICTED = 4

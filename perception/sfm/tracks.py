@@ -9,8 +9,8 @@ import numpy as np
 
 from perception.photos.depth import load_depth
 from perception.photos.lens import camera_from_lens, load_pycolmap
-from perception.photos.reading import view_lens
-from perception.sfm.features import FeatureStore, verified_matches
+from perception.photos.views import view_lens
+from perception.sfm.database import FeatureStore, verified_matches
 from perception.types import View
 
 FLAT = 0.03

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from perception.errors import InputError
-from perception.inputs.load import load_saved_scene, save_scene
 from perception.io.atomic import atomic_file
+from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.types import Scene
 
 TASK, SCENE = "task.json", "scene"
