@@ -122,7 +122,7 @@ def scale_of_sightings(
         if error < LARGEST_ERROR * metres and off < MISSHAPEN:  # false for NaN
             usable.append((thing.corners, rays, error))
     if not usable:
-        raise InputError(f"{source}: its corners cannot be triangulated to its shape; see it from farther apart places")
+        raise InputError(f"{source}: its corners cannot be triangulated to its shape; see it from farther apart")
     weights = np.array([error**-2 for _, _, error in usable])
 
     def mean(kept: np.ndarray) -> float:

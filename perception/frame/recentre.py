@@ -63,7 +63,7 @@ def map_from_input(path: Path, info: dict[str, Any]) -> np.ndarray:
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise ValueError(f"found {origin.tolist()}")
     except (AttributeError, TypeError, ValueError) as error:
-        raise InputError(f"{path / 'map.json'}: scene.origin is no place ({error}); the map is damaged") from error
+        raise InputError(f"{path / 'map.json'}: scene.origin is no position ({error}); the map is damaged") from error
     shift = np.eye(4)
     shift[:3, 3] = -origin
     return shift

@@ -39,11 +39,10 @@ class FeatureStore:
 def verified_matches(database: Path) -> dict[tuple[int, int], np.ndarray]:
     """Verified matches [M, 2] of each pair of image ids, in order of the ids."""
     pycolmap = load_pycolmap()
-    db = pycolmap.Database.open(database)
-    keys, geometries = db.read_two_view_geometries()
-    db.close()
-    found = zip(map(pycolmap.pair_id_to_image_pair, keys), geometries, strict=True)
-    return {pair: geometry.inlier_matches for pair, geometry in sorted(found, key=lambda item: item[0])}
+    with pycolmap.Database.open(database) as db:
+        keys, geometries = db.read_two_view_geometries()
+    keyed = zip(map(pycolmap.pair_id_to_image_pair, keys), geometries, strict=True)
+    return {pair: geometry.inlier_matches for pair, geometry in sorted(keyed, key=lambda item: item[0])}
 
 
 def build_features(

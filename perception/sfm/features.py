@@ -71,10 +71,9 @@ def extract(database: Path, root: Path, groups: list[Group], progress: Progress)
 def _drop_poor(database: Path, names: list[str]) -> list[str]:
     """Deletes the features of photos that have fewer than MIN_FEATURES and returns those photos.
     pycolmap then extracts these again. It has no function that deletes the features of one image."""
-    db = load_pycolmap().Database.open(database)
-    ids = {name: db.read_image_with_name(name).image_id for name in names}
-    poor = [name for name in names if db.num_keypoints_for_image(ids[name]) < MIN_FEATURES]
-    db.close()
+    with load_pycolmap().Database.open(database) as db:
+        ids = {name: db.read_image_with_name(name).image_id for name in names}
+        poor = [name for name in names if db.num_keypoints_for_image(ids[name]) < MIN_FEATURES]
     with closing(sqlite3.connect(database)) as tables, tables:
         for name in poor:
             for table in ("keypoints", "descriptors"):

@@ -89,9 +89,9 @@ def adjusted(model: Any, store: FeatureStore, options: Any) -> Any:
     pycolmap = load_pycolmap()
     with TemporaryDirectory(dir=store.folder) as out:
         model = pycolmap.triangulate_points(model, store.database, store.image_root, out, True, options)
-    db = pycolmap.Database.open(store.database)
-    cache = pycolmap.DatabaseCache.create(db, pycolmap.DatabaseCacheOptions(min_num_matches=options.min_num_matches))
-    db.close()
+    wanted = pycolmap.DatabaseCacheOptions(min_num_matches=options.min_num_matches)
+    with pycolmap.Database.open(store.database) as db:
+        cache = pycolmap.DatabaseCache.create(db, wanted)
     mapper, triangulation = pycolmap.IncrementalMapper(cache), options.get_triangulation()
     mapper.begin_reconstruction(model)
     adjustment = options.get_global_bundle_adjustment()

@@ -18,8 +18,9 @@ from perception.photos.decode import photo_size
 from perception.photos.folder import PhotoSet, choose_photos
 from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import lens_from_camera, lens_text, load_pycolmap
+from perception.sfm.consistency import model_warnings
 from perception.sfm.database import FeatureStore, build_features, verified_matches
-from perception.sfm.incremental import REPEATABLE_PHOTOS, map_photos, model_warnings
+from perception.sfm.incremental import REPEATABLE_PHOTOS, map_photos
 from perception.sfm.model import cloud_of, views_of_model
 from perception.sfm.options import ReadOptions
 from perception.sfm.submodels import map_submodels
@@ -115,14 +116,13 @@ def _report(
 
 def _best_partners(store: FeatureStore) -> dict[str, tuple[int, int]]:
     """name -> (features, geometrically verified matches with the best partner)."""
-    db = load_pycolmap().Database.open(store.database)
-    images = {image.image_id: image.name for image in db.read_all_images()}
-    features = {number: (name, db.num_keypoints_for_image(number)) for number, name in images.items()}
-    db.close()
+    with load_pycolmap().Database.open(store.database) as db:
+        ids = {image.image_id: image.name for image in db.read_all_images()}
+        features = {image_id: (name, db.num_keypoints_for_image(image_id)) for image_id, name in ids.items()}
     best = dict.fromkeys(features, 0)
-    for pair, found in verified_matches(store.database).items():
+    for pair, matches in verified_matches(store.database).items():
         for image_id in pair:
-            best[image_id] = max(best[image_id], len(found))
+            best[image_id] = max(best[image_id], len(matches))
     return {name: (count, best[image_id]) for image_id, (name, count) in features.items()}
 
 

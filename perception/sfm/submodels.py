@@ -9,32 +9,20 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
 
-from perception.errors import InputError
 from perception.io.atomic import atomic_directory
 from perception.photos.lens import load_pycolmap
 from perception.progress import QUIET, Progress
 from perception.sfm import merge, partition
+from perception.sfm.consistency import is_contradicted, outvoted_photos, verified_pairs
 from perception.sfm.database import FeatureStore, verified_matches
 from perception.sfm.feature_tasks import write_part
-from perception.sfm.incremental import (
-    MIN_MODEL_SIZE,
-    Found,
-    is_contradicted,
-    map_photos,
-    outvoted_photos,
-    pipeline_options,
-    take_out,
-    verified_pairs,
-)
+from perception.sfm.incremental import MIN_MODEL_SIZE, Mapped, map_photos, pipeline_options, take_out
 from perception.sfm.options import ReadOptions
-from perception.tasks.folder import has_task, read_facts, write_task
-
-RESULT = "result"
+from perception.tasks.folder import RESULT, has_task, read_facts, run_tasks, write_task
 
 
-def map_submodels(store: FeatureStore, fixed: bool, options: ReadOptions) -> Found | None:
+def map_submodels(store: FeatureStore, fixed: bool, options: ReadOptions) -> Mapped | None:
     """As `map_photos`, by submodels; None where the photos' matches contradict the merged model."""
     counts = {pair: len(matches) for pair, matches in verified_matches(store.database).items() if len(matches)}
     if not counts:
@@ -42,9 +30,10 @@ def map_submodels(store: FeatureStore, fixed: bool, options: ReadOptions) -> Fou
     seed, progress = options.seed, options.progress
     submodels = partition.with_overlap(partition.divide(counts, partition.LARGEST), counts)
     folders = [_task(store, images, number, fixed, seed) for number, images in enumerate(submodels)]
-    tasks = [str(folder.resolve()) for folder in folders]
-    options.engine.run(submodel_task, tasks, "poses: submodel", progress, each_core=True)
-    groups = merge.align(merge.without_repeats([model for folder in folders for model in _models(folder)]), seed)
+    results = run_tasks(options.engine, submodel_task, folders, "poses: submodel", progress, each_core=True)
+    read = load_pycolmap().Reconstruction
+    models = [read(model) for result in results for model in sorted(result.iterdir())]
+    groups = merge.align(merge.without_repeats(models), seed)
     if not groups:
         return None
     progress.update("poses: adjusting", 0, 1)
@@ -86,10 +75,3 @@ def submodel_task(task: str, progress: Progress = QUIET) -> None:
         for number, model in enumerate(models):
             (new / str(number)).mkdir()
             model.write(new / str(number))
-
-
-def _models(folder: Path) -> list[Any]:
-    """The models of one submodel, each in a frame of its own."""
-    if not (folder / RESULT).is_dir():
-        raise InputError(f"{folder}: has no {RESULT} after its task; workers must share the output's folder")
-    return [load_pycolmap().Reconstruction(each) for each in sorted((folder / RESULT).iterdir())]

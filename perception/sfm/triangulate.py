@@ -93,16 +93,13 @@ def random_cloud(views: list[View], seed: int) -> Cloud:
 def _triangulate(views: list[View], store: FeatureStore, seed: int) -> tuple[np.ndarray, np.ndarray, float | None]:
     pycolmap = load_pycolmap()
     model = pycolmap.Reconstruction()
-    db = pycolmap.Database.open(store.database)
-    cameras: set[int] = set()
-    for view, name in zip(views, store.names, strict=True):
-        image = db.read_image_with_name(name)
-        if image.camera_id not in cameras:
+    with pycolmap.Database.open(store.database) as db:
+        images = [db.read_image_with_name(name) for name in store.names]
+    for view, image in zip(views, images, strict=True):
+        if image.camera_id not in model.cameras:
             model.add_camera_with_trivial_rig(camera_from_lens(view_lens(view), image.camera_id))
-            cameras.add(image.camera_id)
-        plain = pycolmap.Image(name=name, camera_id=image.camera_id, image_id=image.image_id)
+        plain = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
         model.add_image_with_trivial_frame(plain, pycolmap.Rigid3d(view.camera_from_world[:3]))
-    db.close()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
     options.num_threads = 1  # the order of sums in several threads is not repeatable

@@ -61,7 +61,7 @@ def test_one_camera_or_many_in_one_place_stay() -> None:
 
 @pytest.mark.parametrize("origin", [[1, 2], "x", [1, 2, float("nan")], None, {}])
 def test_an_origin_that_is_none_is_told(origin: object) -> None:
-    with pytest.raises(InputError, match=r"scene\.origin is no place"):
+    with pytest.raises(InputError, match=r"scene\.origin is no position"):
         map_from_input(Path("m.gsmap"), {"scene": {"origin": origin}})
 
 

@@ -10,7 +10,7 @@ from PIL import Image
 
 from perception.errors import InputError
 from perception.geometry import align_similarity, inverse_se3
-from perception.inputs.load import load_scene
+from perception.inputs.load import load_scene, photo_sizes
 from perception.inputs.transforms import read_frames
 from perception.io import atomic
 from perception.io.atomic import atomic_directory, atomic_file, recover
@@ -137,8 +137,10 @@ def test_empty_sparse_model(tmp_path):
 
 
 def test_folders_that_are_no_scene(tmp_path):
-    with pytest.raises(InputError, match="no such"):
-        load_scene(tmp_path / "gone", ReadOptions(tmp_path / "work"))
+    for read in (lambda path: load_scene(path, ReadOptions(tmp_path / "work")), photo_sizes):
+        for name in ("gone", "gone.json", "gone.mp4"):
+            with pytest.raises(InputError, match=f"{name}: no such file or folder; expected a folder of photos"):
+                read(tmp_path / name)
     (tmp_path / "photos").mkdir()
     with pytest.raises(InputError, match="no photos"):
         load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work"))

@@ -15,10 +15,9 @@ from scipy.spatial.transform import Rotation
 from perception.geometry import align_similarity, inverse_se3
 from perception.inputs.load import load_scene
 from perception.photos.lens import load_pycolmap
-from perception.sfm import features
-from perception.sfm import incremental as incremental_sfm
+from perception.sfm import consistency, features
+from perception.sfm.consistency import Pair
 from perception.sfm.database import build_features
-from perception.sfm.incremental import Pair
 from perception.sfm.options import ReadOptions
 from support.aimed import look_at
 from support.progress import Told
@@ -153,12 +152,12 @@ def test_a_wrecked_model_raises_a_warning(run, wrecked):
     pycolmap = load_pycolmap()
     (store,) = run[2].glob("features-*")
     model = pycolmap.Reconstruction(store / "model")
-    assert incremental_sfm.model_warnings([model], store / "database.db", VIEWS) == []
+    assert consistency.model_warnings([model], store / "database.db", VIEWS) == []
     half_turn = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(np.diag([-1.0, -1.0, 1.0])), np.zeros(3))
     for image in sorted(model.images.values(), key=lambda image: image.name)[-wrecked:]:
         frame = model.frames[image.frame_id]
         frame.rig_from_world = pycolmap.Rigid3d((frame.rig_from_world.matrix() @ matrix_4x4(half_turn))[:3])
-    warnings = incremental_sfm.model_warnings([model], store / "database.db", VIEWS)
+    warnings = consistency.model_warnings([model], store / "database.db", VIEWS)
     assert len(warnings) == 1 and "folded" in warnings[0]
 
 
@@ -168,10 +167,10 @@ def matrix_4x4(transform):
 
 def test_contradictions_count_when_stronger_than_every_chain():
     chain = [Pair(0, 1, 100, 1.0), Pair(1, 2, 60, 0.9)]
-    assert incremental_sfm.stronger_contradictions([*chain, Pair(0, 2, 50, 0.0)]) == []
-    assert incremental_sfm.stronger_contradictions([*chain, Pair(0, 2, 70, 0.1)]) == [Pair(0, 2, 70, 0.1)]
-    assert incremental_sfm.stronger_contradictions([*chain, Pair(0, 2, 60, 0.1)]) == []  # equally strong
-    assert incremental_sfm.outvoted_photos([*chain, Pair(0, 2, 70, 0.1)]) == {2}
+    assert consistency.stronger_contradictions([*chain, Pair(0, 2, 50, 0.0)]) == []
+    assert consistency.stronger_contradictions([*chain, Pair(0, 2, 70, 0.1)]) == [Pair(0, 2, 70, 0.1)]
+    assert consistency.stronger_contradictions([*chain, Pair(0, 2, 60, 0.1)]) == []  # equally strong
+    assert consistency.outvoted_photos([*chain, Pair(0, 2, 70, 0.1)]) == {2}
 
 
 @pytest.mark.parametrize(
@@ -179,7 +178,7 @@ def test_contradictions_count_when_stronger_than_every_chain():
 )
 def test_a_few_strong_contradictions_are_enough_also_in_a_large_place(count, wrong, told):
     chain = [Pair(i, i + 1, 100, 1.0) for i in range(count - wrong)]
-    assert incremental_sfm.is_contradicted([*chain, *(Pair(i, i + 50, 200, 0.0) for i in range(wrong))]) is told
+    assert consistency.is_contradicted([*chain, *(Pair(i, i + 50, 200, 0.0) for i in range(wrong))]) is told
 
 
 def test_photos_with_few_features_are_upsampled(corner, tmp_path, monkeypatch):
