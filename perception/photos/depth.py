@@ -12,7 +12,7 @@ from perception.io.arrays import map_npy
 from perception.io.documents import refusing
 from perception.photos.decode import read_picture, scaled_K
 from perception.photos.lens import rescale_lens, warp_grid
-from perception.photos.reading import view_lens
+from perception.photos.views import view_lens
 from perception.types import DepthImage, Lens, View
 
 SATURATED = 65535

@@ -87,22 +87,22 @@ def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
 def locate_photo(view: View, folder: Path | None) -> Path:
     """The path of the photo of `view`: relative to the map, else its absolute path when the map was made.
     folder: of the map, None when it is not on disk. InputError when there is no file, or only one of another size."""
-    places = [Path(view.photo)]
+    paths = [Path(view.photo)]
     size = None
     if isinstance(view, StoredView):
         size = view.photo_bytes
         if folder is not None and view.photo_beside is not None:
-            places.insert(0, absolute(pointed(folder) / view.photo_beside))
+            paths.insert(0, absolute(pointed(folder) / view.photo_beside))
     other = None
-    for place in places:
+    for path in paths:
         try:
-            found = place.stat().st_size if place.is_file() else None
+            found = path.stat().st_size if path.is_file() else None
         except OSError:
             found = None
         if found is not None and size in (None, found):
-            return place
-        other = other or (found is not None and f"{place}: has {found} bytes, the photo of the map had {size}") or None
-    raise InputError(f"{other or f'{places[0]}: the photo is missing'}; tell where the photos are: perception relink")
+            return path
+        other = other or (found is not None and f"{path}: has {found} bytes, the photo of the map had {size}") or None
+    raise InputError(f"{other or f'{paths[0]}: the photo is missing'}; tell where the photos are: perception relink")
 
 
 def absolute(path: Path) -> Path:
