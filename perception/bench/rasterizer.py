@@ -105,7 +105,7 @@ def _run(scene: dict[str, Any], case: Case, dtype: str) -> tuple[Turn, Any, list
     """One pass: its times, the rasterizer's statistics, and images and gradients, flattened to float64."""
     import torch
 
-    from perception.gaussians.rasterize import RasterizationStats, rasterize
+    from perception.rasterizer.rasterize import RasterizationStats, rasterize
 
     on_gpu = case.simd in ON_GPU and dtype == case.dtype
     device = torch.device(GPU if on_gpu else "cpu")
@@ -154,7 +154,7 @@ def _gsplat(inputs: dict[str, Any]) -> list[Tensor]:
 def cases(threads: Sequence[int], dtypes: Sequence[str], device: str = "cpu") -> list[Case]:
     """Every SIMD level × precision × {RGB, rich} × number of threads; float32 on the GPU."""
     from perception.gaussians.device import choose_device
-    from perception.gaussians.rasterizer.cpu import simd_levels
+    from perception.rasterizer.cpu import simd_levels
 
     both = (False, True)
     chosen = [Case(s, d, rich, t) for d in dtypes for rich in both for s in simd_levels() for t in threads]

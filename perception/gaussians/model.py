@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from perception.colors import rgb_from_sh, sh_from_rgb
-from perception.gaussians.rasterizer.types import Inputs
+from perception.rasterizer.types import Inputs
 
 
 def sigmoid(logits: torch.Tensor) -> torch.Tensor:

@@ -17,11 +17,11 @@ from perception.gaussians.early_stopping import EarlyStopping
 from perception.gaussians.losses import LabelAssignment, assign_labels
 from perception.gaussians.model import STORED, Gaussians
 from perception.gaussians.optimiser import SparseAdam
-from perception.gaussians.rasterizer.types import Gradients
 from perception.gaussians.rates import learning_rates
 from perception.gaussians.size import sized
 from perception.gaussians.views import TrainingView, scene_extent
 from perception.progress import timed
+from perception.rasterizer.types import Gradients
 
 
 @dataclass

@@ -22,12 +22,12 @@ from perception.errors import InputError
 from perception.gaussians import schedule
 from perception.gaussians.losses import depth_loss, instance_loss, photometric, variance_loss
 from perception.gaussians.model import STORED
-from perception.gaussians.rasterize import rasterizer_for
-from perception.gaussians.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 from perception.gaussians.state import TrainingState, TrainRecord
 from perception.gaussians.views import TrainingView, target_photo
 from perception.interrupts import uninterrupted
 from perception.machine import torch_on_one_thread
+from perception.rasterizer.rasterize import rasterizer_for
+from perception.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 
 SSIM_WEIGHT = 0.2
 """β of the photometric loss (eq. 4), as in Kerbl et al. 2023."""

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.rasterize import rasterizer_for
-from perception.gaussians.rasterizer.types import Settings
+from perception.rasterizer.rasterize import rasterizer_for
+from perception.rasterizer.types import Settings
 
 MOST_LABELS = 1 << 24
 """The rasterizer takes smaller ids only; larger ones are numbered anew."""

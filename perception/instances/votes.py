@@ -15,12 +15,12 @@ import torch
 from scipy import sparse
 
 from perception.gaussians.nearby import Nearby
-from perception.gaussians.rasterize import rasterizer_for
-from perception.gaussians.rasterizer.types import Cotangents, Gradients, Settings
 from perception.gaussians.views import TrainingView
 from perception.io.memory import Keep
 from perception.machine import return_free_memory, torch_on_one_thread
 from perception.progress import Progress
+from perception.rasterizer.rasterize import rasterizer_for
+from perception.rasterizer.types import Cotangents, Gradients, Settings
 
 BLOCK = 16  # masks per pass: a feature width that the kernel is specialised for
 TRIM = 16  # views between which freed memory is returned: the kept votes split what one view's arrays filled

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from perception.gaussians.rasterizer import cpu
-from perception.gaussians.rasterizer import device as on_device
-from perception.gaussians.rasterizer.types import Cotangents, Gradients, Settings
+from perception.rasterizer import cpu
+from perception.rasterizer import device as on_device
+from perception.rasterizer.types import Cotangents, Gradients, Settings
 from support.rasterizer import EVERY_GRADIENT, IMAGES, cast, passed, scene
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")

@@ -11,13 +11,13 @@ import pytest
 import torch
 
 import perception
-from perception.gaussians.cuda import compile as compiling
-from perception.gaussians.cuda import launch
-from perception.gaussians.cuda.compile import KernelOptions, compile_kernels, nvrtc_version
-from perception.gaussians.rasterize import rasterizer_for
-from perception.gaussians.rasterizer import cpu
-from perception.gaussians.rasterizer import device as on_device
-from perception.gaussians.rasterizer.types import Settings
+from perception.rasterizer import cpu
+from perception.rasterizer import device as on_device
+from perception.rasterizer.cuda import compile as compiling
+from perception.rasterizer.cuda import launch
+from perception.rasterizer.cuda.compile import KernelOptions, compile_kernels, nvrtc_version
+from perception.rasterizer.rasterize import rasterizer_for
+from perception.rasterizer.types import Settings
 from support.cuda_emulator import build
 from support.rasterizer import passed, scene
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 import perception
-from perception.gaussians.cuda.compile import KernelOptions
-from perception.gaussians.rasterizer import cpu
-from perception.gaussians.rasterizer import device as on_device
-from perception.gaussians.rasterizer.types import Cotangents, Gradients, Settings
+from perception.rasterizer import cpu
+from perception.rasterizer import device as on_device
+from perception.rasterizer.cuda.compile import KernelOptions
+from perception.rasterizer.types import Cotangents, Gradients, Settings
 from support.cuda_emulator import REVERSED, build, emulate, emulated, find_compiler, on_emulator, wide_scene, worst
 from support.hard_scenes import SCENES
 from support.rasterizer import EVERY_GRADIENT, cast, grads_and_images, leaves, loss_of, passed, scene

@@ -13,18 +13,18 @@ from perception import _core
 from perception.config import load_config
 from perception.errors import InputError
 from perception.gaussians import device as devices
-from perception.gaussians import rasterize as public
 from perception.gaussians import schedule
-from perception.gaussians.cuda import training
 from perception.gaussians.losses import assign_labels, instance_loss
 from perception.gaussians.model import from_points
 from perception.gaussians.nearby import Nearby
-from perception.gaussians.rasterizer import cpu
-from perception.gaussians.rasterizer import device as on_device
-from perception.gaussians.rasterizer.types import Settings
 from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView, surface_depth
 from perception.instances.votes import mask_votes
+from perception.rasterizer import cpu
+from perception.rasterizer import device as on_device
+from perception.rasterizer import rasterize as public
+from perception.rasterizer.cuda import training
+from perception.rasterizer.types import Settings
 from support import pretend_device
 from support.cuda_emulator import emulated
 from support.pretend_device import pretended_device

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import perception
-from perception.gaussians.rasterizer import cpu
-from perception.gaussians.rasterizer.types import Cotangents, Gradients, Settings
+from perception.rasterizer import cpu
+from perception.rasterizer.types import Cotangents, Gradients, Settings
 from support import reference_rasterizer as reference
 from support.rasterizer import IMAGES, cast, every_simd_level, grads_and_images, leaves, loss_of, passed, scene  # noqa: F401
 

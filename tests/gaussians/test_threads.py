@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from perception.gaussians.rasterizer import cpu as module
 from perception.machine import torch_on_one_thread
+from perception.rasterizer import cpu as module
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import perception
-from perception.gaussians.rasterizer import cpu
-from perception.gaussians.rasterizer.types import Cotangents, Gradients, Settings
+from perception.rasterizer import cpu
+from perception.rasterizer.types import Cotangents, Gradients, Settings
 from support import reference_rasterizer as reference
 from support.rasterizer import EVERY_GRADIENT, IMAGES, every_simd_level, leaves, loss_of, passed, scene  # noqa: F401
 

@@ -17,10 +17,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from perception.gaussians.cuda.compile import KernelOptions
-from perception.gaussians.cuda.launch import Kernels
-from perception.gaussians.rasterizer import cpu
-from perception.gaussians.rasterizer import device as on_device
+from perception.rasterizer import cpu
+from perception.rasterizer import device as on_device
+from perception.rasterizer.cuda.compile import KernelOptions
+from perception.rasterizer.cuda.launch import Kernels
 from support.rasterizer import grads_and_images, scene
 
 CSRC = Path(__file__).resolve().parents[2] / "csrc"

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 import perception
-from perception.gaussians.rasterizer import cpu
-from perception.gaussians.rasterizer.cpu import simd_levels
-from perception.gaussians.rasterizer.types import Inputs
+from perception.rasterizer import cpu
+from perception.rasterizer.cpu import simd_levels
+from perception.rasterizer.types import Inputs
 from support import reference_rasterizer as reference
 
 IMAGES = ("colors", "alphas", "depths", "features", "feature_variance")

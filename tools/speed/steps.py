@@ -59,8 +59,8 @@ def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
     from perception import _core
     from perception.config import load_config
     from perception.gaussians import schedule, train
-    from perception.gaussians.rasterizer import cpu
     from perception.pipeline.mapping import build_map
+    from perception.rasterizer import cpu
 
     _core.training.set_threads(options.threads)
     frames: list[Any] = []

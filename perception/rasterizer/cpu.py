@@ -12,8 +12,8 @@ from torch import Tensor
 
 from perception import _core
 from perception.errors import InputError
-from perception.gaussians.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 from perception.machine import threads_before
+from perception.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 
 simd_levels = _core.simd_levels
 """The SIMD levels this processor supports, best first."""

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from perception.errors import InputError
-from perception.gaussians.rasterizer import cpu
-from perception.gaussians.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
+from perception.rasterizer import cpu
+from perception.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 
 
 @dataclass
@@ -58,7 +58,7 @@ def rasterizer_for(device: torch.device) -> ModuleType:
     """The module of `rasterize_forward`, `rasterize_backward` and `label_images` for tensors on `device`."""
     if device.type == "cpu":
         return cpu
-    from perception.gaussians.rasterizer import device as on_device
+    from perception.rasterizer import device as on_device
 
     return on_device
 

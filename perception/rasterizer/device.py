@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from perception.errors import InputError
-from perception.gaussians.cuda.compile import MAX_FEATURES, KernelOptions
-from perception.gaussians.cuda.launch import THREADS, Kernels, device_kernels
-from perception.gaussians.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
+from perception.rasterizer.cuda.compile import MAX_FEATURES, KernelOptions
+from perception.rasterizer.cuda.launch import THREADS, Kernels, device_kernels
+from perception.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 
 _POINTER = ctypes.c_void_p
 KernelsFor = Callable[[KernelOptions, torch.device], Kernels]
