@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from perception.errors import InputError
-from perception.map.map import Map
+from perception.map.map import MAX_SIDE, Map
 from perception.photos.view_json import StoredView, absolute, locate_photo
 from perception.query.query_map import QueryMap
 from perception.types import View
@@ -39,7 +39,7 @@ def best_crop(gmap: QueryMap, instance_id: int, side: int = 320, photos: Path | 
     if found is None:
         return None
     try:
-        photo = load_photo(readable_view(gmap, found[0], photos), int(gmap.info["config"]["photos"]["max_side"]))
+        photo = load_photo(readable_view(gmap, found[0], photos), gmap.setting("photos", "max_side", MAX_SIDE))
     except PhotoOutside:
         raise
     except (InputError, OSError, ValueError, KeyError, TypeError):

@@ -86,7 +86,7 @@ def test_photos_below_the_map_are_shown_and_links_out_of_it_are_not(tmp_path: Pa
     assert not shown(other, other)
 
 
-@pytest.mark.parametrize("photo", ["/dev/zero", "\0", "a" * 5000, "", "/proc/self/environ", "~/.ssh/id_rsa"])
+@pytest.mark.parametrize("photo", ["/dev/zero", "a" * 5000, "", "/proc/self/environ", "~/.ssh/id_rsa"])
 def test_what_is_no_photo_is_not_found(tmp_path: Path, photo: str) -> None:
     assert not shown(write_photo_map(tmp_path / "a.gsmap", photo), Path("/"))
 

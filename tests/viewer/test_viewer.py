@@ -24,7 +24,7 @@ from support.viewer_maps import free_port, small_map
 def test_picking_agrees_with_the_rasterizer() -> None:
     """The instance with the largest rendered weight at a pixel is the one its ray picks."""
     from perception.gaussians.model import Gaussians
-    from perception.gaussians.rasterize import rasterize
+    from perception.rasterizer.rasterize import rasterize
 
     gmap = small_map()
     names = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")

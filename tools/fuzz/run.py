@@ -29,10 +29,17 @@ HANG = 20
 
 def _targets() -> dict[str, Callable[[], Any]]:
     from fuzz.core import CoreTarget
+    from fuzz.map_json import MapJson
     from fuzz.served import HttpTarget, PromptTarget, ViewerTarget, served_map
     from fuzz.targets import TARGETS
 
-    served = {"http": HttpTarget, "served-map": served_map, "viewer": ViewerTarget, "prompt": PromptTarget}
+    served = {
+        "http": HttpTarget,
+        "served-map": served_map,
+        "viewer": ViewerTarget,
+        "prompt": PromptTarget,
+        "map-json": MapJson,
+    }
     return {"core": CoreTarget, **TARGETS, **served}
 
 
