@@ -78,6 +78,19 @@ def test_no_line_installs_the_stranger_called_perception() -> None:
     assert not found
 
 
+def test_paths_named_for_contributors_exist() -> None:
+    """A bare file name stands in the folder of the first path of its row."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| [^|]+ \| ([^|]*`[^|]*) \|$", text, re.M)
+    assert 15 < len(rows) <= 25
+    missing = []
+    for row in [re.findall(r"`([^`]+)`", row) for row in rows]:
+        paths = [Path(row[0]).parent / name if "/" not in name and name != "tools" else Path(name) for name in row]
+        missing += [str(path) for path in paths if not (ROOT / path).exists()]
+    named = re.findall(r"`((?:perception|tests|tools|csrc)/[\w/.]+)`", text)
+    assert missing + [path for path in named if not (ROOT / path).exists()] == []
+
+
 def runnable() -> list[str]:
     """The complete commands of all pages on a map of one's own: the README's walkthrough, in its order, comes first."""
     commands = [re.sub(r" MAP\b", " kitchen.gsmap", command) for _, command in documented() if "SCENE" not in command]
