@@ -35,6 +35,7 @@ from perception.pipeline.checkpoint import (
 )
 from perception.pipeline.mapping import build_map
 from perception.pipeline.record import finite
+from perception.sfm.options import ReadOptions
 from perception.types import Scene
 from support.interrupts import interrupt_at
 from support.progress import Told

@@ -30,10 +30,12 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import children
+
 import numpy as np
-from cases import KEPT, Case, Editing, Exporting, Keeping, Mapping, command
-from children import Moment
+
+from kills import children
+from kills.cases import KEPT, Case, Editing, Exporting, Keeping, Mapping, command
+from kills.children import Moment
 
 NAMES = ("mapping", "exporting", "editing", *KEPT)
 FINAL = 40
