@@ -34,9 +34,8 @@ class Surface:
 
     def voxel_of(self, points: np.ndarray) -> np.ndarray:
         """[...] int32 index of the voxel that contains each of points [..., 3]; −1 where there is none."""
-        keys = voxel_keys(points.reshape(-1, 3), self.size)
-        place = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
-        return np.where(self.keys[place] == keys, place, -1).astype(np.int32).reshape(points.shape[:-1])
+        voxel = position_in(self.keys, voxel_keys(points.reshape(-1, 3), self.size))
+        return voxel.astype(np.int32).reshape(points.shape[:-1])
 
 
 @dataclass
@@ -81,6 +80,12 @@ class SurfaceBuilder:
             (sums[:, k] / count).astype(np.float32) for k in (slice(1, 4), slice(7, 10), slice(10, 11))
         )
         return Surface(self.size, self._keys[rows], sums[:, 0], points, normals.astype(np.float32), lab, border[:, 0])
+
+
+def position_in(ascending: np.ndarray, keys: np.ndarray) -> np.ndarray:
+    """[P] position of each of keys [P] in `ascending` [V], V ≥ 1; −1 where it is not one of them."""
+    position = np.minimum(np.searchsorted(ascending, keys), len(ascending) - 1)
+    return np.where(ascending[position] == keys, position, -1)
 
 
 def voxel_keys(points: np.ndarray, size: float) -> np.ndarray:
