@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from perception.instances.consensus import LEAST_SHARE, LOWEST, ONE_SIDED, PRIOR, evidence, merge_tree, node_evidence
+from perception.instances.consensus import LEAST_SHARE, LOWEST, ONE_SIDED, PRIOR, evidence, dendrogram, node_evidence
 from perception.instances.votes import Table
 
 
@@ -77,7 +77,7 @@ def test_merges_are_those_of_a_dense_search_in_float64(seed: int, filled: float)
     np.fill_diagonal(near, False)
     sizes = rng.integers(1, 50, 12)
     children, values = merged_by_hand(table, z, sizes, near)
-    tree = merge_tree(table, z, sizes, sparse.csr_matrix(near))
+    tree = dendrogram(table, z, sizes, sparse.csr_matrix(near))
     assert [tuple(pair) for pair in tree.children.tolist()] == children and len(children) > 3
     np.testing.assert_allclose(tree.affinity, values, rtol=1e-6)
 
@@ -86,14 +86,14 @@ def test_of_equal_affinities_the_first_pair_is_merged() -> None:
     none = sparse.csr_matrix((4, 0), dtype=np.float32)
     table = Table(none, none, np.zeros(0, np.int64), np.zeros(0))
     near = np.array([[0, 0, 0, 1], [0, 0, 1, 0], [0, 1, 0, 0], [1, 0, 0, 0]], bool)
-    tree = merge_tree(table, np.zeros((4, 2)), np.ones(4), sparse.csr_matrix(near))
+    tree = dendrogram(table, np.zeros((4, 2)), np.ones(4), sparse.csr_matrix(near))
     assert tree.children.tolist() == [[0, 3], [1, 2]] and tree.affinity.tolist() == [1, 1]
 
 
 def test_merging_leaves_the_table_as_it_was() -> None:
     table = a_table(3, 6, 1)
     pixels, void = table.pixels.toarray(), table.void.toarray()
-    merge_tree(table, np.zeros((6, 2)), np.ones(6), sparse.csr_matrix(np.ones((6, 6), bool)))
+    dendrogram(table, np.zeros((6, 2)), np.ones(6), sparse.csr_matrix(np.ones((6, 6), bool)))
     np.testing.assert_array_equal(table.pixels.toarray(), pixels)
     np.testing.assert_array_equal(table.void.toarray(), void)
 
@@ -116,7 +116,7 @@ def test_evidence_is_the_formula() -> None:
 
 def test_evidence_of_a_node_is_that_of_its_leaves_together() -> None:
     table = a_table(6, 9, 4, 0.3)
-    tree = merge_tree(table, np.zeros((9, 2)), np.ones(9), sparse.csr_matrix(np.ones((9, 9), bool)))
+    tree = dendrogram(table, np.zeros((9, 2)), np.ones(9), sparse.csr_matrix(np.ones((9, 9), bool)))
     found = node_evidence(tree, table)
     for node in range(9 + len(tree.children)):
         leaves = tree.leaves_of(node)
