@@ -66,11 +66,7 @@ def _summary(found: dict[int, Any], dim: int) -> InstanceDescription:
     mean = np.concatenate([rows for _, _, rows, _ in views]).mean(axis=0)
     colors = palette(np.concatenate([pixels for _, _, _, pixels in views]))
     return InstanceDescription(
-        unit_rows(mean[None])[0],
-        per_view,
-        colors,
-        [name for name, *_ in views],
-        [box for _, box, *_ in views],
+        unit_rows(mean[None])[0], per_view, colors, [name for name, *_ in views], [box for _, box, *_ in views]
     )
 
 
