@@ -12,13 +12,13 @@ __all__ = ["InputError", "__version__", "load_map", "rasterize"]
 
 if TYPE_CHECKING:
     from perception.errors import InputError
-    from perception.gaussians.rasterize import rasterize
     from perception.query import load_map
+    from perception.rasterizer.rasterize import rasterize
 
 _HOMES = {
     "InputError": "perception.errors",
     "load_map": "perception.query",
-    "rasterize": "perception.gaussians.rasterize",
+    "rasterize": "perception.rasterizer.rasterize",
 }
 
 

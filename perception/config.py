@@ -54,8 +54,8 @@ class PhotoConfig(Settings):
         None,
         pattern=r"^[1-9][0-9]*[MG]$",
         title="a size such as 500M or 8G",
-        description="that photos, labels and depth may fill, and beside them votes of masks; others are on disk; "
-        "none: a quarter of the machine's",
+        description="memory for photos, labels and depth, and as much for votes of masks; what does not fit is on "
+        "disk; none: a quarter of the machine's",
     )
 
 
@@ -96,7 +96,7 @@ class TrainConfig(Settings):
     )
     budget: int = Field(0, ge=0, le=10**8, description="most Gaussians the map may have; 0: 100,000, or 2,300 a photo")
     block_photos: int = Field(
-        400, ge=0, le=10**6, description="a place seen by more photos is trained in overlapping blocks; 0: never"
+        400, ge=0, le=10**6, description="a scene of more photos is trained in overlapping blocks; 0: never"
     )
     sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics that is tried")
 

@@ -23,6 +23,7 @@ from perception.config import FrameConfig, InstanceConfig
 from perception.edit.scale import scale_map
 from perception.errors import InputError
 from perception.io.atomic import writing
+from perception.io.json_shapes import LARGEST
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
 from perception.map.files import map_signature, read_info
 from perception.map.map import Map, language_in, prefixed
@@ -284,7 +285,10 @@ class Editor:
 
     def _next_id(self) -> int:
         entries = [entry for state in (*self._past, *self._future) for entry in state.instances]
-        return 1 + max((e["id"] for entry in entries for e in (entry, *entry.get("parts", []))), default=-1)
+        number = 1 + max((e["id"] for entry in entries for e in (entry, *entry.get("parts", []))), default=-1)
+        if number > LARGEST:
+            raise InputError(f"{self.path}: has the id {LARGEST}, the largest; there is none left for another instance")
+        return number
 
     def _entry(self, instance: int, ids: np.ndarray, score: float, views: int, label: Any = None) -> dict[str, Any]:
         gmap, rows = self.original, ids == instance

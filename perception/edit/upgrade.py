@@ -20,10 +20,11 @@ from perception.language.base import Encoder, reading_of
 from perception.language.description import from_arrays, to_arrays
 from perception.language.encoders import make_encoder
 from perception.language.ocr import TextReader, make_reader
-from perception.map.map import Map, language_in, prefixed
+from perception.map.map import MAX_SIDE, Map, language_in, prefixed
 from perception.map.write import read_map, write_map
 from perception.photos.view_json import locate_photo
 from perception.progress import QUIET, Progress
+from perception.query.text_ranking import encoder_of
 
 
 def upgrade_map(
@@ -46,11 +47,10 @@ def upgrade_map(
     with writing(target):
         gmap = read_map(path)
         old = str(gmap.language["encoder"]) if gmap.language else None
-        spec = gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
-        encoder = encoders("conse" if spec == "auto" else spec) if gmap.language else None
+        encoder = encoder_of(gmap, encoders) if gmap.language else None
         if encoder is not None and encoder.identity != old:
             _embed_again(gmap, encoder, progress)
-        _read_again(gmap, make_reader(gmap.info.get("config", {}).get("language", {}).get("texts", "auto")), progress)
+        _read_again(gmap, make_reader(gmap.setting("language", "texts", "auto")), progress)
         write_map(target, gmap, keep_report=True, fresh=output is not None)
     new = str(gmap.language["encoder"]) if gmap.language else None
     return {"map": str(target), "encoder": [old, new]}
@@ -67,7 +67,7 @@ def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:
         choices, load = _shown(gmap, stored, owners, ids)
         return to_arrays(describe_instances(encoder, choices, load, names, zooms, progress), encoder.identity)
 
-    zooms = int(gmap.info.get("config", {}).get("language", {}).get("zooms") or reading_of(encoder).zooms)
+    zooms = gmap.setting("language", "zooms", 0) or reading_of(encoder).zooms
     gmap.language = described(gmap.language, gmap.instance_ids, [entry["id"] for entry in gmap.instances], zooms)
     if stored := language_in(gmap.parts):
         owners = gmap.parts["ids"]
@@ -107,7 +107,7 @@ def _shown(
         )
     wanted = sorted({number[name] for d in descriptions for name in d.views})
     located = {n: replace(gmap.views[n], photo=locate_photo(gmap.views[n], gmap.path)) for n in wanted}
-    gaussians, side = as_gaussians(gmap), int(gmap.info["config"]["photos"]["max_side"])
+    gaussians, side = as_gaussians(gmap), gmap.setting("photos", "max_side", MAX_SIDE)
     rank = {instance: n for n, instance in enumerate(ids)}
     positions = np.array([rank.get(int(i), -1) for i in owners], np.int32)
 

@@ -98,7 +98,7 @@ def map_views(gmap: Map, held_out: bool = True) -> list[View]:
 def _cameras(path: Path) -> list[View]:
     """The frames of a transforms.json as views; their photos need not exist."""
     from perception.inputs.transforms import read_frames
-    from perception.photos.reading import make_view
+    from perception.photos.views import make_view
 
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a transforms.json with the cameras to render")

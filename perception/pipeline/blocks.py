@@ -22,7 +22,7 @@ from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians
 from perception.gaussians.nearby import Nearby
 from perception.gaussians.size import sized
-from perception.gaussians.train import TrainRecord
+from perception.gaussians.state import TrainRecord
 from perception.gaussians.views import surface_depth
 from perception.geometry import camera_centres
 from perception.io.atomic import writing
@@ -243,7 +243,7 @@ def optimise_block(folder: str, progress: Progress = QUIET) -> None:
         source, box = make_source(config.masks, config.sam), np.array(facts["box"])
         optimised = optimise(run, scene, training, held_out, source, box)
         gaussians = optimised.nearby.gaussians.to("cpu")
-        state = {"gaussians": {name: tensor.contiguous() for name, tensor in vars(gaussians).items()}}
+        state = {"gaussians": {name: tensor.contiguous() for name, tensor in gaussians.named().items()}}
         save_checkpoint(home / RESULT, {**state, "record": asdict(optimised.record)}, home.name)
         for name in (CHECKPOINT, BEFORE_MASKS):
             (home / name).unlink(missing_ok=True)

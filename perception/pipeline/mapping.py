@@ -14,12 +14,12 @@ import numpy as np
 
 from perception.config import MapConfig
 from perception.errors import InputError
-from perception.frame.place import placed_scene
 from perception.frame.recentre import recentred
+from perception.frame.world_frame import in_world_frame
 from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians
 from perception.gaussians.photos import split_scene
-from perception.inputs.load import load_saved_scene, load_scene, save_scene
+from perception.inputs.load import load_scene
 from perception.language.base import Encoder
 from perception.language.ocr import TextReader, make_reader
 from perception.map.checksums import is_map
@@ -27,7 +27,7 @@ from perception.map.files import read_info
 from perception.map.write import Map, read_map, write_map
 from perception.masks import MaskSource, make_source
 from perception.masks.compute import load_segmentation
-from perception.photos.reading import Reading
+from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.photos.view_json import stored_view
 from perception.pipeline.blocks import optimiser
 from perception.pipeline.changes import hold_inputs, inputs_of, refuse_changed
@@ -38,6 +38,7 @@ from perception.pipeline.optimise import Run
 from perception.pipeline.record import finite, run_record, scored
 from perception.progress import QUIET, Progress
 from perception.report.text import depth_text, frame_lines
+from perception.sfm.options import ReadOptions
 from perception.tasks.engine import LOCAL, Engine
 from perception.types import Scene, View
 
@@ -136,14 +137,24 @@ def _posed_scene(output: Path, run: Run) -> Scene:
         scene = load_saved_scene(kept)
         if scene is None:
             log_estimate(source, config, progress.log)
-            photos = config.photos
+            photos, frames = config.photos, frames_folder(output)
             masks, camera, cloud = (
                 Path(p) if p else None for p in (photos.ignore_masks, photos.camera, photos.init_points)
             )
-            how = Reading(work / "sfm", config.seed, progress, photos.strict, masks, camera, poses=photos.poses)
-            how = replace(how, frames=frames_folder(output), init_points=cloud, engine=run.engine)
-            scene = load_scene(source, how)
-            save_scene(kept, scene := placed_scene(recentred(scene), config.frame, config.seed))
+            options = ReadOptions(
+                work / "sfm",
+                config.seed,
+                progress,
+                photos.strict,
+                masks,
+                camera,
+                frames,
+                cloud,
+                photos.poses,
+                run.engine,
+            )
+            scene = load_scene(source, options)
+            save_scene(kept, scene := in_world_frame(recentred(scene), config.frame, config.seed))
         if config.losses.depth_weight == 0:
             scene = replace(scene, views=[replace(view, depth=None) for view in scene.views])
     _log_scene(scene, progress)
@@ -160,7 +171,7 @@ def _assemble(
 ) -> Map:
     """The map to write; in JSON values, None replaces NaN and infinity."""
     held = {view.name: view for view in held_out}
-    arrays = {name: tensor.detach().numpy() for name, tensor in vars(gaussians).items()}
+    arrays: dict[str, Any] = {name: tensor.detach().numpy() for name, tensor in gaussians.named().items()}
     arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)
     return Map(
         **arrays,

@@ -60,7 +60,8 @@ def scene_graph(gmap: Map) -> networkx.DiGraph:
 
     places, level = Places.of(gmap), level_from_map(gmap)
     if places is None or level is None:
-        raise InputError(f"{gmap.path}: which way is up is not known, and a scene graph needs it; see frame.up")
+        advice = "map photos of a level camera, or a transforms.json with 'gravity'"
+        raise InputError(f"{gmap.path}: which way is up is not known, and a scene graph needs it; {advice}")
     points = [_thinned(gmap.index.of(entry["id"])) @ level.T for entry in gmap.instances]
     held = holders(points, places)
     beside, rooms = places.match("beside"), _rooms(gmap)

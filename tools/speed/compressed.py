@@ -20,7 +20,7 @@ AXES = np.array([1, -1, -1])
 
 def render(gmap: object, arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
     """Pictures from the map's held-out views."""
-    from perception.gaussians.rasterize import rasterize
+    from perception.rasterizer.rasterize import rasterize
 
     names = ("means", "quats", "scales", "opacities", "sh")
     tensors = [torch.from_numpy(np.ascontiguousarray(arrays[name], np.float32)) for name in names]
