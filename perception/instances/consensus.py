@@ -45,7 +45,7 @@ import numpy as np
 from scipy import sparse
 
 from perception import _core
-from perception.instances.votes import Table
+from perception.instances.votes import MaskVotes
 
 LEAST_SHARE = 0.1  # of w_ijv; a view that shows less of a segment is ignored
 ONE_SIDED = 0.5  # weight of a view that labels only one of the two, relative to a view that labels both
@@ -55,7 +55,7 @@ SUPPORT = 0.6  # IoU with a mask from which a photo supports a group
 LEAST_PIXELS = 8.0  # pixels under masks from which a view shows a group
 LARGEST_PART = 0.8  # share of the instance's pixels; a larger part is nearly the instance
 PART_VIEWS = 2  # photos that must support a part
-AT_ONCE, ENTRIES = 64, 2_000_000  # nodes whose tables are held together, and their entries: 60 bytes each
+AT_ONCE, ENTRIES = 64, 2_000_000  # nodes whose votes are held together, and their entries: 60 bytes each
 
 
 @dataclass(frozen=True)
@@ -76,21 +76,21 @@ class Dendrogram:
         return sorted(at for at in nodes if at < self.leaves)
 
 
-def dendrogram(table: Table, prototypes: np.ndarray, sizes: np.ndarray, near: sparse.csr_matrix) -> Dendrogram:
+def dendrogram(votes: MaskVotes, prototypes: np.ndarray, sizes: np.ndarray, near: sparse.csr_matrix) -> Dendrogram:
     """Repeatedly merges the pair with the largest affinity, until none reaches LOWEST (csrc/graph/merge.cpp).
 
-    table: of the S segments; prototypes [S, D]: z; sizes [S]: Gaussian counts; near [S, S]: nonzero for spatial
+    votes: of the S segments; prototypes [S, D]: z; sizes [S]: Gaussian counts; near [S, S]: nonzero for spatial
     neighbours. Only pairs that are near or share a mask have an affinity, so only these are held.
     """
     count = len(sizes)
     if count == 0:
         return Dendrogram(0, np.zeros((0, 2), np.int64), np.zeros(0))
     children, affinity = np.zeros((count - 1, 2), np.int32), np.zeros(count - 1)
-    rows = [(m.indptr.astype(np.int64), np.asarray(m.indices, np.int32)) for m in (table.pixels, table.void, near)]
-    values = [np.asarray(m.data, np.float32) for m in (table.pixels, table.void)]
+    rows = [(m.indptr.astype(np.int64), np.asarray(m.indices, np.int32)) for m in (votes.pixels, votes.void, near)]
+    values = [np.asarray(m.data, np.float32) for m in (votes.pixels, votes.void)]
     z, weights = np.ascontiguousarray(prototypes, np.float64), np.ascontiguousarray(sizes, np.float64)
     merges = _core.merge_segments(
-        *(*rows[0], values[0], *rows[1], values[1], table.view.astype(np.int32), table.void.shape[1], *rows[2]),
+        *(*rows[0], values[0], *rows[1], values[1], votes.view.astype(np.int32), votes.void.shape[1], *rows[2]),
         *(z, weights, LEAST_SHARE, ONE_SIDED, PRIOR, LOWEST, children, affinity),
     )
     return Dendrogram(count, children[:merges].astype(np.int64), affinity[:merges])
@@ -117,27 +117,27 @@ class Evidence:
         return self.matched / np.maximum(self.pixels, 1e-12)
 
 
-def evidence(table: Table) -> Evidence:
-    """Evidence of the groups of a table. A view shows a group that fills at least LEAST_PIXELS of its masks."""
-    count, views = table.void.shape
-    row, view, first, labelled = table.runs()
-    P = table.pixels.data.astype(np.float64)
-    T = table.per_entry(first, labelled + np.asarray(table.void[row, view]).reshape(-1))
-    iou = P / np.maximum(T + table.area[table.pixels.indices] - P, 1e-12)
+def evidence(votes: MaskVotes) -> Evidence:
+    """Evidence of groups, from their votes. A view shows a group that fills at least LEAST_PIXELS of its masks."""
+    count, views = votes.void.shape
+    row, view, first, labelled = votes.runs()
+    P = votes.pixels.data.astype(np.float64)
+    T = votes.per_entry(first, labelled + np.asarray(votes.void[row, view]).reshape(-1))
+    iou = P / np.maximum(T + votes.area[votes.pixels.indices] - P, 1e-12)
     shown = labelled >= LEAST_PIXELS
     best = np.maximum.reduceat(iou, first)[shown] if len(first) else np.zeros(0)
     fit = sparse.csr_matrix((best, (row[shown], view[shown])), shape=(count, views))
-    matched = np.bincount(table.per_entry(first, row), P * iou, minlength=count)
+    matched = np.bincount(votes.per_entry(first, row), P * iou, minlength=count)
     return Evidence(np.bincount(row, labelled, minlength=count), matched, np.bincount(row[shown], minlength=count), fit)
 
 
-def node_evidence(tree: Dendrogram, table: Table) -> Evidence:
-    """Evidence of all nodes of a dendrogram, from the table of its leaves."""
+def node_evidence(tree: Dendrogram, votes: MaskVotes) -> Evidence:
+    """Evidence of all nodes of a dendrogram, from the votes of its leaves."""
     leaves = [np.array([leaf], np.int32) for leaf in range(tree.leaves)]
     for a, b in tree.children.tolist():
         leaves.append(np.concatenate([leaves[a], leaves[b]]))
-    some = min(AT_ONCE, ENTRIES // max(1, len(table.area)) + 1)
-    found = [evidence(table.pooled(leaves[at : at + some])) for at in range(0, len(leaves), some)]
+    some = min(AT_ONCE, ENTRIES // max(1, len(votes.area)) + 1)
+    found = [evidence(votes.pooled(leaves[at : at + some])) for at in range(0, len(leaves), some)]
     pixels, matched, views = (
         np.concatenate([getattr(part, name) for part in found]) for name in ("pixels", "matched", "views")
     )

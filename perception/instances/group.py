@@ -96,11 +96,11 @@ def _by_consensus(
     segments = over_segment(means[solid], features[solid], wanted, seed)
     segment_of[solid] = segments
     sizes = np.bincount(segments)
-    table = votes.table(segment_of, len(sizes))
+    segment_votes = votes.of_groups(segment_of, len(sizes))
     prototypes = sums_by(segments, features[solid], len(sizes)) / sizes[:, None]
-    tree = dendrogram(table, prototypes, sizes, touching(means[solid], segments, len(sizes)))
+    tree = dendrogram(segment_votes, prototypes, sizes, touching(means[solid], segments, len(sizes)))
     return_free_memory()  # tables grow with the photos; without this, those of each step lie beside the next one's
-    found = node_evidence(tree, table)
+    found = node_evidence(tree, segment_votes)
     return_free_memory()
     instance, part, parents = np.full(tree.leaves, -1), np.full(tree.leaves, -1), list[int]()  # of segments
     for number, node in enumerate(best_cut(tree, found.matched)):
@@ -119,7 +119,7 @@ def _without_small(ids: np.ndarray, votes: MaskVotes, min_size: int) -> np.ndarr
     if count == 0:
         return ids
     sizes = np.bincount(ids[ids >= 0], minlength=count)
-    support = evidence(votes.table(ids, count)).support
+    support = evidence(votes.of_groups(ids, count)).support
     kept = (sizes >= min_size) | ((sizes >= LEAST) & (support >= 2))
     kept &= (support > 0) | (sizes >= LEAST_OF_MEDIAN * np.median(sizes[sizes > 0]))
     return np.where((ids >= 0) & np.append(kept, False)[ids], ids, -1)
@@ -132,7 +132,7 @@ def _scored(ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: Mask
     renamed = np.full(old.max() + 2, -1)  # −1 for groups without members; the last entry is for id −1
     renamed[old[:-1]] = ids
     membership = memberships(ids, votes)
-    found = evidence(votes.table(ids, int(ids.max(initial=-1)) + 1))
+    found = evidence(votes.of_groups(ids, int(ids.max(initial=-1)) + 1))
     scores = calibrated(raw_scores(ids, membership, found))
     return Grouping(ids, membership, scores, *scored_parts(ids, parts, renamed[parents], votes))
 
@@ -149,6 +149,6 @@ def scored_parts(
     renamed = np.full(len(parents) + 1, -1)  # the last entry is for −1
     renamed[kept] = np.arange(len(kept))
     number = renamed[inside]
-    found = evidence(votes.table(number, len(kept)))
+    found = evidence(votes.of_groups(number, len(kept)))
     part_ids = np.where(number >= 0, number + ids.max(initial=-1) + 1, -1).astype(np.int32)
     return part_ids, parents[kept].tolist(), np.clip(found.agreement, 0, 1).tolist(), found.views.tolist()
