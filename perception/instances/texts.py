@@ -1,9 +1,13 @@
 """Printed texts of instances: lines of text read in their best views, assigned by silhouette and fused over the views.
 
 A line belongs to the instance that covers most of its rectangle. Views read a text in part or with errors. Of all reads
-of an instance, the text that explains most characters is kept, those that agree with it are set aside, and so on. With
-the maxima over the reads r in view v that agree with t, d the edit distance, and d' that to the nearest stretch:
-    explained(t) = Σ_v max s_r · (l − d'(r, t) − UNREAD · (L − l))   l, L: lengths of the shorter and longer of r and t
+of an instance, the text that explains most characters is kept, those that agree with it are set aside, and so on.
+
+    r, s_r  a read and its score     v      a view; maxima are over its reads that agree with t
+    t       a text                   l, L   lengths of the shorter and longer of r and t
+    d, d'   edit distance of r and t, and of the shorter to the nearest stretch of the longer
+
+    explained(t) = Σ_v max s_r · (l − d'(r, t) − UNREAD · (L − l))
     score(t) = 1 − Π_v (1 − max s_r · (1 − d(r, t) / L))
 """
 
@@ -40,11 +44,10 @@ def read_texts(
 
     choices and load: as for `describe.describe_instances`.
     """
-    rank: dict[int, int] = {}
-    for views in choices:
-        for place, view in enumerate(views):
-            rank[int(view)] = min(place, rank.get(int(view), place))
-    wanted = sorted(sorted(rank, key=lambda view: (rank[view], view))[:MOST_VIEWS])
+    best: dict[int, int] = {}  # rank of each view for the instance that it is best for
+    for rank, view in ((rank, int(view)) for views in choices for rank, view in enumerate(views)):
+        best[view] = min(rank, best.get(view, rank))
+    wanted = sorted(sorted(best, key=lambda view: (best[view], view))[:MOST_VIEWS])
     reads: list[list[Read]] = [[] for _ in choices]
     for done, view in enumerate(wanted, start=1):
         photo, ids = load(view)
