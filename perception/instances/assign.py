@@ -40,10 +40,10 @@ def memberships(ids: np.ndarray, votes: MaskVotes) -> np.ndarray:
     """[N] float32 in [0, 1]: agreement of each Gaussian's masks with its instance (`affinities`); 0 for noise."""
     count = int(ids.max(initial=-1)) + 1
     shares = mask_shares(votes.of_groups(ids, count))
-    found = np.zeros(len(ids), np.float32)
+    agreement = np.zeros(len(ids), np.float32)
     for rows in _in_chunks(np.flatnonzero(ids >= 0), votes, count):
-        found[rows] = affinities(votes, shares, rows)[0][np.arange(len(rows)), ids[rows]]
-    return np.clip(found, 0, 1)
+        agreement[rows] = affinities(votes, shares, rows)[0][np.arange(len(rows)), ids[rows]]
+    return np.clip(agreement, 0, 1)
 
 
 def reassign(

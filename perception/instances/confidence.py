@@ -20,13 +20,13 @@ CALIBRATION = (
 of 40 random scenes of balls with mask errors. Made strictly increasing, to keep the order of raw scores."""
 
 
-def raw_scores(ids: np.ndarray, membership: np.ndarray, found: Evidence) -> np.ndarray:
+def raw_scores(ids: np.ndarray, membership: np.ndarray, seen: Evidence) -> np.ndarray:
     """[K] float64 in [0, 1] from ids [N] int32, membership [N] in [0, 1] and the evidence of the K instances."""
-    count = len(found.pixels)
+    count = len(seen.pixels)
     member = ids >= 0
     sizes = np.maximum(np.bincount(ids[member], minlength=count), 1)
     strength = np.bincount(ids[member], weights=membership[member], minlength=count) / sizes
-    factors = (found.agreement, strength, (found.support + 0.5) / (found.support + 2.5))
+    factors = (seen.agreement, strength, (seen.support + 0.5) / (seen.support + 2.5))
     product = np.prod([np.clip(factor, 0, 1) for factor in factors], axis=0)
     return np.asarray(product ** (1 / len(factors)))
 

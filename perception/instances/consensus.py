@@ -137,11 +137,11 @@ def node_evidence(tree: Dendrogram, votes: MaskVotes) -> Evidence:
     for a, b in tree.children.tolist():
         leaves.append(np.concatenate([leaves[a], leaves[b]]))
     some = min(AT_ONCE, ENTRIES // max(1, len(votes.area)) + 1)
-    found = [evidence(votes.pooled(leaves[at : at + some])) for at in range(0, len(leaves), some)]
+    parts = [evidence(votes.pooled(leaves[at : at + some])) for at in range(0, len(leaves), some)]
     pixels, matched, views = (
-        np.concatenate([getattr(part, name) for part in found]) for name in ("pixels", "matched", "views")
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("pixels", "matched", "views")
     )
-    return Evidence(pixels, matched, views, sparse.vstack([part.fit for part in found], format="csr"))
+    return Evidence(pixels, matched, views, sparse.vstack([part.fit for part in parts], format="csr"))
 
 
 def best_cut(tree: Dendrogram, matched: np.ndarray) -> list[int]:
@@ -161,16 +161,16 @@ def best_cut(tree: Dendrogram, matched: np.ndarray) -> list[int]:
     return sorted(chosen)
 
 
-def parts_of(tree: Dendrogram, instance: int, found: Evidence) -> list[int]:
+def parts_of(tree: Dendrogram, instance: int, seen: Evidence) -> list[int]:
     """Highest nodes below an instance that PART_VIEWS or more photos support, with a larger IoU than the instance's.
 
     A part fills at most LARGEST_PART of the pixels of the instance.
     """
     parts, nodes = [], tree.children_of(instance)
     for node in nodes:
-        fit, fit_of_instance = found.fit[[node, instance]].toarray()
+        fit, fit_of_instance = seen.fit[[node, instance]].toarray()
         supported = (fit >= SUPPORT) & (fit > fit_of_instance)
-        if supported.sum() >= PART_VIEWS and found.pixels[node] <= LARGEST_PART * found.pixels[instance]:
+        if supported.sum() >= PART_VIEWS and seen.pixels[node] <= LARGEST_PART * seen.pixels[instance]:
             parts.append(node)
         else:
             nodes += tree.children_of(node)

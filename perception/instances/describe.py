@@ -69,7 +69,7 @@ def _summary(views: dict[int, Any], dim: int) -> InstanceDescription:
 
 
 def _color_sample(photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Up to COLOR_SAMPLES pixels [P, 3] of the mask without its rim of mixed colours; the whole mask if it is thin."""
+    """Up to COLOR_SAMPLES pixels [P, 3] of the mask without its rim of mixed colours; the full mask if it is thin."""
     import cv2
 
     inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)

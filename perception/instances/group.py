@@ -100,12 +100,12 @@ def _by_consensus(
     prototypes = sums_by(segments, features[solid], len(sizes)) / sizes[:, None]
     tree = dendrogram(segment_votes, prototypes, sizes, touching(means[solid], segments, len(sizes)))
     return_free_memory()  # tables grow with the photos; without this, those of each step lie beside the next one's
-    found = node_evidence(tree, segment_votes)
+    seen = node_evidence(tree, segment_votes)
     return_free_memory()
     instance, part, parents = np.full(tree.leaves, -1), np.full(tree.leaves, -1), list[int]()  # of segments
-    for number, node in enumerate(best_cut(tree, found.matched)):
+    for number, node in enumerate(best_cut(tree, seen.matched)):
         instance[tree.leaves_of(node)] = number
-        for below in parts_of(tree, node, found):
+        for below in parts_of(tree, node, seen):
             part[tree.leaves_of(below)] = len(parents)
             parents.append(number)
     ids[solid], parts[solid] = instance[segments], part[segments]
@@ -132,8 +132,8 @@ def _scored(ids: np.ndarray, parts: np.ndarray, parents: np.ndarray, votes: Mask
     renamed = np.full(old.max() + 2, -1)  # −1 for groups without members; the last entry is for id −1
     renamed[old[:-1]] = ids
     membership = memberships(ids, votes)
-    found = evidence(votes.of_groups(ids, int(ids.max(initial=-1)) + 1))
-    scores = calibrated(raw_scores(ids, membership, found))
+    seen = evidence(votes.of_groups(ids, int(ids.max(initial=-1)) + 1))
+    scores = calibrated(raw_scores(ids, membership, seen))
     return Grouping(ids, membership, scores, *scored_parts(ids, parts, renamed[parents], votes))
 
 
@@ -149,6 +149,6 @@ def scored_parts(
     renamed = np.full(len(parents) + 1, -1)  # the last entry is for −1
     renamed[kept] = np.arange(len(kept))
     number = renamed[inside]
-    found = evidence(votes.of_groups(number, len(kept)))
+    seen = evidence(votes.of_groups(number, len(kept)))
     part_ids = np.where(number >= 0, number + ids.max(initial=-1) + 1, -1).astype(np.int32)
-    return part_ids, parents[kept].tolist(), np.clip(found.agreement, 0, 1).tolist(), found.views.tolist()
+    return part_ids, parents[kept].tolist(), np.clip(seen.agreement, 0, 1).tolist(), seen.views.tolist()

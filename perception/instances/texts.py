@@ -56,7 +56,7 @@ def read_texts(
             if owner is not None and line.score >= LEAST and sum(c.isalnum() for c in line.text) > 1:
                 reads[owner].append((view, line.text, line.score))
         progress.update("texts", done, len(wanted))
-    return [fuse(found) for found in reads]
+    return [fuse(own) for own in reads]
 
 
 def store_texts(entries: Sequence[dict[str, Any]], texts: Sequence[list[dict[str, Any]]]) -> None:
@@ -73,8 +73,8 @@ def owner_of(corners: np.ndarray, ids: np.ndarray) -> int | None:
     top, bottom = corners[0] + s * (corners[1] - corners[0]), corners[3] + s * (corners[2] - corners[3])
     points = np.floor(top[:, None] + t[None] * (bottom - top)[:, None]).astype(np.int64).reshape(-1, 2)
     inside = ((points >= 0) & (points < ids.shape[::-1])).all(axis=1)
-    found = ids[points[inside, 1], points[inside, 0]]
-    counts = np.bincount(found[found >= 0]) if (found >= 0).any() else np.zeros(1, int)
+    shown = ids[points[inside, 1], points[inside, 0]]
+    counts = np.bincount(shown[shown >= 0]) if (shown >= 0).any() else np.zeros(1, int)
     return int(counts.argmax()) if counts.max() >= COVER * len(points) else None
 
 
@@ -84,9 +84,9 @@ def fuse(reads: Sequence[Read]) -> list[dict[str, Any]]:
     left = list(reads)
     while left and len(texts) < MOST_TEXTS:
         candidates = sorted({text for _, text, _ in left})
-        found = [_by_view([read for read in left if _agree(read[1], text)], text) for text in candidates]
-        chosen = int(np.argmax([views[:, 0].sum() for views in found]))
-        best, views = candidates[chosen], found[chosen]
+        support = [_by_view([read for read in left if _agree(read[1], text)], text) for text in candidates]
+        chosen = int(np.argmax([views[:, 0].sum() for views in support]))
+        best, views = candidates[chosen], support[chosen]
         score = 1.0 - float(np.prod(1.0 - views[:, 1]))
         if score >= (SINGLE if len(views) == 1 or len(best) < FEW else LEAST):
             texts.append({"text": best, "score": round(min(score, 0.99), 2)})

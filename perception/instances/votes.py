@@ -154,7 +154,7 @@ def _of_view(nearby: Nearby, view: TrainingView) -> tuple[sparse.csc_matrix, np.
     settings = Settings(width, height, variance=False, depth=False, eps2d=view.eps2d)
     forward = rasterizer.rasterize_forward(replace(inputs, features=None), settings)
     seen = forward.visible[0].cpu().numpy().nonzero()[0]
-    found: list[tuple[np.ndarray, ...]] = []
+    blocks: list[tuple[np.ndarray, ...]] = []
     for first in range(0, len(masks), BLOCK):
         block = masks[first : first + BLOCK]
         inside = torch.zeros(1, height, width, BLOCK)
@@ -165,7 +165,7 @@ def _of_view(nearby: Nearby, view: TrainingView) -> tuple[sparse.csc_matrix, np.
         assert gradients.features is not None  # for the type checker
         weights = gradients.features.cpu().numpy()[seen]
         row, column = np.nonzero(weights > FAINTEST)
-        found.append((weights[row, column], rows[seen[row]], column + first))
-    weights, row, column = map(np.concatenate, zip(*found, strict=True))
+        blocks.append((weights[row, column], rows[seen[row]], column + first))
+    weights, row, column = map(np.concatenate, zip(*blocks, strict=True))
     table = sparse.csc_matrix((weights, (row, column)), shape=(len(nearby.gaussians), len(names)))
     return table, np.bincount(dense.reshape(-1)[:-1], minlength=len(names)).astype(float)

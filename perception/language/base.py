@@ -119,7 +119,7 @@ def packaged_file(package: str, pattern: str) -> Path:
     if spec is None or spec.origin is None:
         raise missing_extra(package.replace("_", "-"), "demo")
     folder = Path(spec.origin).parent
-    found = sorted(folder.glob(pattern))
-    if not found:
+    files = sorted(folder.glob(pattern))
+    if not files:
         raise InputError(f"{folder}: holds no {pattern}; reinstall {package.replace('_', '-')}")
-    return found[0]
+    return files[0]

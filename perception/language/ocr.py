@@ -99,7 +99,7 @@ class TextReader:
         inside = _run(self._networks[0], pixels)[0, 0]
         factor = np.array([width / size[0], height / size[1]], np.float32)
         contours, _ = cv2.findContours((inside > THRESHOLD).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
-        found = []
+        rectangles = []
         for contour in contours:
             center, (a, b), angle = cv2.minAreaRect(contour)
             if min(a, b) < 3 or _mean_inside(inside, contour) < LINE_SCORE:
@@ -107,8 +107,8 @@ class TextReader:
             grown = UNCLIP * a * b / (a + b)  # 2 d, with perimeter 2 (a + b)
             corners = _rectangle(np.array(center), a + grown, b + grown, np.deg2rad(angle)) * factor
             if min(_sides(corners)) >= LEAST_HEIGHT:
-                found.append(corners)
-        return sorted(found, key=lambda c: -float(np.prod(_sides(c))))[:LINES]
+                rectangles.append(corners)
+        return sorted(rectangles, key=lambda c: -float(np.prod(_sides(c))))[:LINES]
 
     def recognise(self, photo: np.ndarray, corners: np.ndarray) -> tuple[str, float]:
         """Text and score of one rectangle [4, 2] whose first corner is the text's top left."""

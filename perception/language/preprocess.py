@@ -69,7 +69,7 @@ class Family:
 
 
 CLIP_FAMILY = Family("CLIP")
-# What `config.json` says of the model (`model_type` of transformers, names of timm in open_clip's) -> family.
+# Names of the model in `config.json` (`model_type` of transformers, names of timm in open_clip's) -> family.
 FAMILIES = {
     "siglip": Family("SigLIP", SIGLIP, canonical=True, pooled=True),
     "fastvit_mci": Family("MobileCLIP", MOBILECLIP),
@@ -86,12 +86,12 @@ def find_preprocess(model: Path, input_side: int | None) -> Preprocess:
     InputError if neither is known: guessed normalisation gives wrong embeddings that look right.
     """
     family = family_of(model)
-    found = _from_configs(model) or (family and family.preprocess)
-    if not found:
+    known = _from_configs(model) or (family and family.preprocess)
+    if not known:
         raise InputError(
             f"{model}: its preprocessing is not known; put the model's own {_HINT} beside it or into the folder above"
         )
-    return replace(found, size=input_side) if input_side else found
+    return replace(known, size=input_side) if input_side else known
 
 
 def family_of(model: Path) -> Family | None:

@@ -78,8 +78,8 @@ def _padding_id(backend: Any, model: Path) -> int:
     name = read_config(model, "tokenizer_config.json").get("pad_token")
     if isinstance(name, dict):
         name = name.get("content")
-    found = backend.token_to_id(name) if isinstance(name, str) else None
-    return int((backend.padding or {}).get("pad_id") or 0) if found is None else int(found)
+    number = backend.token_to_id(name) if isinstance(name, str) else None
+    return int((backend.padding or {}).get("pad_id") or 0) if number is None else int(number)
 
 
 def _text_config(model: Path) -> dict[str, Any]:

@@ -28,7 +28,7 @@ _LEAST_VOXELS = 100
 
 
 class BuiltinSegmentation(MaskSource):
-    """Segments whole objects in all photos jointly. Needs approximate depth of every photo, which the map renders."""
+    """Segments objects in all photos jointly. Needs approximate depth of every photo, which the map renders."""
 
     needs_depth = True
 

@@ -182,6 +182,6 @@ def region_features(graph: SurfaceGraph, a: int, sibling: int | None) -> np.ndar
             -(colours * np.log(colours + 1e-9)).sum(),  # colours, entropy of their histogram in nats
             next_size,  # logarithm of the sibling's voxels over its own
             next_contact,  # as contact, with the sibling alone, relative to the smaller one
-            np.log(pixels / voxels),  # pixels for each voxel, logarithm: how closely it was seen
+            np.log(pixels / voxels),  # pixels for each voxel, logarithm: large where cameras were near
         ]
     )

@@ -251,8 +251,8 @@ def open_sam(spec: str, threads: int = 0) -> SamModel:
     if len(encoders) == 1 and len(decoders) == 1:
         return SamModel(encoders[0], decoders[0])
     kinds = ("encoder" if g.is_encoder else "decoder" if g.is_decoder else signature(g.session) for g in graphs)
-    found = "; ".join(f"{g.path.name}: {kind}" for g, kind in zip(graphs, kinds, strict=True))
-    what = f"expected one SAM encoder and its decoder, found {found}"
+    roles = "; ".join(f"{g.path.name}: {kind}" for g, kind in zip(graphs, kinds, strict=True))
+    what = f"expected one SAM encoder and its decoder, found {roles}"
     raise InputError(f"sam:{spec}: {what}; put both into one folder or write sam:ENCODER,DECODER")
 
 
@@ -279,8 +279,8 @@ def sam_graphs(path: Path) -> list[Path]:
     if path.is_dir():
         return model_graphs(path)[0]
     if not path.is_file():
-        found = "no such file or folder, nor a stored model; expected a SAM encoder and decoder as ONNX"
-        raise InputError(f"sam:{path}: {found}; {known_names()}")
+        missing = "no such file or folder, nor a stored model; expected a SAM encoder and decoder as ONNX"
+        raise InputError(f"sam:{path}: {missing}; {known_names()}")
     partners = [path.with_name(path.name.replace(a, b)) for a, b in (("encoder", "decoder"), ("decoder", "encoder"))]
     beside = [partner for partner in partners if partner != path and partner.is_file()]
     other = [file for file in sorted(path.parent.glob("*.onnx")) if file != path and "decoder" in file.name]
@@ -309,8 +309,8 @@ def _check_pair(encoder: Graph, decoder: Graph) -> None:
         raise InputError(f"{decoder.path}: needs {', '.join(unmet)}, which {encoder.path.name} does not give")
     lacking = [role for role in ("masks", "iou") if role not in decoder.outputs]
     if lacking:
-        found = ", ".join(argument.name for argument in decoder.session.get_outputs())
-        raise InputError(f"{decoder.path}: no output for {' and '.join(lacking)} (found {found}); not a SAM decoder")
+        outputs = ", ".join(argument.name for argument in decoder.session.get_outputs())
+        raise InputError(f"{decoder.path}: no output for {' and '.join(lacking)} (found {outputs}); not a SAM decoder")
     logits = next(x for x in decoder.session.get_outputs() if x.name == decoder.outputs["masks"])
     if "bool" in logits.type:
         raise InputError(f"{decoder.path}: gives masks without logits; stability cannot be measured")

@@ -143,18 +143,18 @@ def choose_neighbours(views: list[StereoView]) -> list[list[int]]:
         useful = np.stack([_usefulness(view, other, points) for other in views])
         useful[i] = 0
         first = second = np.zeros(len(points))  # usefulness of the best two chosen views for each point
-        found: list[int] = []
-        while len(found) < min(NEIGHBOURS, len(views) - 1):
+        best_views: list[int] = []
+        while len(best_views) < min(NEIGHBOURS, len(views) - 1):
             gain = np.maximum(useful, first) + np.clip(np.minimum(useful, first), second, None) - first - second
             gain = gain.mean(axis=1)
-            gain[found] = -1
+            gain[best_views] = -1
             best = int(gain.argmax())
             if gain[best] < _LEAST_GAIN:
                 break
-            found.append(best)
+            best_views.append(best)
             second = np.maximum(second, np.minimum(useful[best], first))
             first = np.maximum(first, useful[best])
-        chosen.append(found)
+        chosen.append(best_views)
     return chosen
 
 

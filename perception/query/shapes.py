@@ -1,4 +1,4 @@
-"""Shape scores: how well each instance's geometry fits a floor, wall, ceiling, picture, rug, table, ball or box.
+"""Shape scores: fit of each instance's geometry to a floor, wall, ceiling, picture, rug, table, ball or box.
 
 An image classifier does not recognise walls and floors, but a map has geometry: the up direction, level and upright
 planes, the lowest surface, flat objects on a wall. No metric scale is needed: lengths are relative to `span`, the
@@ -104,11 +104,11 @@ def shape_scores(
     bodies = [body for body in measured if body is not None]
     if not bodies:
         return scores
-    found = {"ball": np.array([roundness(body.points) for body in bodies])}
+    by_kind = {"ball": np.array([roundness(body.points) for body in bodies])}
     if up is not None:
-        found["box"] = np.array([boxiness(body.points) for body in bodies])
-        found |= room_scores(bodies, float(np.median((camera_centres(camera_from_world) @ frame.T)[:, 2])))
-    for kind, values in found.items():
+        by_kind["box"] = np.array([boxiness(body.points) for body in bodies])
+        by_kind |= room_scores(bodies, float(np.median((camera_centres(camera_from_world) @ frame.T)[:, 2])))
+    for kind, values in by_kind.items():
         scores[rows, KINDS.index(kind)] = values
     return scores
 
@@ -165,8 +165,8 @@ def roundness(points: np.ndarray) -> float:
     radii = np.linalg.norm(points - solution[:3], axis=1)
     radius = float(np.median(radii))
     size = np.percentile(points, 97, axis=0) - np.percentile(points, 3, axis=0)
-    whole = ramp(float(size.min()) / max(2 * radius, 1e-9), *WHOLE_BALL)
-    return whole * ramp(float(np.abs(radii - radius).mean()) / max(radius, 1e-9), *ROUND)
+    complete = ramp(float(size.min()) / max(2 * radius, 1e-9), *WHOLE_BALL)
+    return complete * ramp(float(np.abs(radii - radius).mean()) / max(radius, 1e-9), *ROUND)
 
 
 def boxiness(points: np.ndarray) -> float:
