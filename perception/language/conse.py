@@ -20,7 +20,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,13 +30,12 @@ from perception.io.atomic import atomic_file
 from perception.io.documents import DAMAGE
 from perception.language import minilm
 from perception.language.base import Part, Reading, check_images, check_texts, packaged_file, unit_rows
-from perception.language.household import household_thing
+from perception.language.household import CLASSES, class_names, household_thing
 from perception.language.minilm import MiniLM
 from perception.machine import torch_on_one_thread
 from perception.onnx.store import cache_folder
 
 TOP = 20  # number of classes T in the sentence-space embedding
-CLASSES = 1000
 TAU = 0.03  # temperature τ: cosine difference at which two words no longer mean the same class
 KNOWN = 0.5  # weight in q of the classes that the table lists for a household thing
 SHARE = 0.7  # weight of class space in the relevancy; TAU and SHARE are tuned on the demo's objects
@@ -138,12 +136,6 @@ class ConseEncoder:
         from perception.language.efficientnet_lite2 import load_classifier
 
         return load_classifier(packaged_file(*CLASSIFIER))
-
-
-def class_names() -> list[list[str]]:
-    """The names of each of the 1000 ImageNet classes, in the classifier's order."""
-    text = (Path(__file__).parent / "imagenet_classes.txt").read_text(encoding="utf-8")
-    return [line.split(", ") for line in text.splitlines()]
 
 
 def _cached(names: list[list[str]], encode: Any) -> np.ndarray:

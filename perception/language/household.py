@@ -10,7 +10,7 @@ import numpy as np
 
 from perception.language.shape_words import thing_words
 
-CLASSES = 1000
+CLASSES = 1000  # of ImageNet
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,12 @@ class Household:
     classes: np.ndarray | None
     size: tuple[float, float]
     thickness: float
+
+
+def class_names() -> list[list[str]]:
+    """The names of each of the 1000 ImageNet classes, in the classifier's order."""
+    text = (Path(__file__).parent / "imagenet_classes.txt").read_text(encoding="utf-8")
+    return [line.split(", ") for line in text.splitlines()]
 
 
 def household_thing(text: str) -> Household | None:
@@ -49,8 +55,6 @@ def _longest() -> int:
 
 @lru_cache(maxsize=1)
 def _table() -> dict[str, Household]:
-    from perception.language.conse import class_names
-
     number: dict[str, int] = {}
     for n, names in enumerate(class_names()):
         number.setdefault(names[0], n)

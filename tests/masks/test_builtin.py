@@ -438,6 +438,12 @@ def test_relatives_of_regions_are_compared_with_them():
     np.testing.assert_array_equal(rows[:, 12:], np.array([parent, grandparent, larger]).T < 0)
 
 
+def test_every_input_of_the_trained_weights_has_a_name():
+    model, relatives, missing = read_model(), 6, 3
+    assert len(model.pair.parts[0]) == len(set(PAIR_FEATURES))
+    assert len(model.region.parts[0]) == relatives * len(set(REGION_COLUMNS)) + missing
+
+
 def test_networks_give_the_same_bits_for_any_batch():
     network = read_model().pair
     x = np.random.default_rng(0).normal(0, 2, (50, len(network.parts[0]))) * network.parts[1] + network.parts[0]
