@@ -2,48 +2,48 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy import sparse
 
-from perception.instances.votes import MaskVotes, Table
+from perception.instances.votes import MaskVotes
 
 CHUNK, ENTRIES = 20_000, 10_000_000  # Gaussians, and their affinities with all instances or 4 × weights, at once
-NEIGHBOURS = 8
-LEAST_AGREEMENT = 0.5
-MARGIN = 0.15
+NEIGHBOURS = 8  # nearest voters of a Gaussian
+LEAST_AGREEMENT = 0.5  # affinity with an instance that a Gaussian may join: half of its pixels are in its masks
+MARGIN = 0.15  # affinity by which another instance must be better
 
 
-def mask_shares(table: Table) -> sparse.csr_matrix:
+def mask_shares(groups: MaskVotes) -> sparse.csr_matrix:
     """[K, M]: of the pixels of instance k under masks of a view, the fraction in each mask of that view."""
-    _, _, first, labelled = table.runs()
-    shares = table.pixels.copy()
-    shares.data /= np.maximum(table.per_entry(first, labelled), 1e-12).astype(np.float32)
+    _, _, first, labelled = groups.runs()
+    shares = groups.pixels.copy()
+    shares.data /= np.maximum(groups.per_entry(first, labelled), 1e-12).astype(np.float32)
     return shares
 
 
 def affinities(votes: MaskVotes, shares: sparse.csr_matrix, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean of `shares` over the pixels of each Gaussian [R, K], and its number of pixels under masks [R]."""
-    weights = votes.weights[rows]
-    pixels = np.asarray(weights.sum(axis=1)).reshape(-1)
-    return (weights @ shares.T).toarray() / np.maximum(pixels, 1e-12)[:, None], pixels
+    pixels = votes.pixels[rows]
+    total = np.asarray(pixels.sum(axis=1)).reshape(-1)
+    return (pixels @ shares.T).toarray() / np.maximum(total, 1e-12)[:, None], total
 
 
-def _at_once(votes: MaskVotes, count: int) -> int:
-    """The number of Gaussians whose affinities with `count` instances are computed together."""
-    return min(CHUNK, ENTRIES // max(1, count, 4 * votes.weights.nnz // max(1, votes.weights.shape[0])) + 1)
+def _in_chunks(rows: np.ndarray, votes: MaskVotes, count: int) -> Iterator[np.ndarray]:
+    """Parts of rows [R] whose affinities with `count` instances are computed together."""
+    size = min(CHUNK, ENTRIES // max(1, count, 4 * votes.pixels.nnz // max(1, votes.pixels.shape[0])) + 1)
+    yield from (rows[begin : begin + size] for begin in range(0, len(rows), size))
 
 
 def memberships(ids: np.ndarray, votes: MaskVotes) -> np.ndarray:
     """[N] float32 in [0, 1]: agreement of each Gaussian's masks with its instance (`affinities`); 0 for noise."""
     count = int(ids.max(initial=-1)) + 1
-    shares = mask_shares(votes.table(ids, count))
-    found = np.zeros(len(ids), np.float32)
-    chunk = _at_once(votes, count)
-    for begin in range(0, len(ids), chunk):
-        rows = begin + np.flatnonzero(ids[begin : begin + chunk] >= 0)
-        if len(rows):
-            found[rows] = affinities(votes, shares, rows)[0][np.arange(len(rows)), ids[rows]]
-    return np.clip(found, 0, 1)
+    shares = mask_shares(votes.of_groups(ids, count))
+    agreement = np.zeros(len(ids), np.float32)
+    for rows in _in_chunks(np.flatnonzero(ids >= 0), votes, count):
+        agreement[rows] = affinities(votes, shares, rows)[0][np.arange(len(rows)), ids[rows]]
+    return np.clip(agreement, 0, 1)
 
 
 def reassign(
@@ -63,17 +63,14 @@ def reassign(
         return assigned
     from scipy.spatial import cKDTree
 
-    shares = mask_shares(votes.table(ids, count))
+    shares = mask_shares(votes.of_groups(ids, count))
     tree = cKDTree(means[voters])
     near = min(NEIGHBOURS + 1, len(voters))
-    finite = np.flatnonzero(np.isfinite(means).all(axis=1))
-    chunk = _at_once(votes, count)
-    for begin in range(0, len(finite), chunk):
-        rows = finite[begin : begin + chunk]
+    for rows in _in_chunks(np.flatnonzero(np.isfinite(means).all(axis=1)), votes, count):
         affinity, pixels = affinities(votes, shares, rows)
-        _, found = tree.query(means[rows], k=near, workers=-1)
-        around = ids[voters[found]]
-        around[voters[found] == rows[:, None]] = -1  # a Gaussian is not its own neighbour
+        neighbours = voters[tree.query(means[rows], k=near, workers=-1)[1]]
+        around = ids[neighbours]
+        around[neighbours == rows[:, None]] = -1  # a Gaussian is not its own neighbour
         popular, support = _mode(around)
         at, own = np.arange(len(rows)), ids[rows]
         mine = np.where(own >= 0, affinity[at, own], 0)

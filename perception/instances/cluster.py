@@ -9,6 +9,7 @@ import numpy as np
 
 from perception.config import InstanceConfig
 
+NEIGHBOURS = 12
 MIN_OPACITY = 0.1
 """Minimum opacity of Gaussians that are clustered. Fainter ones are mostly semi-transparent noise between objects."""
 MAX_CLUSTERED = 60_000
@@ -34,10 +35,10 @@ def cluster_gaussians(
     solid = np.flatnonzero((opacities >= least) & np.isfinite(features).all(axis=1))
     if len(solid) < config.min_cluster_size:
         return ids
-    found = cluster_features(features[solid], config, seed)
+    labels = cluster_features(features[solid], config, seed)
     if config.split:
-        found = split_disconnected(means[solid], scales[solid], found, config.min_cluster_size)
-    ids[solid] = by_falling_size(found)
+        labels = split_disconnected(means[solid], scales[solid], labels, config.min_cluster_size)
+    ids[solid] = by_falling_size(labels)
     return ids
 
 
@@ -91,9 +92,9 @@ def _spread(features: np.ndarray, chosen: np.ndarray, labels: np.ndarray, sample
 def split_disconnected(means: np.ndarray, scales: np.ndarray, ids: np.ndarray, smallest: int) -> np.ndarray:
     """Gives each spatially connected component of a cluster its own id. Components under `smallest` become noise.
 
-    Two Gaussians are connected if one is among the 12 nearest of the other, and the distance of their means is at most
-    max(s, twice the sum of their largest scales) and at most 4 s, with s = 3 × the 95th percentile of nearest-neighbour
-    distances. Objects that share no photo need this: the loss does not separate their features.
+    Two Gaussians are connected if one is among the NEIGHBOURS nearest of the other, and the distance of their means is
+    at most max(s, twice the sum of their largest scales) and at most 4 s, with s = 3 × the 95th percentile of
+    nearest-neighbour distances. Objects that share no photo need this: the loss does not separate their features.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -104,12 +105,9 @@ def split_disconnected(means: np.ndarray, scales: np.ndarray, ids: np.ndarray, s
     radius = scales.max(axis=1)
     for cluster in range(int(ids.max(initial=-1)) + 1):
         rows = np.flatnonzero(ids == cluster)
-        if len(rows) == 0:
+        if len(rows) < max(smallest, 2):
             continue
-        k = min(13, len(rows))
-        distance, neighbour = cKDTree(means[rows]).query(means[rows], k=k, workers=-1)
-        if k == 1:
-            continue
+        distance, neighbour = cKDTree(means[rows]).query(means[rows], k=min(NEIGHBOURS + 1, len(rows)), workers=-1)
         spacing = 3 * float(np.quantile(distance[:, 1], 0.95))
         reach = np.maximum(spacing, 2 * (radius[rows][:, None] + radius[rows][neighbour]))
         source, column = np.nonzero(distance <= np.minimum(reach, 4 * spacing))
@@ -126,9 +124,7 @@ def by_falling_size(ids: np.ndarray) -> np.ndarray:
     """Renumbers ids to 0, 1, … by falling size (ties: the smaller old id first). −1 is kept."""
     count = int(ids.max(initial=-1)) + 1
     sizes = np.bincount(ids[ids >= 0], minlength=count)
-    order = np.argsort(-sizes, kind="stable")
-    rank = np.empty(count + 1, np.int32)
-    rank[order] = np.arange(count)
-    rank[count] = -1  # id −1 indexes the last entry
+    rank = np.full(count + 1, -1, np.int32)  # id −1 indexes the last entry
+    rank[np.argsort(-sizes, kind="stable")] = np.arange(count)
     rank[:count][sizes == 0] = -1
-    return rank[ids].astype(np.int32)
+    return rank[ids]

@@ -1,6 +1,6 @@
 """A score in [0, 1] per instance, computed without ground truth and calibrated to the probability of being correct.
 
-    raw = geometric mean of  agreement · membership · (support + ½) / (support + 2½)
+    raw = geometric mean of agreement, membership and (support + ½) / (support + 2½)
 
 agreement: IoU with the 2D mask at each of its pixels, mean over its pixels in the training views. membership: mean
 of `assign.memberships` over its Gaussians. support: number of photos in which one mask matches it.
@@ -13,32 +13,24 @@ import numpy as np
 from perception.instances.consensus import Evidence
 
 CALIBRATION = (
-    (0.0, 0.0),
-    (0.2, 0.662),
-    (0.3, 0.782),
-    (0.4, 0.829),
-    (0.5, 0.904),
-    (0.6, 0.996),
-    (0.7, 0.997),
-    (0.85, 0.998),
-    (1.0, 1.0),
+    (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0),
+    (0.0, 0.662, 0.782, 0.829, 0.904, 0.996, 0.997, 0.998, 1.0),
 )
-"""Raw score → probability of IoU > 0.5 with a true object: isotonic fit on 662 instances (537 correct) of 40 random
-scenes of balls with mask errors. Made strictly increasing, to keep the order of raw scores."""
+"""Raw scores, and the probability of IoU > 0.5 with a true object at each: isotonic fit on 662 instances (537 correct)
+of 40 random scenes of balls with mask errors. Made strictly increasing, to keep the order of raw scores."""
 
 
-def raw_scores(ids: np.ndarray, membership: np.ndarray, found: Evidence) -> np.ndarray:
+def raw_scores(ids: np.ndarray, membership: np.ndarray, seen: Evidence) -> np.ndarray:
     """[K] float64 in [0, 1] from ids [N] int32, membership [N] in [0, 1] and the evidence of the K instances."""
-    count = len(found.pixels)
+    count = len(seen.pixels)
     member = ids >= 0
     sizes = np.maximum(np.bincount(ids[member], minlength=count), 1)
     strength = np.bincount(ids[member], weights=membership[member], minlength=count) / sizes
-    factors = (found.agreement, strength, (found.support + 0.5) / (found.support + 2.5))
+    factors = (seen.agreement, strength, (seen.support + 0.5) / (seen.support + 2.5))
     product = np.prod([np.clip(factor, 0, 1) for factor in factors], axis=0)
     return np.asarray(product ** (1 / len(factors)))
 
 
 def calibrated(raw: np.ndarray) -> np.ndarray:
     """Probability that an instance has IoU > 0.5 with a true object; monotone in the raw score."""
-    x, y = np.array(CALIBRATION).T
-    return np.interp(raw, x, y)
+    return np.interp(raw, *CALIBRATION)

@@ -20,8 +20,7 @@ FILL = 127  # grey value of the padding: mid-range, near zero after any encoder'
 
 
 def view_scores(mask_pixels: np.ndarray, image_pixels: np.ndarray, visible_fraction: np.ndarray) -> np.ndarray:
-    """s_vi [I, V], or [L] of some pairs of both, from mask_pixels, image_pixels and visible_fraction in [0, 1], arrays
-    of this shape, or [V] for all instances."""
+    """s_vi [I, V], or [L] of some pairs of both; visible_fraction: in [0, 1]. Arrays of this shape, or [V]."""
     return np.asarray(mask_pixels, np.float64) / np.asarray(image_pixels, np.float64) * visible_fraction
 
 
@@ -51,11 +50,9 @@ def expand_box(box: Box, ratio: float, width: int, height: int) -> Box:
 
 def letterbox(image: np.ndarray) -> np.ndarray:
     """Pads an image [H, W, 3] to a square of side max(H, W), centred, without scaling."""
-    height, width = image.shape[:2]
-    side = max(height, width)
-    top, left = (side - height) // 2, (side - width) // 2
-    bottom, right = side - height - top, side - width - left
-    return cv2.copyMakeBorder(image, top, bottom, left, right, cv2.BORDER_CONSTANT, value=(FILL,) * 3)
+    rows, columns = (max(image.shape[:2]) - side for side in image.shape[:2])  # to be added
+    ends = rows // 2, rows - rows // 2, columns // 2, columns - columns // 2
+    return cv2.copyMakeBorder(image, *ends, cv2.BORDER_CONSTANT, value=(FILL,) * 3)
 
 
 def crop_levels(photo: np.ndarray, mask: np.ndarray, levels: int = 3) -> list[np.ndarray]:

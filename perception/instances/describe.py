@@ -13,7 +13,7 @@ import numpy as np
 from perception.instances.crops import crop_levels, mask_box
 from perception.language.base import Encoder, unit_rows
 from perception.language.colors import palette
-from perception.language.description import InstanceDescription, unseen
+from perception.language.description import Box, InstanceDescription, unseen
 from perception.progress import QUIET, Progress
 
 COLOR_SAMPLES = 2000  # pixels of a mask per view, from which the palette is computed
@@ -38,44 +38,38 @@ def describe_instances(
     for instance, views in enumerate(choices):
         for rank, view in enumerate(views):
             wanted.setdefault(int(view), []).append((instance, rank))
-    seen: list[dict[int, Any]] = [{} for _ in choices]
+    seen: list[dict[int, tuple[str, Box | None, np.ndarray, np.ndarray]]] = [{} for _ in choices]
     crops: list[np.ndarray] = []
-    waiting: list[tuple[int, int, Any]] = []
+    waiting: list[tuple[int, int, str, Box | None, slice, np.ndarray]] = []
     for done, view in enumerate(sorted(wanted), start=1):
         photo, ids = load(view)
         for instance, rank in wanted[view]:
             mask = ids == instance
-            if levelled := crop_levels(photo, mask, levels):
-                rows = slice(len(crops), len(crops) + len(levelled))
-                waiting.append((instance, rank, (view_names[view], mask_box(mask), rows, _color_sample(photo, mask))))
-                crops += levelled
+            if own := crop_levels(photo, mask, levels):
+                rows = slice(len(crops), len(crops) + len(own))
+                waiting.append((instance, rank, view_names[view], mask_box(mask), rows, _color_sample(photo, mask)))
+                crops += own
         if len(crops) >= AT_ONCE or (crops and done == len(wanted)):
             embedded = encoder.encode_images(crops)
-            for instance, rank, (name, box, rows, colors) in waiting:
+            for instance, rank, name, box, rows, colors in waiting:
                 seen[instance][rank] = (name, box, embedded[rows], colors)
             crops, waiting = [], []
         progress.update("language", done, len(wanted))
-    return [_summary(found, encoder.dim) for found in seen]
+    return [_summary(views, encoder.dim) for views in seen]
 
 
-def _summary(found: dict[int, Any], dim: int) -> InstanceDescription:
-    if not found:
+def _summary(views: dict[int, Any], dim: int) -> InstanceDescription:
+    """views: by rank, name, box, embeddings of its crops [L, D], and pixels [P, 3] of the instance."""
+    if not views:
         return unseen(dim)
-    views = [found[rank] for rank in sorted(found)]
-    per_view = unit_rows(np.stack([rows.mean(axis=0) for _, _, rows, _ in views]))
-    mean = np.concatenate([rows for _, _, rows, _ in views]).mean(axis=0)
-    colors = palette(np.concatenate([pixels for _, _, _, pixels in views]))
-    return InstanceDescription(
-        unit_rows(mean[None])[0],
-        per_view,
-        colors,
-        [name for name, *_ in views],
-        [box for _, box, *_ in views],
-    )
+    names, boxes, crops, pixels = zip(*(views[rank] for rank in sorted(views)), strict=True)
+    per_view = unit_rows(np.stack([rows.mean(axis=0) for rows in crops]))
+    embedding = unit_rows(np.concatenate(crops).mean(axis=0)[None])[0]
+    return InstanceDescription(embedding, per_view, palette(np.concatenate(pixels)), list(names), list(boxes))
 
 
 def _color_sample(photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Up to COLOR_SAMPLES pixels [P, 3] of the mask without its rim of mixed colours; the whole mask if it is thin."""
+    """Up to COLOR_SAMPLES pixels [P, 3] of the mask without its rim of mixed colours; the full mask if it is thin."""
     import cv2
 
     inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)

@@ -24,9 +24,9 @@ def over_segment(means: np.ndarray, features: np.ndarray, count: int, seed: int 
         axis = int(np.ptp(np.quantile(means, [0.05, 0.95], axis=0), axis=0).argmax())
         order = np.argsort(means[:, axis], kind="stable")
         halves = np.array_split(order, 2)
-        found = [over_segment(means[half], features[half], -(-count // 2), seed) for half in halves]
+        pair = [over_segment(means[half], features[half], -(-count // 2), seed) for half in halves]
         groups = np.empty(len(means), np.int64)
-        groups[order] = np.concatenate([found[0], found[1] + found[0].max() + 1])
+        groups[order] = np.concatenate([pair[0], pair[1] + pair[0].max() + 1])
         return groups
     centred = means - np.median(means, axis=0)
     radius = float(np.quantile(np.linalg.norm(centred, axis=1), 0.9)) if len(means) else 1.0

@@ -19,8 +19,8 @@ MOST_LABELS = 1 << 24
 
 @dataclass(frozen=True)
 class Silhouettes:
-    """One view of shape (H, W). packed: `ids`, compressed; shown [S]: ids of the instances with pixels; pixels [S]: how
-    many; visible [S]: how many of their Gaussians contribute to any pixel."""
+    """One view of shape (H, W). packed: `ids`, compressed; shown [S]: ids of the instances with pixels; pixels [S]:
+    their number; visible [S]: number of their Gaussians that contribute to any pixel."""
 
     packed: bytes
     shape: tuple[int, ...]
@@ -57,12 +57,12 @@ def render_silhouettes(
         owners = np.where(owners < 0, -1, np.searchsorted(known, owners)).astype(np.int32)
     label_images = rasterizer_for(gaussians.means.device).label_images
     images, visible = label_images(inputs, owners, threshold, Settings(width, height, depth=False, eps2d=eps2d))
-    found = []
+    silhouettes = []
     for ids, image in zip(owners, images, strict=True):
         shown, pixels = np.unique(image[image >= 0], return_counts=True)
         seen = np.bincount(ids[visible & (ids >= 0)])[shown]
         if known is not None:
             shown, image = known[shown], np.where(image < 0, -1, known[image])
         packed = zlib.compress(image.astype(np.int32).tobytes(), 1)
-        found.append(Silhouettes(packed, image.shape, shown, pixels, seen))
-    return found
+        silhouettes.append(Silhouettes(packed, image.shape, shown, pixels, seen))
+    return silhouettes

@@ -1,9 +1,13 @@
 """Printed texts of instances: lines of text read in their best views, assigned by silhouette and fused over the views.
 
 A line belongs to the instance that covers most of its rectangle. Views read a text in part or with errors. Of all reads
-of an instance, the text that explains most characters is kept, those that agree with it are set aside, and so on. With
-the maxima over the reads r in view v that agree with t, d the edit distance, and d' that to the nearest stretch:
-    explained(t) = Σ_v max s_r · (l − d'(r, t) − UNREAD · (L − l))   l, L: lengths of the shorter and longer of r and t
+of an instance, the text that explains most characters is kept, those that agree with it are set aside, and so on.
+
+    r, s_r  a read and its score     v      a view; maxima are over its reads that agree with t
+    t       a text                   l, L   lengths of the shorter and longer of r and t
+    d, d'   edit distance of r and t, and of the shorter to the nearest stretch of the longer
+
+    explained(t) = Σ_v max s_r · (l − d'(r, t) − UNREAD · (L − l))
     score(t) = 1 − Π_v (1 − max s_r · (1 − d(r, t) / L))
 """
 
@@ -40,11 +44,10 @@ def read_texts(
 
     choices and load: as for `describe.describe_instances`.
     """
-    rank: dict[int, int] = {}
-    for views in choices:
-        for place, view in enumerate(views):
-            rank[int(view)] = min(place, rank.get(int(view), place))
-    wanted = sorted(sorted(rank, key=lambda view: (rank[view], view))[:MOST_VIEWS])
+    best: dict[int, int] = {}  # rank of each view for the instance that it is best for
+    for rank, view in ((rank, int(view)) for views in choices for rank, view in enumerate(views)):
+        best[view] = min(rank, best.get(view, rank))
+    wanted = sorted(sorted(best, key=lambda view: (best[view], view))[:MOST_VIEWS])
     reads: list[list[Read]] = [[] for _ in choices]
     for done, view in enumerate(wanted, start=1):
         photo, ids = load(view)
@@ -53,7 +56,7 @@ def read_texts(
             if owner is not None and line.score >= LEAST and sum(c.isalnum() for c in line.text) > 1:
                 reads[owner].append((view, line.text, line.score))
         progress.update("texts", done, len(wanted))
-    return [fuse(found) for found in reads]
+    return [fuse(own) for own in reads]
 
 
 def store_texts(entries: Sequence[dict[str, Any]], texts: Sequence[list[dict[str, Any]]]) -> None:
@@ -70,8 +73,8 @@ def owner_of(corners: np.ndarray, ids: np.ndarray) -> int | None:
     top, bottom = corners[0] + s * (corners[1] - corners[0]), corners[3] + s * (corners[2] - corners[3])
     points = np.floor(top[:, None] + t[None] * (bottom - top)[:, None]).astype(np.int64).reshape(-1, 2)
     inside = ((points >= 0) & (points < ids.shape[::-1])).all(axis=1)
-    found = ids[points[inside, 1], points[inside, 0]]
-    counts = np.bincount(found[found >= 0]) if (found >= 0).any() else np.zeros(1, int)
+    shown = ids[points[inside, 1], points[inside, 0]]
+    counts = np.bincount(shown[shown >= 0]) if (shown >= 0).any() else np.zeros(1, int)
     return int(counts.argmax()) if counts.max() >= COVER * len(points) else None
 
 
@@ -81,9 +84,9 @@ def fuse(reads: Sequence[Read]) -> list[dict[str, Any]]:
     left = list(reads)
     while left and len(texts) < MOST_TEXTS:
         candidates = sorted({text for _, text, _ in left})
-        found = [_by_view([read for read in left if _agree(read[1], text)], text) for text in candidates]
-        chosen = int(np.argmax([views[:, 0].sum() for views in found]))
-        best, views = candidates[chosen], found[chosen]
+        support = [_by_view([read for read in left if _agree(read[1], text)], text) for text in candidates]
+        chosen = int(np.argmax([views[:, 0].sum() for views in support]))
+        best, views = candidates[chosen], support[chosen]
         score = 1.0 - float(np.prod(1.0 - views[:, 1]))
         if score >= (SINGLE if len(views) == 1 or len(best) < FEW else LEAST):
             texts.append({"text": best, "score": round(min(score, 0.99), 2)})

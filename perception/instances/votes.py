@@ -2,7 +2,7 @@
 
 The weight of Gaussian n in mask m is Σ_{p ∈ m} w_n(p), with w_n(p) = alpha · transmittance, the weight of its colour in
 pixel p. Rendering is linear in the features, so these sums are the gradient of the sum of the rendered features over
-the mask. One backward pass computes 16 masks for all Gaussians.
+the mask. One backward pass computes BLOCK masks for all Gaussians.
 """
 
 from __future__ import annotations
@@ -28,24 +28,39 @@ FAINTEST = 0.02  # pixels; smaller weights are dropped to keep the matrix sparse
 
 
 @dataclass(frozen=True)
-class Table:
-    """Pixels that R groups fill, sparse: [R, M] per mask, void [R, V] per view without a mask. view, area: as in
-    MaskVotes. The columns of each row ascend."""
+class MaskVotes:
+    """Weights of N Gaussians, or of groups of them, in the M masks of V views: the pixels that they fill; sparse.
+
+    pixels [N, M] float32: in each mask. void [N, V] float32: in each view, where it has no mask. view [M] int64: of
+    each mask, 0 … V − 1 ascending. area [M] float64: pixels of each mask.
+    """
 
     pixels: sparse.csr_matrix
     void: sparse.csr_matrix
     view: np.ndarray
     area: np.ndarray
 
-    def pooled(self, groups: Sequence[np.ndarray]) -> Table:
-        """The table of G unions of rows; groups: the rows of each."""
+    def of_groups(self, ids: np.ndarray, count: int) -> MaskVotes:
+        """Votes of the groups 0 … count − 1, sums over their members; ids [N]: the group of each row, −1 = none."""
+        rows = np.flatnonzero(ids >= 0)
+        ones = np.ones(len(rows), np.float32)
+        return self._summed(sparse.csr_matrix((ones, (ids[rows], rows)), shape=(count, len(ids))))
+
+    def pooled(self, groups: Sequence[np.ndarray]) -> MaskVotes:
+        """Votes of groups that may share rows; groups: the rows of each."""
         ends = np.cumsum([0, *map(len, groups)])
-        gather = (np.ones(ends[-1], np.float32), np.concatenate(groups), ends)
-        shape = (len(groups), self.pixels.shape[0])
-        return summed(sparse.csr_matrix(gather, shape=shape), self.pixels, self.void, self.view, self.area)
+        members = (np.ones(ends[-1], np.float32), np.concatenate(groups), ends)
+        return self._summed(sparse.csr_matrix(members, shape=(len(groups), self.pixels.shape[0])))
+
+    def _summed(self, members: sparse.csr_matrix) -> MaskVotes:
+        """members [R, N]: 1 for the rows of each of R groups. The columns of each row of the result ascend."""
+        tables = members @ self.pixels, members @ self.void
+        for table in tables:
+            table.sort_indices()
+        return MaskVotes(*tables, self.view, self.area)
 
     def runs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """(row, view) [L] of each group and view with masks of it, the first of its entries in `pixels.data` [L], and
+        """(row, view) [L] of each row and view with masks of it, the first of its entries in `pixels.data` [L], and
         the pixels under its masks [L] float64."""
         row = np.repeat(np.arange(self.pixels.shape[0]), np.diff(self.pixels.indptr))
         view = self.view[self.pixels.indices]
@@ -56,37 +71,6 @@ class Table:
     def per_entry(self, first: np.ndarray, values: np.ndarray) -> np.ndarray:
         """`values` [L] of `runs` repeated for each entry of `pixels.data`."""
         return np.repeat(values, np.diff(first, append=self.pixels.nnz))
-
-
-@dataclass(frozen=True)
-class MaskVotes:
-    """Weights of N Gaussians in the M masks of V views; sparse, float32, in pixels.
-
-    weights [N, M]: per mask. void [N, V]: per view, where it has no mask. view [M] int64: view of each mask, 0 … V − 1
-    ascending. area [M] float64: pixels of each mask.
-    """
-
-    weights: sparse.csr_matrix
-    void: sparse.csr_matrix
-    view: np.ndarray
-    area: np.ndarray
-
-    def table(self, ids: np.ndarray, count: int) -> Table:
-        """Sums the weights of the Gaussians of each id 0 … count − 1 (−1 = none), per mask and per view's void."""
-        rows = np.flatnonzero(ids >= 0)
-        ones = np.ones(len(rows), np.float32)
-        gather = sparse.csr_matrix((ones, (ids[rows], rows)), shape=(count, len(ids)))
-        return summed(gather, self.weights, self.void, self.view, self.area)
-
-
-def summed(
-    gather: sparse.csr_matrix, pixels: sparse.csr_matrix, void: sparse.csr_matrix, view: np.ndarray, area: np.ndarray
-) -> Table:
-    """The table of the groups that `gather` [R, N] makes of N rows of `pixels` [N, M] and `void` [N, V]."""
-    tables = gather @ pixels, gather @ void
-    for table in tables:
-        table.sort_indices()
-    return Table(*tables, view, area)
 
 
 @torch_on_one_thread()
@@ -143,9 +127,9 @@ def beside(parts: list[sparse.csc_matrix], keep: Keep = np.asarray) -> sparse.cs
         rows = part.indices[order]
         first = np.flatnonzero(np.diff(rows, prepend=-1))
         runs = np.diff(np.append(first, len(rows)))
-        place = np.arange(len(rows)) + np.repeat(free[rows[first]] - first, runs)
-        columns[place] = width + np.repeat(np.arange(part.shape[1]), np.diff(part.indptr))[order]
-        values[place] = part.data[order]
+        entry = np.arange(len(rows)) + np.repeat(free[rows[first]] - first, runs)
+        columns[entry] = width + np.repeat(np.arange(part.shape[1]), np.diff(part.indptr))[order]
+        values[entry] = part.data[order]
         free[rows[first]] += runs
         width += part.shape[1]
         parts[index] = None
@@ -158,7 +142,7 @@ def beside(parts: list[sparse.csc_matrix], keep: Keep = np.asarray) -> sparse.cs
 @torch.no_grad()
 def _of_view(nearby: Nearby, view: TrainingView) -> tuple[sparse.csc_matrix, np.ndarray]:
     """Weights [N, 1 + masks] and areas of one view. Column 0 holds the pixels that no mask covers."""
-    assert view.labels is not None  # told by the caller
+    assert view.labels is not None  # checked by the caller
     height, width = view.photo.shape[:2]
     names, dense = np.unique(np.append(view.labels.numpy(), 0), return_inverse=True)
     labels = torch.from_numpy(dense.reshape(-1)[:-1].reshape(height, width))
@@ -170,7 +154,7 @@ def _of_view(nearby: Nearby, view: TrainingView) -> tuple[sparse.csc_matrix, np.
     settings = Settings(width, height, variance=False, depth=False, eps2d=view.eps2d)
     forward = rasterizer.rasterize_forward(replace(inputs, features=None), settings)
     seen = forward.visible[0].cpu().numpy().nonzero()[0]
-    found: list[tuple[np.ndarray, ...]] = []
+    blocks: list[tuple[np.ndarray, ...]] = []
     for first in range(0, len(masks), BLOCK):
         block = masks[first : first + BLOCK]
         inside = torch.zeros(1, height, width, BLOCK)
@@ -181,7 +165,7 @@ def _of_view(nearby: Nearby, view: TrainingView) -> tuple[sparse.csc_matrix, np.
         assert gradients.features is not None  # for the type checker
         weights = gradients.features.cpu().numpy()[seen]
         row, column = np.nonzero(weights > FAINTEST)
-        found.append((weights[row, column], rows[seen[row]], column + first))
-    weights, row, column = map(np.concatenate, zip(*found, strict=True))
+        blocks.append((weights[row, column], rows[seen[row]], column + first))
+    weights, row, column = map(np.concatenate, zip(*blocks, strict=True))
     table = sparse.csc_matrix((weights, (row, column)), shape=(len(nearby.gaussians), len(names)))
     return table, np.bincount(dense.reshape(-1)[:-1], minlength=len(names)).astype(float)

@@ -1,4 +1,4 @@
-"""The encoder protocol, how to interpret an encoder's similarities, and shared input checks."""
+"""The encoder protocol, the meaning of an encoder's similarities, and shared input checks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Part:
     """A slice of an embedding that is compared separately.
 
     stop: its end; it begins where the previous part ends. weight: its share of the relevancy. references: [R, d] unit
-    rows of many common words in this part, used to measure how specific a text is; None: not measured.
+    rows of many common words in this part, by which the specificity of a text is measured; None: not measured.
     """
 
     stop: int
@@ -28,13 +28,13 @@ class Part:
 
 @dataclass(frozen=True)
 class Reading:
-    """How an encoder's similarities are interpreted.
+    """What the similarities of an encoder mean.
 
     parts: slices of its embeddings; empty: one part. calibration: a and b of Φ(a z + b), the probability that the
-    thing is there, where z is the best hit's distance above the map's probes, see `ranking`. canonical: generic phrases
-    that a prompt must exceed (LERF); empty for encoders whose sentence embeddings do not describe images in general.
+    thing is there, where z is the best hit's distance above the map's probes, see `query.ranking`. canonical: generic
+    phrases that a prompt must exceed (LERF); empty for encoders whose sentence embeddings do not describe images.
     zooms: best number of crops per view (3 in the paper). colors: it knows colours, so that colour words stay in the
-    prompt. scale: factor of a cosine in the model's log-odds (CLIP's and SigLIP's logit_scale). even: cosine at which a
+    prompt. scale: factor of a cosine in the model's log odds (CLIP's and SigLIP's logit_scale). even: cosine at which a
     text and a picture are as likely to belong together as not; None: not known.
     """
 
@@ -119,7 +119,7 @@ def packaged_file(package: str, pattern: str) -> Path:
     if spec is None or spec.origin is None:
         raise missing_extra(package.replace("_", "-"), "demo")
     folder = Path(spec.origin).parent
-    found = sorted(folder.glob(pattern))
-    if not found:
+    files = sorted(folder.glob(pattern))
+    if not files:
         raise InputError(f"{folder}: holds no {pattern}; reinstall {package.replace('_', '-')}")
-    return found[0]
+    return files[0]

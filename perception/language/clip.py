@@ -168,7 +168,7 @@ class ClipEncoder:
                 ids, mask = self._tokenizer(["a"] * (shape[0] or 1))
                 feed[value.name] = mask if "mask" in value.name else ids
             feed[value.name] = feed[value.name].astype(dtype_of(value), copy=False)
-        return [np.asarray(found, np.float32) for found in session.run(outputs, feed)]
+        return [np.asarray(output, np.float32) for output in session.run(outputs, feed)]
 
 
 def _find_pair(folder: Path) -> tuple[Path, Path]:
@@ -182,8 +182,8 @@ def _find_pair(folder: Path) -> tuple[Path, Path]:
         raise InputError(f"{lonely}: the other tower is not beside it; both are needed")
     if "model" in named:
         return named["model"], named["model"]
-    found = ", ".join(sorted(p.name for p in folder.iterdir())[:6]) or "nothing"
-    raise InputError(f"{folder}: expected vision_model.onnx and text_model.onnx (or model.onnx), found {found}")
+    held = ", ".join(sorted(p.name for p in folder.iterdir())[:6]) or "nothing"
+    raise InputError(f"{folder}: expected vision_model.onnx and text_model.onnx (or model.onnx), found {held}")
 
 
 def _pixel_input(session: Any, path: Path) -> Any:
@@ -196,9 +196,9 @@ def _pixel_input(session: Any, path: Path) -> Any:
 
 def _ids_input(session: Any, path: Path) -> Any:
     inputs = [v for v in session.get_inputs() if len(v.shape) == 2 and "int" in v.type and "mask" not in v.name]
-    found = next((value for name in _IDS for value in inputs if value.name == name), None)
-    if found is not None or len(inputs) == 1:
-        return found or inputs[0]
+    usual = next((value for name in _IDS for value in inputs if value.name == name), None)
+    if usual is not None or len(inputs) == 1:
+        return usual or inputs[0]
     raise InputError(
         f"{path}: no input takes token ids [n, length] ({signature(session)}); the order is clip:IMAGE.onnx,TEXT.onnx"
     )
@@ -208,14 +208,14 @@ def _row_output(session: Any, names: Sequence[str], path: Path, family: Family) 
     """The output with one row per item: recognised by a usual name, else the only output of rank 2."""
     rows = [v for v in session.get_outputs() if len(v.shape) == 2]
     names = [*names, "pooler_output"] if family.pooled else names
-    found = next((value for name in names for value in rows if value.name == name), None)
-    if found is None and not family.pooled and "pooler_output" in {value.name for value in rows}:
+    usual = next((value for name in names for value in rows if value.name == name), None)
+    if usual is None and not family.pooled and "pooler_output" in {value.name for value in rows}:
         raise InputError(
             f"{path}: its pooler_output is {family.name}'s state before the projection; export it with projection "
             "(CLIPVisionModelWithProjection, CLIPTextModelWithProjection)"
         )
-    if found is not None or len(rows) == 1:
-        return found or rows[0]
+    if usual is not None or len(rows) == 1:
+        return usual or rows[0]
     raise InputError(f"{path}: no output holds one embedding a row ({signature(session)}); not of the CLIP family")
 
 

@@ -59,16 +59,16 @@ _NOT_A_COLOR = {
 def color_words(text: str) -> list[str]:
     """Colour words of a text in canonical spelling, in order, without duplicates. "many" stands for multicoloured."""
     words = [word.lower() for word in _PATTERN.findall(text)]
-    found: list[str] = []
+    names: list[str] = []
     for n, word in enumerate(words):
         if (word, words[n + 1] if n + 1 < len(words) else "") in _NOT_A_COLOR:
             continue
         if word == "orange" and (len(words) == 1 or n == len(words) - 1):
             continue
         name = "many" if word in _MANY else _SYNONYMS.get(word, word)
-        if (name in _EXAMPLES or name == "many") and name not in found:
-            found.append(name)
-    return found
+        if (name in _EXAMPLES or name == "many") and name not in names:
+            names.append(name)
+    return names
 
 
 def without_color_words(text: str) -> str:

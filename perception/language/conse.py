@@ -1,14 +1,16 @@
 """ConSE (Norouzi et al. 2014), an encoder whose weights come with pip packages.
 
-An ImageNet classifier gives p(c|x) of an image x, a sentence encoder gives s(t) of a text t. Two comparisons are used.
-In sentence space, as in the paper:
-    f(x) = Σ_{c in top T} √p(c|x) · (s(c) − s̄)  against  s(t) − s̄,   s(c) = mean embedding of the class's names.
+    p(c|x)  probability of class c of ImageNet for an image x, by a classifier
+    s(t)    embedding of a text t, by a sentence encoder; s(c): mean over the names of class c; s̄: mean over all classes
+
+Two comparisons are used. In sentence space, as in the paper:
+    f(x) = Σ_{c in top T} √p(c|x) · (s(c) − s̄)  against  s(t) − s̄
 In class space, where the dot product is the Bhattacharyya coefficient:
     √p(·|x)  against  √q(·|t),   q(c|t) ∝ exp(cos(s(t) − s̄, s(c) − s̄) / τ),
 half of q from the classes that look like t where t is a household thing known by hand (see `household`).
 
-Sentence space generalises to words that name no class. Class space separates the object from similar ones. s̄ is the
-mean over all classes. The paper weights by p; √p measured better on objects without a class of their own.
+Sentence space generalises to texts that name no class. Class space separates the object from similar ones. The paper
+weights by p; √p measured better on objects without a class of their own.
 """
 
 from __future__ import annotations
@@ -18,7 +20,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,13 +30,12 @@ from perception.io.atomic import atomic_file
 from perception.io.documents import DAMAGE
 from perception.language import minilm
 from perception.language.base import Part, Reading, check_images, check_texts, packaged_file, unit_rows
-from perception.language.household import household_thing
+from perception.language.household import CLASSES, class_names, household_thing
 from perception.language.minilm import MiniLM
 from perception.machine import torch_on_one_thread
 from perception.onnx.store import cache_folder
 
 TOP = 20  # number of classes T in the sentence-space embedding
-CLASSES = 1000
 TAU = 0.03  # temperature τ: cosine difference at which two words no longer mean the same class
 KNOWN = 0.5  # weight in q of the classes that the table lists for a household thing
 SHARE = 0.7  # weight of class space in the relevancy; TAU and SHARE are tuned on the demo's objects
@@ -138,12 +138,6 @@ class ConseEncoder:
         return load_classifier(packaged_file(*CLASSIFIER))
 
 
-def class_names() -> list[list[str]]:
-    """The names of each of the 1000 ImageNet classes, in the classifier's order."""
-    text = (Path(__file__).parent / "imagenet_classes.txt").read_text(encoding="utf-8")
-    return [line.split(", ") for line in text.splitlines()]
-
-
 def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
     """Mean embedding per group of names, from the user's cache, or computed (1000 in two seconds) and kept there."""
     flat = [name for group in names for name in group]
@@ -156,9 +150,8 @@ def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
     except DAMAGE:
         pass  # missing or damaged: recomputed below
     embedded = encode(flat)
-    starts = np.cumsum([0] + [len(group) for group in names[:-1]])
     sizes = np.array([len(group) for group in names])
-    classes = unit_rows(np.add.reduceat(embedded, starts, axis=0) / sizes[:, None])
+    classes = unit_rows(np.add.reduceat(embedded, np.cumsum(sizes) - sizes, axis=0) / sizes[:, None])
     with suppress(OSError, InputError), atomic_file(path) as aside, aside.open("wb") as file:
         np.save(file, classes)  # without a writable cache the embeddings are recomputed each time
     return classes

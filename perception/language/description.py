@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -37,9 +38,8 @@ class InstanceDescription:
 
 def unseen(dim: int) -> InstanceDescription:
     """The description of an instance that no photo shows."""
-    return InstanceDescription(
-        np.zeros(dim, np.float32), np.zeros((0, dim), np.float32), np.zeros((PALETTE, 4), np.float32)
-    )
+    none, colours = np.zeros((0, dim), np.float32), np.zeros((PALETTE, 4), np.float32)
+    return InstanceDescription(np.zeros(dim, np.float32), none, colours)
 
 
 def to_arrays(descriptions: Sequence[InstanceDescription], encoder: str) -> dict[str, np.ndarray]:
@@ -54,26 +54,18 @@ def to_arrays(descriptions: Sequence[InstanceDescription], encoder: str) -> dict
         "view_counts": np.array([len(d.views) for d in descriptions], np.int64),
         "view_names": np.array(views, dtype=np.str_),
         "view_boxes": np.array(boxes, np.int32).reshape(len(boxes), 4),
-        "view_embeddings": np.concatenate([d.per_view for d in descriptions] or [np.zeros((0, dim))]).astype(
-            np.float32
-        ),
+        "view_embeddings": np.concatenate([np.zeros((0, dim), np.float32), *(d.per_view for d in descriptions)]),
     }
 
 
 def from_arrays(arrays: dict[str, np.ndarray]) -> tuple[list[InstanceDescription], str]:
     """Inverse of `to_arrays`: the descriptions and the encoder's identity."""
-    counts = arrays["view_counts"]
-    stops = np.cumsum(counts)
     descriptions = []
-    for n, stop in enumerate(stops):
-        part = slice(int(stop - counts[n]), int(stop))
-        boxes = [(int(b[0]), int(b[1]), int(b[2]), int(b[3])) for b in arrays["view_boxes"][part]]
-        names = [str(name) for name in arrays["view_names"][part]]
-        descriptions.append(
-            InstanceDescription(
-                arrays["embeddings"][n], arrays["view_embeddings"][part], arrays["palettes"][n], names, boxes
-            )
-        )
+    ends = np.cumsum(arrays["view_counts"]).tolist()
+    for n, (start, end) in enumerate(pairwise([0, *ends])):
+        names, boxes = arrays["view_names"][start:end].tolist(), arrays["view_boxes"][start:end].tolist()
+        embeddings = arrays["embeddings"][n], arrays["view_embeddings"][start:end]
+        descriptions.append(InstanceDescription(*embeddings, arrays["palettes"][n], names, [tuple(b) for b in boxes]))
     return descriptions, str(arrays["encoder"])
 
 

@@ -58,8 +58,8 @@ class EfficientNetLite2(nn.Module):
         self._conv_stem, self._bn0 = _Convolution(3, STEM, 3, 2, bias=False), _norm(STEM)
         blocks, inputs = [], STEM
         for stage, (count, kernel, stride, outputs) in enumerate(STAGES):
-            for place in range(count):
-                blocks.append(_Block(inputs, outputs, kernel, 1 if place else stride, EXPANSION if stage else 1))
+            for block in range(count):
+                blocks.append(_Block(inputs, outputs, kernel, 1 if block else stride, EXPANSION if stage else 1))
                 inputs = outputs
         self._blocks = nn.Sequential(*blocks)
         self._conv_head, self._bn1 = _Convolution(inputs, HEAD, 1, bias=False), _norm(HEAD)

@@ -1,4 +1,4 @@
-"""Household things: which ImageNet classes look like them, how long and how thick they are (household.txt, by hand)."""
+"""Household things: the ImageNet classes that look like them, their length and thickness (household.txt, by hand)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from perception.language.shape_words import thing_words
 
-CLASSES = 1000
+CLASSES = 1000  # of ImageNet
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,14 @@ class Household:
     thickness: float
 
 
+def class_names() -> list[list[str]]:
+    """The names of each of the 1000 ImageNet classes, in the classifier's order."""
+    text = (Path(__file__).parent / "imagenet_classes.txt").read_text(encoding="utf-8")
+    return [line.split(", ") for line in text.splitlines()]
+
+
 def household_thing(text: str) -> Household | None:
-    """What the table says of the thing that a text names: its longest known ending, as "game controller" of "the red
+    """The entry of the thing that a text names: its longest known ending, as "game controller" of "the red
     game controller"; None if there is none."""
     words = thing_words(text)
     endings = (" ".join(words[start:]) for start in range(max(0, len(words) - _longest()), len(words)))
@@ -34,8 +40,8 @@ def household_thing(text: str) -> Household | None:
 
 
 def size_misfits(sides: np.ndarray, known: Household) -> tuple[np.ndarray, np.ndarray]:
-    """[I] each, as log2, 0 inside: how many times the longest of sides [I, 3] is shorter or longer than `known.size`,
-    and how many times the shortest is thicker than `known.thickness`."""
+    """[I] each, log2 of ratios, 0 inside: the longest of sides [I, 3] to the nearer end of `known.size`, and the
+    shortest to `known.thickness`."""
     longest, shortest = np.maximum(sides.max(axis=1), 1e-6), np.maximum(sides.min(axis=1), 1e-6)
     length = np.maximum(np.log2(known.size[0] / longest), np.log2(longest / known.size[1]))
     return np.maximum(length, 0.0), np.maximum(np.log2(shortest / known.thickness), 0.0)
@@ -49,8 +55,6 @@ def _longest() -> int:
 
 @lru_cache(maxsize=1)
 def _table() -> dict[str, Household]:
-    from perception.language.conse import class_names
-
     number: dict[str, int] = {}
     for n, names in enumerate(class_names()):
         number.setdefault(names[0], n)

@@ -60,8 +60,8 @@ class MiniLM:
                 mask[row, : len(tokens[n])] = True
             with torch.inference_mode():
                 out[batch] = self._forward(ids, mask).numpy()
-        place = {text: n for n, text in enumerate(once)}
-        return unit_rows(out)[[place[text] for text in tidy]]
+        row_of = {text: n for n, text in enumerate(once)}
+        return unit_rows(out)[[row_of[text] for text in tidy]]
 
     def _forward(self, ids: Any, mask: Any) -> Any:
         """Token ids and mask [B, T] → mean of the last hidden states over non-padding tokens [B, 384]."""

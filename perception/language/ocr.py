@@ -96,10 +96,10 @@ class TextReader:
         size = [max(32, round(side * scale / 32) * 32) for side in (width, height)]
         resized = cv2.resize(photo, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
         pixels = (resized[..., ::-1] / np.float32(255) - _MEAN) / _STD
-        inside = self._run(self._networks[0], pixels.transpose(2, 0, 1)[None])[0, 0]
+        inside = _run(self._networks[0], pixels)[0, 0]
         factor = np.array([width / size[0], height / size[1]], np.float32)
         contours, _ = cv2.findContours((inside > THRESHOLD).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
-        found = []
+        rectangles = []
         for contour in contours:
             center, (a, b), angle = cv2.minAreaRect(contour)
             if min(a, b) < 3 or _mean_inside(inside, contour) < LINE_SCORE:
@@ -107,8 +107,8 @@ class TextReader:
             grown = UNCLIP * a * b / (a + b)  # 2 d, with perimeter 2 (a + b)
             corners = _rectangle(np.array(center), a + grown, b + grown, np.deg2rad(angle)) * factor
             if min(_sides(corners)) >= LEAST_HEIGHT:
-                found.append(corners)
-        return sorted(found, key=lambda c: -float(np.prod(_sides(c))))[:LINES]
+                rectangles.append(corners)
+        return sorted(rectangles, key=lambda c: -float(np.prod(_sides(c))))[:LINES]
 
     def recognise(self, photo: np.ndarray, corners: np.ndarray) -> tuple[str, float]:
         """Text and score of one rectangle [4, 2] whose first corner is the text's top left."""
@@ -118,25 +118,24 @@ class TextReader:
         width = int(np.clip(np.ceil(HEIGHT * along / across), 16, 2000))
         target = np.array([[0, 0], [width, 0], [width, HEIGHT], [0, HEIGHT]], np.float32)
         warp = cv2.getPerspectiveTransform(corners.astype(np.float32), target)
-        strip = cv2.warpPerspective(
-            photo, warp, (width, HEIGHT), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
-        )
+        strip = cv2.warpPerspective(photo, warp, (width, HEIGHT), None, cv2.INTER_CUBIC, cv2.BORDER_REPLICATE)
         pixels = strip[..., ::-1].astype(np.float32) / 127.5 - 1.0
-        chances = self._run(self._networks[1], pixels.transpose(2, 0, 1)[None])[0]  # [T, characters]
+        chances = _run(self._networks[1], pixels)[0]  # [T, characters]
         best = chances.argmax(axis=1)
         kept = (best > 0) & (best != np.concatenate([[0], best[:-1]]))  # 0: CTC's blank
         text = "".join(self._characters[n] for n in best[kept]).strip()
         return text, float(chances[kept, best[kept]].mean()) if text else 0.0
 
-    @staticmethod
-    def _run(session: Any, planes: np.ndarray) -> np.ndarray:
-        feed = {session.get_inputs()[0].name: np.ascontiguousarray(planes, np.float32)}
-        return np.asarray(session.run(None, feed)[0])
-
     @cached_property
     def _networks(self) -> tuple[Any, Any]:
         """Of detection and recognition."""
         return open_session(self._paths[0]), open_session(self._paths[1])
+
+
+def _run(session: Any, pixels: np.ndarray) -> np.ndarray:
+    """The first output of a network for one picture [h, w, 3]."""
+    planes = np.ascontiguousarray(pixels.transpose(2, 0, 1)[None], np.float32)
+    return np.asarray(session.run(None, {session.get_inputs()[0].name: planes})[0])
 
 
 def _mean_inside(inside: np.ndarray, contour: np.ndarray) -> float:

@@ -69,7 +69,7 @@ class Family:
 
 
 CLIP_FAMILY = Family("CLIP")
-# What `config.json` says of the model (`model_type` of transformers, names of timm in open_clip's) -> family.
+# Names of the model in `config.json` (`model_type` of transformers, names of timm in open_clip's) -> family.
 FAMILIES = {
     "siglip": Family("SigLIP", SIGLIP, canonical=True, pooled=True),
     "fastvit_mci": Family("MobileCLIP", MOBILECLIP),
@@ -83,15 +83,15 @@ _HINT = "preprocessor_config.json, preprocess_cfg.json or open_clip_config.json"
 def find_preprocess(model: Path, input_side: int | None) -> Preprocess:
     """Preprocessing from the config files beside a model, else its family's. input_side: the model's, if fixed.
 
-    InputError if neither is known: guessed normalisation gives embeddings that look right and are not.
+    InputError if neither is known: guessed normalisation gives wrong embeddings that look right.
     """
     family = family_of(model)
-    found = _from_configs(model) or (family and family.preprocess)
-    if not found:
+    known = _from_configs(model) or (family and family.preprocess)
+    if not known:
         raise InputError(
             f"{model}: its preprocessing is not known; put the model's own {_HINT} beside it or into the folder above"
         )
-    return replace(found, size=input_side) if input_side else found
+    return replace(known, size=input_side) if input_side else known
 
 
 def family_of(model: Path) -> Family | None:
@@ -99,10 +99,10 @@ def family_of(model: Path) -> Family | None:
     known = {**read_config(model, "config.json"), **read_config(model, "open_clip_config.json").get("model_cfg", {})}
     vision, text = known.get("vision_cfg") or {}, known.get("text_cfg") or {}
     named = [vision.get("timm_model_name"), known.get("model_type"), text.get("hf_tokenizer_name")]
-    told = " ".join(str(name) for name in named if name).lower()
+    names = " ".join(str(name) for name in named if name).lower()
     if vision and not vision.get("timm_model_name"):
-        told += " clip"  # open_clip's own vision transformers and ResNets
-    return next((family for key, family in FAMILIES.items() if key in told), CLIP_FAMILY if vision else None)
+        names += " clip"  # open_clip's own vision transformers and ResNets
+    return next((family for key, family in FAMILIES.items() if key in names), CLIP_FAMILY if vision else None)
 
 
 def _from_configs(model: Path) -> Preprocess | None:
@@ -110,9 +110,8 @@ def _from_configs(model: Path) -> Preprocess | None:
     hugging = read_config(model, "preprocessor_config.json")
     if "image_mean" in hugging or "size" in hugging:
         return _from_transformers(model, hugging)
-    described = read_config(model, "preprocess_cfg.json") or read_config(model, "open_clip_config.json").get(
-        "preprocess_cfg", {}
-    )
+    own = read_config(model, "preprocess_cfg.json")
+    described = own or read_config(model, "open_clip_config.json").get("preprocess_cfg", {})
     if not {"size", "mean", "std"} <= set(described):
         return None
     size = described["size"]
@@ -125,9 +124,8 @@ def _from_transformers(model: Path, config: dict[str, Any]) -> Preprocess:
     crop = config.get("crop_size") if config.get("do_center_crop") else None
     size = crop or config.get("size", 224)
     squash = isinstance(config.get("size"), dict) and "height" in config["size"] and not config.get("do_center_crop")
-    sides = (
-        {size[key] for key in ("height", "width", "shortest_edge") if key in size} if isinstance(size, dict) else {size}
-    )
+    named = size if isinstance(size, dict) else {"height": size}
+    sides = {named[key] for key in ("height", "width", "shortest_edge") if key in named}
     plain = not config.get("do_normalize", True)
     mean, std = config.get("image_mean", CLIP.mean), config.get("image_std", CLIP.std)
     filtering = {2: "bilinear", 3: "bicubic"}.get(config.get("resample", 3), str(config.get("resample")))

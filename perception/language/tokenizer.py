@@ -13,7 +13,7 @@ from perception.errors import InputError, missing_extra
 from perception.language.preprocess import family_of
 from perception.onnx.sessions import read_config
 
-_GEMMA = 200_000  # words that SigLIP 2's vocabulary exceeds; it is trained on lower case with punctuation
+_GEMMA = 200_000  # tokens that SigLIP 2's vocabulary exceeds; it is trained on lower case with punctuation
 _PUNCTUATION = str.maketrans("", "", string.punctuation)
 
 
@@ -36,8 +36,8 @@ class Tokenizer:
             tokens = encoding.ids[: self.length]
             if len(encoding.ids) > self.length and encoding.special_tokens_mask[-1]:
                 tokens[-1] = encoding.ids[-1]
-            place = slice(self.length - len(tokens), None) if self._left else slice(len(tokens))
-            ids[row, place], mask[row, place] = tokens, 1
+            columns = slice(self.length - len(tokens), None) if self._left else slice(len(tokens))
+            ids[row, columns], mask[row, columns] = tokens, 1
         return ids, mask
 
     def _cleaned(self, text: str) -> str:
@@ -78,8 +78,8 @@ def _padding_id(backend: Any, model: Path) -> int:
     name = read_config(model, "tokenizer_config.json").get("pad_token")
     if isinstance(name, dict):
         name = name.get("content")
-    found = backend.token_to_id(name) if isinstance(name, str) else None
-    return int((backend.padding or {}).get("pad_id") or 0) if found is None else int(found)
+    number = backend.token_to_id(name) if isinstance(name, str) else None
+    return int((backend.padding or {}).get("pad_id") or 0) if number is None else int(number)
 
 
 def _text_config(model: Path) -> dict[str, Any]:

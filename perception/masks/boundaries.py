@@ -1,6 +1,6 @@
 """Learned borders of objects: a small convolutional network sees the colours, normals, steps and creases of a photo.
 
-It tells the border of a thing from a shadow or from print by what is around it. `python tools training.masks` makes
+It separates borders of things from shadows and from print by what is around them. `python tools training.masks` makes
 its packaged weights from rendered worlds alone, see docs/masks.md.
 """
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     Layers = list[tuple[torch.Tensor, torch.Tensor]]  # weights [out, in, k, k] and offsets [out]
 
 WEIGHTS = Path(__file__).with_name("boundary_weights.npz")
-REACH = 4  # pixels: the network tells whether the pixels this far to either side are of different things
+REACH = 4  # pixels: whether the pixels this far to either side are of different things is what the network predicts
 INPUTS, OUTPUTS = 11, 3
 WIDTHS = (16, 24, 32, 48)  # channels at 1/2, 1/4, 1/8 and 1/16 of the resolution
 _STEP = 0.06  # largest step, relative to depth
@@ -68,11 +68,11 @@ def forward(layers: Layers, inputs: torch.Tensor) -> torch.Tensor:
     import torch
     from torch.nn.functional import conv2d, interpolate, relu
 
-    place = iter(layers)
+    layer = iter(layers)
 
     def two_layers(x: torch.Tensor, stride: int) -> torch.Tensor:
-        x = relu(conv2d(x, *next(place), stride=stride, padding=1))
-        return relu(conv2d(x, *next(place), padding=1))
+        x = relu(conv2d(x, *next(layer), stride=stride, padding=1))
+        return relu(conv2d(x, *next(layer), padding=1))
 
     skips = [inputs]
     for _ in WIDTHS:
@@ -81,7 +81,7 @@ def forward(layers: Layers, inputs: torch.Tensor) -> torch.Tensor:
     for skip in skips[:0:-1]:
         x = interpolate(x, skip.shape[2:], mode="bilinear", align_corners=False)
         x = two_layers(torch.cat([x, skip], dim=1), 1)
-    return interpolate(conv2d(x, *next(place)), inputs.shape[2:], mode="bilinear", align_corners=False)
+    return interpolate(conv2d(x, *next(layer)), inputs.shape[2:], mode="bilinear", align_corners=False)
 
 
 @functools.cache

@@ -14,6 +14,7 @@ from perception.geometry import move_points
 from perception.io.memory import Keep
 from perception.masks.base import LoadImage, MaskSource
 from perception.masks.boundaries import WEIGHTS, boundaries, read_layers
+from perception.masks.cues import filled
 from perception.masks.merging import Segmentation, segmentation
 from perception.masks.stereo import StereoView, make_stereo_view, measure_depths
 from perception.masks.surface import FOOTPRINTS, Surface, SurfaceBuilder
@@ -27,7 +28,7 @@ _LEAST_VOXELS = 100
 
 
 class BuiltinSegmentation(MaskSource):
-    """Segments whole objects in all photos jointly. Needs approximate depth of every photo, which the map renders."""
+    """Segments objects in all photos jointly. Needs approximate depth of every photo, which the map renders."""
 
     needs_depth = True
 
@@ -41,7 +42,7 @@ class BuiltinSegmentation(MaskSource):
             )
         self.name = "builtin"
         self.identity = f"builtin {VERSION}"
-        self._views: dict[str, StereoView] = {}
+        self._voxels: dict[str, np.ndarray] = {}  # of each photo, [h, w] the voxel that each pixel shows, −1 = none
         self._segment = np.zeros(0, np.int32)
 
     def prepare(
@@ -52,34 +53,29 @@ class BuiltinSegmentation(MaskSource):
         progress: Progress = QUIET,
         keep: Keep = np.asarray,
     ) -> Segmentation | None:
-        """Segments the surface seen by all photos jointly; None if fewer than two photos have depth, or no depths
-        agree."""
-        made = [make_stereo_view(view, load_photo(view), load_depth(view), keep) for view in views]
-        found = [view for view in made if view is not None]
-        if len(found) < 2:
+        """None if fewer than two photos have depth, or no depths agree."""
+        made = (make_stereo_view(view, load_photo(view), load_depth(view), keep) for view in views)
+        stereo = [view for view in made if view is not None]
+        if len(stereo) < 2:
             return None
-        measure_depths(found, progress)
-        surface = fuse(found)
+        measure_depths(stereo, progress)
+        surface = fuse(stereo)
         if len(surface) < _LEAST_VOXELS:
             return None
-        cuts = segmentation(surface_graph(found, surface))
-        for seen in found:
-            seen.store(lambda image: image[:0].copy())  # `voxel` is what label images need
-        self._segment, self._views = cuts.segment, {seen.name: seen for seen in found}
+        cuts = segmentation(surface_graph(stereo, surface))
+        self._segment, self._voxels = cuts.segment, {view.name: view.voxel for view in stereo}
         return cuts
 
     def label_image(self, view: View, photo: np.ndarray) -> np.ndarray:
         """[H, W] int32 labels of `photo` [H, W, 3], after `prepare`. All 0 if the photo does not show the surface."""
         import cv2
-        from scipy.ndimage import distance_transform_edt
 
-        if view.name not in self._views:
+        if view.name not in self._voxels:
             return np.zeros(photo.shape[:2], np.int32)
-        voxel = self._views[view.name].voxel
+        voxel = self._voxels[view.name]
         labels = np.where(voxel >= 0, self._segment[voxel], 0)
         if labels.any():  # pixels off the surface take the nearest segment in the image
-            nearest = distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
-            labels = labels[tuple(nearest)]
+            labels = filled(labels, labels > 0)
         return cv2.resize(labels, photo.shape[1::-1], interpolation=cv2.INTER_NEAREST)
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import hashlib
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -46,7 +47,11 @@ def compute_masks(
         if load_depth is None:
             raise ValueError(f"masks from {source.name} need load_depth")
         if any(stored_key(label_file(folder, view)) != _key(view, source, depth_key) for view in views):
-            _write_segmentation(folder, source.prepare(views, load_photo, load_depth, progress, keep))
+            cuts = source.prepare(views, load_photo, load_depth, progress, keep)
+            (folder / SEGMENTATION).unlink(missing_ok=True)
+            if cuts is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+                np.savez(folder / SEGMENTATION, **asdict(cuts))
 
     def masks_of(view: View) -> tuple[int, bool]:
         """Number of masks in the view's label image, and whether it was there already."""
@@ -77,13 +82,6 @@ def compute_masks(
         "empty": empty,
         "warnings": warnings,
     }
-
-
-def _write_segmentation(folder: Path, segments: Segmentation | None) -> None:
-    (folder / SEGMENTATION).unlink(missing_ok=True)
-    if segments is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        np.savez(folder / SEGMENTATION, **vars(segments))
 
 
 def load_segmentation(folder: Path) -> Segmentation | None:

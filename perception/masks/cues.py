@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 _REACH = 4  # pixels to either side, used to measure steps and creases
+_SIDE = 3  # pixels ahead and behind, used to measure tangents
+_SMOOTH = 0.01  # relative to the depth: steps of both sides that differ by less are of one surface
 _BINS = (4, 6, 6)  # of L, a, b
 COLOUR_BINS = 4 * 6 * 6
 
@@ -71,40 +73,47 @@ def _gradient(image: np.ndarray) -> np.ndarray:
 
 def _colour_bins(lab: np.ndarray) -> np.ndarray:
     """[h, w] int64 index of a coarse Lab bin. Values of a and b beyond ±50 count in the outermost bin."""
-    scaled = [lab[..., 0] / 256, (lab[..., 1] - 128) / 100 + 0.5, (lab[..., 2] - 128) / 100 + 0.5]
-    index = np.zeros(lab.shape[:2], np.int64)
-    for value, bins in zip(scaled, _BINS, strict=True):
-        index = index * bins + np.clip(value * bins, 0, bins - 1).astype(np.int64)
-    return index
+    middle, width, first = np.array([[0, 128, 128], [256, 100, 100], [0, 0.5, 0.5]], np.float32)
+    bins = np.array(_BINS, np.float32)
+    index = np.clip(((lab - middle) / width + first) * bins, 0, bins - 1).astype(np.int64)
+    return np.asarray(index @ np.array([_BINS[1] * _BINS[2], _BINS[2], 1]))
+
+
+def filled(image: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """image [h, w] whose pixels outside `known` take the value of the nearest pixel inside."""
+    from scipy.ndimage import distance_transform_edt
+
+    if known.all():
+        return image
+    return image[tuple(distance_transform_edt(~known, return_distances=False, return_indices=True))]
 
 
 def filled_depth(depth: np.ndarray) -> np.ndarray:
     """[h, w] float32 > 0. Pixels without depth take the depth of the nearest pixel that has one."""
-    from scipy.ndimage import distance_transform_edt
-
-    known = np.isfinite(depth) & (depth > 0)
-    if known.all():
-        return depth.astype(np.float32)
-    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return depth[tuple(nearest)].astype(np.float32)
+    return filled(depth, np.isfinite(depth) & (depth > 0)).astype(np.float32)
 
 
-def _tangent(points: np.ndarray, axis: int, reach: int = 3) -> np.ndarray:
+def _tangent(points: np.ndarray, axis: int) -> np.ndarray:
     """[h, w, 3] tangent along x (axis 0) or y (axis 1): central difference if smooth, else the smaller side's."""
     along = 1 - axis
-    first, last = (slice(None),) * along + (slice(-reach),), (slice(None),) * along + (slice(reach, None),)
+    first, last = (slice(None),) * along + (slice(-_SIDE),), (slice(None),) * along + (slice(_SIDE, None),)
     chord = points[last] - points[first]
     ahead, behind = (
-        np.pad(chord, [side if i == along else (0, 0) for i in range(3)], "edge") for side in ((0, reach), (reach, 0))
+        np.pad(chord, [side if i == along else (0, 0) for i in range(3)], "edge") for side in ((0, _SIDE), (_SIDE, 0))
     )
     z_ahead, z_behind = ahead[..., 2], behind[..., 2]
     share = (np.abs(z_ahead) <= np.abs(z_behind)).astype(np.float32)
-    share[np.abs(z_ahead - z_behind) < 0.01 * points[..., 2]] = 0.5
+    share[np.abs(z_ahead - z_behind) < _SMOOTH * points[..., 2]] = 0.5
     return behind + share[..., None] * (ahead - behind)
 
 
 def _across(points: np.ndarray, normals: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Step and bend over ±_REACH pixels, each [h, w]."""
+    """Step and bend over ±_REACH pixels, each [h, w]. a, b: the points on both sides, n_a, n_b: their normals.
+
+    chord = b − a   off_a = n_a · chord   off_b = n_b · chord    distance of a point from the other's plane
+    step = min(|off_a|, |off_b|) / depth                          on a crease one of them is small
+    bend = (off_b − off_a) / |chord|
+    """
     a, b = _both_sides(points, axis)
     normal_a, normal_b = _both_sides(normals, axis)
     chord = b - a

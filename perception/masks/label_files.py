@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import struct
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.atomic import atomic_file
 from perception.io.documents import safe_name
 from perception.types import View
 
@@ -44,17 +43,8 @@ def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
         raise ValueError(f"{file}: labels must lie in 0..65535, found {labels.min()}..{labels.max()}")
     info = PngImagePlugin.PngInfo()
     info.add_text(_KEY, key)
-    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            Image.fromarray(labels.astype(np.uint16)).save(temporary, "PNG", compress_level=4, pnginfo=info)
-            temporary.replace(file)
-        finally:
-            with suppress(OSError):  # on a read-only disk the first error is the one to report
-                temporary.unlink()
-    except OSError as error:
-        raise InputError(f"{file}: cannot be written ({error.strerror or error})") from error
+    with atomic_file(file) as aside:
+        Image.fromarray(labels.astype(np.uint16)).save(aside, "PNG", compress_level=4, pnginfo=info)
 
 
 def stored_key(file: Path) -> str | None:

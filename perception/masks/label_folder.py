@@ -72,6 +72,7 @@ class LabelFolder(MaskSource):
 
 
 def _check_header(file: Path, width: int, height: int) -> None:
+    """InputError unless the PNG has one channel of 8 or 16 bit and that size."""
     *size, bits, colour_type = read_png_header(file)
     kind = _COLOUR_TYPES.get(colour_type, f"colour type {colour_type}")
     if kind not in ("grey", "palette") or bits not in (8, 16):

@@ -2,30 +2,40 @@
 
 The most likely pair of neighbours is merged first, and the evidence is recomputed after every merge (Nunez-Iglesias et
 al. 2013), until nothing is left to merge. The cut maximises Σ (p − cost) over its regions, where p is the learned
-probability that a region is an object. Small neural networks tell the probabilities; `python tools training.masks`
+probability that a region is an object. Small neural networks give the probabilities; `python tools training.masks`
 makes their packaged weights from rendered worlds alone, see docs/masks.md.
+
+Log odds of a probability p: log(p / (1 − p)). R: patches of the graph; M: merges; R + M: regions of the tree.
 """
 
 from __future__ import annotations
 
 import functools
 import heapq
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from perception.masks.merge_features import REGION_FEATURES, pair_features, region_features
 from perception.masks.surface_graph import SurfaceGraph
 
-SMALLEST = 2e-4  # area / (camera distance)² below which a patch joins a neighbour before all others do
-GROUP_COST = 0.4  # of an object, for groups
-_LARGE = 0.1  # area in the same unit, above which a flat segment can be a part of a floor, a wall or a table
+WEIGHTS = Path(__file__).with_name("merge_weights.npz")
+SMALLEST = 2e-4  # area / depth² below which a patch joins a neighbour before all others do
+GROUP_COST = 0.4  # of one more group, in units of an object's probability
+PART_COST = 1 / 3  # of one more part, relative to that of an object
+_LARGE = 0.1  # area / depth² above which a flat segment can be a part of a floor, a wall or a table
 _FLAT = 0.03  # relative to depth: standard deviation of such a segment across its plane, including low objects on it
 _UNKNOWN = 9.0  # largest log odds of a feature, and those of merges inside a patch
-WEIGHTS = Path(__file__).with_name("merge_weights.npz")
 _CLIP = 5.0  # standard deviations: inputs far from all training data do not extrapolate
-_PARTS = 8  # arrays of a network
+_ARRAYS = 8  # of a network
+
+HISTORY = ("lowest_odds", "last_odds", "patches", "next_odds")
+"""Log odds of the least likely merge inside a region, of its last merge, logarithm of its number of patches, and log
+odds of the merge that it goes into."""
+REGION_COLUMNS = (*HISTORY, *REGION_FEATURES)
 
 
 @dataclass(frozen=True)
@@ -47,26 +57,32 @@ class Network:
 
 @dataclass(frozen=True)
 class MergeModel:
-    """pair: features of two neighbours (SurfaceGraph.features) -> [M, 1] log odds that they are one object.
+    """pair: `pair_features` of two neighbours -> [M, 1] log odds that they are one object.
 
-    whole: features of a region (MergeTree.features) -> [M, 2] log odds that its IoU with an object exceeds 0.5, 0.75.
-    cost: of one more object, in units of an object's probability. calibration: slope and offset of the log odds of the
-    regions that were selected.
+    region: features of a region (MergeTree.features) -> [R + M, 2] log odds that its IoU with an object exceeds 0.5,
+    0.75. cost: of one more object, in units of an object's probability. calibration: slope and offset of the first log
+    odds of regions that were selected.
     """
 
     pair: Network
-    whole: Network
+    region: Network
     cost: float
     calibration: tuple[float, float] = (1.0, 0.0)
+
+    def probabilities(self, tree: MergeTree) -> tuple[np.ndarray, np.ndarray]:
+        """[R + M] each: mean probability of both IoU, by which the tree is cut; calibrated one of IoU > 0.5."""
+        odds = self.region(tree.features).astype(np.float64)
+        slope, offset = self.calibration
+        return _logistic(odds).mean(axis=1), _logistic(slope * odds[:, 0] + offset)
 
 
 @functools.cache
 def read_model(file: Path = WEIGHTS) -> MergeModel:
     """The model of the package, or of another file of `tools/training/masks.py`."""
     with np.load(file) as stored:
-        settings, *parts = (stored[f"arr_{k}"] for k in range(1 + 2 * _PARTS))
+        settings, *arrays = (stored[f"arr_{k}"] for k in range(1 + 2 * _ARRAYS))
     cost, slope, offset = settings.tolist()
-    return MergeModel(Network(tuple(parts[:_PARTS])), Network(tuple(parts[_PARTS:])), cost, (slope, offset))
+    return MergeModel(Network(tuple(arrays[:_ARRAYS])), Network(tuple(arrays[_ARRAYS:])), cost, (slope, offset))
 
 
 @dataclass(frozen=True)
@@ -88,34 +104,31 @@ class Segmentation:
 
 
 def segmentation(graph: SurfaceGraph) -> Segmentation:
-    """The cuts with the packaged model, at a third of its cost of an object, at its cost, and at GROUP_COST; such cuts
-    are nested."""
+    """The cuts with the packaged model, at its cost of an object, at PART_COST of it, and at GROUP_COST; such cuts are
+    nested."""
     model = read_model()
     tree = tree_by(model, graph)
     segment, probability = divided(graph, tree, model)
-    odds = model.whole(tree.features).astype(np.float64)
-    p, sure = _logistic(odds).mean(axis=1), _logistic(model.calibration[0] * odds[:, 0] + model.calibration[1])
-    fine, coarse = (tree.cut(p - cost)[graph.patch] for cost in (model.cost / 3, GROUP_COST))
-    names, part = np.unique(segment * np.int64(len(p)) + fine, return_inverse=True)
-    votes = np.zeros((len(probability), len(p)), np.int32)
-    np.add.at(votes, (segment, coarse), 1)
-    groups, group = np.unique(votes.argmax(axis=1), return_inverse=True)
+    p, calibrated = model.probabilities(tree)
+    fine, coarse = (tree.cut(p - cost)[graph.patch] for cost in (model.cost * PART_COST, GROUP_COST))
+    pairs, part = np.unique(segment * np.int64(len(p)) + fine, return_inverse=True)
+    shared = np.zeros((len(probability), len(p)), np.int32)  # voxels of each segment in each region
+    np.add.at(shared, (segment, coarse), 1)
+    groups, group = np.unique(shared.argmax(axis=1), return_inverse=True)
     points = graph.surface.points.astype(np.float32)
-    return Segmentation(points, segment, probability, part, sure[names % len(p)], group, sure[groups])
+    return Segmentation(points, segment, probability, part, calibrated[pairs % len(p)], group, calibrated[groups])
 
 
 def tree_by(model: MergeModel, graph: SurfaceGraph) -> MergeTree:
     """The tree of merges in the order of the model's log odds."""
-    return merge_tree(graph, lambda state, pairs: model.pair(state.features(pairs))[:, 0])
+    return merge_tree(graph, lambda state, pairs: model.pair(pair_features(state, pairs))[:, 0])
 
 
 def divided(graph: SurfaceGraph, tree: MergeTree, model: MergeModel) -> tuple[np.ndarray, np.ndarray]:
-    """As `segments`, from a tree of the graph; and [S + 1] the probability of each that its IoU with an object exceeds
-    0.5."""
-    odds = model.whole(tree.features).astype(np.float64)
-    sure = _logistic(model.calibration[0] * odds[:, 0] + model.calibration[1])
-    regions = tree.cut(_logistic(odds).mean(axis=1) - model.cost)
-    graph, patch = graph.copy(), list(range(tree.leaves))
+    """`segment` [V] and `probability` [S + 1] of a Segmentation, from a tree of the graph."""
+    p, calibrated = model.probabilities(tree)
+    regions = tree.cut(p - model.cost)
+    graph, patch = graph.copy(), list(range(tree.leaves))  # the patch of the graph that each region is merged into
     for k, (one, two) in enumerate(tree.children.tolist(), start=tree.leaves):
         patch.append(patch[one])
         if regions[patch[one]] >= k:  # a merge within a region of the cut
@@ -126,7 +139,7 @@ def divided(graph: SurfaceGraph, tree: MergeTree, model: MergeModel) -> tuple[np
     order = np.argsort(np.where(names < 0, -np.inf, -counts), kind="stable")
     rank = np.argsort(order).astype(np.int32) + np.int32(names[0] >= 0)
     probability = np.zeros(int(rank.max()) + 1)
-    probability[rank] = [0 if name < 0 else sure[regions[ends == name]].max() for name in names]
+    probability[rank] = [0 if name < 0 else calibrated[regions[ends == name]].max() for name in names]
     return rank[index], probability
 
 
@@ -137,23 +150,25 @@ def _logistic(odds: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True)
 class MergeTree:
     """Leaves 0 … R − 1 are the patches, then one region per merge, in order. children: [M, 2], the larger one first.
-    features: [R + M, 6 F + 3] of each region and of its relatives in the tree."""
+    features: [R + M, 6 F + 3], F REGION_COLUMNS of each region, then those of its relatives (`_with_relatives`)."""
 
     leaves: int
     children: np.ndarray
     features: np.ndarray
 
     def cut(self, gain: np.ndarray) -> np.ndarray:
-        """[R] the region of each leaf, in the set of disjoint regions with the largest sum of `gain` [R + M]. Where a
-        region and its parts are equal, the region is taken."""
+        """[R] the region of each leaf, in the set of disjoint regions with the largest sum of `gain` [R + M].
+
+        best_k = max(gain_k, best_one + best_two) for the children one and two of k; at ties the region is not divided.
+        """
         best = gain.astype(np.float64)
         owner = np.arange(len(gain))
-        whole = np.ones(len(gain), bool)
+        undivided = np.ones(len(gain), bool)
         for k, (one, two) in enumerate(self.children.tolist(), start=self.leaves):
             if best[one] + best[two] > best[k]:
-                best[k], whole[k] = best[one] + best[two], False
+                best[k], undivided[k] = best[one] + best[two], False
         for k in range(len(gain) - 1, self.leaves - 1, -1):
-            if whole[k] or owner[k] != k:
+            if undivided[k] or owner[k] != k:
                 owner[self.children[k - self.leaves]] = owner[k]
         return owner[: self.leaves]
 
@@ -163,8 +178,8 @@ def merge_tree(graph: SurfaceGraph, score: Callable[[SurfaceGraph, np.ndarray], 
     score: (graph as merged so far, pairs [M, 2]) -> [M] log odds that the two are one; −inf: never merge."""
     graph = graph.copy()
     count = graph.count
-    node = list(range(count))  # of each patch that others were merged into
-    lowest, last, leaves = [_UNKNOWN] * count, [_UNKNOWN] * count, [1] * count
+    region = list(range(count))  # the last region of each patch that others were merged into, −1 once it is merged
+    lowest, last, leaves = [_UNKNOWN] * count, [_UNKNOWN] * count, [1] * count  # HISTORY of each region
     features: dict[int, np.ndarray] = {}
     children: list[tuple[int, int]] = []
     version = np.zeros(count, np.int64)  # a queue entry is stale if either patch was merged since
@@ -179,9 +194,9 @@ def merge_tree(graph: SurfaceGraph, score: Callable[[SurfaceGraph, np.ndarray], 
                 heapq.heappush(queue, (large, -odds, a, b, int(version[a]), int(version[b])))
 
     def describe(a: int, sibling: int | None, odds: float) -> None:
-        k = node[a]
+        k = region[a]
         history = [lowest[k], last[k], np.log(leaves[k]), odds]
-        features[k] = np.concatenate([np.clip(history, -_UNKNOWN, _UNKNOWN), graph.region_features(a, sibling)])
+        features[k] = np.concatenate([np.clip(history, -_UNKNOWN, _UNKNOWN), region_features(graph, a, sibling)])
 
     offer([(a, b) for a, links in enumerate(graph.borders) for b in links if a < b])
     while queue:
@@ -192,16 +207,16 @@ def merge_tree(graph: SurfaceGraph, score: Callable[[SurfaceGraph, np.ndarray], 
             a, b = b, a
         describe(a, b, -odds)
         describe(b, a, -odds)
-        lowest.append(min(-odds, lowest[node[a]], lowest[node[b]]))
+        lowest.append(min(-odds, lowest[region[a]], lowest[region[b]]))
         last.append(-odds)
-        leaves.append(leaves[node[a]] + leaves[node[b]])
-        children.append((node[a], node[b]))
+        leaves.append(leaves[region[a]] + leaves[region[b]])
+        children.append((region[a], region[b]))
         graph.merge(a, b)
-        node[a], node[b] = len(leaves) - 1, -1
+        region[a], region[b] = len(leaves) - 1, -1
         version[[a, b]] += 1
         offer([(a, other) for other in graph.borders[a]])
     for a in range(count):
-        if node[a] >= 0:
+        if region[a] >= 0:
             describe(a, None, -_UNKNOWN)
     own = np.array([features[k] for k in range(len(leaves))], np.float32)
     pairs = np.array(children, np.int64).reshape(-1, 2)
@@ -211,10 +226,9 @@ def merge_tree(graph: SurfaceGraph, score: Callable[[SurfaceGraph, np.ndarray], 
 def _with_relatives(own: np.ndarray, children: np.ndarray) -> np.ndarray:
     """[N, 6 F + 3] features of each region, own [N, F]; then those of its parent, the parent's other child, the
     grandparent and both children, less its own, 0 where there is none; then whether it has no parent, no grandparent,
-    no children. What a region would become, and what it is made of, tell whether it is a whole (Liu et al. 2016)."""
-    regions, none = np.arange(len(own)), np.full(len(own), -1)
-    parent, sibling, larger, smaller = (none.copy() for _ in range(4))
-    merged = regions[len(own) - len(children) :]
+    no children. What a region would become, and what it is made of, shows whether it is an object (Liu et al. 2016)."""
+    parent, sibling, larger, smaller = np.full((4, len(own)), -1)
+    merged = np.arange(len(own) - len(children), len(own))
     parent[children] = merged[:, None]
     sibling[children] = children[:, ::-1]
     larger[merged], smaller[merged] = children.T
@@ -231,8 +245,7 @@ def join_planes(graph: SurfaceGraph, ends: np.ndarray) -> np.ndarray:
     large = [i for i in np.unique(ends).tolist() if graph.area(i) > _LARGE]
     large = [i for i in large if graph.extents[i, 0] < _FLAT * graph.depth(i)]
     joined = np.arange(graph.count)
-    for place, a in enumerate(large):
-        for b in large[place + 1 :]:
-            if graph.one_plane(a, b):
-                joined[joined == joined[b]] = joined[a]
+    for a, b in itertools.combinations(large, 2):
+        if graph.one_plane(a, b):
+            joined[joined == joined[b]] = joined[a]
     return joined[ends]

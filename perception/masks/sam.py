@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import zlib
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import cv2
@@ -87,17 +88,17 @@ def automatic_masks(model: SamModel, photo: np.ndarray, settings: SamConfig) -> 
         points = points[np.random.default_rng(0).permutation(len(points))]
         at_once = COVERING_BATCH if model.batched else 1
     step = max(1, min(at_once, _BATCH_BYTES // (width * height * 4 * 4)))
-    found: list[SamMask] = []
+    masks: list[SamMask] = []
     while len(points):
         good = _good_masks(model, embedding, points[:step], settings)
-        found += [mask for masks in good for mask in masks]
+        masks += chain(*good)
         points = points[step:]
         if settings.skip_covered:
-            for masks in filter(None, good):
-                covered |= min(masks, key=lambda mask: mask.area).pixels()
+            for nested in filter(None, good):
+                covered |= min(nested, key=lambda mask: mask.area).pixels()
             points = points[~covered[points[:, 1].astype(int), points[:, 0].astype(int)]]
-    boxes = np.array([mask.box for mask in found]).reshape(-1, 4)
-    return [found[row] for row in box_nms(boxes, np.array([mask.pred_iou for mask in found]), BOX_NMS)]
+    boxes = np.array([mask.box for mask in masks]).reshape(-1, 4)
+    return [masks[row] for row in box_nms(boxes, np.array([mask.pred_iou for mask in masks]), BOX_NMS)]
 
 
 def paint(masks: list[SamMask], shape: tuple[int, int]) -> np.ndarray:

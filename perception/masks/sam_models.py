@@ -1,7 +1,7 @@
 """Segment Anything exports with separate encoder and decoder, recognised by the names of their inputs and outputs.
 
 Exporters and the names they use: segment-anything and samexporter (SAM, MobileSAM), EdgeSAM, EfficientSAM, transformers
-and optimum (SAM, SlimSAM, SAM 2 and 2.1), samexporter, onnxruntime and osam (SAM 2). `FAMILIES` lists how they differ.
+and optimum (SAM, SlimSAM, SAM 2 and 2.1), samexporter, onnxruntime and osam (SAM 2). `FAMILIES` lists the differences.
 """
 
 from __future__ import annotations
@@ -26,46 +26,33 @@ from perception.onnx.sessions import (
 )
 from perception.onnx.store import known_names, resolve
 
-# Role -> names of it in public exporters.
-_ALIASES = {
-    "image": ("input_image", "image", "batched_images", "pixel_values", "x", "input", "images"),
-    "embedding": ("image_embeddings", "image_embed", "image_embedding", "embeddings", "image_embeddings.2"),
-    "high_res_0": (
-        "high_res_feats_0",
-        "high_res_feat_0",
-        "high_res_features1",
-        "image_features_0",
-        "image_embeddings.0",
-    ),
-    "high_res_1": (
-        "high_res_feats_1",
-        "high_res_feat_1",
-        "high_res_features2",
-        "image_features_1",
-        "image_embeddings.1",
-    ),
-    "positional": ("image_positional_embeddings",),
-    "points": ("point_coords", "batched_point_coords", "input_points"),
-    "labels": ("point_labels", "batched_point_labels", "input_labels"),
-    "boxes": ("input_boxes",),
-    "mask_input": ("mask_input", "input_masks"),
-    "has_mask": ("has_mask_input", "has_input_masks"),
-    "size": ("orig_im_size", "original_image_size"),
-    # Low resolution first: some exports fix the photo size that they were traced with, or give no logits at full size.
-    "masks": ("low_res_masks", "pred_masks", "masks", "output_masks"),
-    "iou": ("iou_predictions", "iou_scores", "iou_preds", "scores"),
+# Role -> names of it in public exporters. Masks at low resolution come first: some exports fix the photo size that they
+# were traced with, or give no logits at full size.
+_NAMES = {
+    "image": "input_image image batched_images pixel_values x input images",
+    "embedding": "image_embeddings image_embed image_embedding embeddings image_embeddings.2",
+    "high_res_0": "high_res_feats_0 high_res_feat_0 high_res_features1 image_features_0 image_embeddings.0",
+    "high_res_1": "high_res_feats_1 high_res_feat_1 high_res_features2 image_features_1 image_embeddings.1",
+    "positional": "image_positional_embeddings",
+    "points": "point_coords batched_point_coords input_points",
+    "labels": "point_labels batched_point_labels input_labels",
+    "boxes": "input_boxes",
+    "mask_input": "mask_input input_masks",
+    "has_mask": "has_mask_input has_input_masks",
+    "size": "orig_im_size original_image_size",
+    "masks": "low_res_masks pred_masks masks output_masks",
+    "iou": "iou_predictions iou_scores iou_preds scores",
 }
-_ROLES = {alias: role for role, aliases in reversed(_ALIASES.items()) for alias in aliases}
-_MEAN = (123.675, 116.28, 103.53)
-_STD = (58.395, 57.12, 57.375)
+_ROLES = {name: role for role, names in reversed(_NAMES.items()) for name in names.split()}
+_MEAN, _STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)  # ImageNet's, RGB in 0–255
 
 
 @dataclass(frozen=True)
 class Family:
-    """How a family's exports differ from each other.
+    """What the exports of a family have in common.
 
     fit: the photo in the encoder's input: "pad" (long side fills the square, padded bottom and right), "squash" (both
-    sides do) or "whole" (in 0–1, its own size, and prompts in its pixels). nested: prompts are [1, P, 1, 2], else
+    sides do) or "own size" (in 0–1, and prompts in its pixels). nested: prompts are [1, P, 1, 2], else
     [P, n, 2]. pads: a point prompt is followed by the point (0, 0) with label −1, as in the published predictor; the
     others' decoders add it themselves.
     """
@@ -80,7 +67,7 @@ class Family:
 FAMILIES = {
     ("point_coords", False): Family("SAM", pads=True),
     ("point_coords", True): Family("SAM 2", "squash"),
-    ("batched_point_coords", False): Family("EfficientSAM", "whole", nested=True),
+    ("batched_point_coords", False): Family("EfficientSAM", "own size", nested=True),
     ("input_points", False): Family("SAM by Hugging Face", nested=True),
     ("input_points", True): Family("SAM 2 by Hugging Face", "squash", nested=True),
 }
@@ -137,13 +124,11 @@ class SamModel:
         _check_pair(encoder, decoder)
         self.fingerprint = f"{fingerprint(encoder.path)}-{fingerprint(decoder.path)}"
         self.provider = " + ".join(dict.fromkeys(g.session.get_providers()[0] for g in (encoder, decoder)))
-        found = (provider_warning(graph.path, graph.session) for graph in (encoder, decoder))
-        self.warnings = [warning for warning in found if warning]
+        self.warnings = list(filter(None, (provider_warning(g.path, g.session) for g in (encoder, decoder))))
         config = read_config(encoder.path, "preprocessor_config.json")
-        mean, std = (config.get(key) for key in ("image_mean", "image_std"))
         self._mean, self._std = (
-            np.asarray(known, np.float32) * 255 if known else np.asarray(usual, np.float32)
-            for known, usual in ((mean, _MEAN), (std, _STD))
+            np.asarray(config[key], np.float32) * 255 if config.get(key) else np.asarray(usual, np.float32)
+            for key, usual in (("image_mean", _MEAN), ("image_std", _STD))
         )
         self.batched = self._probe()
 
@@ -192,7 +177,7 @@ class SamModel:
     def _prepare(self, photo: np.ndarray) -> tuple[np.ndarray, tuple[int, int], tuple[int, int]]:
         """The encoder's input, the (h, w) that the photo covers in it, and the input's (h, w)."""
         shape = shape_of(self.encoder.inputs["image"])
-        if self.kind.fit == "whole":
+        if self.kind.fit == "own size":
             return photo.transpose(2, 0, 1)[None] / np.float32(255), photo.shape[:2], photo.shape[:2]
         raw = len(shape) == 3  # [h, w, 3] in 0–255, normalised by the graph
         height, width = (n or 1024 for n in (shape[:2] if raw else shape[2:]))
@@ -266,8 +251,8 @@ def open_sam(spec: str, threads: int = 0) -> SamModel:
     if len(encoders) == 1 and len(decoders) == 1:
         return SamModel(encoders[0], decoders[0])
     kinds = ("encoder" if g.is_encoder else "decoder" if g.is_decoder else signature(g.session) for g in graphs)
-    found = "; ".join(f"{g.path.name}: {kind}" for g, kind in zip(graphs, kinds, strict=True))
-    what = f"expected one SAM encoder and its decoder, found {found}"
+    roles = "; ".join(f"{g.path.name}: {kind}" for g, kind in zip(graphs, kinds, strict=True))
+    what = f"expected one SAM encoder and its decoder, found {roles}"
     raise InputError(f"sam:{spec}: {what}; put both into one folder or write sam:ENCODER,DECODER")
 
 
@@ -279,12 +264,11 @@ def open_graph(path: Path, threads: int = 0) -> Graph:
 
 
 def _outputs(names: list[str]) -> dict[str, str]:
-    """Role -> output name. Of several mask outputs the first in the order of _ALIASES is used."""
+    """Role -> output name. Of several mask outputs the first in the order of _NAMES is used."""
     outputs: dict[str, str] = {}
     for role in ("embedding", "high_res_0", "high_res_1", "positional", "masks", "iou"):
-        found = [alias for alias in _ALIASES[role] if alias in names]
-        if found:
-            outputs[role] = found[0]
+        if known := [name for name in _NAMES[role].split() if name in names]:
+            outputs[role] = known[0]
     if len(names) == 1 and not outputs:
         outputs["embedding"] = names[0]  # encoders whose only output has a generic name
     return outputs
@@ -295,8 +279,8 @@ def sam_graphs(path: Path) -> list[Path]:
     if path.is_dir():
         return model_graphs(path)[0]
     if not path.is_file():
-        found = "no such file or folder, nor a stored model; expected a SAM encoder and decoder as ONNX"
-        raise InputError(f"sam:{path}: {found}; {known_names()}")
+        missing = "no such file or folder, nor a stored model; expected a SAM encoder and decoder as ONNX"
+        raise InputError(f"sam:{path}: {missing}; {known_names()}")
     partners = [path.with_name(path.name.replace(a, b)) for a, b in (("encoder", "decoder"), ("decoder", "encoder"))]
     beside = [partner for partner in partners if partner != path and partner.is_file()]
     other = [file for file in sorted(path.parent.glob("*.onnx")) if file != path and "decoder" in file.name]
@@ -325,8 +309,8 @@ def _check_pair(encoder: Graph, decoder: Graph) -> None:
         raise InputError(f"{decoder.path}: needs {', '.join(unmet)}, which {encoder.path.name} does not give")
     lacking = [role for role in ("masks", "iou") if role not in decoder.outputs]
     if lacking:
-        found = ", ".join(argument.name for argument in decoder.session.get_outputs())
-        raise InputError(f"{decoder.path}: no output for {' and '.join(lacking)} (found {found}); not a SAM decoder")
+        outputs = ", ".join(argument.name for argument in decoder.session.get_outputs())
+        raise InputError(f"{decoder.path}: no output for {' and '.join(lacking)} (found {outputs}); not a SAM decoder")
     logits = next(x for x in decoder.session.get_outputs() if x.name == decoder.outputs["masks"])
     if "bool" in logits.type:
         raise InputError(f"{decoder.path}: gives masks without logits; stability cannot be measured")

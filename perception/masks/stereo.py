@@ -19,11 +19,15 @@ from perception.progress import QUIET, Progress
 from perception.types import View
 
 PLANES = 96
-NEIGHBOURS = 6
+NEAREST, FARTHEST = 0.75, 1.35  # of the planes, relative to the prior's range
+NEIGHBOURS = 6  # photos that a photo is matched with, at most
 _CONFIRMED = 2  # photos that must agree with a depth before it contributes to the surface
 _AGREE = 0.03  # largest relative difference of depths that confirm each other
 SIDE = 320  # pixels of the long side at stereo resolution
 _LEAST_DEPTH = 0.05  # share of a photo's pixels that must have depth; other photos are not used
+_GRID = 24  # pixels between the points by which neighbours are chosen
+_LEAST_GAIN = 1e-3  # mean usefulness that one more neighbour must add
+ANGLE, NARROWER, WIDER = 12.0, 5.0, 10.0  # degrees between rays: best one, standard deviations below and above it
 
 
 @dataclass
@@ -31,9 +35,9 @@ class StereoView:
     """One photo. photo: [h, w, 3] uint8 RGB; grey: [h, w] uint8; K: [3, 3]; camera_from_world: [4, 4] float64.
 
     prior: [h, w] depth known before stereo, 0 = none. depth: [h, w] current best depth. confirmed: [h, w] bool, pixels
-    whose depth other photos agree with. measured: the prior comes from a sensor. voxel: [h, w] int32, the voxel of the
-    surface that each pixel shows, −1 = none, set by `surface_graph`. learned: [3, h, w] float16, see `boundaries`, set
-    by `fuse`. keep: where images that are made later are kept.
+    whose depth other photos agree with. measured: the prior comes from a sensor. learned: [3, h, w] float16, see
+    `boundaries`, set by `fuse`. voxel: [h, w] int32, the voxel of the surface that each pixel shows, −1 = none, set by
+    `surface_graph`. keep: where images that are made later are kept.
     """
 
     name: str
@@ -48,11 +52,6 @@ class StereoView:
     voxel: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.int32))
     learned: np.ndarray = field(default_factory=lambda: np.zeros((3, 0, 0), np.float16))
     keep: Keep = np.asarray
-
-    def store(self, keep: Keep) -> None:
-        """Puts the images but `voxel` where `keep` puts them."""
-        for name in ("photo", "grey", "prior", "depth", "confirmed", "learned"):
-            setattr(self, name, keep(getattr(self, name)))
 
     @property
     def center(self) -> np.ndarray:
@@ -85,9 +84,8 @@ def make_stereo_view(view: View, photo: np.ndarray, depth: np.ndarray, keep: Kee
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     pose = np.asarray(view.camera_from_world, np.float64)
     measured = view.depth is not None
-    made = StereoView(view.name, small, grey, K, pose, prior, filled_depth(prior), prior > 0, measured, keep=keep)
-    made.store(keep)
-    return made
+    filled, known = keep(filled_depth(prior)), keep(prior > 0)
+    return StereoView(view.name, keep(small), keep(grey), K, pose, keep(prior), filled, known, measured, keep=keep)
 
 
 def measure_depths(views: list[StereoView], progress: Progress = QUIET) -> None:
@@ -124,7 +122,7 @@ def sweep(view: StereoView, others: list[StereoView]) -> np.ndarray:
 def plane_depths(prior: np.ndarray) -> np.ndarray:
     """[PLANES] inverse depths, near to far, covering the prior's range with a margin."""
     near, far = np.percentile(prior[prior > 0], [1, 99])
-    return np.linspace(1 / (0.75 * near), 1 / (1.35 * far), PLANES)
+    return np.linspace(1 / (NEAREST * near), 1 / (FARTHEST * far), PLANES)
 
 
 def homographies(view: StereoView, other: StereoView) -> tuple[np.ndarray, np.ndarray]:
@@ -132,9 +130,9 @@ def homographies(view: StereoView, other: StereoView) -> tuple[np.ndarray, np.nd
     other_from_view = other.camera_from_world @ np.linalg.inv(view.camera_from_world)
     half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])  # OpenCV's pixel centres are at whole numbers
     inverse_K = np.linalg.inv(half @ view.K)
-    still = half @ other.K @ other_from_view[:3, :3] @ inverse_K
-    moving = half @ other.K @ np.outer(other_from_view[:3, 3], [0, 0, 1.0]) @ inverse_K
-    return still, moving
+    A = half @ other.K @ other_from_view[:3, :3] @ inverse_K
+    B = half @ other.K @ np.outer(other_from_view[:3, 3], [0, 0, 1.0]) @ inverse_K
+    return A, B
 
 
 def choose_neighbours(views: list[StereoView]) -> list[list[int]]:
@@ -145,24 +143,24 @@ def choose_neighbours(views: list[StereoView]) -> list[list[int]]:
         useful = np.stack([_usefulness(view, other, points) for other in views])
         useful[i] = 0
         first = second = np.zeros(len(points))  # usefulness of the best two chosen views for each point
-        found: list[int] = []
-        while len(found) < min(NEIGHBOURS, len(views) - 1):
+        best_views: list[int] = []
+        while len(best_views) < min(NEIGHBOURS, len(views) - 1):
             gain = np.maximum(useful, first) + np.clip(np.minimum(useful, first), second, None) - first - second
             gain = gain.mean(axis=1)
-            gain[found] = -1
+            gain[best_views] = -1
             best = int(gain.argmax())
-            if gain[best] < 1e-3:
+            if gain[best] < _LEAST_GAIN:
                 break
-            found.append(best)
+            best_views.append(best)
             second = np.maximum(second, np.minimum(useful[best], first))
             first = np.maximum(first, useful[best])
-        chosen.append(found)
+        chosen.append(best_views)
     return chosen
 
 
-def _sample(view: StereoView, every: int = 24) -> np.ndarray:
+def _sample(view: StereoView) -> np.ndarray:
     """[P, 3] world points of a coarse grid of pixels."""
-    y, x = np.mgrid[every // 2 : view.prior.shape[0] : every, every // 2 : view.prior.shape[1] : every]
+    y, x = np.mgrid[tuple(slice(_GRID // 2, side, _GRID) for side in view.prior.shape)]
     z = view.prior[y, x]
     rays = np.stack([x + 0.5, y + 0.5, np.ones(x.shape)], axis=-1) @ np.linalg.inv(view.K).T
     points = (rays * z[..., None])[z > 0]
@@ -170,7 +168,11 @@ def _sample(view: StereoView, every: int = 24) -> np.ndarray:
 
 
 def _usefulness(view: StereoView, other: StereoView, points: np.ndarray) -> np.ndarray:
-    """[P] in [0, 1]: 0 where `other` does not see a point, else a weight from ray angle and distance ratio."""
+    """[P] in [0, 1]: 0 where `other` does not see a point, else r exp(−((α − ANGLE) / σ)² / 2).
+
+    α: angle between the rays of both views to the point, degrees; σ: NARROWER below ANGLE, else WIDER; r: ratio of its
+    smaller to its larger distance from the views, as at twice the distance the resolution is half.
+    """
     local = points @ other.camera_from_world[:3, :3].T + other.camera_from_world[:3, 3]
     z = np.maximum(local[:, 2], 1e-9)
     pixel = local @ other.K.T / z[:, None]
@@ -179,10 +181,10 @@ def _usefulness(view: StereoView, other: StereoView, points: np.ndarray) -> np.n
     a, b = points - view.center, points - other.center
     cosine = (a * b).sum(axis=1) / np.maximum(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1), 1e-12)
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    width = np.where(angle < 12, 5.0, 10.0)
+    width = np.where(angle < ANGLE, NARROWER, WIDER)
     closeness = np.linalg.norm(b, axis=1) / np.maximum(np.linalg.norm(a, axis=1), 1e-12)
-    alike = np.minimum(closeness, 1 / np.maximum(closeness, 1e-12))  # at twice the distance the resolution is half
-    return np.asarray(inside * alike * np.exp(-(((angle - 12) / width) ** 2) / 2))
+    alike = np.minimum(closeness, 1 / np.maximum(closeness, 1e-12))
+    return np.asarray(inside * alike * np.exp(-(((angle - ANGLE) / width) ** 2) / 2))
 
 
 def confirmed(
@@ -193,14 +195,14 @@ def confirmed(
     pixels = np.stack([*np.mgrid[:h, :w][::-1], np.ones((h, w), np.int64)]).reshape(3, -1)
     count, ratios = np.zeros(h * w, np.int32), np.ones(h * w)
     for other, theirs in zip(others, their_depths, strict=True):
-        still, moving = homographies(view, other)
-        u, v, nearer = still @ pixels + moving[:, 2:] / depth.reshape(-1)  # their depth over this one
+        A, B = homographies(view, other)
+        u, v, nearer = A @ pixels + B[:, 2:] / depth.reshape(-1)  # nearer: their depth over this one
         rows, columns = theirs.shape
         with np.errstate(divide="ignore", invalid="ignore"):
             column, row = np.rint(u / nearer), np.rint(v / nearer)
         inside = (nearer > 0) & (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
-        places = np.where(inside, row * columns + column, 0).astype(np.int64)
-        ratio = theirs.reshape(-1)[places] / np.where(inside, nearer * depth.reshape(-1), 1)
+        pixel = np.where(inside, row * columns + column, 0).astype(np.int64)
+        ratio = theirs.reshape(-1)[pixel] / np.where(inside, nearer * depth.reshape(-1), 1)
         agrees = inside & (np.abs(ratio - 1) < _AGREE)
         count += agrees
         ratios += np.where(agrees, ratio, 0)  # for similar view directions, both depths scale by the same ratio

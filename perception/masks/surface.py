@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from perception.masks.cues import DepthCues, PhotoCues
 FOOTPRINTS = 4.0  # voxel side in pixel footprints at the median depth; above the noise of the depth
 _MOST = 400_000  # voxels; larger scenes use larger voxels
 _LEAST_PIXELS = 3  # over all photos, minimum for a voxel to be kept
+_COUNT, _POINT, _NORMAL, _LAB, _BORDER = 0, slice(1, 4), slice(4, 7), slice(7, 10), 10
 _OFFSET = 1 << 20  # makes voxel indices positive; 2^21 values per axis
 
 
@@ -34,18 +35,19 @@ class Surface:
 
     def voxel_of(self, points: np.ndarray) -> np.ndarray:
         """[...] int32 index of the voxel that contains each of points [..., 3]; −1 where there is none."""
-        keys = voxel_keys(points.reshape(-1, 3), self.size)
-        place = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
-        return np.where(self.keys[place] == keys, place, -1).astype(np.int32).reshape(points.shape[:-1])
+        voxel = position_in(self.keys, voxel_keys(points.reshape(-1, 3), self.size))
+        return voxel.astype(np.int32).reshape(points.shape[:-1])
 
 
-@dataclass
 class SurfaceBuilder:
-    """Accumulates photos one by one. Memory grows with the surface, not with the number of photos."""
+    """Accumulates photos one by one. Memory grows with the surface, not with the number of photos.
 
-    size: float
-    _keys: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
-    _sums: np.ndarray = field(default_factory=lambda: np.zeros((0, 11)))
+    size: side of the voxels. Each voxel has sums over its pixels, columns _COUNT to _BORDER.
+    """
+
+    def __init__(self, size: float) -> None:
+        self.size = size
+        self._keys, self._sums = np.zeros(0, np.int64), np.zeros((0, _BORDER + 1))
 
     def add(
         self, photo: PhotoCues, depth: DepthCues, border: np.ndarray, known: np.ndarray, world_from_camera: np.ndarray
@@ -54,10 +56,8 @@ class SurfaceBuilder:
         world_from_camera: [4, 4]."""
         points = move_points(world_from_camera, depth.points[known].astype(np.float64))
         normals = depth.normals[known] @ world_from_camera[:3, :3].T
-        values = np.concatenate(
-            [np.ones((len(points), 1)), points, normals, photo.lab[known], border[known][:, None]], axis=1
-        )
-        self._merge(voxel_keys(points, self.size), values)
+        columns = [np.ones((len(points), 1)), points, normals, photo.lab[known], border[known][:, None]]
+        self._merge(voxel_keys(points, self.size), np.concatenate(columns, axis=1))
 
     def _merge(self, keys: np.ndarray, values: np.ndarray) -> None:
         """Adds values [P, C] to the sums of voxels keys [P]; too many voxels are made eight times as large."""
@@ -68,19 +68,23 @@ class SurfaceBuilder:
         self._keys, self._sums = every, total
         if len(every) > 2 * _MOST:
             self.size *= 2
-            self._keys, self._sums = np.zeros(0, np.int64), np.zeros((0, values.shape[1]))
+            self._keys, self._sums = self._keys[:0], self._sums[:0]
             self._merge(pack_voxels(unpack_voxels(every) // 2), total)
 
     def build(self) -> Surface:
         """The voxels with at least _LEAST_PIXELS pixels."""
-        rows = self._sums[:, 0] >= _LEAST_PIXELS
+        rows = self._sums[:, _COUNT] >= _LEAST_PIXELS
         sums = self._sums[rows]
-        count = np.maximum(sums[:, :1], 1)
-        normals = sums[:, 4:7] / np.maximum(np.linalg.norm(sums[:, 4:7], axis=1, keepdims=True), 1e-9)
-        points, lab, border = (
-            (sums[:, k] / count).astype(np.float32) for k in (slice(1, 4), slice(7, 10), slice(10, 11))
-        )
-        return Surface(self.size, self._keys[rows], sums[:, 0], points, normals.astype(np.float32), lab, border[:, 0])
+        normals = sums[:, _NORMAL] / np.maximum(np.linalg.norm(sums[:, _NORMAL], axis=1, keepdims=True), 1e-9)
+        means = (sums / sums[:, :1]).astype(np.float32)
+        points, lab, border = (np.ascontiguousarray(means[:, column]) for column in (_POINT, _LAB, _BORDER))
+        return Surface(self.size, self._keys[rows], sums[:, _COUNT], points, normals.astype(np.float32), lab, border)
+
+
+def position_in(ascending: np.ndarray, keys: np.ndarray) -> np.ndarray:
+    """[P] position of each of keys [P] in `ascending` [V], V ≥ 1; −1 where it is not one of them."""
+    position = np.minimum(np.searchsorted(ascending, keys), len(ascending) - 1)
+    return np.where(ascending[position] == keys, position, -1)
 
 
 def voxel_keys(points: np.ndarray, size: float) -> np.ndarray:

@@ -37,6 +37,6 @@ def likely_names(ranker: Ranker, count: int = 3) -> list[list[str]]:
 @lru_cache(maxsize=1)
 def vocabulary() -> list[str]:
     """The first name of every ImageNet class, and common words where the class names are too specific."""
-    from perception.language.conse import class_names
+    from perception.language.household import class_names
 
     return list(dict.fromkeys([group[0] for group in class_names()] + list(PLAIN_WORDS)))

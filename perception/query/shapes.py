@@ -1,30 +1,9 @@
-"""Shape scores: how well each instance's geometry fits a floor, wall, ceiling, picture, rug, table, ball or box.
+"""Shape scores: fit of each instance's geometry to a floor, wall, ceiling, picture, rug, table, ball or box.
 
 An image classifier does not recognise walls and floors, but a map has geometry: the up direction, level and upright
-planes, the lowest surface, flat objects on a wall. All lengths are relative to the scene's own, so no metric scale is
-needed. ramp(x; p, q) rises linearly from 0 at p to 1 at q; [·] is 1 if true, else 0. Of each instance:
-
-    n, z, a, t: normal, height of the centre, covered area and thickness of its best plane; h: from low to high
-    top, s, rests: height and share of points of its fullest horizontal slab, and the number of smaller objects on it
-    gap: distance to the nearest parallel wall
-
-Of the scene:
-
-    span: height of all instances together; e: median height of the cameras
-    a_max, a_up, a_typ: largest area, largest upright area, typical area
-    ground: height of the lowest large level plane, if nothing lies much lower
-
-Scores:
-
-    flat = ramp(t; .35, .2)   level = flat ramp(|n_z|; .85, .95)   upright = flat ramp(|n_z|; .3, .15)
-    wall = upright ramp(a / a_up; .15, .35) ramp(a / a_max; .05, .15) ramp(h; .2 span, .4 span)
-    picture = upright (1 − wall) ramp(gap / span; .1, .05)
-    floor = level [at the ground] a / (largest a of those): a floor may be in pieces
-    rug = level [on the ground, not the largest] ramp(a; a_typ, 2 a_typ); ½ for the largest, which may be carpeted
-    ceiling = level ramp(z; e, e + .1 span) ramp(a; .1 a_max, .3 a_max)
-    table = [upright < ½] ramp(s; .25, .45) ramp(a; a_typ, 3 a_typ) (½ + ½ ramp(rests; 0, 2))
-            · ramp(top; e + .05 span, e − .05 span) · ramp(top; ground + .05 span, ground + .12 span)
-    ball: see `roundness`   box: see `boxiness`
+planes, the lowest surface, flat objects on a wall. No metric scale is needed: lengths are relative to `span`, the
+height of all instances together, and areas to the largest or the typical one. A score is a product of ramps: each
+pair of constants below is where a ramp is 0 and where it is 1.
 
 A table top seen from close by can look like a floor. The floor therefore gets half a table score, whatever its height.
 """
@@ -42,11 +21,56 @@ from perception.language.shape_words import KINDS
 
 SAMPLES = 1000  # points used per instance
 LEAST = 20  # points; instances with fewer get no scores
+CERTAIN = 0.5  # score from which an instance counts as level or upright for the scores of others
+
+# Planes. Thickness: see `measure`; the others are |z| of the unit normal.
+FLAT = 0.35, 0.20  # thickness: walls with frames and rugs with folds are flat, chairs are not
+LEVEL = 0.85, 0.95  # tilted by 32° and 18°
+UPRIGHT = 0.30, 0.15  # leaning by 17° and 9°
+PARALLEL = 0.95  # cosine of the angle between the planes of a picture and its wall: 18°
+
+# The floor. Heights in spans above the ground, the lowest large level plane.
+GROUND_AREA = 0.1  # of the largest area: what is smaller, such as a box's top, is no ground
+LOWER_THINGS = 0.1  # spans that the ground may lie above the lowest points; more: it is a table top
+AT_GROUND = 0.05  # centre of a floor in pieces: errors of a map bend it
+ON_GROUND = 0.08  # highest point of a rug
+LARGEST_RUG = 0.8  # of the largest area; more is the floor itself
+CARPET = 0.5  # rug score of the floor, which may be carpeted
+
+# Walls, pictures, ceilings
+WALL_OF_UPRIGHT = 0.15, 0.35  # area / largest upright one: cupboards are smaller
+WALL_OF_LARGEST = 0.05, 0.15  # area / largest: where no wall is in the map, the largest upright thing is none
+WALL_HEIGHT = 0.2, 0.4  # low to high, in spans: a sofa's back is lower
+NEAR_WALL = 0.1, 0.05  # distance of a picture from a wall's plane, in spans
+WALL_OF_PICTURE = 0.3  # area / largest upright one, from which a plane can carry pictures
+ABOVE_EYES = 0.0, 0.1  # height of a ceiling above the cameras, in spans
+CEILING_AREA = 0.1, 0.3  # area / largest: shelves are smaller
+
+# Rugs and tables. The typical area is the median, at most LARGEST_TYPICAL of the largest one.
+LARGEST_TYPICAL = 0.03
+RUG_AREA = 1.0, 2.0  # area / typical
+TABLE_AREA = 1.0, 3.0  # area / typical
+TABLE_SLAB = 0.25, 0.45  # share of points in the fullest horizontal slab: the top, seen better than the legs
+TABLE_BELOW_EYES = 0.05, -0.05  # height of the top above the cameras, in spans
+TABLE_HEIGHT = 0.05, 0.12  # height of the top above the ground, in spans
+ON_TABLE = 0.0, 2.0  # number of smaller things on it; none halves the score
+RESTING = 0.06  # spans between the bottom of a thing and the top of what it rests on
+
+# Balls and boxes
+WHOLE_BALL = 0.6, 0.8  # smallest extent / diameter: a shallow cap of a large sphere is not a ball
+ROUND = 0.10, 0.05  # mean distance from the sphere / radius
+BOX_FACES = 0.11, 0.06  # mean distance to the nearest face / √(smallest side · middle side)
+BOX_EDGES = 0.02, 0.08  # share of points near upright edges, which a cylinder has none of
+NEAR_EDGE = 0.12  # distance to both faces of an edge / side: a point is near it
 
 
 @dataclass(frozen=True)
 class Body:
-    """Points [P, 3] of an instance without outliers, in a frame with z up, and measures of them (see the module)."""
+    """Points [P, 3] of an instance without outliers, in a frame with z up, and measures of them.
+
+    center [3]; normal [3], thickness and area: of its best plane, see `measure`; low, high: of its z; top, top_share,
+    footprint: of its fullest horizontal slab the height, the share of points, and low and high corner [2, 2].
+    """
 
     points: np.ndarray
     center: np.ndarray
@@ -57,7 +81,7 @@ class Body:
     high: float
     top: float
     top_share: float
-    footprint: np.ndarray  # low and high corner [2, 2] of the slab's bounding rectangle
+    footprint: np.ndarray
 
 
 def shape_scores(
@@ -80,11 +104,11 @@ def shape_scores(
     bodies = [body for body in measured if body is not None]
     if not bodies:
         return scores
-    found = {"ball": np.array([roundness(body.points) for body in bodies])}
+    by_kind = {"ball": np.array([roundness(body.points) for body in bodies])}
     if up is not None:
-        found["box"] = np.array([boxiness(body.points) for body in bodies])
-        found |= room_scores(bodies, float(np.median((camera_centres(camera_from_world) @ frame.T)[:, 2])))
-    for kind, values in found.items():
+        by_kind["box"] = np.array([boxiness(body.points) for body in bodies])
+        by_kind |= room_scores(bodies, float(np.median((camera_centres(camera_from_world) @ frame.T)[:, 2])))
+    for kind, values in by_kind.items():
         scores[rows, KINDS.index(kind)] = values
     return scores
 
@@ -134,37 +158,35 @@ def roundness(points: np.ndarray) -> float:
     """1 for points x [P, 3] on a sphere or most of one, 0 for other shapes.
 
     Least-squares sphere (o, r):  2 x · o + (r² − |o|²) = |x|²;  then
-    ramp(smallest extent / 2r; .6, .8) · ramp(mean | |x − o| − r | / r; .10, .05)
+    ramp(smallest extent / 2r; WHOLE_BALL) · ramp(mean | |x − o| − r | / r; ROUND)
     """
     rows = np.concatenate([2 * points, np.ones((len(points), 1))], axis=1)
     solution, *_ = np.linalg.lstsq(rows, (points**2).sum(axis=1), rcond=None)
     radii = np.linalg.norm(points - solution[:3], axis=1)
     radius = float(np.median(radii))
     size = np.percentile(points, 97, axis=0) - np.percentile(points, 3, axis=0)
-    whole = ramp(float(size.min()) / max(2 * radius, 1e-9), 0.6, 0.8)  # a shallow cap of a large sphere is not a ball
-    return whole * ramp(float(np.abs(radii - radius).mean()) / max(radius, 1e-9), 0.10, 0.05)
+    complete = ramp(float(size.min()) / max(2 * radius, 1e-9), *WHOLE_BALL)
+    return complete * ramp(float(np.abs(radii - radius).mean()) / max(radius, 1e-9), *ROUND)
 
 
 def boxiness(points: np.ndarray) -> float:
     """1 for points [P, 3] on the faces of an upright box (z up), 0 for round or irregular shapes.
 
-    Uses the upright bounding box with the smallest ground area, with rotations in steps of 5° and sides S:
-    ramp(mean distance to the nearest face / √(min S · median S); .11, .06) · ramp(share near upright edges; .02, .08)
+    Uses the upright bounding box with the smallest ground area, of rotations in steps of 5°. With its sides S:
+    ramp(mean distance to the nearest face / √(min S · median S); BOX_FACES) · ramp(share near upright edges; BOX_EDGES)
     """
-    best = None
+    best = np.inf
     for angle in np.radians(np.arange(0, 90, 5)):
         c, s = np.cos(angle), np.sin(angle)
         turned = points @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
         low, high = np.percentile(turned, [2, 98], axis=0)
-        size = np.maximum(high - low, 1e-9)
-        if best is None or size[0] * size[1] < best[0]:
-            best = (size[0] * size[1], turned, low, high, size)
-    assert best is not None
-    _, turned, low, high, size = best
-    inside = np.minimum(turned - low, high - turned)  # distance to the nearer of the two faces along each axis
+        sides = np.maximum(high - low, 1e-9)
+        if sides[0] * sides[1] < best:
+            best, size, inside = sides[0] * sides[1], sides, np.minimum(turned - low, high - turned)
+    # inside: distance to the nearer of the two faces along each axis
     nearest = np.abs(inside / np.sqrt(size.min() * np.median(size))).min(axis=1)
-    corners = np.abs(inside[:, :2] / size[:2]).max(axis=1) < 0.12  # a box has upright edges, a cylinder has none
-    return ramp(float(nearest.mean()), 0.11, 0.06) * ramp(float(corners.mean()), 0.02, 0.08)
+    at_edges = np.abs(inside[:, :2] / size[:2]).max(axis=1) < NEAR_EDGE
+    return ramp(float(nearest.mean()), *BOX_FACES) * ramp(float(at_edges.mean()), *BOX_EDGES)
 
 
 def ramp(x: Any, zero: Any, one: Any) -> Any:
@@ -172,39 +194,49 @@ def ramp(x: Any, zero: Any, one: Any) -> Any:
     return np.clip((x - zero) / np.where(one == zero, 1e-9, one - zero), 0.0, 1.0)
 
 
-def room_scores(bodies: list[Body], e: float) -> dict[str, np.ndarray]:
-    """Scores [B] of the kinds that depend on the other instances. e: median height of the cameras."""
-    n_z = np.abs([body.normal[2] for body in bodies])
-    z = np.array([body.center[2] for body in bodies])
-    t, a, low, high, top, s = (
+def _rise(x: Any, bounds: tuple[float, float], unit: float = 1.0, base: float = 0.0) -> Any:
+    """`ramp` with bounds in a unit above a base."""
+    return ramp(x, base + bounds[0] * unit, base + bounds[1] * unit)
+
+
+def room_scores(bodies: list[Body], eyes: float) -> dict[str, np.ndarray]:
+    """Scores [B] of the kinds that depend on the other instances. eyes: median height of the cameras."""
+    tilt = np.abs([body.normal[2] for body in bodies])
+    height = np.array([body.center[2] for body in bodies])
+    thickness, area, low, high, top, top_share = (
         np.array([getattr(body, name) for body in bodies])
         for name in ("thickness", "area", "low", "high", "top", "top_share")
     )
-    flat = ramp(t, 0.35, 0.2)
-    level, upright = flat * ramp(n_z, 0.85, 0.95), flat * ramp(n_z, 0.3, 0.15)
+    flat = ramp(thickness, *FLAT)
+    level, upright = flat * ramp(tilt, *LEVEL), flat * ramp(tilt, *UPRIGHT)
     span = high.max() - low.min() + 1e-9
-    a_max, a_up = a.max(), max(a[upright > 0.5].max(initial=0.0), 1e-9)
-    a_typ = min(float(np.median(a)), 0.03 * a_max)
-    ground = z[(level > 0.5) & (z < e) & (a > 0.1 * a_max)].min(initial=np.inf)
-    if ground > float(np.percentile(np.concatenate([body.points[:, 2] for body in bodies]), 2)) + 0.1 * span:
-        ground = np.inf  # something lies lower: this is a table top, and the floor is not in the map
+    largest, largest_upright = area.max(), max(area[upright > CERTAIN].max(initial=0.0), 1e-9)
+    typical = min(float(np.median(area)), LARGEST_TYPICAL * largest)
+
+    ground = height[(level > CERTAIN) & (height < eyes) & (area > GROUND_AREA * largest)].min(initial=np.inf)
+    lowest = float(np.percentile(np.concatenate([body.points[:, 2] for body in bodies]), 2))
+    if ground > lowest + LOWER_THINGS * span:
+        ground = np.inf  # the floor is not in the map
     known = bool(np.isfinite(ground))
-    at_ground = (level > 0.5) & (z < ground + 0.05 * span) & known
-    floor = at_ground & (np.arange(len(a)) == np.where(at_ground, a, -1).argmax())
-    on_ground = known & ~floor & (high < ground + 0.08 * span) & (a < 0.8 * a_max)
-    walls = [body for body, u, area in zip(bodies, upright, a, strict=True) if u > 0.5 and area >= 0.3 * a_up]
-    gap = np.array([min((_gap(body, w) for w in walls if w is not body), default=np.inf) for body in bodies])
+    at_ground = (level > CERTAIN) & (height < ground + AT_GROUND * span) & known
+    floor = at_ground & (np.arange(len(area)) == np.where(at_ground, area, -1).argmax())  # the largest piece
+    on_ground = known & ~floor & (high < ground + ON_GROUND * span) & (area < LARGEST_RUG * largest)
+
+    carries = (upright > CERTAIN) & (area >= WALL_OF_PICTURE * largest_upright)
+    walls = [body for body, wall in zip(bodies, carries, strict=True) if wall]
+    gap = np.array([min((_gap(body, wall) for wall in walls if wall is not body), default=np.inf) for body in bodies])
     rests = np.array([sum(_rests_on(other, body, span) for other in bodies if other is not body) for body in bodies])
-    raised = np.where(floor, 0.5, ramp(top, ground + 0.05 * span, ground + 0.12 * span) if known else 1.0)
-    wall = upright * ramp(a / a_up, 0.15, 0.35) * ramp(a / a_max, 0.05, 0.15) * ramp(high - low, 0.2 * span, 0.4 * span)
-    table = ramp(s, 0.25, 0.45) * ramp(a, a_typ, 3 * a_typ) * (0.5 + 0.5 * ramp(rests, 0, 2))
+    raised = np.where(floor, 0.5, _rise(top, TABLE_HEIGHT, span, ground) if known else 1.0)
+    wall = upright * ramp(area / largest_upright, *WALL_OF_UPRIGHT) * ramp(area / largest, *WALL_OF_LARGEST)
+    wall *= _rise(high - low, WALL_HEIGHT, span)
+    table = ramp(top_share, *TABLE_SLAB) * _rise(area, TABLE_AREA, typical) * (0.5 + 0.5 * ramp(rests, *ON_TABLE))
     return {
         "wall": wall,
-        "picture": upright * (1 - wall) * ramp(gap / span, 0.1, 0.05),
-        "floor": level * at_ground * a / max(a[floor].max(initial=0.0), 1e-9),
-        "rug": level * np.where(floor, 0.5, on_ground * ramp(a, a_typ, 2 * a_typ)),
-        "ceiling": level * ramp(z, e, e + 0.1 * span) * ramp(a, 0.1 * a_max, 0.3 * a_max),
-        "table": (upright < 0.5) * table * ramp(top, e + 0.05 * span, e - 0.05 * span) * raised,
+        "picture": upright * (1 - wall) * ramp(gap / span, *NEAR_WALL),
+        "floor": level * at_ground * area / max(area[floor].max(initial=0.0), 1e-9),  # it may be in pieces
+        "rug": level * np.where(floor, CARPET, on_ground * _rise(area, RUG_AREA, typical)),
+        "ceiling": level * _rise(height, ABOVE_EYES, span, eyes) * _rise(area, CEILING_AREA, largest),
+        "table": (upright < CERTAIN) * table * _rise(top, TABLE_BELOW_EYES, span, eyes) * raised,
     }
 
 
@@ -235,11 +267,11 @@ def _slab(points: np.ndarray) -> tuple[float, float, np.ndarray]:
 def _rests_on(upper: Body, lower: Body, span: float) -> bool:
     """Whether a smaller body stands on the top slab of `lower`."""
     inside = ((upper.center[:2] > lower.footprint[0]) & (upper.center[:2] < lower.footprint[1])).all()
-    return bool(inside and upper.area < lower.area and abs(upper.low - lower.top) < 0.06 * span)
+    return bool(inside and upper.area < lower.area and abs(upper.low - lower.top) < RESTING * span)
 
 
 def _gap(body: Body, wall: Body) -> float:
     """Distance of a body's centre from a wall's plane if both are parallel, else infinity."""
-    if abs(float(body.normal @ wall.normal)) < 0.95:
+    if abs(float(body.normal @ wall.normal)) < PARALLEL:
         return float("inf")
     return float(abs((body.center - wall.center) @ wall.normal))

@@ -202,8 +202,8 @@ def test_labels_and_votes_of_a_photo_are_those_of_the_cpu(pretended, monkeypatch
         assert found.dtype == expected.dtype and (found != expected).mean() < 0.002  # single precision at near ties
         assert len(np.unique(expected[0])) > 4 and (expected[1] == -1).all()
     here, there = (mask_votes(Nearby(where), [view], half_resolution=False) for where in (g, g.to(pretended)))
-    np.testing.assert_allclose(there.weights.toarray(), here.weights.toarray(), atol=2e-2)  # FAINTEST is dropped
-    assert here.weights.nnz > 20
+    np.testing.assert_allclose(there.pixels.toarray(), here.pixels.toarray(), atol=2e-2)  # FAINTEST is dropped
+    assert here.pixels.nnz > 20
 
 
 def test_a_full_memory_is_met_with_fewer_records_then_refused(pretended, monkeypatch):

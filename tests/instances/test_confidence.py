@@ -9,19 +9,19 @@ from scipy import sparse
 pytest.importorskip("perception._core")
 from perception.instances.confidence import CALIBRATION, calibrated, raw_scores
 from perception.instances.consensus import evidence
-from perception.instances.votes import Table
+from perception.instances.votes import MaskVotes
 
 
-def table(*rows: list[float], area: list[float], view: list[int]) -> Table:
+def table(*rows: list[float], area: list[float], view: list[int]) -> MaskVotes:
     void = sparse.csr_matrix((len(rows), max(view) + 1), dtype=np.float32)
-    return Table(sparse.csr_matrix(np.array(rows, np.float32)), void, np.array(view), np.array(area))
+    return MaskVotes(sparse.csr_matrix(np.array(rows, np.float32)), void, np.array(view), np.array(area))
 
 
 def test_calibration_rises_strictly_within_its_bounds() -> None:
     raw = np.linspace(0, 1, 101)
     score = calibrated(raw)
     assert (np.diff(score) > 0).all() and score[0] == 0 and score[-1] == 1
-    assert [x for x, _ in CALIBRATION] == sorted(x for x, _ in CALIBRATION)
+    assert all(list(row) == sorted(row) for row in CALIBRATION)
 
 
 def test_evidence_by_hand() -> None:
@@ -35,7 +35,7 @@ def test_evidence_by_hand() -> None:
 
 def test_unmasked_pixels_are_part_of_the_extent() -> None:
     seen = table([100.0], area=[100], view=[0])
-    half_blank = Table(seen.pixels, sparse.csr_matrix([[100.0]], dtype=np.float32), seen.view, seen.area)
+    half_blank = MaskVotes(seen.pixels, sparse.csr_matrix([[100.0]], dtype=np.float32), seen.view, seen.area)
     assert evidence(seen).agreement[0] == 1 and evidence(half_blank).agreement[0] == 0.5
 
 

@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from perception.instances.consensus import LEAST_SHARE, LOWEST, ONE_SIDED, PRIOR, evidence, merge_tree, node_evidence
-from perception.instances.votes import Table
+from perception.instances.consensus import LEAST_SHARE, LOWEST, ONE_SIDED, PRIOR, dendrogram, evidence, node_evidence
+from perception.instances.votes import MaskVotes
 
 
-def a_table(seed: int, segments: int, views: int, filled: float = 0.5) -> Table:
+def a_table(seed: int, segments: int, views: int, filled: float = 0.5) -> MaskVotes:
     rng = np.random.default_rng(seed)
     view = np.sort(np.concatenate([np.arange(views), rng.integers(0, views, 2 * views)]))
     pixels = rng.uniform(0, 100, (segments, len(view))) * (rng.random((segments, len(view))) < filled)
     void = rng.uniform(0, 60, (segments, views)) * (rng.random((segments, views)) < 0.4)
     area = pixels.sum(axis=0) + rng.uniform(0, 50, len(view))
-    return Table(*(sparse.csr_matrix(a.astype(np.float32)) for a in (pixels, void)), view, area)
+    return MaskVotes(*(sparse.csr_matrix(a.astype(np.float32)) for a in (pixels, void)), view, area)
 
 
-def affinity(table: Table, z: np.ndarray, near: np.ndarray, i: int, j: int) -> float:
+def affinity(table: MaskVotes, z: np.ndarray, near: np.ndarray, i: int, j: int) -> float:
     """a_ij as the module's docstring has it."""
     P, B = (a.toarray().astype(np.float64) for a in (table.pixels, table.void))
     views = range(B.shape[1])
@@ -39,14 +39,14 @@ def affinity(table: Table, z: np.ndarray, near: np.ndarray, i: int, j: int) -> f
 
 
 def merged_by_hand(
-    table: Table, z: np.ndarray, sizes: np.ndarray, near: np.ndarray
+    table: MaskVotes, z: np.ndarray, sizes: np.ndarray, near: np.ndarray
 ) -> tuple[list[tuple[int, int]], list[float]]:
     """Nodes and affinities of all merges: every pair anew after each, on pooled dense tables."""
     P, B = (a.toarray().astype(np.float64) for a in (table.pixels, table.void))
     z, sizes, near, node = z.copy(), sizes.astype(float), near.copy(), list(range(len(z)))
     children, values = [], []
     while len(node) > 1:
-        pooled = Table(sparse.csr_matrix(P), sparse.csr_matrix(B), table.view, table.area)
+        pooled = MaskVotes(sparse.csr_matrix(P), sparse.csr_matrix(B), table.view, table.area)
         pairs = [(i, j) for i in range(len(node)) for j in range(i + 1, len(node))]
         found = [affinity(pooled, z, near, i, j) for i, j in pairs]
         best = int(np.argmax(found))
@@ -77,23 +77,23 @@ def test_merges_are_those_of_a_dense_search_in_float64(seed: int, filled: float)
     np.fill_diagonal(near, False)
     sizes = rng.integers(1, 50, 12)
     children, values = merged_by_hand(table, z, sizes, near)
-    tree = merge_tree(table, z, sizes, sparse.csr_matrix(near))
+    tree = dendrogram(table, z, sizes, sparse.csr_matrix(near))
     assert [tuple(pair) for pair in tree.children.tolist()] == children and len(children) > 3
     np.testing.assert_allclose(tree.affinity, values, rtol=1e-6)
 
 
 def test_of_equal_affinities_the_first_pair_is_merged() -> None:
     none = sparse.csr_matrix((4, 0), dtype=np.float32)
-    table = Table(none, none, np.zeros(0, np.int64), np.zeros(0))
+    table = MaskVotes(none, none, np.zeros(0, np.int64), np.zeros(0))
     near = np.array([[0, 0, 0, 1], [0, 0, 1, 0], [0, 1, 0, 0], [1, 0, 0, 0]], bool)
-    tree = merge_tree(table, np.zeros((4, 2)), np.ones(4), sparse.csr_matrix(near))
+    tree = dendrogram(table, np.zeros((4, 2)), np.ones(4), sparse.csr_matrix(near))
     assert tree.children.tolist() == [[0, 3], [1, 2]] and tree.affinity.tolist() == [1, 1]
 
 
 def test_merging_leaves_the_table_as_it_was() -> None:
     table = a_table(3, 6, 1)
     pixels, void = table.pixels.toarray(), table.void.toarray()
-    merge_tree(table, np.zeros((6, 2)), np.ones(6), sparse.csr_matrix(np.ones((6, 6), bool)))
+    dendrogram(table, np.zeros((6, 2)), np.ones(6), sparse.csr_matrix(np.ones((6, 6), bool)))
     np.testing.assert_array_equal(table.pixels.toarray(), pixels)
     np.testing.assert_array_equal(table.void.toarray(), void)
 
@@ -116,12 +116,12 @@ def test_evidence_is_the_formula() -> None:
 
 def test_evidence_of_a_node_is_that_of_its_leaves_together() -> None:
     table = a_table(6, 9, 4, 0.3)
-    tree = merge_tree(table, np.zeros((9, 2)), np.ones(9), sparse.csr_matrix(np.ones((9, 9), bool)))
+    tree = dendrogram(table, np.zeros((9, 2)), np.ones(9), sparse.csr_matrix(np.ones((9, 9), bool)))
     found = node_evidence(tree, table)
     for node in range(9 + len(tree.children)):
         leaves = tree.leaves_of(node)
         sums = [sparse.csr_matrix(a.toarray()[leaves].sum(axis=0)) for a in (table.pixels, table.void)]
-        alone = evidence(Table(*sums, table.view, table.area))
+        alone = evidence(MaskVotes(*sums, table.view, table.area))
         assert found.matched[node] == pytest.approx(alone.matched[0], rel=1e-5)
         assert found.pixels[node] == pytest.approx(alone.pixels[0], rel=1e-5)
         assert (found.views[node], found.support[node]) == (alone.views[0], alone.support[0])

@@ -59,7 +59,7 @@ def test_a_photo_votes_for_the_gaussians_near_it_as_if_there_were_no_others() ->
     near = np.arange(100, 300)
     votes = mask_votes(Nearby(g, {one.name: [near[:50], near[50:]]}), [one, other])
     of_near, of_all = mask_votes(Nearby(g.rows(torch.from_numpy(near))), [one]), mask_votes(Nearby(g), [other])
-    for name in ("weights", "void"):
+    for name in ("pixels", "void"):
         both = getattr(votes, name).toarray()
         width = getattr(of_near, name).shape[1]
         np.testing.assert_array_equal(both[near, :width], getattr(of_near, name).toarray())
@@ -82,7 +82,7 @@ def test_votes_are_the_weights_with_which_gaussians_enter_the_picture() -> None:
         )  # fmt: skip
         picture = out.features[0, ..., 0].numpy()
         expected = np.array([picture[view.labels.numpy() == name].sum() for name in names])
-        found = votes.weights[n].toarray()[0]
+        found = votes.pixels[n].toarray()[0]
         assert np.abs(np.where(expected > 0.02, expected, 0) - found).max() < 1e-3
         assert votes.void[n].sum() == pytest.approx(picture[view.labels.numpy() == 0].sum(), abs=0.03)
     assert votes.area.tolist() == [int((view.labels == name).sum()) for name in names]
@@ -97,7 +97,7 @@ def test_votes_at_half_resolution_weigh_what_the_full_picture_does() -> None:
     K = torch.tensor([[64.0, 0, 32], [0, 64, 32], [0, 0, 1]])
     labels = torch.ones(64, 64, dtype=torch.int32)
     view = TrainingView("a", torch.zeros(64, 64, 3, dtype=torch.uint8), labels, K, torch.eye(4))
-    full, half = (mask_votes(Nearby(g), [view], half_resolution=choice).weights[0, 0] for choice in (False, True))
+    full, half = (mask_votes(Nearby(g), [view], half_resolution=choice).pixels[0, 0] for choice in (False, True))
     expected = (deviation**2 + 0.3 + 0.25) / (deviation**2 + 0.3)
     assert 4 * half / full == pytest.approx(expected, rel=0.02)  # alpha under 1/255 is cut; with eps2d 0.3: 23 % more
 

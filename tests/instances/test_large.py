@@ -31,13 +31,13 @@ def test_tables_of_many_photos_are_made_in_parts(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(
         assign,
         "affinities",
-        lambda votes, shares, rows: weights.append(votes.weights[rows].nnz) or affinities(votes, shares, rows),
+        lambda votes, shares, rows: weights.append(votes.pixels[rows].nnz) or affinities(votes, shares, rows),
     )
     monkeypatch.setattr(consensus, "ENTRIES", 5_000)
     monkeypatch.setattr(assign, "ENTRIES", 100_000)
     found = grouped(*made)
     for name, value in vars(expected).items():
         np.testing.assert_array_equal(getattr(found, name), value)
-    masks = made[2].weights.shape[1]
+    masks = made[2].pixels.shape[1]
     assert len(nodes) > 100 and max(nodes) <= 5_000 + masks
     assert len(weights) > 10 and max(weights) < 1.5 * 100_000 / 4  # of 60 weights for each Gaussian

@@ -20,9 +20,10 @@ from perception.errors import InputError  # noqa: E402
 from perception.instances.crops import choose_views  # noqa: E402
 from perception.instances.describe import describe_instances  # noqa: E402
 from perception.language.base import packaged_file  # noqa: E402
-from perception.language.conse import CLASSIFIER, KNOWN, TAU, TOP, ConseEncoder, _cached, class_names  # noqa: E402
+from perception.language.conse import CLASSIFIER, KNOWN, TAU, TOP, ConseEncoder, _cached  # noqa: E402
 from perception.language.efficientnet_lite2 import SIDE, EfficientNetLite2  # noqa: E402
 from perception.language.encoders import make_encoder  # noqa: E402
+from perception.language.household import class_names  # noqa: E402
 from perception.language.minilm import WEIGHTS, MiniLM  # noqa: E402
 from perception.query.ranking import Ranker  # noqa: E402
 from support.truth_scenes import TruthScene  # noqa: E402

@@ -10,9 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perception.language import household
-from perception.language.conse import class_names
 from perception.language.description import InstanceDescription
-from perception.language.household import Household, household_thing, size_misfits
+from perception.language.household import Household, class_names, household_thing, size_misfits
 from perception.query.ranking import Ranker
 from perception.query.text_ranking import extents
 

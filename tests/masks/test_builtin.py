@@ -16,7 +16,9 @@ from perception.geometry import move_points
 from perception.masks import compute_masks, load_labels, make_source
 from perception.masks.builtin import BuiltinSegmentation, fuse, surface_graph
 from perception.masks.cues import depth_cues
+from perception.masks.merge_features import PAIR_FEATURES, pair_features
 from perception.masks.merging import (
+    REGION_COLUMNS,
     MergeTree,
     _with_relatives,
     divided,
@@ -33,7 +35,7 @@ from perception.masks.stereo import (
     plane_depths,
 )
 from perception.masks.surface import pack_voxels, unpack_voxels, voxel_keys
-from perception.masks.surface_graph import SurfaceGraph, voxel_edges
+from perception.masks.surface_graph import CONTACT, DEPTH, PIXELS, VOXELS, SurfaceGraph, voxel_edges
 from perception.types import DepthImage, View
 from support.mask_scores import best_ious, leaf_sums
 
@@ -216,7 +218,9 @@ def test_merging_patches_keeps_the_evidence_exact():
         graph.link()
         return graph
 
-    contacts = np.array([[links[b][-1] if b in links else 0 for b in range(first.count)] for links in first.borders])
+    contacts = np.array(
+        [[links[b][CONTACT] if b in links else 0 for b in range(first.count)] for links in first.borders]
+    )
     rng, patch, into = np.random.default_rng(1), first.patch.copy(), np.arange(first.count)
     for _ in range(first.count // 2):
         a = int(rng.choice([i for i in range(first.count) if first.borders[i]]))
@@ -229,10 +233,10 @@ def test_merging_patches_keeps_the_evidence_exact():
     compared = 0
     for i, a in enumerate(kept):
         for j in fresh.borders[i]:
-            old, new = (g.features(np.array([pair]))[0] for g, pair in ((first, (a, kept[j])), (fresh, (i, j))))
-            of_contacts = [8, 9]
+            old, new = (pair_features(g, np.array([pair]))[0] for g, pair in ((first, (a, kept[j])), (fresh, (i, j))))
+            of_contacts = [PAIR_FEATURES.index(name) for name in ("contact_share", "contact")]
             np.testing.assert_allclose(np.delete(old, of_contacts), np.delete(new, of_contacts), atol=1e-6)
-            assert first.borders[a][kept[j]][-1] == contacts[into == a][:, into == kept[j]].sum()
+            assert first.borders[a][kept[j]][CONTACT] == contacts[into == a][:, into == kept[j]].sum()
             compared += 1
     assert compared > 3
 
@@ -249,7 +253,7 @@ def test_growth_of_a_union_against_its_voxels():
             larger, smaller = (one, two) if len(one) > len(two) else (two, one)
             if len(smaller) < 12:
                 continue
-            pixels, depths = graph.sums[[a, b], 0], graph.sums[[a, b], 5]
+            pixels, depths = graph.sums[[a, b], PIXELS], graph.sums[[a, b], DEPTH]
             depth, least = depths.sum() / pixels.sum(), surface.size / 4
 
             def extent(points: np.ndarray, least: float = least) -> np.ndarray:
@@ -268,9 +272,9 @@ def test_growth_of_a_union_against_its_voxels():
                 *np.log(small / depth),
                 np.log(union.prod() / (big.prod() + small.prod())),
             ]
-            np.testing.assert_allclose(
-                graph.features(np.array([[a, b]]))[0, 23:34], expected, atol=1e-4
-            )  # points are float32
+            first, last = (PAIR_FEATURES.index(name) for name in ("distance", "volume_growth"))
+            found = pair_features(graph, np.array([[a, b]]))[0, first : last + 1]
+            np.testing.assert_allclose(found, expected, atol=1e-4)  # points are float32
             compared += 1
     assert compared > 20
 
@@ -412,9 +416,11 @@ def test_regions_of_the_tree_are_sums_of_their_patches():
     graph = surface_graph(seen, surface)
     tree = tree_by(read_model(), graph)
     sums = leaf_sums(tree, graph.sums)
-    area = sums[:, 6] * surface.size**2 / (sums[:, 5] / np.maximum(sums[:, 0], 1)).clip(1e-9) ** 2
-    np.testing.assert_allclose(tree.features[:, 4], np.log(area), atol=1e-4)
-    np.testing.assert_allclose(np.exp(tree.features[:, 2]), leaf_sums(tree, np.ones((graph.count, 1)))[:, 0], rtol=1e-5)
+    depth = sums[:, DEPTH] / np.maximum(sums[:, PIXELS], 1)
+    area = sums[:, VOXELS] * surface.size**2 / depth.clip(1e-9) ** 2
+    columns = dict(zip(REGION_COLUMNS, tree.features.T, strict=False))
+    np.testing.assert_allclose(columns["area"], np.log(area), atol=1e-4)
+    np.testing.assert_allclose(np.exp(columns["patches"]), leaf_sums(tree, np.ones((graph.count, 1)))[:, 0], rtol=1e-5)
 
 
 def test_relatives_of_regions_are_compared_with_them():
@@ -430,6 +436,12 @@ def test_relatives_of_regions_are_compared_with_them():
         expected.append(np.array([own[k] - row if k >= 0 else 0 * row for k, row in zip(relatives, own, strict=True)]))
     np.testing.assert_array_equal(rows[:, :12], np.concatenate(expected, axis=1))
     np.testing.assert_array_equal(rows[:, 12:], np.array([parent, grandparent, larger]).T < 0)
+
+
+def test_every_input_of_the_trained_weights_has_a_name():
+    model, relatives, missing = read_model(), 6, 3
+    assert len(model.pair.parts[0]) == len(set(PAIR_FEATURES))
+    assert len(model.region.parts[0]) == relatives * len(set(REGION_COLUMNS)) + missing
 
 
 def test_networks_give_the_same_bits_for_any_batch():

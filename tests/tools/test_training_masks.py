@@ -41,7 +41,7 @@ def test_truth_of_a_worlds_voxels_against_the_true_points(photographed, stereo):
 def test_equal_seeds_make_equal_weights(photographed):
     world = make_world(photographed[0], False)
     first, second = (learn([world, world], seed=0) for _ in range(2))
-    for one, two in zip(first.pair.parts + first.whole.parts, second.pair.parts + second.whole.parts, strict=True):
+    for one, two in zip(first.pair.parts + first.region.parts, second.pair.parts + second.region.parts, strict=True):
         np.testing.assert_array_equal(one, two)
 
 
@@ -49,7 +49,7 @@ def test_networks_learn_a_rule_that_is_not_linear():
     rng = np.random.default_rng(2)
     x = rng.normal(3, 2, (6000, 4))
     y = (np.abs(x[:, :1] - 3) > 1.5) != (x[:, 1:2] > 3)
-    network = fit([(x[:5000], y[:5000], np.ones(5000))], {}, 60, 0)
+    network = fit([(x[:5000], y[:5000], np.ones(5000))], np.zeros(4, int), 60, 0)
     assert ((network(x[5000:]) > 0) == y[5000:]).mean() > 0.9
 
 

@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=1000)
     options = parser.parse_args()
     means, features, votes, truth = building(options.gaussians, options.views)
-    votes_mib = (votes.weights.data.nbytes + votes.weights.indices.nbytes) >> 20
+    votes_mib = (votes.pixels.data.nbytes + votes.pixels.indices.nbytes) >> 20
     before, cpu, wall = _peak_mib(), time.process_time(), time.monotonic()
     found = grouped(means, features, votes)
     known = found.ids >= 0

@@ -29,7 +29,9 @@ import numpy as np
 from perception.bench.output import Column, table
 from perception.masks.boundaries import WEIGHTS as BORDERS
 from perception.masks.boundaries import inputs_of
+from perception.masks.merge_features import PAIR_FEATURES, pair_features
 from perception.masks.merging import (
+    REGION_COLUMNS,
     SMALLEST,
     WEIGHTS,
     MergeModel,
@@ -56,8 +58,11 @@ VIEWS = 9  # of a reading that borders are learned from
 MEMBERS = 3  # networks of an ensemble for pairs; twice as many for regions, of which there are fewer
 COSTS = (0.01, 0.02, 0.05, 0.1, 0.15)  # higher ones join things in scenes unlike the worlds
 NOISE, NEARER = 0.1, 0.3  # standard deviations: of inputs, relative to theirs; of the logarithm of the size of things
-PAIR_SIZE = {6: 2, 7: 2, 9: 1, **dict.fromkeys(range(27, 33), 1)}  # power of that size in SurfaceGraph.features
-WHOLE_SIZE = {4: 2, 5: 1, 6: 1, 7: 1}  # and in MergeTree.features
+EXTENTS = ("thickness", "width", "length")
+# Power of that size in each feature of pairs
+PAIR_SIZE = {"smaller_area": 2, "larger_area": 2, "contact": 1}
+PAIR_SIZE |= {f"{which}_{name}": 1 for which in ("larger", "smaller") for name in EXTENTS}
+REGION_SIZE = {"area": 2, **dict.fromkeys(EXTENTS, 1)}  # and of regions
 RENDERED, SENSED = 0.1, 0.025  # relative errors of depth; the latter make flat patches as thick as a Kinect's are
 POSES = 0.005  # errors of poses: radians, and relative to the median depth
 SIDES = (3.0, 5.0)  # of voxels, in pixel footprints
@@ -197,7 +202,9 @@ def make_world(folder: Path, stereo: bool, borders: Path = BORDERS) -> World:
 
 def plain_rule(features: np.ndarray) -> np.ndarray:
     """Alike in colour, without an edge, on one plane: the order of the merges that are first learned from."""
-    return np.asarray(2 - features[:, [0, 2, 14]].sum(axis=1, keepdims=True) + 2 * features[:, 18:19])
+    unlike = features[:, [PAIR_FEATURES.index(name) for name in ("edge", "colour", "turn")]]
+    same_plane = features[:, PAIR_FEATURES.index("same_plane"), None]
+    return np.asarray(2 - unlike.sum(axis=1, keepdims=True) + 2 * same_plane)
 
 
 def pairs_of(world: World, policy: Callable[[np.ndarray], np.ndarray], seed: int) -> Samples:
@@ -209,7 +216,7 @@ def pairs_of(world: World, policy: Callable[[np.ndarray], np.ndarray], seed: int
     found: list[Samples] = []
 
     def score(state: SurfaceGraph, pairs: np.ndarray) -> np.ndarray:
-        features = state.features(pairs)
+        features = pair_features(state, pairs)
         votes = state.sums[pairs, columns:]
         size, top = votes.sum(axis=-1), votes.argmax(axis=-1)
         sure = (votes[..., 1:].sum(axis=-1) > 10) & (votes.max(axis=-1) > 0.7 * size)
@@ -233,11 +240,11 @@ def regions_of(world: World, pair: Network) -> Samples:
 
 
 def fit(
-    samples: list[Samples], size: dict[int, int], epochs: int, seed: int, members: int = MEMBERS,
+    samples: list[Samples], size: np.ndarray, epochs: int, seed: int, members: int = MEMBERS,
     hidden: tuple[int, int] = (24, 12),
 ) -> Network:  # fmt: skip
-    """Networks with two layers of `hidden` units, by AdamW on the weighted cross entropy. size: features that grow with
-    the size of things, and their power of it. Inputs are varied by other sizes and by noise, for stability."""
+    """Networks with two layers of `hidden` units, by AdamW on the weighted cross entropy. size: [F] power of the
+    size of things in each feature. Inputs are varied by other sizes and by noise, for stability."""
     import torch
 
     torch.manual_seed(seed)
@@ -247,7 +254,7 @@ def fit(
     mean, scale = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-3)
     inputs = torch.from_numpy(np.clip((x - mean) / scale, -5, 5).astype(np.float32))
     target, weights = (torch.from_numpy(a.astype(np.float32)) for a in (y, weight[:, None] / weight.mean()))
-    nearer = torch.tensor([NEARER * size.get(k, 0) / float(scale[k]) for k in range(len(scale))])
+    nearer = torch.tensor([NEARER * power / float(scale[k]) for k, power in enumerate(size.tolist())])
     sizes = [x.shape[1], *hidden, y.shape[1]]
     layers = [(torch.randn(members, b, a) * (2 / a) ** 0.5).requires_grad_() for a, b in pairwise(sizes)]
     offsets = [torch.zeros(members, 1, b, requires_grad=True) for b in sizes[1:]]
@@ -271,10 +278,14 @@ def fit(
 def learn(worlds: list[World], seed: int = 0, each: Callable[..., Iterable[Samples]] = map) -> MergeModel:
     """Both networks, with a cost and a calibration yet to be tuned. each: `map`, or that of a pool."""
     samples = list(each(pairs_of, worlds, repeat(plain_rule), repeat(seed)))
-    first = fit(samples, PAIR_SIZE, 6, seed)
-    pair = fit(samples + list(each(pairs_of, worlds, repeat(first), repeat(seed + 1))), PAIR_SIZE, 6, seed)
-    whole = fit(list(each(regions_of, worlds, repeat(pair))), WHOLE_SIZE, 20, seed, 2 * MEMBERS, (32, 16))
-    return MergeModel(pair, whole, COSTS[0])
+    size = np.array([PAIR_SIZE.get(name, 0) for name in PAIR_FEATURES])
+    first = fit(samples, size, 6, seed)
+    pair = fit(samples + list(each(pairs_of, worlds, repeat(first), repeat(seed + 1))), size, 6, seed)
+    regions = list(each(regions_of, worlds, repeat(pair)))
+    size = np.zeros(regions[0][0].shape[1], int)
+    size[: len(REGION_COLUMNS)] = [REGION_SIZE.get(name, 0) for name in REGION_COLUMNS]  # the rest are differences
+    region = fit(regions, size, 20, seed, 2 * MEMBERS, (32, 16))
+    return MergeModel(pair, region, COSTS[0])
 
 
 def scores(world: World, tree: MergeTree, model: MergeModel) -> dict[str, Any]:
@@ -378,7 +389,7 @@ def train(work: Path, sets: int, output: Path, pool: ProcessPoolExecutor) -> Non
     worlds, kept = (made_worlds(some, borders, pool) for some in (jobs, jobs_of(work, KEPT["validation"])))
     model = tuned(learn(worlds, each=pool.map), kept)
     settings = np.array([model.cost, *model.calibration])
-    np.savez_compressed(output / WEIGHTS.name, settings, *model.pair.parts, *model.whole.parts)
+    np.savez_compressed(output / WEIGHTS.name, settings, *model.pair.parts, *model.region.parts)
     shutil.copyfile(borders, output / BORDERS.name)
 
 
