@@ -171,7 +171,7 @@ def _info(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _report(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.outputs import refuse_inputs
+    from perception.map.outputs import refuse_inputs
     from perception.query import load_map
     from perception.report.page import write_map_report
 

@@ -70,7 +70,7 @@ def register(commands: Any) -> None:
 
 
 def _query(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from perception.io.outputs import refuse_inputs
+    from perception.map.outputs import refuse_inputs
     from perception.query import load_map
     from perception.report.text import guessed_names, query_text, write_hits
 
@@ -155,7 +155,7 @@ def _export(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.export.export_map import export_map, side_file
     from perception.export.mesh import check_outputs, export_mesh, export_voxels
     from perception.export.transfer import ExportOptions
-    from perception.io.outputs import check_side_file, refuse_inputs
+    from perception.map.outputs import check_side_file, refuse_inputs
     from perception.map.write import read_map
     from perception.query.query_map import load_map
     from perception.query.scene_graph import write_graph

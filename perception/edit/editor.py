@@ -22,10 +22,10 @@ from perception.boxes import instance_entry
 from perception.config import FrameConfig, InstanceConfig
 from perception.edit.scale import scale_map
 from perception.errors import InputError
-from perception.io.atomic import writing
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
 from perception.map.files import map_signature, read_info
 from perception.map.map import Map, language_in, prefixed
+from perception.map.replace import writing
 from perception.map.write import read_map, write_map
 
 UNDO_DEPTH = 100

@@ -14,8 +14,8 @@ from perception.frame.place import measured_scale
 from perception.frame.recentre import map_from_input, moved
 from perception.frame.scale import KnownLength, Measurement, combined, known_length
 from perception.geometry import move_points
-from perception.io.atomic import writing
 from perception.map.map import Map
+from perception.map.replace import writing
 from perception.map.write import read_map, write_map
 from perception.types import OrientedBox
 

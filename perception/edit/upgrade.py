@@ -15,12 +15,12 @@ from perception.gaussians.photos import training_view
 from perception.instances.describe import Load, describe_instances
 from perception.instances.silhouettes import render_silhouettes
 from perception.instances.texts import read_texts, store_texts
-from perception.io.atomic import writing
 from perception.language.base import Encoder, reading_of
 from perception.language.description import from_arrays, to_arrays
 from perception.language.encoders import make_encoder
 from perception.language.ocr import TextReader, make_reader
 from perception.map.map import Map, language_in, prefixed
+from perception.map.replace import writing
 from perception.map.write import read_map, write_map
 from perception.photos.view_json import locate_photo
 from perception.progress import QUIET, Progress

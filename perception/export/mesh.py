@@ -15,7 +15,7 @@ from perception.export.neighbors import nearest_gaussian
 from perception.export.transfer import ExportOptions, export_labels
 from perception.export.volume import FREE, OCCUPIED, closed_body, grid_shape, occupancy, signed_distance
 from perception.frame.recentre import map_from_input
-from perception.io.atomic import replacing
+from perception.io.atomic import atomic_file
 from perception.io.cloud import write_cloud
 from perception.io.open3d import fuse_depth, write_glb
 from perception.map.write import Map
@@ -99,7 +99,7 @@ def export_voxels(gmap: Map, output: Path, voxel: float | None) -> tuple[dict[st
         "frame": np.array(gmap.frame),
         "unit": np.array(_unit(gmap)),
     }
-    with replacing(output) as file:
+    with atomic_file(output) as new, new.open("wb") as file:
         np.savez(file, **arrays)
     shares = {name: float((state == value).mean()) for name, value in (("free", FREE), ("occupied", OCCUPIED))}
     facts = {"shape": list(state.shape), "voxel_size": size, "unit": _unit(gmap), **shares}

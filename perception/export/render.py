@@ -19,7 +19,7 @@ from perception.gaussians.views import depth_image
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.atomic import atomic_file
 from perception.io.documents import safe_name
-from perception.io.outputs import refuse_inputs
+from perception.map.outputs import refuse_inputs
 from perception.map.write import Map, read_map
 from perception.photos.decode import SUFFIXES
 from perception.query.crops import cut_out
@@ -169,5 +169,5 @@ def write_picture(path: Path, image: np.ndarray) -> None:
 
     if image.ndim == 3:
         image = np.ascontiguousarray(image[..., ::-1])
-    with atomic_file(path) as aside:
+    with atomic_file(path, parents=True) as aside:
         aside.write_bytes(cv2.imencode(".png", image)[1].tobytes())

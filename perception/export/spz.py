@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.atomic import replacing
+from perception.io.atomic import atomic_file
 from perception.map.map import Map
 
 MAGIC, VERSION = 0x5053474E, 2
@@ -33,10 +33,10 @@ def write_spz(path: Path, gmap: Map) -> None:
     colours 1/510. InputError where a value is not finite.
     """
     data = spz_bytes(gmap, path)
-    with replacing(path.with_suffix(".npy")) as file:
+    with atomic_file(path.with_suffix(".npy")) as new, new.open("wb") as file:
         np.save(file, gmap.instance_ids.astype(np.int32))
-    with replacing(path) as file:
-        file.write(data)
+    with atomic_file(path) as new:
+        new.write_bytes(data)
 
 
 def spz_bytes(gmap: Map, path: Path = Path("map.spz")) -> bytes:

@@ -15,7 +15,7 @@ import numpy as np
 from perception.errors import InputError
 from perception.export.neighbors import nearest_gaussian
 from perception.export.smooth import read_segments, segment_cloud, vote
-from perception.io.atomic import replacing
+from perception.io.atomic import atomic_file
 from perception.io.cloud import write_cloud
 from perception.types import PointCloud
 
@@ -109,8 +109,8 @@ def write_export(
         row = {"score": float(known.get("score", 1.0)), "label": known.get("label"), "num_points": n}
         rows[str(i)] = row | {key: known[key] for key in ("parent", "instances") if key in known}
     sidecar = {**(facts or {}), "instances": rows}
-    with replacing(path.with_suffix(".json")) as file:
-        file.write(json.dumps(sidecar, indent=1).encode())
+    with atomic_file(path.with_suffix(".json")) as new:
+        new.write_text(json.dumps(sidecar, indent=1), encoding="utf-8")
     labelled = {"instance_id": labels.astype(np.int32)}
     write_cloud(path, PointCloud(cloud.points, cloud.colors, cloud.normals, cloud.faces, labelled))
     return sidecar

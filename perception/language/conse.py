@@ -157,6 +157,6 @@ def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
     starts = np.cumsum([0] + [len(group) for group in names[:-1]])
     sizes = np.array([len(group) for group in names])
     classes = unit_rows(np.add.reduceat(embedded, starts, axis=0) / sizes[:, None])
-    with suppress(OSError, InputError), atomic_file(path) as aside, aside.open("wb") as file:
+    with suppress(InputError), atomic_file(path, parents=True) as aside, aside.open("wb") as file:
         np.save(file, classes)  # without a writable cache the embeddings are recomputed each time
     return classes

@@ -25,8 +25,8 @@ from perception.gaussians.size import sized
 from perception.gaussians.train import TrainRecord
 from perception.gaussians.views import surface_depth
 from perception.geometry import camera_centres
-from perception.io.atomic import writing
 from perception.machine import memory_limit
+from perception.map.replace import writing
 from perception.masks import MaskSource, make_source
 from perception.pipeline.checkpoint import BEFORE_MASKS, CHECKPOINT, digest, load_checkpoint, save_checkpoint
 from perception.pipeline.estimate import largest_budget

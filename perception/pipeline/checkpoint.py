@@ -33,8 +33,9 @@ from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.train import Trainer
 from perception.inputs.load import EXPECTED
-from perception.io.atomic import atomic_file, writing
+from perception.io.atomic import atomic_file
 from perception.machine import peak_memory_mib
+from perception.map.replace import writing
 from perception.progress import Progress
 
 CHECKPOINT = "checkpoint.pt"

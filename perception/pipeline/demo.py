@@ -15,7 +15,7 @@ from perception.config import MapConfig, load_config
 from perception.evaluate.instances import evaluate
 from perception.export.transfer import export_labels, write_export
 from perception.geometry import align_similarity, camera_centres
-from perception.io.outputs import check_empty
+from perception.map.outputs import check_empty
 from perception.map.write import Map
 from perception.pipeline.mapping import build_map
 from perception.progress import Progress

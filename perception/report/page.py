@@ -90,7 +90,7 @@ def write_page(path: Path, data: Mapping[str, Any]) -> Path:
         page = text.encode(errors="replace")  # an unpaired surrogate in a file name cannot be encoded as UTF-8
         if len(page) < LIMIT:
             break
-    with atomic_file(path) as aside:
+    with atomic_file(path, parents=True) as aside:
         aside.write_bytes(page)
     return path
 

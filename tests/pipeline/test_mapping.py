@@ -18,8 +18,8 @@ import perception
 from perception.cli import main
 from perception.config import load_config
 from perception.errors import InputError
-from perception.io.atomic import lock_file
 from perception.io.cloud import read_cloud
+from perception.map.replace import lock_file
 from perception.map.write import read_map
 from perception.pipeline import checkpoint
 from perception.pipeline.checkpoint import work_folder

@@ -16,7 +16,7 @@ from perception.evaluate.instances import Protocol, evaluate_overlaps, evaluated
 from perception.evaluate.layouts import instances_table
 from perception.evaluate.overlap import OBJECT, Overlap, Truth
 from perception.export.transfer import Instances
-from perception.io.atomic import replacing
+from perception.io.atomic import atomic_file
 
 
 def write_scannet(
@@ -39,10 +39,10 @@ def write_scannet(
     for number, i in enumerate(sorted(ids, key=lambda i: (-score[i], i))):
         name = f"{scene}_{number:03d}.txt"
         digits = np.where(labels == i, ord("1"), ord("0")).astype(np.uint8)
-        with replacing(masks / name) as file:
+        with atomic_file(masks / name) as new, new.open("wb") as file:
             file.write(np.stack([digits, np.full_like(digits, ord("\n"))], axis=1).tobytes())
         rows.append(f"predicted_masks/{name} {1 if classes is None else classes.get(i, 0)} {score[i]:.6f}\n")
-    with replacing(folder / f"{scene}.txt") as file:
+    with atomic_file(folder / f"{scene}.txt") as new, new.open("wb") as file:
         file.write("".join(rows).encode())
     return folder / f"{scene}.txt"
 

@@ -136,7 +136,7 @@ class ScanNetPP(DatasetBench):
         submission.mkdir(parents=True, exist_ok=True)
         parts = [self.work / "predictions" / name for name in scenes]
         for part, (name, scene) in zip(parts, scenes.items(), strict=True):
-            with atomic_file(truth / f"{name}.txt") as aside:
+            with atomic_file(truth / f"{name}.txt", parents=True) as aside:
                 np.savetxt(aside, vertex_truth(scene, classes), fmt="%d")
             for file in (*part.glob(f"{name}.txt"), *part.glob("predicted_masks/*.txt")):
                 link(file, submission / file.relative_to(part))
