@@ -29,12 +29,12 @@ from perception.masks import MaskSource, make_source
 from perception.masks.compute import load_segmentation
 from perception.photos.reading import Reading
 from perception.photos.view_json import stored_view
-from perception.pipeline.blocks import optimiser
+from perception.pipeline.blocks import optimise_scene
 from perception.pipeline.changes import hold_inputs, inputs_of, refuse_changed
 from perception.pipeline.checkpoint import check_name, clear_work, fingerprint, frames_folder, poses_mark, working
 from perception.pipeline.estimate import log_estimate
-from perception.pipeline.instances import FoundInstances, describe, group_gaussians
-from perception.pipeline.optimise import Run
+from perception.pipeline.instances import DescribedInstances, describe, group_gaussians
+from perception.pipeline.optimise import PARAMETERS, Run
 from perception.pipeline.record import finite, run_record, scored
 from perception.progress import QUIET, Progress
 from perception.report.text import depth_text, frame_lines
@@ -58,8 +58,8 @@ def build_map(
     """
     started = time.monotonic()
     check_name(output)
-    if resume and _is_finished(source, output, config):
-        return _finished(output, progress)
+    if resume and (finished := _finished(source, output, config, progress)) is not None:
+        return finished
 
     with working(source, output, resume) as work:
         # Files, models and devices are opened first, so that errors appear before hours of work.
@@ -73,17 +73,18 @@ def build_map(
         scene, training, held_out = split_scene(scene, config.photos)
 
         # Masks M_v,i of every photo (§3.2), and Gaussians optimised on photos and masks (§3.1 to 3.2.3).
-        optimised = optimiser(scene, config.train.block_photos)(run, scene, training, held_out, masks)
+        optimised = optimise_scene(run, scene, training, held_out, masks)
         segments = load_segmentation(run.masks) if masks.needs_depth else None
         del masks  # with its images
 
         # Group the Gaussians by their features into instances (§3.2.1), describe these from their best views (§3.2.2).
-        grouped = group_gaussians(optimised, run, segments)
-        found = describe(optimised, grouped, run, encoder, reader)
+        with run.stage("instances"):
+            grouped = group_gaussians(optimised, run, segments)
+            described = describe(optimised, grouped, run, encoder, reader)
 
         gaussians, quality = scored(run, optimised, scene.metric)
-        info = run_record(run, scene, optimised, found.report, quality, time.monotonic() - started)
-        gmap = _assemble(gaussians, found, scene, held_out, {**info, "inputs": inputs}, output)
+        info = run_record(run, scene, optimised, described.report, quality, time.monotonic() - started)
+        gmap = _assemble(gaussians, described, scene, held_out, {**info, "inputs": inputs}, output)
         write_map(output, gmap, fresh=True)
     _log_result(gmap, output, progress)
     return gmap
@@ -92,24 +93,20 @@ def build_map(
 # ----------------------------------------------------------------------- stages
 
 
-def _is_finished(source: Path, output: Path, config: MapConfig) -> bool:
-    """Whether a map of this input and these settings lies at `output`. InputError when the input has changed since."""
+def _finished(source: Path, output: Path, config: MapConfig, progress: Progress) -> Map | None:
+    """The finished map of this input and these settings, if any. InputError when the input has changed since."""
     if not is_map(output) or (info := read_info(output)).get("fingerprint") != fingerprint(source, config):
-        return False
+        return None
     refuse_changed(output, info, inputs_of(source, config, output))
-    return True
-
-
-def _finished(output: Path, progress: Progress) -> Map:
     progress.log(f"{output}: this run is finished")
     clear_work(output)
     return read_map(output)
 
 
 def _open_run(source: Path, config: MapConfig, work: Path, progress: Progress, engine: Engine) -> Run:
-    device, line = choose_device(config.device)
-    if line is not None:
-        progress.log(line)
+    device, notice = choose_device(config.device)
+    if notice is not None:
+        progress.log(notice)
     return Run(source, config, work, work / "masks", device, progress, engine)
 
 
@@ -137,12 +134,11 @@ def _posed_scene(output: Path, run: Run) -> Scene:
         if scene is None:
             log_estimate(source, config, progress.log)
             photos = config.photos
-            masks, camera, cloud = (
-                Path(p) if p else None for p in (photos.ignore_masks, photos.camera, photos.init_points)
-            )
-            how = Reading(work / "sfm", config.seed, progress, photos.strict, masks, camera, poses=photos.poses)
-            how = replace(how, frames=frames_folder(output), init_points=cloud, engine=run.engine)
-            scene = load_scene(source, how)
+            files = (photos.ignore_masks, photos.camera, photos.init_points)
+            masks, camera, cloud = (Path(file) if file else None for file in files)
+            reading = Reading(work / "sfm", config.seed, progress, photos.strict, poses=photos.poses, engine=run.engine)
+            reading = replace(reading, masks=masks, camera=camera, frames=frames_folder(output), init_points=cloud)
+            scene = load_scene(source, reading)
             save_scene(kept, scene := placed_scene(recentred(scene), config.frame, config.seed))
         if config.losses.depth_weight == 0:
             scene = replace(scene, views=[replace(view, depth=None) for view in scene.views])
@@ -152,7 +148,7 @@ def _posed_scene(output: Path, run: Run) -> Scene:
 
 def _assemble(
     gaussians: Gaussians,
-    found: FoundInstances,
+    described: DescribedInstances,
     scene: Scene,
     held_out: list[View],
     record: dict[str, Any],
@@ -160,18 +156,18 @@ def _assemble(
 ) -> Map:
     """The map to write; in JSON values, None replaces NaN and infinity."""
     held = {view.name: view for view in held_out}
-    arrays = {name: tensor.detach().numpy() for name, tensor in vars(gaussians).items()}
+    arrays = {name: getattr(gaussians, name).detach().numpy() for name in PARAMETERS}
     arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)
     return Map(
         **arrays,
-        instance_ids=found.ids,
-        membership=found.membership,
-        instances=finite(found.instances),
+        instance_ids=described.ids,
+        membership=described.membership,
+        instances=finite(described.instances),
         info=finite(record),
         views=[stored_view(held.get(view.name, view), output, view.name in held) for view in scene.views],
-        language=found.language,
-        parts=found.parts,
-        groups=found.groups,
+        language=described.language,
+        parts=described.parts,
+        groups=described.groups,
     )
 
 

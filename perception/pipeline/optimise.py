@@ -34,6 +34,8 @@ from perception.types import Scene, View
 
 GEOMETRY_START = 0.3
 """Training progress at which masks that use the depth of the map (the built-in ones) are made."""
+PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
+"""The tensors of `Gaussians`, as maps and results of blocks name them."""
 PHOTOS_A_TASK = 8
 """Photos whose masks one task makes: minutes with SAM on a CPU, and reading the model takes seconds."""
 
@@ -57,7 +59,7 @@ class Run:
         self.keep: Keep = self._arrays.keep
 
     def new_keep(self) -> Keep:
-        """A place for arrays that fill what those of `keep` leave of `photos.memory`; it goes with the last of them."""
+        """Keeps arrays in what those of `keep` leave of `photos.memory`, until the last of them is freed."""
         return DiskArrays(self.work, 2 * self._arrays.most, self._arrays).keep
 
     def stage(self, name: str) -> AbstractContextManager[None]:
@@ -87,16 +89,11 @@ class Photos:
             views = load_all(training, side, run.progress, run.keep)
             return cls(training, held_out, views, load_all(held_out, side, run.progress, run.keep))
 
-    def labelled(self, folder: Path) -> Photos:
-        """The same photos, those of `views` with their label images in `folder`."""
-        pairs = zip(self.views, self.training, strict=True)
-        return replace(self, views=[with_labels(decoded, view, folder) for decoded, view in pairs])
-
 
 @dataclass(frozen=True)
 class Optimised:
-    """What training gives: the Gaussians, the photos with their labels, the training's record, the report of the masks,
-    and a report of each block of a large scene."""
+    """The Gaussians, the photos with their labels, the training's record, the report of the masks, and a report of
+    each block of a large scene."""
 
     nearby: Nearby
     photos: Photos
@@ -167,10 +164,9 @@ def label_by_tasks(run: Run, views: Sequence[View], source: MaskSource) -> None:
         return
     folders = []
     for start in range(0, len(views), PHOTOS_A_TASK):
-        some = list(views[start : start + PHOTOS_A_TASK])
-        folders.append(run.work / f"labels-{digest(run.mark, source.identity, [view.name for view in some])}")
+        scene = Scene(list(views[start : start + PHOTOS_A_TASK]), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+        folders.append(run.work / f"labels-{digest(run.mark, source.identity, [view.name for view in scene.views])}")
         if not has_task(folders[-1]):
-            scene = Scene(some, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
             write_task(folders[-1], scene, config=run.config.to_json(), masks=str(run.masks.resolve()))
     with run.stage("masks"):
         run.engine.run(label_task, [str(folder.resolve()) for folder in folders], "photo set", run.progress)
@@ -207,4 +203,6 @@ def label_photos(
         )
         for warning in report["warnings"]:
             run.progress.log(f"warning: {warning}")
-        return photos.labelled(run.masks), report
+        pairs = zip(photos.views, photos.training, strict=True)
+        labelled = [with_labels(decoded, view, run.masks) for decoded, view in pairs]
+        return replace(photos, views=labelled), report

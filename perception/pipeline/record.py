@@ -1,4 +1,4 @@
-"""What map.json holds of a run: settings, times, memory, and how good it is in views held out of training."""
+"""The record of a run in map.json: settings, times, memory, and quality in views held out of training."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ from perception.pipeline.optimise import Optimised, Run
 from perception.tasks.folder import versions
 from perception.types import Scene
 
+CLOSE_METRES, CLOSE_SHARE = 0.05, 0.025
+"""Errors that count as close: in metres, or relative to the depth where the unit is not known to be the metre."""
+FRAME_FACTS = ("map_from_input", "scale", "gravity")
+"""Entries of a scene's report that map.json holds at its top level."""
+
 
 def finite(value: Any) -> Any:
     """JSON-able `value` with None for every float that is NaN or infinite, which JSON cannot hold."""
@@ -25,14 +30,6 @@ def finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [finite(inner) for inner in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-CLOSE_METRES, CLOSE_SHARE = 0.05, 0.025
-"""Errors that count as close: in metres, or relative to the depth where the unit is not known to be the metre."""
-
-
-FRAME_FACTS = ("map_from_input", "scale", "gravity")
-"""Entries of a scene's report that map.json holds at its top level."""
 
 
 def run_record(
@@ -62,7 +59,7 @@ def run_record(
 
 
 def scored(run: Run, optimised: Optimised, metric: bool) -> tuple[Gaussians, dict[str, Any]]:
-    """The Gaussians on the CPU, and how good they are in the held-out views."""
+    """The Gaussians on the CPU, and their quality in the held-out views."""
     with run.stage("score"):
         gaussians = optimised.nearby.gaussians.to("cpu")
         return gaussians, score_views(gaussians, optimised.photos.held, metric)
