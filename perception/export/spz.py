@@ -40,8 +40,10 @@ def write_spz(path: Path, gmap: Map) -> None:
 
 
 def spz_bytes(gmap: Map, path: Path = Path("map.spz")) -> bytes:
-    """The file's bytes; path: for messages."""
-    check_finite(gmap, path)
+    """The file's bytes. InputError naming `path` where a value is not finite."""
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+        if not np.isfinite(getattr(gmap, name)).all():
+            raise InputError(f"{path}: {name} of some Gaussians are not finite; upgrade or rebuild the map")
     count, degree = len(gmap), math.isqrt(gmap.sh.shape[1]) - 1
     means = gmap.means.astype(np.float64) * [1, -1, -1]
     largest = max(1.0, float(np.abs(means).max(initial=0.0)))
@@ -60,13 +62,6 @@ def spz_bytes(gmap: Map, path: Path = Path("map.spz")) -> bytes:
     ]
     header = struct.pack("<IIIBBBB", MAGIC, VERSION, count, degree, bits, 0, 0)
     return gzip.compress(header + b"".join(column.tobytes() for column in columns), 6, mtime=0)
-
-
-def check_finite(gmap: Map, path: Path) -> None:
-    """InputError where a value is not finite; path: for the message."""
-    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
-        if not np.isfinite(getattr(gmap, name)).all():
-            raise InputError(f"{path}: {name} of some Gaussians are not finite; upgrade or rebuild the map")
 
 
 def _harmonics(rest: np.ndarray) -> np.ndarray:

@@ -89,7 +89,7 @@ def test_instances_agree_with_the_truth(finished: Path, small_scene: Path, tmp_p
     truth = small_scene / "truth" / "gt_points.ply"
     assert main(["export", str(finished), "--points", str(truth), "-o", str(out), "--json"]) == 0
     assert main(["eval", "instances", str(out), str(truth), "--json"]) == 0
-    from perception.evaluate.layouts import run_instances
+    from perception.evaluate.instances import run_instances
 
     result, _ = run_instances(out, truth)
     assert result["ap25"] > 0.4
