@@ -96,7 +96,7 @@ class TrainConfig(Settings):
     )
     budget: int = Field(0, ge=0, le=10**8, description="most Gaussians the map may have; 0: 100,000, or 2,300 a photo")
     block_photos: int = Field(
-        400, ge=0, le=10**6, description="a place seen by more photos is trained in overlapping blocks; 0: never"
+        400, ge=0, le=10**6, description="a scene of more photos is trained in overlapping blocks; 0: never"
     )
     sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics that is tried")
 
@@ -194,7 +194,7 @@ PAPER: dict[str, Any] = {
 """OpenSplat3D as published: 30k iterations, each training all parameters at full resolution (3DGS reduces photos wider
 than 1600 pixels), with the densification threshold of the authors' LERF configuration; then HDBSCAN of the features
 alone. β, λ_inst2d, the growth of the crops (.3) and the threshold of silhouettes (.2) are constants, the paper's.
-What still differs from the paper stands in docs/benchmarks.md.
+What still differs from the paper is listed in docs/benchmarks.md.
 """
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -256,15 +256,14 @@ def expected(field: FieldInfo) -> str:
     """Type and range of a setting as text; a field's `title` gives it if the constraints do not."""
     kinds = _kinds(field)
     if field.title:
-        words = field.title
+        text = field.title
     elif isinstance(kinds[0], str):  # a Literal
-        words = ", ".join(kinds[:-1]) + f" or {kinds[-1]}"
+        text = ", ".join(kinds[:-1]) + f" or {kinds[-1]}"
     else:
-        words = {bool: "true or false", str: "text", int: "a whole number", float: "a number"}[kinds[0]]
-        for name, word in (("gt", "above"), ("ge", "from"), ("le", "to")):
-            bounds = [getattr(item, name) for item in field.metadata if hasattr(item, name)]
-            words += "".join(f" {word} {bound}" for bound in bounds)
-    return f"{words} or none" if NoneType in kinds else words
+        text = {bool: "true or false", str: "text", int: "a whole number", float: "a number"}[kinds[0]]
+        for name, relation in (("gt", "above"), ("ge", "from"), ("le", "to")):
+            text += "".join(f" {relation} {getattr(m, name)}" for m in field.metadata if hasattr(m, name))
+    return f"{text} or none" if NoneType in kinds else text
 
 
 def settings_text() -> str:
@@ -302,20 +301,19 @@ def _unknown(key: str, known: list[str]) -> str:
     near = _like(last, group, 0.6) or _like(last, known, 0.75) or difflib.get_close_matches(key, known, 1, 0.8)
     if near:
         return f"unknown setting '{key}', did you mean {' or '.join(near)}?"
-    group = group or known
-    return f"unknown setting '{_short(key)[1:-1]}', expected one of: {', '.join(group)}"
+    return f"unknown setting '{_short(key)[1:-1]}', expected one of: {', '.join(group or known)}"
 
 
-def _like(word: str, known: list[str], least: float) -> list[str]:
-    """The settings whose last name is the one nearest to `word`, when their similarity is at least `least`."""
-    last = {name: name.rpartition(".")[2] for name in known}
-    near = difflib.get_close_matches(word, sorted(set(last.values())), 1, least)
-    return [name for name in known if last[name] in near]
+def _like(name: str, known: list[str], least: float) -> list[str]:
+    """The settings whose last name is the one nearest to `name`, when their similarity is at least `least`."""
+    last = {key: key.rpartition(".")[2] for key in known}
+    near = difflib.get_close_matches(name, sorted(set(last.values())), 1, least)
+    return [key for key in known if last[key] in near]
 
 
-def _short(value: Any, most: int = 80) -> str:
+def _short(value: Any) -> str:
     text = repr(value)
-    return text if len(text) <= most else f"{text[: most - 3]}..."
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def flat(table: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -102,9 +102,8 @@ def _shown(
     number = {view.name: n for n, view in enumerate(gmap.views)}
     unknown = [name for d in descriptions for name in d.views if name not in number]
     if unknown:
-        raise InputError(
-            f"{gmap.path}: lists the photo {unknown[0]!a}, which is none of its views; build the map again"
-        )
+        found = f"lists the photo {unknown[0]!a}, which is none of its views"
+        raise InputError(f"{gmap.path}: {found}; build the map again")
     wanted = sorted({number[name] for d in descriptions for name in d.views})
     located = {n: replace(gmap.views[n], photo=locate_photo(gmap.views[n], gmap.path)) for n in wanted}
     gaussians, side = as_gaussians(gmap), int(gmap.info["config"]["photos"]["max_side"])

@@ -75,10 +75,9 @@ class Alignment:
     def refusal(self) -> str | None:
         """Why the alignment must not be used; None when it may."""
         if self.agreement < LEAST_AGREEMENT or self.cover < LEAST_COVER:
-            return (
-                f"the best place has {self.agreement:.0%} of the points on surfaces that the map sees, and covers "
-                f"{self.cover:.0%} of the map (at least {LEAST_AGREEMENT:.0%} and {LEAST_COVER:.0%} are needed)"
-            )
+            found = f"the best place has {self.agreement:.0%} of the points on surfaces that the map sees, and covers "
+            needed = f"at least {LEAST_AGREEMENT:.0%} and {LEAST_COVER:.0%} are needed"
+            return f"{found}{self.cover:.0%} of the map ({needed})"
         if self.likeness is not None and self.likeness < LEAST_LIKENESS:
             return f"at the best place, the colours of the scan and of the map do not go together ({self.likeness:.2f})"
         if self.stiffness < LEAST_STIFFNESS:
@@ -126,9 +125,11 @@ class Registration:
         self.rows = np.arange(0, len(self.scan), max(len(self.scan) // ROWS, 1))
 
     def candidates(self) -> list[Place]:
-        """Places by the correlation, best first: the best two shifts of each rotation and scale, by the sum of the grid
-        over the N cells that the scan occupies, over √N. The sum alone grows with the scale: of a cropped scan, right
-        places came after 200 larger ones."""
+        """Places by the correlation, best first: the best two shifts of each rotation and scale.
+
+        Score: Σ of the grid over the N cells that the scan occupies, over √N. The sum alone grows with the scale: of a
+        cropped scan, right places came after 200 larger ones.
+        """
         step = self.extent / GRID
         low = self.points.min(axis=0) - 2 * step
         grid = self._evidence(low, step)
@@ -198,19 +199,19 @@ class Registration:
         w, fine = self.tolerance, np.arange(0, len(self.scan), max(len(self.scan) // FINE_ROWS, 1))
         tried = []
         for place in self._distinct(places, ELSEWHERE, FINALISTS):
-            found, rms, information = self._icp(place, fine, [w] * 3 + [w / 2] * 6 + [w / 4] * 12)
-            found = self._photometric(found, fine)
-            tried.append((self.judged(found), found, rms, information))
+            refined, rms, information = self._icp(place, fine, [w] * 3 + [w / 2] * 6 + [w / 4] * 12)
+            refined = self._photometric(refined, fine)
+            tried.append((self.judged(refined), refined, rms, information))
         tried.sort(key=lambda row: -row[0][0])
         (score, agreement, overlap, cover), best, rms, information = tried[0]
-        rival = max((row[0][0] for row in tried[1:] if self.apart(row[1], best) > ELSEWHERE * self.extent), default=0.0)
+        others = (figures[0] for figures, other, *_ in tried[1:] if self.apart(other, best) > ELSEWHERE * self.extent)
+        rival = max(others, default=0.0) / max(score, 1e-9)
         matrix = np.eye(4)
         matrix[:3, :3] = best.linear
         matrix[:3, 3] = best.shift + self.middle - best.linear @ self.scan_middle
         stiffness = float(np.linalg.eigvalsh(information)[0])
         light = self.brightness
         likeness = None if light is None else self._alike(best(self.scan[self.rows]), light[self.rows], self.views)
-        rival /= max(score, 1e-9)
         return Alignment(matrix, best.scale, agreement, overlap, cover, rms, rival, stiffness, likeness)
 
     def judged(self, place: Place, views: Sequence[DepthView] | None = None) -> tuple[float, float, float, float]:
@@ -225,7 +226,7 @@ class Registration:
         index, distance = self.scan_tree.query(back, 1, self.tolerance / place.scale)
         turned = self.normals[chosen] @ place.linear / place.scale
         facing = np.einsum("ij,ij->i", turned, self.scan_normals[index[:, 0]])
-        near = (index[:, 0] >= 0) & (np.abs(facing) > 0.7)
+        near = (index[:, 0] >= 0) & (np.abs(facing) > FACING)
         depth = np.where(near, distance[:, 0] * place.scale / self.tolerance, 1.0)
         score = max(2 * agreement - 1, 0.0) * float((1 - depth**2).mean())
         if self.brightness is not None:

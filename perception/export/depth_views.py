@@ -1,4 +1,4 @@
-"""Depth rendered from a map's own cameras: what each place of the scene is, as those cameras see it."""
+"""Depth rendered from a map's own cameras, and whether these see a point, see through it, or see neither."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from scipy.ndimage import binary_erosion
 
 from perception.gaussians.model import Gaussians
 from perception.gaussians.render import render
@@ -110,15 +111,14 @@ def grid_cells(points: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray
 
 
 def _backprojected(view: DepthView) -> tuple[np.ndarray, np.ndarray]:
+    """Points and unit normals [P, 3] in the world, of every second pixel with depth whose neighbours have depth."""
     height, width = view.depth.shape
     v, u = np.mgrid[:height, :width] + 0.5
     rays = np.stack([(u - view.K[0, 2]) / view.K[0, 0], (v - view.K[1, 2]) / view.K[1, 1], np.ones_like(u)], axis=-1)
     own = rays * view.depth[..., None]
     normal = np.cross(own[2:, 1:-1] - own[:-2, 1:-1], own[1:-1, 2:] - own[1:-1, :-2])[::2, ::2]
-    whole = view.depth > 0
-    whole = whole[1:-1, 1:-1] & whole[2:, 1:-1] & whole[:-2, 1:-1] & whole[1:-1, 2:] & whole[1:-1, :-2]
-    whole = whole[::2, ::2]
-    inner = own[1:-1, 1:-1][::2, ::2][whole]
-    length = np.linalg.norm(normal[whole], axis=1, keepdims=True)
+    known = binary_erosion(view.depth > 0)[1:-1, 1:-1][::2, ::2]  # also of the four neighbours
+    inner = own[1:-1, 1:-1][::2, ::2][known]
+    length = np.linalg.norm(normal[known], axis=1, keepdims=True)
     rotation, shift = view.camera_from_world[:3, :3], view.camera_from_world[:3, 3]
-    return (inner - shift) @ rotation, (normal[whole] / np.maximum(length, 1e-30)) @ rotation
+    return (inner - shift) @ rotation, (normal[known] / np.maximum(length, 1e-30)) @ rotation

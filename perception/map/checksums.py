@@ -126,13 +126,8 @@ def verify(folder: Path, info: dict[str, Any]) -> dict[str, str]:
 def listed(folder: Path, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """The file table of map.json; {} for older maps without one. InputError when the table is malformed."""
     files = info.get("files", {})
-    good = isinstance(files, dict) and all(
-        isinstance(facts, dict)
-        and isinstance(facts.get("bytes"), int)
-        and isinstance(facts.get("sha256"), str)
-        and Path(name).name == name
-        for name, facts in files.items()
-    )
-    if not good:
-        raise damaged(folder / FACTS, "its list of files cannot be understood")
-    return files
+    for name, facts in files.items() if isinstance(files, dict) else [("", None)]:
+        known = isinstance(facts, dict) and isinstance(facts.get("bytes"), int) and isinstance(facts.get("sha256"), str)
+        if not known or Path(name).name != name:
+            raise damaged(folder / FACTS, "its list of files cannot be understood")
+    return dict(files)

@@ -138,16 +138,6 @@ def writing(path: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _lock_if_possible(descriptor: int, folder: Path) -> bool:
-    try:
-        return lock(descriptor)
-    except OSError as error:
-        if error.errno not in _NO_LOCKS:
-            raise
-        warnings.warn(f"{folder}: its file system has no locks; let only one program write there at once", stacklevel=2)
-        return True
-
-
 def lock_file(path: Path) -> Path:
     """Path of the lock file of the map at `path`, which exists while the map is written."""
     return path.with_name(f".{path.name}.lock")
@@ -159,7 +149,15 @@ def _take(path: Path) -> int:
         file.parent.mkdir(parents=True, exist_ok=True)
         while True:
             descriptor = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
-            if not _lock_if_possible(descriptor, file.parent):
+            try:
+                locked = lock(descriptor)
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise
+                what = "its file system has no locks; let only one program write there at once"
+                warnings.warn(f"{file.parent}: {what}", stacklevel=2)
+                locked = True
+            if not locked:
                 holder = os.pread(descriptor, 32, 0).decode("ascii", "replace").strip()
                 os.close(descriptor)
                 who = f"process {holder}" if holder.isdigit() else "another process"

@@ -13,7 +13,7 @@ import numpy as np
 
 from perception.config import load_config
 from perception.evaluate.instances import evaluate
-from perception.export.transfer import export_labels, write_export
+from perception.export.export_map import export_labels, write_export
 from perception.geometry import align_similarity, camera_centres
 from perception.map.outputs import check_empty
 from perception.map.write import Map

@@ -44,7 +44,7 @@ def largest_budget(limit: int | None) -> int | None:
 
 
 def log_estimate(source: Path, config: MapConfig, log: Callable[[str], None]) -> None:
-    """Passes the estimate for the input `source` to `log` as one line; InputError if memory is not sufficient."""
+    """Logs the estimate for the input `source` as one line; InputError if memory is not sufficient."""
     photos = photo_sizes(source)
     if photos.sizes:
         needed = check_memory(photos, config)
@@ -57,7 +57,7 @@ def check_memory(photos: PhotoSizes, config: MapConfig, limit: int | None = None
     limit None: the memory available to this process; nothing is checked if that is unknown.
     """
     limit = memory_limit() if limit is None else limit
-    count, block = len(photos.sizes), config.train.block_photos  # a block at a time, in a large place
+    count, block = len(photos.sizes), config.train.block_photos  # a block at a time, in a large scene
     budget = sized(config, min(count, block) if block else count, largest_budget(limit)).train.budget
     side = config.photos.max_side
     memory = image_memory(config, limit)

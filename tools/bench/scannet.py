@@ -14,12 +14,15 @@ import numpy as np
 from perception.errors import InputError
 from perception.evaluate.instances import Protocol, evaluate_overlaps, evaluated_truth, get_protocol, instances_table
 from perception.evaluate.overlap import OBJECT, Overlap, Truth
-from perception.export.transfer import Instances
 from perception.io.atomic import atomic_file
 
 
 def write_scannet(
-    folder: str | Path, scene: str, labels: np.ndarray, instances: Instances, classes: Mapping[int, int] | None = None
+    folder: str | Path,
+    scene: str,
+    labels: np.ndarray,
+    instances: Mapping[int, Mapping[str, Any]],
+    classes: Mapping[int, int] | None = None,
 ) -> Path:
     """ScanNet's 3D instance submission: <scene>.txt with "predicted_masks/<scene>_<nnn>.txt <class> <confidence>" rows.
 

@@ -18,7 +18,7 @@ from bench.datasets import DatasetBench, link
 from bench.scannet import run_scannet, write_scannet
 from perception.errors import InputError
 from perception.evaluate.instances import instances_table
-from perception.export.transfer import ExportOptions, export_labels
+from perception.export.export_map import ExportOptions, export_labels
 from perception.io.atomic import atomic_file
 from perception.io.cloud import read_cloud, write_cloud
 from perception.photos.decode import photo_size
