@@ -79,10 +79,7 @@ class SamConfig(Settings):
 
 class TrainConfig(Settings):
     effort: float = Field(
-        1.0,
-        ge=0.01,
-        le=100,
-        description="multiple of the iterations and Gaussians that the number of photos suggests",
+        1.0, ge=0.01, le=100, description="multiple of the iterations and Gaussians that the number of photos suggests"
     )
     iterations: int = Field(
         0, ge=0, le=10**8, description="iterations of training, all schedules scale with them; 0: 2000, or 46 a photo"
@@ -92,7 +89,7 @@ class TrainConfig(Settings):
         0.03,
         ge=0,
         le=1000,
-        description="dB of held-out PSNR that 10 % more time must gain, else growth or training ends; 0: never",
+        description="dB of held-out PSNR that 10 % more time must gain, else training ends; 0: never",
     )
     budget: int = Field(0, ge=0, le=10**8, description="most Gaussians the map may have; 0: 100,000, or 2,300 a photo")
     block_photos: int = Field(
@@ -124,8 +121,7 @@ class LossConfig(Settings):
 
 class InstanceConfig(Settings):
     method: Literal["consensus", "hdbscan"] = Field(
-        "consensus",
-        description="segments merged as the masks of all photos agree, or the paper's clustering of features alone",
+        "consensus", description="segments merged as all masks agree, or the paper's clustering of features alone"
     )
     split: bool = Field(True, description="clusters of HDBSCAN are split into parts that are connected in space")
     settle: bool = Field(

@@ -38,12 +38,15 @@ REFINED, JUDGED = 100, 16
 FINALISTS = 3
 """Places apart from each other that are refined with all points and colours."""
 FEW_ROWS, ROWS, FINE_ROWS = 500, 1500, 20_000
+"""Points of the scan in the steps: the first refinement, the second and judging, the last refinement."""
+FEWEST, FEWEST_IN_VIEW = 30, 50
+"""Points below which nothing is fitted or correlated: of all views, of one view."""
 TOLERANCE = 1 / 60
 """Distance in extents of the map within which a scan point lies on the rendered surface."""
 ELSEWHERE = 0.1
 """Root mean square distance in extents of the scan's points in one place to those in another place."""
-LEAST_AGREEMENT, LEAST_COVER, MOST_RIVAL, LEAST_STIFFNESS = 0.95, 0.05, 0.85, 1e-3
-LEAST_LIKENESS = 0.5
+LEAST_AGREEMENT, LEAST_COVER, MOST_RIVAL, LEAST_STIFFNESS, LEAST_LIKENESS = 0.95, 0.05, 0.85, 1e-3, 0.5
+"""Bounds of the figures of an `Alignment` that is accepted."""
 FACING = 0.7
 """Least cosine of the normals of points that are matched."""
 LEAST_GAIN = 0.2
@@ -56,9 +59,9 @@ class Alignment:
 
     agreement: of the scan's points that some camera sees or sees through, the share on the rendered surface. overlap,
     cover: the shares of all scan points on the map's surface, and of that surface near the scan. rms: of the distances
-    to the map's planes, weighted as ICP does, in map units. rival: the score of the next best other place over this
-    one's. stiffness: the smallest eigenvalue of ICP's information matrix; 0 if the scan can slide or turn.
-    likeness: correlation of the brightness of scan and map; None without colours.
+    to the map's planes, weighted as ICP does, in map units. rival: the score of the next best place over this one's.
+    stiffness: the smallest eigenvalue of ICP's information matrix; 0 if the scan can slide or turn. likeness:
+    correlation of the brightness of scan and map; None without colours.
     """
 
     map_from_scan: np.ndarray
@@ -246,7 +249,7 @@ class Registration:
             total[rows] += view.brightness[v.astype(np.int64), u.astype(np.int64)]
             count[rows] += 1
         seen = count > 0
-        if seen.sum() < 30:
+        if seen.sum() < FEWEST:
             return 0.0
         a, b = total[seen] / count[seen], brightness[seen]
         a, b = a - a.mean(), b - b.mean()
@@ -262,7 +265,7 @@ class Registration:
         for width in widths:
             index, _ = self.tree.query(place(self.scan[rows]), 1, 3 * width)
             near = np.flatnonzero(index[:, 0] >= 0)
-            if len(near) < 30:
+            if len(near) < FEWEST:
                 break
             own, at = rows[near], index[near, 0]
             moved, facing = place(self.scan[own]), self.normals[at]
@@ -304,7 +307,7 @@ class Registration:
         A, b = np.zeros((size, size)), np.zeros(size)
         for view, *layers in images:
             rows, u, v, own = view.seen(moved, self.tolerance)
-            if len(rows) < 50:
+            if len(rows) < FEWEST_IN_VIEW:
                 continue
             I, Iu, Iv = (map_coordinates(layer, [v - 0.5, u - 0.5], order=1, mode="nearest") for layer in layers)
             gain, r, w = robust_gain(I.astype(np.float64), brightness[rows])

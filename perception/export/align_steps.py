@@ -16,6 +16,8 @@ COUNT, KEPT, APART = 12_000, 64, 12.0
 """Rotations tried, which leave none farther than about 8° away; kept, at least APART degrees from one another."""
 SHARPNESS = 25.0
 """Concentration of the kernel about each normal: a standard deviation of 8°."""
+TUKEY = 4.5
+"""Cut-off of Tukey's weights in medians of |r|, about three standard deviations."""
 _SIDE = 33
 
 
@@ -70,7 +72,7 @@ def robust_gain(I: np.ndarray, g: np.ndarray) -> tuple[float, np.ndarray, np.nda
         i, h = I - (w * I).sum() / total, g - (w * g).sum() / total
         gain = float((w * i * h).sum() / max((w * i * i).sum(), 1e-9))
         r = gain * i - h
-        spread = 4.5 * float(np.median(np.abs(r))) + 1e-6
+        spread = TUKEY * float(np.median(np.abs(r))) + 1e-6
         w = np.maximum(1 - (r / spread) ** 2, 0) ** 2
     return gain, r, w / spread**2
 

@@ -33,8 +33,9 @@ class DepthView:
         """[H, W] float32, the mean of the colour channels."""
         return self.colors.mean(axis=2)
 
-    def look(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of points [P, 3]: (in camera axes with u and v, [P, 5]; depth [P] in the pixel of each, 0 = none)."""
+    def look(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of points [P, 3]: their coordinates [P, 3] in camera axes, their pixels u, v [P, 2], and the depth [P] there,
+        0 = none or outside the image."""
         own = np.einsum("nj,ij->ni", points, self.camera_from_world[:3, :3]) + self.camera_from_world[:3, 3]
         height, width = self.depth.shape
         front = own[:, 2] > 1e-9
@@ -43,13 +44,13 @@ class DepthView:
         depth = np.zeros(len(points), np.float32)
         column, row = uv[inside].astype(np.int64).T
         depth[inside] = self.depth[row, column]
-        return np.concatenate([own, uv], axis=1), depth
+        return own, uv, depth
 
     def seen(self, points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """(rows of the points [P, 3] within `tolerance` of the depth, their u, v, and [R, 3] in camera axes)."""
-        own, depth = self.look(points)
+        own, uv, depth = self.look(points)
         rows = np.flatnonzero((depth > 0) & (np.abs(depth - own[:, 2]) <= tolerance))
-        return rows, own[rows, 3], own[rows, 4], own[rows, :3]
+        return rows, uv[rows, 0], uv[rows, 1], own[rows]
 
 
 @torch.no_grad()
@@ -80,7 +81,7 @@ def observe(
     on, free = np.zeros((2, len(points)), np.int32)
     gap = np.zeros(len(points))
     for view in views:
-        own, depth = view.look(points)
+        own, _, depth = view.look(points)
         ahead = np.where(depth > 0, depth - own[:, 2], -np.inf)
         near = np.abs(ahead) <= tolerance
         on += near

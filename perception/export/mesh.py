@@ -12,7 +12,7 @@ from scipy import ndimage
 from perception.colors import instance_palette, rgb8_from_sh
 from perception.errors import InputError
 from perception.export.depth_views import DepthView, observe
-from perception.export.export_map import ExportOptions, export_labels, rendered_depth
+from perception.export.export_map import SURFACE_OPACITY, ExportOptions, export_labels, rendered_depth
 from perception.export.neighbors import nearest_gaussian
 from perception.frame.recentre import map_from_input
 from perception.geometry import camera_centres
@@ -61,7 +61,7 @@ def export_mesh(
         own = gmap.instance_ids == instance
         if not own.any():
             raise InputError(f"--instance {instance}: the map has no such instance; `perception query` lists their ids")
-        opaque = own & (gmap.opacities >= min(0.5, gmap.opacities[own].max()))
+        opaque = own & (gmap.opacities >= min(SURFACE_OPACITY, gmap.opacities[own].max()))
         bounds = np.percentile(gmap.means[opaque], [1, 99], axis=0)
         size = voxel or max(_footprint(views), float((bounds[1] - bounds[0]).max()) / 64)
         low, high = bounds[0] - size, bounds[1] + size
@@ -88,8 +88,8 @@ def export_voxels(gmap: Map, output: Path, voxel: float | None) -> tuple[dict[st
     """
     views = rendered_depth(gmap, MOST_VIEWS, LONG_SIDE // 2)
     eyes = camera_centres(np.stack([view.camera_from_world for view in views]))
-    solid = gmap.means[gmap.opacities >= 0.5] if (gmap.opacities >= 0.5).any() else gmap.means
-    bounds = np.percentile(solid, [1, 99], axis=0)
+    solid = gmap.opacities >= SURFACE_OPACITY
+    bounds = np.percentile(gmap.means[solid] if solid.any() else gmap.means, [1, 99], axis=0)
     low, high = np.minimum(bounds[0], eyes.min(axis=0)), np.maximum(bounds[1], eyes.max(axis=0))
     size = voxel or (0.05 if gmap.metric else float(np.linalg.norm(high - low)) / 128)
     low, high = low - 2 * size, high + 2 * size

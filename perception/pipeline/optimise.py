@@ -110,10 +110,8 @@ def optimise(
     source: MaskSource,
     box: np.ndarray | None = None,
 ) -> Optimised:
-    """Trains the Gaussians of a scene, or of the block of one that owns `box` (see `Trainer`).
-
-    Goes on from the checkpoint in `run.work`, if there is one.
-    """
+    """Trains the Gaussians of a scene, or of the block of one that owns `box` (see `Trainer`), from the checkpoint in
+    `run.work` on, if there is one."""
     label_by_tasks(run, training, source)
     photos = Photos.load(run, training, held_out)
     config = sized(run.config, len(photos.views), largest_budget(memory_limit()))
