@@ -1,4 +1,4 @@
-"""Parts of an alignment: likely rotations (extended Gaussian images), and the steps of Gauss-Newton on a place."""
+"""Parts of an alignment: likely rotations (extended Gaussian images), and the steps of Gauss-Newton on a pose."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SIDE = 33
 
 
 @dataclass(frozen=True)
-class Place:
+class Similarity:
     """x ↦ linear x + shift; linear [3, 3] a rotation times a scale, shift [3]; score: higher is better."""
 
     linear: np.ndarray
@@ -36,16 +36,16 @@ class Place:
     def scale(self) -> float:
         return float(np.cbrt(np.linalg.det(self.linear)))
 
-    def stepped(self, delta: np.ndarray, middle: np.ndarray, extent: float) -> Place:
+    def stepped(self, delta: np.ndarray, middle: np.ndarray, extent: float) -> Similarity:
         """Turned, shifted and, with 7 numbers, scaled about `middle`; delta: lengths, at the distance `extent`."""
         turn = Rotation.from_rotvec(delta[:3] / extent).as_matrix()
         grow = float(np.exp(delta[6] / extent)) if len(delta) == 7 else 1.0
         rotation = nearest_rotation(turn @ self.linear / self.scale)
-        return Place(grow * self.scale * rotation, grow * turn @ (self.shift - middle) + middle + delta[3:6])
+        return Similarity(grow * self.scale * rotation, grow * turn @ (self.shift - middle) + middle + delta[3:6])
 
 
 def jacobian(points: np.ndarray, slopes: np.ndarray, middle: np.ndarray, extent: float, similar: bool) -> np.ndarray:
-    """[P, 6 or 7] derivative of f by `Place.stepped`, given its slopes [P, 3] at points [P, 3]."""
+    """[P, 6 or 7] derivative of f by `Similarity.stepped`, given its slopes [P, 3] at points [P, 3]."""
     arm = (points - middle) / extent
     parts = [np.cross(arm, slopes), slopes]
     return np.concatenate([*parts, np.einsum("ij,ij->i", arm, slopes)[:, None]] if similar else parts, axis=1)

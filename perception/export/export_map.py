@@ -1,5 +1,5 @@
 """`perception export`: transfers the instances of a map to a cloud, or to the map's own surface points. A scan from
-another frame is placed in the map by a known transform, or by registration.
+another frame is aligned with the map by a known transform, or by registration.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def export_map(
     points: Path | None,
     options: ExportOptions,
     color: str = "original",
-    place: Path | bool = False,
+    pose: Path | bool = False,
     granularity: str = "default",
 ) -> tuple[dict[str, Any], str]:
     """Labels a cloud, writes it and its sidecar JSON, and returns (JSON-able facts, table).
@@ -110,7 +110,7 @@ def export_map(
     result are in the coordinates of the map's input (`map_from_input`). Without `points` they are the map's, or the
     input's if that was only shifted.
 
-    color: of the written points, "original" or "instance". place: `points` lie in a frame of their own: True registers
+    color: of the written points, "original" or "instance". pose: `points` lie in a frame of their own: True registers
     them (`export.align`), a path names a file with map_from_scan [4, 4]. The result keeps that frame; the sidecar and
     the facts hold `map_from_scan`. granularity: see `at_granularity`.
     """
@@ -118,32 +118,32 @@ def export_map(
         return _export_spz(map_path, output, points)
     if output.suffix.lower() not in SUFFIXES:
         raise InputError(f"{output}: unknown kind of cloud '{output.suffix}', expected one of {', '.join(SUFFIXES)}")
-    if place and points is None:
-        raise InputError("--align and --transform place a scan in the map; give it with --points")
-    known = None if isinstance(place, bool) else read_transform(place)
+    if pose and points is None:
+        raise InputError("--align and --transform need a scan; give it with --points")
+    known = None if isinstance(pose, bool) else read_transform(pose)
     gmap = read_map(map_path)
     ids, instances = at_granularity(gmap, granularity)
-    given = None if points is None else read_cloud(points)
-    placed = map_from_input(map_path, gmap.info)
-    if points is None and not np.array_equal(placed[:3, :3], np.eye(3)):
-        placed = np.eye(4)
+    cloud = None if points is None else read_cloud(points)
+    map_from_cloud = map_from_input(map_path, gmap.info)
+    if points is None and not np.array_equal(map_from_cloud[:3, :3], np.eye(3)):
+        map_from_cloud = np.eye(4)
     facts: dict[str, Any] = {}
     if known is not None:
-        placed = known
-    elif place and given is not None:
-        placed, facts["alignment"] = aligned(gmap, given, str(points))
-    if place:
-        facts["map_from_scan"] = placed.tolist()
-    moved = not np.array_equal(placed, np.eye(4))
-    means = move_points(np.linalg.inv(placed), gmap.means.astype(np.float64)) if moved else gmap.means
+        map_from_cloud = known
+    elif pose and cloud is not None:
+        map_from_cloud, facts["alignment"] = aligned(gmap, cloud, str(points))
+    if pose:
+        facts["map_from_scan"] = map_from_cloud.tolist()
+    moved = not np.array_equal(map_from_cloud, np.eye(4))
+    means = move_points(np.linalg.inv(map_from_cloud), gmap.means.astype(np.float64)) if moved else gmap.means
     began = time.perf_counter()
-    if given is None:
+    if cloud is None:
         rows, options = np.flatnonzero(gmap.opacities >= SURFACE_OPACITY), ExportOptions(smooth=False)
-        given = PointCloud(means[rows], rgb8_from_sh(gmap.sh[rows, 0]))
+        cloud = PointCloud(means[rows], rgb8_from_sh(gmap.sh[rows, 0]))
         labels = ids[rows].astype(np.int32)
     else:
-        labels = export_labels(means, ids, given, options)
-    cloud, inside = given, check_overlap(means, given.points)
+        labels = export_labels(means, ids, cloud, options)
+    inside = check_overlap(means, cloud.points)
     if color == "instance":
         cloud = replace(cloud, colors=instance_palette(labels))
     sidecar = write_export(output, cloud, labels, instances, facts)  # last: where it is, everything was written
@@ -153,7 +153,7 @@ def export_map(
         "inside_map": inside,
         "seconds": time.perf_counter() - began,
         "max_distance": options.max_distance,
-        "metric": gmap.metric and abs(scale_of(placed) - 1) < 1e-9,
+        "metric": gmap.metric and abs(scale_of(map_from_cloud) - 1) < 1e-9,
         "smoothed": options.smooth,
         **sidecar,
     }

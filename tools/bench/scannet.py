@@ -12,8 +12,16 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
-from perception.evaluate.instances import Protocol, evaluate_overlaps, evaluated_truth, get_protocol, instances_table
-from perception.evaluate.overlap import OBJECT, Overlap, Truth
+from perception.evaluate.instances import (
+    OBJECT,
+    Overlap,
+    Protocol,
+    Truth,
+    evaluate_overlaps,
+    evaluated_truth,
+    get_protocol,
+    instances_table,
+)
 from perception.io.atomic import atomic_file
 
 

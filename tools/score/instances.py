@@ -57,8 +57,7 @@ def score_map(scene: Path, map_path: Path) -> dict[str, Any]:
     Under the key SCORED, a pair for each instance with at least MIN_POINTS points: its score, and 1 if its IoU with a
     true instance exceeds 0.5, else 0.
     """
-    from perception.evaluate.instances import evaluate
-    from perception.evaluate.overlap import overlap_of_ids, read_truth
+    from perception.evaluate.instances import evaluate, overlap_of_ids, read_truth
     from perception.export.export_map import export_labels
     from perception.export.render import as_gaussians
     from perception.map.write import read_map
