@@ -299,7 +299,7 @@ class Registration:
     def _photometric_step(self, pose: Similarity, points: np.ndarray, light: np.ndarray, images: Images) -> Similarity:
         """A step that lowers Σ w (a_v I_v(π_v(s R p + t)) + b_v − g_p)² over views v and the points p on their depth.
 
-        points [P, 3] with brightness g = light [P]; I_v: rendered brightness; a_v, b_v: gain and offset of each view; w:
+        points [P, 3] of brightness g = light [P]; I_v: rendered brightness; a_v, b_v: gain and offset of each view; w:
         Tukey's weights by the spread of the view's residuals.
         """
         moved = pose(points)
