@@ -46,18 +46,19 @@ def upgrade_map(
     with writing(target):
         gmap = read_map(path)
         old = str(gmap.language["encoder"]) if gmap.language else None
-        spec = gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
+        settings = gmap.info.get("config", {}).get("language", {})
+        spec = settings.get("encoder", "auto")
         encoder = encoders("conse" if spec == "auto" else spec) if gmap.language else None
         if encoder is not None and encoder.identity != old:
-            _embed_again(gmap, encoder, progress)
-        _read_again(gmap, make_reader(gmap.info.get("config", {}).get("language", {}).get("texts", "auto")), progress)
+            _embed_again(gmap, encoder, int(settings.get("zooms") or reading_of(encoder).zooms), progress)
+        _read_again(gmap, make_reader(settings.get("texts", "auto")), progress)
         write_map(target, gmap, keep_report=True, fresh=output is not None)
     new = str(gmap.language["encoder"]) if gmap.language else None
     return {"map": str(target), "encoder": [old, new]}
 
 
-def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:
-    """Replaces `language` and, if present, that of the parts and groups."""
+def _embed_again(gmap: Map, encoder: Encoder, zooms: int, progress: Progress) -> None:
+    """Replaces `language`, from `zooms` crops a view, and, if present, that of the parts and groups, from one."""
     names = [view.name for view in gmap.views]
 
     def described(
@@ -67,7 +68,6 @@ def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:
         choices, load = _shown(gmap, stored, owners, ids)
         return to_arrays(describe_instances(encoder, choices, load, names, zooms, progress), encoder.identity)
 
-    zooms = int(gmap.info.get("config", {}).get("language", {}).get("zooms") or reading_of(encoder).zooms)
     gmap.language = described(gmap.language, gmap.instance_ids, [entry["id"] for entry in gmap.instances], zooms)
     if stored := language_in(gmap.parts):
         owners = gmap.parts["ids"]

@@ -118,10 +118,8 @@ def _compare(source: Path, before: Any, now: Inputs, since: str, todo: str) -> N
         old, new = ({(key, name): stat for key in one for name, stat in one[key].items()} for one in (before, now))
     except (AttributeError, LookupError, TypeError) as error:
         raise InputError(f"{source}: its list of input files is damaged; {todo}") from error
-    changed = sorted(key for key in old.keys() | new.keys() if old.get(key) != new.get(key))
-    if not changed:
-        return
-    states = ("new" if key not in old else "gone" if key not in new else "changed" for key in changed)
-    names = [f"{name} ({state})" for (_, name), state in zip(changed, states, strict=True)]
-    shown = ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
-    raise InputError(f"{source}: input files are others {since}, {len(names)} in all: {shown}; {todo}")
+    state = dict.fromkeys(old, "gone") | {key: "changed" if key in old else "new" for key in new}
+    changed = [f"{key[1]} ({state[key]})" for key in sorted(state) if old.get(key) != new.get(key)]
+    if changed:
+        shown = ", ".join(changed[:SHOWN]) + (f" and {len(changed) - SHOWN} more" if len(changed) > SHOWN else "")
+        raise InputError(f"{source}: input files are others {since}, {len(changed)} in all: {shown}; {todo}")

@@ -31,7 +31,7 @@ SETTINGS = ["train.iterations=1300", "train.budget=40000"]
 
 @dataclass(frozen=True)
 class DemoTruth:
-    """Ground truth of the scene; it is used to score the map, never to build it. Metres.
+    """Ground truth of the scene, by which the map is scored, never built. Metres.
 
     prompts: of the demo. queries: every known prompt with the ids of what it means. instances: name of each id.
     centres: camera centre [3] of each photo. points: of the surfaces that two photos see, with normals and colours;

@@ -67,7 +67,7 @@ def check_memory(photos: PhotoSizes, config: MapConfig, limit: int | None = None
     smaller = [(max(64, int(side * share)), max(1000, int(budget * share))) for share in (0.75, 0.5, 0.35, 0.2, 0.1)]
     fitting = next((pair for pair in smaller if needed_bytes(photos, *pair, memory) <= limit), None)
     advice = "give fewer or smaller photos, or use a machine with more memory"
-    raise InputError(
-        f"{photos.what} need about {needed / 2**30:.1f} GiB with --max-side {side} --budget {budget}, and there are "
-        f"{limit / 2**30:.1f}; " + (f"give --max-side {fitting[0]} --budget {fitting[1]}" if fitting else advice)
-    )
+    if fitting is not None:
+        advice = f"give --max-side {fitting[0]} --budget {fitting[1]}"
+    found = f"need about {needed / 2**30:.1f} GiB with --max-side {side} --budget {budget}"
+    raise InputError(f"{photos.what} {found}, and there are {limit / 2**30:.1f}; {advice}")

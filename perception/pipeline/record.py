@@ -74,8 +74,8 @@ def score_views(gaussians: Gaussians, views: list[TrainingView], metric: bool = 
     for view in views:
         image = render_view(gaussians, view)
         weight = None if view.weight is None else view.weight.numpy()
-        similarity = ssim(image.numpy().astype(np.float64), view.photo.numpy().astype(np.float64) / 255, weight)
-        per_view[view.name] = {"psnr": psnr(image, view.photo, view.weight), "ssim": float(similarity)}
+        similarity = ssim(image.numpy(), view.photo.numpy().astype(np.float64) / 255, weight)
+        per_view[view.name] = {"psnr": psnr(image, view.photo, view.weight), "ssim": similarity}
     if not per_view:
         return {"views": {}}
     means = {name: float(np.mean([entry[name] for entry in per_view.values()])) for name in ("psnr", "ssim")}

@@ -286,6 +286,5 @@ def _instance_rows(opened: QueryMap, album: _Album) -> list[dict[str, Any]]:
 
 def _query_row(opened: QueryMap, text: str, album: _Album) -> dict[str, Any]:
     hits = opened.query(text)
-    best = opened.position(hits[0].instance_id) if hits else None
-    picture = None if best is None else _best_picture(opened, best, album, cropped=False)
+    picture = _best_picture(opened, opened.position(hits[0].instance_id), album, cropped=False) if hits else None
     return {"text": text, "hits": [(hit.instance_id, hit.score) for hit in hits], "picture": picture}
