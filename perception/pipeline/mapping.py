@@ -81,7 +81,6 @@ def build_map(
         with run.stage("instances"):
             grouped = group_gaussians(optimised, run, segments)
             described = describe(optimised, grouped, run, encoder, reader)
-
         gaussians, quality = scored(run, optimised, scene.metric)
         info = run_record(run, scene, optimised, described.report, quality, time.monotonic() - started)
         gmap = _assemble(gaussians, described, scene, held_out, {**info, "inputs": inputs}, output)
