@@ -1,6 +1,25 @@
 """From photos to a 3D instance map of Gaussians that answers text prompts.
 
-Importing this package does nothing heavy: torch and the compiled core load on first use of a name below.
+Public names, by what they are for; each has an example:
+
+- make a map: `perception.pipeline.mapping.build_map`, `perception.config.load_config`, `perception.config.MapConfig`
+- open it: `perception.load_map`, `perception.map.map.Map`, `perception.map.write.read_map`,
+  `perception.map.write.write_map`
+- ask it: `perception.query.QueryMap`, `perception.query.Hit`, `perception.query.Description`,
+  `perception.query.Neighbor`, `perception.query.Where`, `perception.query.axis_box`, `perception.query.Frame`
+- plan with it: `perception.query.scene_graph.scene_graph`, `perception.query.standing.where_to_stand`,
+  `perception.query.standing.Stand`, `perception.query.floor_grid.floor_grid`
+- ask many maps: `perception.query.indexing.index_maps`
+- serve it: `perception.serve.engine.QueryEngine`, `perception.query.requests.Request`,
+  `perception.query.requests.Reply`, `perception.query.requests.EngineBusy`,
+  `perception.query.requests.AnswerTimeout`, `perception.query.requests.EngineClosed`
+- correct it: `perception.edit.editor.Editor`, `perception.map.write.set_labels`
+- export it: `perception.export.export_map.export_map`, `perception.export.export_map.ExportOptions`,
+  `perception.export.mesh.export_mesh`, `perception.export.mesh.export_voxels`
+- render Gaussians: `perception.rasterize`
+- bad input: `perception.InputError`, one line that says what was found, what was expected and what to do
+
+Importing this package does nothing heavy: torch and the compiled core load on first use of such a name.
 """
 
 from __future__ import annotations
@@ -12,13 +31,13 @@ __all__ = ["InputError", "__version__", "load_map", "rasterize"]
 
 if TYPE_CHECKING:
     from perception.errors import InputError
-    from perception.gaussians.rasterize import rasterize
     from perception.query import load_map
+    from perception.rasterizer.rasterize import rasterize
 
 _HOMES = {
     "InputError": "perception.errors",
     "load_map": "perception.query",
-    "rasterize": "perception.gaussians.rasterize",
+    "rasterize": "perception.rasterizer.rasterize",
 }
 
 

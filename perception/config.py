@@ -54,8 +54,8 @@ class PhotoConfig(Settings):
         None,
         pattern=r"^[1-9][0-9]*[MG]$",
         title="a size such as 500M or 8G",
-        description="that photos, labels and depth may fill, and beside them votes of masks; others are on disk; "
-        "none: a quarter of the machine's",
+        description="memory for photos, labels and depth, and as much for votes of masks; what does not fit is on "
+        "disk; none: a quarter of the machine's",
     )
 
 
@@ -141,7 +141,13 @@ class LanguageConfig(Settings):
 
 
 class MapConfig(Settings):
-    """All settings of `perception map`. The descriptions and ranges are what `perception map --help` prints."""
+    """All settings of `perception map`. The descriptions and ranges are what `perception map --help` prints.
+
+    Made by `load_config`, which raises InputError for a setting that is unknown or out of range.
+
+    >>> MapConfig(seed=3).to_json()["seed"]
+    3
+    """
 
     seed: int = Field(0, ge=0, le=LARGEST_SEED, description="of all random choices")
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="what trains; auto: a GPU if one works")
@@ -156,6 +162,7 @@ class MapConfig(Settings):
     language: LanguageConfig = LanguageConfig()
 
     def to_json(self) -> dict[str, Any]:
+        """All settings as nested dicts, as `config` of map.json."""
         return self.model_dump()
 
 
@@ -207,7 +214,12 @@ AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
 def load_config(file: Path | None = None, pairs: list[str] | None = None, preset: str = "default") -> MapConfig:
-    """Defaults, overridden by the preset, the TOML file and KEY=VALUE pairs. Raises InputError for the first error."""
+    """Defaults, overridden by the preset, the TOML file and KEY=VALUE pairs. Raises InputError for the first error.
+
+    >>> config = load_config(pairs=["train.iterations=500", "masks=labels:labels"], preset="fast")
+    >>> config.train.iterations, config.train.effort, config.masks
+    (500, 0.4, 'labels:labels')
+    """
     if preset not in PRESETS:
         raise InputError(f"--preset: found '{preset}', expected one of: {', '.join(PRESETS)}")
     given = {key: (value, "--preset") for key, value in PRESETS[preset].items()}

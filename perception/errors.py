@@ -13,6 +13,12 @@ class InputError(ValueError):
     """Invalid user input, with a one-line message: what was read, found and expected, and what to do.
 
     Characters that are not visible text (line ends, control codes), for example from file names, are escaped.
+
+    >>> try:
+    ...     perception.load_map("nothing.gsmap")
+    ... except InputError as error:
+    ...     print(error)
+    nothing.gsmap: is no map (no map.json inside); give a directory made by `perception map`
     """
 
     def __init__(self, message: object = ""):

@@ -15,7 +15,7 @@ from perception.errors import InputError, missing_extra
 from perception.io.atomic import atomic_directory
 from perception.io.documents import brief
 from perception.map.checksums import facts_of, sha256
-from perception.onnx.sessions import model_graphs, model_root, side_files
+from perception.onnx.sessions import model_graphs, model_root, refuse_outside_weights, side_files
 from perception.onnx.store import NAME, RECORD, Entry, StoredModel, catalogue, find_model, known_names, models_folder
 from perception.progress import QUIET, Progress
 
@@ -182,11 +182,15 @@ def _local(source: str) -> list[tuple[str, Path, str]]:
     path = Path(source).expanduser()
     if path.is_dir():
         root, graphs = model_root(path), model_graphs(path)[0]
+        for graph in graphs:
+            refuse_outside_weights(graph)
         files = [*graphs, *(f for graph in graphs for f in side_files(graph) if f.is_file())]
         files += [f for f in sorted(root.rglob("*")) if f.is_file() and f.suffix in _KEPT and f.name != RECORD]
         return [(str(f.relative_to(root)), f, str(f)) for f in files]
     if not path.is_file():
         raise InputError(f"{source}: no such file or folder")
+    if path.suffix == ".onnx":
+        refuse_outside_weights(path)
     beside = side_files(path) if path.suffix == ".onnx" else []
     return [(str(p.relative_to(path.parent)), p, str(p)) for p in [path, *beside] if p.is_file()]
 

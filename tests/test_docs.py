@@ -78,6 +78,19 @@ def test_no_line_installs_the_stranger_called_perception() -> None:
     assert not found
 
 
+def test_paths_named_for_contributors_exist() -> None:
+    """A bare file name stands in the folder of the first path of its row."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| [^|]+ \| ([^|]*`[^|]*) \|$", text, re.M)
+    assert 15 < len(rows) <= 25
+    missing = []
+    for row in [re.findall(r"`([^`]+)`", row) for row in rows]:
+        paths = [Path(row[0]).parent / name if "/" not in name and name != "tools" else Path(name) for name in row]
+        missing += [str(path) for path in paths if not (ROOT / path).exists()]
+    named = re.findall(r"`((?:perception|tests|tools|csrc)/[\w/.]+)`", text)
+    assert missing + [path for path in named if not (ROOT / path).exists()] == []
+
+
 def runnable() -> list[str]:
     """The complete commands of all pages on a map of one's own: the README's walkthrough, in its order, comes first."""
     commands = [re.sub(r" MAP\b", " kitchen.gsmap", command) for _, command in documented() if "SCENE" not in command]
@@ -86,14 +99,18 @@ def runnable() -> list[str]:
 
 
 def test_documented_options_and_settings_exist() -> None:
-    """Every `--option` in running text is one of some command, every `--set KEY=VALUE` can be set."""
+    """Every `--option` in running text is one of some command or its script, every `--set KEY=VALUE` can be set."""
     from perception.config import load_config
 
     options, settings = set(), set()
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
+        for name, rest in re.findall(r"python tools ([a-z_]+\.[a-z_]+)([^`\n#]*)", text):
+            source = (ROOT / "tools" / f"{name.replace('.', '/')}.py").read_text(encoding="utf-8")
+            if name != "bench.run":  # whose options are those of the benches below
+                assert [o for o in re.findall(r"(?<![\w-])--[a-z][\w-]+", rest) if o not in source] == [], name
         for code in re.findall(r"`([^`\n]*)`", text):
-            if not code.startswith(("pip", "cmake", "ros2")):
+            if not code.startswith(("pip", "cmake", "ros2", "python tools", "ray")):
                 options |= set(re.findall(r"(?<![\w-])--[a-z][\w-]+", code))
             settings |= set(re.findall(r"--set ([a-z][\w.]*=[\w:.]+)", code))
     assert len(options) > 15 and settings

@@ -20,9 +20,13 @@ def scripts() -> dict[str, str]:
     for file in sorted(HOME.glob("*/*.py")):
         text = file.read_text(encoding="utf-8")
         if '__name__ == "__main__"' in text:
-            words = " ".join((ast.get_docstring(ast.parse(text)) or "").split())
-            found[f"{file.parent.name}.{file.stem}"] = words.partition(". ")[0]
+            first = (ast.get_docstring(ast.parse(text)) or "").partition("\n\n")[0]
+            found[f"{file.parent.name}.{file.stem}"] = " ".join(first.split()).partition(". ")[0].rstrip(".")
     return found
+
+
+def listing() -> str:
+    return "".join(f"{name:20} {sentence}\n" for name, sentence in scripts().items())
 
 
 def run(name: str, run_name: str = "__main__") -> None:
@@ -34,12 +38,11 @@ def run(name: str, run_name: str = "__main__") -> None:
 
 
 def main() -> None:
-    known = scripts()
     if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
-        print(*(f"{name:24} {words}" for name, words in known.items()), sep="\n")
+        print(listing(), end="")
         return
     name = sys.argv.pop(1)
-    if name not in known:
+    if name not in scripts():
         sys.exit(f"tools: no script {name}; python tools lists them")
     sys.argv[0] = name
     run(name)

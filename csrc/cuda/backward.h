@@ -1,11 +1,5 @@
-// The backward pass over the pixels: a lane a pixel for the weights, then a lane a Gaussian for the sums.
-//
-// With cg = Σ_channels (cotangent · value of this splat) and R = Σ over the splats behind of w cg, dL/dalpha = T cg -
-// R / (1 - alpha), so h = dL/d ln alpha = w (cg - R / T'), T' the transmittance behind this splat. The variance enters
-// linearly: with V = Σ w f² - S², S = Σ w f, and any constant c (here the features of the tile's first splat, so that
-// large common offsets do not cancel), e = f - c:
-//   g S + v V has dL/dw = (g - 2 v (S - c)) e + v e² + const,  const = c g + v (c² - 2 S c),
-// and a constant channel is the accumulated alpha, whose gradient is const T_final / (1 - alpha).
+// The backward pass over the pixels: a lane a pixel for the weights, then a lane a Gaussian for the sums. The formulas
+// and symbols (alpha, w, T, T', T_final, cg, R, k, h, S, g, v, c, e) are those of rasterizer/backward.cpp.
 #pragma once
 #include "device.h"
 
@@ -28,7 +22,8 @@ struct WarpMemory {
 static __device__ inline int weight_at(int splat, int pixel) { return splat * kPitch + pixel; }
 static __device__ inline int moment_at(int splat, int pixel) { return (kGroup + splat) * kPitch + pixel; }
 
-// Writes the pixel's cotangents to its column and returns R before the first splat.
+// Writes the pixel's cotangents to its column and returns R - k T_final before the first splat, where R is over all.
+// shift: c.
 static __device__ inline T load_cotangents(const Scene &scene, const Images &images, const Cotangents &grad,
                                            const Pixel &p, const SHARED(T) * shift, WarpMemory &memory) {
   for (int c = 0; c < kChannels; ++c) memory.cotangent[c][p.lane] = 0;
@@ -78,7 +73,8 @@ static __device__ inline T weigh(const Splat &s, const SHARED(T) * features, con
   return cg;
 }
 
-// The sums of splat `lane % kGroup` over the granule, in a fixed order; all lanes of the splat return them.
+// The sums of splat `lane % kGroup` over the granule (kSums, with u = dx + k dy), in a fixed order; all lanes of the
+// splat return them.
 static __device__ inline void sum_pixels(const Splat &s, bool touched, const Pixel &p, const WarpMemory &memory,
                                          T *sums) {
   const int j = p.lane % kGroup, first = p.lane / kGroup * kPixels;

@@ -2,7 +2,7 @@
 //
 // One source for two compilers: NVRTC on the user's machine, and the system's compiler for the tests, which run the
 // thread blocks on the CPU (emulate.h). Macros fix the shape: REAL (float or double), NF (feature channels of this
-// slice, 0 to 8), VARIANCE and DEPTH (0 or 1). The structs are filled in by perception/gaussians/cuda/rasterize.py.
+// slice, 0 to 8), VARIANCE and DEPTH (0 or 1). The structs are filled in by perception/rasterizer/device.py.
 #pragma once
 #ifndef __CUDACC__
 #include "emulate.h"

@@ -1,4 +1,4 @@
-// kernels.cu on the CPU, behind the functions of the CUDA driver that perception/gaussians/cuda/launch.py calls: for
+// kernels.cu on the CPU, behind the functions of the CUDA driver that perception/rasterizer/cuda/launch.py calls: for
 // tests. Calls are synchronous, and one process runs one at a time.
 #include "kernels.cu"
 

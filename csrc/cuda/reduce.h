@@ -28,7 +28,7 @@ static __device__ inline void sum_records(Reals records, Index begin, Index end,
   }
 }
 
-// From a record's moments to cotangents of the projection (see Projected for the factored form).
+// From a record's moments to cotangents of the projection; rasterizer/reduce.cpp has the formulas.
 static __device__ inline ProjectedGrad<T> picture_gradient(const Splat &s, const T *r) {
   const T precision_x = s.a * (-2 / kLog2E<T>), precision_y = s.d * (-2 / kLog2E<T>);  // 1/var_x, 1/var_y
   const T gu = -r[1] * precision_x;

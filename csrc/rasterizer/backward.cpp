@@ -1,12 +1,24 @@
-// Stage 5: the backward pass, splat by splat over each 16x16 tile, replaying the blending front to back. With
-//   cg = Σ_channels (cotangent · value of this splat),  R = Σ over the splats behind of w cg,
-// dL/dalpha = T cg - R / (1 - alpha), so dL/d ln alpha = w (cg - R / T'), T' the transmittance behind this splat: two
-// numbers a pixel, T and R, whatever the number of channels.
+// Stage 5: the backward pass, from the gradients of the images to the records of the splats (records.h). Splat by splat
+// over each 16x16 tile, it repeats the blending front to back. At one pixel, for splat i of its list:
+//   alpha    the splat's opacity there
+//   T        the transmittance in front of it, Π_{j<i} (1 - alpha_j); T' = T (1 - alpha) behind it, T_final behind all
+//   w        its weight, alpha T
+//   x        its value in a channel: red, green, blue, depth or a feature; the image holds Σ w x + T_final background
+//   A        the accumulated alpha, Σ w = 1 - T_final
+//   g        dL/d(image) of a channel, its cotangent
+//   cg       Σ_channels g x, which is dL/dw
+//   R        Σ_{j>i} w_j cg_j, over the splats behind
+//   k        what multiplies A in the loss: dL/dA, -g background of each channel (T_final = 1 - A), and see below
+// Each w_j behind has a factor 1 - alpha, and dA/dalpha = T_final / (1 - alpha), so
+//   dL/dalpha = T cg - (R - k T_final) / (1 - alpha)
+//   h = dL/d ln alpha = w (cg - (R - k T_final) / T').
+// R - k T_final is one number a pixel, `behind`, and with T all that is kept, whatever the number of channels.
 //
-// The variance enters linearly: with V = Σ w f² - S², S = Σ w f, and any constant c (here the features of the tile's
-// first splat, so that large common offsets do not cancel), e = f - c:
-//   g S + v V has dL/dw = (g - 2 v (S - c)) e + v e² + const,  const = c g + v (c² - 2 S c),
-// and a constant channel is the accumulated alpha, whose gradient is const T_final / (1 - alpha).
+// A feature channel f has the sum S = Σ w f, the variance V = Σ w f² - S², g = dL/dS and v = dL/dV. With any constant c
+// (here the features of the tile's first splat, so that large common offsets do not cancel) and e = f - c,
+//   dL/dw = g f + v (f² - 2 S f) = (g - 2 v (S - c)) e + v e² + c g + v (c² - 2 S c).
+// The first two terms are linear in e and e²: two channels, with the cotangents g - 2 v (S - c) and v. The last two are
+// the same for all splats and belong to k.
 #include "kernels.h"
 #include "matrix.h"
 #include "records.h"
@@ -20,7 +32,7 @@ template <class T, bool FEATURES>
 struct ColorTile {
   static constexpr int kChunk = FEATURES ? 64 : 128;
   alignas(64) T px[16][16], py[16][16], transmittance[16][16];
-  alignas(64) T behind[16][16];                                              // R
+  alignas(64) T behind[16][16];                                              // R - k T_final
   alignas(64) T cotangent[16][4][16];                                        // of red, green, blue, depth
   alignas(64) T products[FEATURES ? 16 : 1][FEATURES ? kChunk + 8 : 1][16];  // per granule and splat: first Σ_c e g,
                                                                              // then the weights
@@ -38,12 +50,13 @@ struct BackwardTile : ColorTile<T, (NF > 0)> {
   alignas(64) T by_pixel[16][16][NF ? kRow : 1];    // the same, a row of channels a pixel
 };
 
-// Feature channels of one pixel (COUNT of them, a constant NF but in the last slice) with accumulated alpha a: their
-// cotangents in terms of e = f - shift go to row (e, then e²), what each adds to R to `behind`.
+// Feature channels of one pixel (`count` of them, a constant NF but in the last slice) that begin at `at`, with
+// accumulated alpha a: the cotangents of e, then of e², go to row, what each adds to `behind` to `behind`. shift: c.
 template <class T, int NF, bool VAR, class Count>
-inline void load_pixel_features(int64_t at, Count count, const T *shift, T a, const Outputs<T> &out,
-                                const Cotangents<T> &grad, T *row, T *behind) {
+inline void load_pixel_features(const Pass<T> &pass, int64_t at, Count count, const T *shift, T a, T *row, T *behind) {
   using C = Channels<T, NF>;
+  const Outputs<T> &out = pass.out;
+  const Cotangents<T> &grad = pass.grad;
   const C s = load_channels<NF>(shift, NF), sum = load_channels<NF>(out.features + at, count), e = sum - s * a;
   C g = {};
   if (grad.features) g = load_channels<NF>(grad.features + at, count);
@@ -64,12 +77,13 @@ inline void load_pixel_features(int64_t at, Count count, const T *shift, T a, co
   store_channels(moving - constant * (1 - a), behind, NF);
 }
 
-// Cotangents and R before the first splat of row `row`, `columns` of it inside the image (a constant 16 but at the
-// edge).
+// Cotangents and `behind` before the first splat, where R is over all splats, for row `row` of a tile: from pixel
+// `pixel` of the images on, `columns` of it inside them (a constant 16 but at the edge).
 template <class T, int NF, bool VAR, class Columns, class Count>
-inline void load_row(const Inputs<T> &in, const T *background, int64_t pixel, int row, Columns columns, Slice slice,
-                     Count count, const T *shift, const Outputs<T> &out, const Cotangents<T> &grad,
-                     BackwardTile<T, NF, VAR> &tile) {
+inline void load_row(const Pass<T> &pass, const T *background, int64_t pixel, int row, Columns columns, Slice slice,
+                     Count count, const T *shift, BackwardTile<T, NF, VAR> &tile) {
+  const Outputs<T> &out = pass.out;
+  const Cotangents<T> &grad = pass.grad;
   T constant[16] = {}, behind[16] = {}, cotangent[4][16] = {};
   if (slice.begin == 0) {
     if (grad.alphas)
@@ -92,9 +106,9 @@ inline void load_row(const Inputs<T> &in, const T *background, int64_t pixel, in
   if constexpr (NF > 0) {
     alignas(64) T by_pixel[16][NF] = {}, by_channel[NF][16];
     for (int i = 0; i < columns; ++i)
-      load_pixel_features<T, NF, VAR>((pixel + i) * in.dims + slice.begin, count, shift, out.alphas[pixel + i], out,
-                                      grad, tile.by_pixel[(row >> 2) * 4 + (i >> 2)][(row & 3) * 4 + (i & 3)],
-                                      by_pixel[i]);
+      load_pixel_features<T, NF, VAR>(pass, (pixel + i) * pass.in.dims + slice.begin, count, shift,
+                                      out.alphas[pixel + i],
+                                      tile.by_pixel[(row >> 2) * 4 + (i >> 2)][(row & 3) * 4 + (i & 3)], by_pixel[i]);
     transpose<16, NF>(by_pixel[0], by_channel[0]);
     for (int half = NF / 2; half > 0; half /= 2)
       for (int c = 0; c < half; ++c)
@@ -105,18 +119,18 @@ inline void load_row(const Inputs<T> &in, const T *background, int64_t pixel, in
   for (int c = 0; c < 4; ++c) row_to_granules(cotangent[c], row, [&](int g) { return tile.cotangent[g][c]; });
 }
 
-// (x, y): the 16x16 tile relative to its 64x64 tile at (x0, y0).
 template <class T, int NF, bool VAR>
-void load_tile(const Inputs<T> &in, int camera, int x0, int y0, int x, int y, Slice slice, const T *shift,
-               const Outputs<T> &out, const Cotangents<T> &grad, BackwardTile<T, NF, VAR> &tile) {
+void load_tile(const Pass<T> &pass, const TileList &list, Slice slice, const T *shift, BackwardTile<T, NF, VAR> &tile) {
+  const Inputs<T> &in = pass.in;
+  const int x = list.x0 + list.x, y = list.y0 + list.y;
   T background[3] = {};
-  if (in.background) std::memcpy(background, in.background + 3 * camera, sizeof background);
-  const bool full = x0 + x + 16 <= in.width && y0 + y + 16 <= in.height;
+  if (in.background) std::memcpy(background, in.background + 3 * pass.camera, sizeof background);
+  const bool full = x + 16 <= in.width && y + 16 <= in.height;
   tile.open = 0;
   for (int g = 0; g < 16; ++g) {
-    const uint32_t inside = pixels_inside(x0 + x, y0 + y, g, in.width, in.height);
+    const uint32_t inside = pixels_inside(x, y, g, in.width, in.height);
     tile.open |= static_cast<uint32_t>(inside != 0) << g;
-    granule_pixels(x, y, g, inside, tile.px[g], tile.py[g]);
+    granule_pixels(list.x, list.y, g, inside, tile.px[g], tile.py[g]);
     for (T &t : tile.transmittance[g]) t = 1;
   }
   if (!full) {
@@ -124,23 +138,27 @@ void load_tile(const Inputs<T> &in, int camera, int x0, int y0, int x, int y, Sl
     std::memset(tile.cotangent, 0, sizeof tile.cotangent);
     std::memset(tile.by_pixel, 0, sizeof tile.by_pixel);
   }
-  for (int row = 0; row < 16 && y0 + y + row < in.height; ++row) {
-    const int64_t pixel = (static_cast<int64_t>(camera) * in.height + y0 + y + row) * in.width + x0 + x;
+  for (int row = 0; row < 16 && y + row < in.height; ++row) {
+    const int64_t pixel = (static_cast<int64_t>(pass.camera) * in.height + y + row) * in.width + x;
     if (full && slice.count == NF)
-      load_row(in, background, pixel, row, std::integral_constant<int, 16>(), slice, std::integral_constant<int, NF>(),
-               shift, out, grad, tile);
+      load_row(pass, background, pixel, row, std::integral_constant<int, 16>(), slice,
+               std::integral_constant<int, NF>(), shift, tile);
     else
-      load_row(in, background, pixel, row, std::min(16, in.width - x0 - x), slice, slice.count, shift, out, grad, tile);
+      load_row(pass, background, pixel, row, std::min(16, in.width - x), slice, slice.count, shift, tile);
   }
   if constexpr (NF > 0)
     for (int g = 0; g < 16; ++g)
       transpose<16, BackwardTile<T, NF, VAR>::kRow>(tile.by_pixel[g][0], tile.by_channel[g][0]);
 }
 
-// The sums over pixels that one splat gathers, a lane a pixel.
+// The sums over pixels that one splat gathers, a lane a pixel: numbers [0..9] of its record (records.h). With (dx, dy)
+// from the pixel's centre to the splat's mean and u = dx + k dy (k of the splat, see Projected),
+//   ln alpha = ln opacity - (u² / var_x + dy² / var_y) / 2,
+// so the gradients of mean, var_x, k and var_y are sums of h times u, dy and their products: see picture_gradient.
 template <class T, bool DEPTH>
 struct Moments {
-  Vec<T> h, hu, hy, huu, huy, hyy, rgb[3], z;
+  Vec<T> h, hu, hy, huu, huy, hyy;  // Σ h, Σ h u, Σ h dy, Σ h u², Σ h u dy, Σ h dy²
+  Vec<T> rgb[3], z;                 // Σ w g of red, green, blue and depth
   Moments() {
     const Vec<T> zero(T(0));
     h = hu = hy = huu = huy = hyy = rgb[0] = rgb[1] = rgb[2] = z = zero;
@@ -202,13 +220,12 @@ inline void backward_step(const Splat<T> &s, bool clamps, int g, int lane, T *pr
 
 // Splats [begin, end) of the list that touch an open granule, with their masks; returns how many.
 template <class T, bool FEATURES>
-int list_splats(const Worker<T> &w, int x, int y, const uint32_t *list, int begin, int end,
-                ColorTile<T, FEATURES> &tile) {
+int list_splats(const Worker<T> &w, const TileList &list, int begin, int end, ColorTile<T, FEATURES> &tile) {
   int n = 0;
   for (int j = begin; j < end; ++j) {
-    const Splat<T> &s = w.splats[list[j]];
-    const uint32_t mask = boxes_touched<T, 1>(s, s.x - x, s.y - y) & tile.open;
-    tile.splats[n] = list[j], tile.masks[n] = static_cast<uint16_t>(mask);
+    const Splat<T> &s = w.splats[list.splats[j]];
+    const uint32_t mask = boxes_touched<T, 1>(s, s.x - list.x, s.y - list.y) & tile.open;
+    tile.splats[n] = list.splats[j], tile.masks[n] = static_cast<uint16_t>(mask);
     n += mask != 0;
   }
   return n;
@@ -271,19 +288,18 @@ template <bool DEPTH, class T, bool FEATURES>
 }
 
 template <class T, int NF, bool VAR>
-void backward_tile(Worker<T> &w, bool depth, int x, int y, const uint32_t *list, int n,
-                   BackwardTile<T, NF, VAR> &tile) {
+void backward_tile(Worker<T> &w, bool depth, const TileList &list, BackwardTile<T, NF, VAR> &tile) {
   using Tile = BackwardTile<T, NF, VAR>;
   auto &colors = static_cast<ColorTile<T, (NF > 0)> &>(tile);
-  for (int begin = 0; begin < n && tile.open; begin += Tile::kChunk) {
-    const int count = list_splats(w, x, y, list, begin, n < begin + Tile::kChunk ? n : begin + Tile::kChunk, colors);
+  for (int begin = 0; begin < list.n && tile.open; begin += Tile::kChunk) {
+    const int count = list_splats(w, list, begin, std::min(list.n, begin + Tile::kChunk), colors);
     if constexpr (NF > 0) feature_products<Tile::kRow>(w, count, tile.by_channel[0][0], colors);
     depth ? blend_chunk<true>(w, count, Tile::kRecord, colors) : blend_chunk<false>(w, count, Tile::kRecord, colors);
     if constexpr (NF > 0) feature_gradients<Tile::kRow>(w, tile.by_pixel[0][0], colors);
   }
 }
 
-// Writes one splat's record to its slot: the geometry's moments, then the feature gradient Σ w (g' + 2 v e).
+// Writes one splat's record to its slot: the moments, then the feature gradient dL/df = Σ w (g - 2 v (S - c) + 2 v e).
 template <class T, int NF, bool VAR>
 inline void store_record(const Worker<T> &w, int j, uint64_t slot, Scratch<T> &scratch) {
   using Tile = BackwardTile<T, NF, VAR>;
@@ -298,10 +314,9 @@ inline void store_record(const Worker<T> &w, int j, uint64_t slot, Scratch<T> &s
 }
 
 template <class T, int NF, bool VAR>
-void backward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int index, Slice slice, Scratch<T> &scratch,
-                        Worker<T> &w, const Outputs<T> &out, const Cotangents<T> &grad) {
+void backward_supertile(const Pass<T> &pass, int index, Slice slice, Scratch<T> &scratch, Worker<T> &w) {
   using Tile = BackwardTile<T, NF, VAR>;
-  load_supertile<NF, Tile::kRow>(in, f, index, slice, w);
+  load_supertile<NF, Tile::kRow>(pass.in, pass.frame, index, slice, w);
   if (!w.n) return;
   T shift[NF ? NF : 1] = {};
   for (int c = 0; c < NF; ++c) shift[c] = w.features[c];
@@ -315,42 +330,33 @@ void backward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int 
     }
     std::memset(w.features.data() + static_cast<std::size_t>(w.n) * Tile::kRow, 0, Tile::kRow * sizeof(T));
   }
-  std::memset(w.touched.reserve(w.n), 0, w.n * sizeof(uint16_t));
   w.records.reserve(static_cast<std::size_t>(w.n + 1) * Tile::kRecord);
-  Tile &tile = *reinterpret_cast<Tile *>(w.tile.reserve(sizeof(Tile) / sizeof(T) + 1));
-  const int x0 = index % f.tiles_x * 64, y0 = index / f.tiles_x * 64;
-  for (int q = 0; q < 16; ++q) {
-    const int x = (q & 3) * 16, y = (q >> 2) * 16;
-    if (x0 + x >= in.width || y0 + y >= in.height || !w.counts[q]) continue;
-    load_tile(in, camera, x0, y0, x, y, slice, shift, out, grad, tile);
-    backward_tile(w, grad.depths != nullptr, x, y, w.lists.data() + q * static_cast<std::size_t>(w.stride), w.counts[q],
-                  tile);
-  }
-  for_each_slot(f, index, w, scratch, kGeometry + NF,
+  for_each_tile<Tile>(pass.in, pass.frame, index, w, [&](const TileList &list, Tile &tile) {
+    if (!list.n) return;
+    load_tile(pass, list, slice, shift, tile);
+    backward_tile(w, pass.grad.depths != nullptr, list, tile);
+  });
+  for_each_slot(pass.frame, index, w, scratch, kGeometry + NF,
                 [&](int j, uint64_t slot) { store_record<T, NF, VAR>(w, j, slot, scratch); });
 }
 
 }  // namespace
 
 template <class T>
-void backward(const Inputs<T> &in, int camera, const Options &opt, const Frame<T> &f, Slice slice, TileRange range,
-              Scratch<T> &scratch, const Outputs<T> &out, const Cotangents<T> &grad) {
-  with_shape<T>(slice, opt.variance, [&](auto width, auto variance) {
-    parallel_for(opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
+void backward(const Pass<T> &pass, Slice slice, TileRange range, Scratch<T> &scratch) {
+  const Frame<T> &f = pass.frame;
+  with_shape<T>(slice, pass.opt.variance, [&](auto width, auto variance) {
+    parallel_for(pass.opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
       const int tile = f.tile_order[i];
       if (tile < range.begin || tile >= range.end) return;
-      backward_supertile<T, width(), variance()>(in, camera, f, tile, slice, scratch, scratch.workers[worker], out,
-                                                 grad);
+      backward_supertile<T, width(), variance()>(pass, tile, slice, scratch, scratch.workers[worker]);
     });
   });
 }
 
-#define INSTANTIATE(T)                                                                                              \
-  template void backward(const Inputs<T> &, int, const Options &, const Frame<T> &, Slice, TileRange, Scratch<T> &, \
-                         const Outputs<T> &, const Cotangents<T> &);
-INSTANTIATE(float)
+template void backward(const Pass<float> &, Slice, TileRange, Scratch<float> &);
 #ifdef PERCEPTION_LEVEL_baseline
-INSTANTIATE(double)
+template void backward(const Pass<double> &, Slice, TileRange, Scratch<double> &);
 #endif
 
 }  // namespace perception::PERCEPTION_LEVEL

@@ -67,7 +67,7 @@ struct Arguments {
   Array<const T> viewmats, Ks;
   Optional<const T> background;
   int width, height, sh_degree;
-  T near_plane, eps2d;
+  double near_plane, eps2d;
   int threads;
   bool depth, variance;
   int64_t max_records;
@@ -81,7 +81,8 @@ struct Arguments {
     if (n >= INT32_MAX) throw std::invalid_argument("means: too many Gaussians");
     if (width < 1 || height < 1 || width > 1 << 20 || height > 1 << 20)
       throw std::invalid_argument("width, height: expected 1 to 1048576 pixels");
-    if (!(eps2d >= T(0.01) && eps2d <= T(1e4))) throw std::invalid_argument("eps2d: expected 0.01 to 10000 px²");
+    in.near_plane = static_cast<T>(near_plane), in.eps2d = static_cast<T>(eps2d);
+    if (!(in.eps2d >= T(0.01) && in.eps2d <= T(1e4))) throw std::invalid_argument("eps2d: expected 0.01 to 10000 px²");
     if (sh_degree > 3) throw std::invalid_argument("sh_degree: expected at most 3");
     in.means = checked("means", means, {n, 3}), in.quats = checked("quats", quats, {n, 4});
     in.scales = checked("scales", scales, {n, 3}), in.opacities = checked("opacities", opacities, {n});
@@ -105,7 +106,7 @@ struct Arguments {
       if (!(in.Ks[9 * i] != 0 && in.Ks[9 * i + 4] != 0))
         throw std::invalid_argument("Ks[" + std::to_string(i) + "]: a focal length is 0");
     in.background = checked("background", background, {c, 3});
-    in.width = width, in.height = height, in.near_plane = near_plane, in.eps2d = eps2d;
+    in.width = width, in.height = height;
     return in;
   }
   perception::Options options(const perception::Inputs<T> &in) const {
@@ -119,14 +120,49 @@ template <class T>
 struct Images {
   Array<T> colors, alphas;
   Optional<T> depths, features, variance;
-  void fill(const perception::Inputs<T> &in, const perception::Options &opt, perception::Outputs<T> &out) {
+
+  perception::Outputs<T> outputs(const perception::Inputs<T> &in, const perception::Options &opt) {
     const int64_t c = in.cameras, h = in.height, w = in.width;
+    perception::Outputs<T> out{};
     out.colors = checked("out colors", colors, {c, h, w, 3}), out.alphas = checked("out alphas", alphas, {c, h, w});
     out.depths = checked("out depths", depths, {c, h, w});
     out.features = checked("out features", features, {c, h, w, in.dims});
     out.variance = checked("out feature_variance", variance, {c, h, w, in.dims});
     if (opt.variance && !(out.features && out.variance))
       throw std::invalid_argument("features and feature_variance need outputs");
+    return out;
+  }
+};
+
+template <class T>
+struct Cotangents {
+  Optional<const T> colors, alphas, depths, features, variance;
+
+  perception::Cotangents<T> checked_for(const perception::Inputs<T> &in) {
+    const int64_t c = in.cameras, h = in.height, w = in.width, d = in.dims;
+    return {checked("colors' gradient", colors, {c, h, w, 3}), checked("alphas' gradient", alphas, {c, h, w}),
+            checked("depths' gradient", depths, {c, h, w}), checked("features' gradient", features, {c, h, w, d}),
+            checked("feature_variance's gradient", variance, {c, h, w, d})};
+  }
+};
+
+template <class T>
+struct Gradients {
+  Optional<T> means, quats, scales, opacities, colors, features, viewmats, mean2d;
+
+  perception::Gradients<T> checked_for(const perception::Inputs<T> &in, bool stored) {
+    const int64_t n = in.n, c = in.cameras;
+    const std::vector<int64_t> color_shape =
+        in.sh_degree < 0 ? std::vector<int64_t>{n, 3} : std::vector<int64_t>{n, in.sh_stride, 3};
+    return {checked("out means", means, {n, 3}),
+            checked("out quats", quats, {n, 4}),
+            checked("out scales", scales, {n, 3}),
+            checked("out opacities", opacities, {n}),
+            checked("out colors", colors, color_shape),
+            checked("out features", features, {n, in.dims}),
+            checked("out viewmats", viewmats, {c, 4, 4}),
+            checked("out mean2d", mean2d, {c, n, 2}),
+            stored};
   }
 };
 
@@ -136,13 +172,12 @@ void throw_if(const perception::NonFinite &bad) {
 }
 
 template <class T>
-std::unique_ptr<Handle<T>> forward(Arguments<T> &a, Images<T> images, Array<uint8_t> visible, Optional<T> radii,
+std::unique_ptr<Handle<T>> forward(Arguments<T> &a, Images<T> &images, Array<uint8_t> visible, Optional<T> radii,
                                    const std::string &simd) {
   const perception::Inputs<T> in = a.inputs();
   const perception::Options opt = a.options(in);
   const Level level = perception::parse_level(simd);
-  perception::Outputs<T> out{};
-  images.fill(in, opt, out);
+  perception::Outputs<T> out = images.outputs(in, opt);
   if (in.dims && !out.features) throw std::invalid_argument("features need an output");
   out.visible = checked("out visible", visible, {in.cameras, in.n});
   out.radii = checked("out radii", radii, {in.cameras, in.n});
@@ -184,38 +219,19 @@ void label(Arguments<T> &a, Array<const int32_t> labels, double least, Array<int
 }
 
 template <class T>
-void backward(Arguments<T> &a, Handle<T> &handle, Images<T> images, Optional<const T> g_colors,
-              Optional<const T> g_alphas, Optional<const T> g_depths, Optional<const T> g_features,
-              Optional<const T> g_variance, Optional<T> means, Optional<T> quats, Optional<T> scales,
-              Optional<T> opacities, Optional<T> colors, Optional<T> features, Optional<T> viewmats,
-              Optional<T> mean2d, bool stored) {
+void backward(Arguments<T> &a, Handle<T> &handle, Images<T> &images, Cotangents<T> &cotangents,
+              Gradients<T> &gradients, bool stored) {
   const perception::Inputs<T> in = a.inputs();
   const perception::Options opt = a.options(in);
   const perception::Frames<T> *frames = handle.frames.get();
   if (!frames || static_cast<int64_t>(frames->cameras.size()) != in.cameras || frames->n != in.n ||
       frames->width != in.width || frames->height != in.height)
     throw std::invalid_argument("frames: not of inputs with as many Gaussians, cameras and pixels");
-  const int64_t n = in.n, c = in.cameras, h = in.height, w = in.width, d = in.dims;
-  perception::Outputs<T> out{};
-  images.fill(in, opt, out);
-  if (stored && c != 1) throw std::invalid_argument("stored: expected one camera");
-  perception::Cotangents<T> grad{};
-  grad.colors = checked("colors' gradient", g_colors, {c, h, w, 3});
-  grad.alphas = checked("alphas' gradient", g_alphas, {c, h, w});
-  grad.depths = checked("depths' gradient", g_depths, {c, h, w});
+  if (stored && in.cameras != 1) throw std::invalid_argument("stored: expected one camera");
+  const perception::Outputs<T> out = images.outputs(in, opt);
+  const perception::Cotangents<T> grad = cotangents.checked_for(in);
   if (opt.depth && grad.depths && !out.depths) throw std::invalid_argument("depths: missing, their gradient is given");
-  grad.features = checked("features' gradient", g_features, {c, h, w, d});
-  grad.variance = checked("feature_variance's gradient", g_variance, {c, h, w, d});
-  perception::Gradients<T> result{};
-  result.means = checked("out means", means, {n, 3}), result.quats = checked("out quats", quats, {n, 4});
-  result.scales = checked("out scales", scales, {n, 3}), result.opacities = checked("out opacities", opacities, {n});
-  const std::vector<int64_t> color_shape =
-      in.sh_degree < 0 ? std::vector<int64_t>{n, 3} : std::vector<int64_t>{n, in.sh_stride, 3};
-  result.colors = checked("out colors", colors, color_shape);
-  result.features = checked("out features", features, {n, d});
-  result.viewmats = checked("out viewmats", viewmats, {c, 4, 4});
-  result.mean2d = checked("out mean2d", mean2d, {c, n, 2});
-  result.stored = stored;
+  const perception::Gradients<T> result = gradients.checked_for(in, stored);
   if (in.dims && !out.features && !(result.features_alone() && !opt.variance))
     throw std::invalid_argument("features: missing, gradients need them");
   nb::gil_scoped_release release;
@@ -225,69 +241,36 @@ void backward(Arguments<T> &a, Handle<T> &handle, Images<T> images, Optional<con
 template <class T>
 void bind(nb::module_ &m, const char *suffix) {
   auto name = [suffix](const char *base) { return std::string(base) + suffix; };
+  auto arg = [](const char *of) { return nb::arg(of).noconvert(); };
   nb::class_<Handle<T>>(m, name("RasterizerFrames").c_str(), "What a backward call needs of its forward call.")
       .def_prop_ro("evaluated", [](const Handle<T> &h) { return h.frames->stats.evaluated; })
       .def_prop_ro("contributing", [](const Handle<T> &h) { return h.frames->stats.contributing; })
       .def_prop_ro("seconds", [](const Handle<T> &h) { return stage_seconds(h.frames->stats); });
   nb::class_<Arguments<T>>(m, name("RasterizerInputs").c_str())
-      .def(
-          "__init__",
-          [](Arguments<T> *self, Array<const T> means, Array<const T> quats, Array<const T> scales,
-             Array<const T> opacities, Array<const T> colors, Optional<const T> features, Array<const T> viewmats,
-             Array<const T> Ks, Optional<const T> background, int width, int height, int sh_degree, double near_plane,
-             double eps2d, int threads, bool depth, bool variance, int64_t max_records) {
-            new (self) Arguments<T>{means,
-                                    quats,
-                                    scales,
-                                    opacities,
-                                    colors,
-                                    features,
-                                    viewmats,
-                                    Ks,
-                                    background,
-                                    width,
-                                    height,
-                                    sh_degree,
-                                    static_cast<T>(near_plane),
-                                    static_cast<T>(eps2d),
-                                    threads,
-                                    depth,
-                                    variance,
-                                    max_records};
-          },
-          "means"_a.noconvert(), "quats"_a.noconvert(), "scales"_a.noconvert(), "opacities"_a.noconvert(),
-          "colors"_a.noconvert(), "features"_a.noconvert().none(), "viewmats"_a.noconvert(), "Ks"_a.noconvert(),
-          "background"_a.noconvert().none(), "width"_a, "height"_a, "sh_degree"_a, "near_plane"_a, "eps2d"_a,
-          "threads"_a, "depth"_a, "variance"_a, "max_records"_a);
-  m.def(
-      name("rasterize_forward").c_str(),
-      [](Arguments<T> &inputs, Array<T> colors, Array<T> alphas, Optional<T> depths, Optional<T> features,
-         Optional<T> variance, Array<uint8_t> visible, Optional<T> radii, const std::string &simd) {
-        return forward<T>(inputs, {colors, alphas, depths, features, variance}, visible, radii, simd);
-      },
-      "inputs"_a, "colors"_a.noconvert(), "alphas"_a.noconvert(), "depths"_a.noconvert().none(),
-      "features"_a.noconvert().none(), "variance"_a.noconvert().none(), "visible"_a.noconvert(),
-      "radii"_a.noconvert().none(), "simd"_a);
+      .def(nb::init<Array<const T>, Array<const T>, Array<const T>, Array<const T>, Array<const T>, Optional<const T>,
+                    Array<const T>, Array<const T>, Optional<const T>, int, int, int, double, double, int, bool, bool,
+                    int64_t>(),
+           arg("means"), arg("quats"), arg("scales"), arg("opacities"), arg("colors"), arg("features").none(),
+           arg("viewmats"), arg("Ks"), arg("background").none(), "width"_a, "height"_a, "sh_degree"_a, "near_plane"_a,
+           "eps2d"_a, "threads"_a, "depth"_a, "variance"_a, "max_records"_a);
+  nb::class_<Images<T>>(m, name("RasterizerImages").c_str())
+      .def(nb::init<Array<T>, Array<T>, Optional<T>, Optional<T>, Optional<T>>(), arg("colors"), arg("alphas"),
+           arg("depths").none(), arg("features").none(), arg("feature_variance").none());
+  nb::class_<Cotangents<T>>(m, name("RasterizerCotangents").c_str())
+      .def(nb::init<Optional<const T>, Optional<const T>, Optional<const T>, Optional<const T>, Optional<const T>>(),
+           arg("colors").none(), arg("alphas").none(), arg("depths").none(), arg("features").none(),
+           arg("feature_variance").none());
+  nb::class_<Gradients<T>>(m, name("RasterizerGradients").c_str())
+      .def(nb::init<Optional<T>, Optional<T>, Optional<T>, Optional<T>, Optional<T>, Optional<T>, Optional<T>,
+                    Optional<T>>(),
+           arg("means").none(), arg("quats").none(), arg("scales").none(), arg("opacities").none(),
+           arg("colors").none(), arg("features").none(), arg("viewmats").none(), arg("mean2d").none());
+  m.def(name("rasterize_forward").c_str(), &forward<T>, "inputs"_a, "images"_a, arg("visible"), arg("radii").none(),
+        "simd"_a);
   m.def(name("rasterize_labels").c_str(), &label<T>, "inputs"_a, "labels"_a.noconvert(), "least"_a,
         "images"_a.noconvert(), "visible"_a.noconvert(), "simd"_a);
-  m.def(
-      name("rasterize_backward").c_str(),
-      [](Arguments<T> &inputs, Handle<T> &frames, Array<T> colors, Array<T> alphas, Optional<T> depths,
-         Optional<T> features, Optional<T> variance, Optional<const T> g_colors, Optional<const T> g_alphas,
-         Optional<const T> g_depths, Optional<const T> g_features, Optional<const T> g_variance, Optional<T> d_means,
-         Optional<T> d_quats, Optional<T> d_scales, Optional<T> d_opacities, Optional<T> d_colors,
-         Optional<T> d_features, Optional<T> d_viewmats, Optional<T> d_mean2d, bool stored) {
-        backward<T>(inputs, frames, {colors, alphas, depths, features, variance}, g_colors, g_alphas, g_depths,
-                    g_features, g_variance, d_means, d_quats, d_scales, d_opacities, d_colors, d_features, d_viewmats,
-                    d_mean2d, stored);
-      },
-      "inputs"_a, "frames"_a, "colors"_a.noconvert(), "alphas"_a.noconvert(), "depths"_a.noconvert().none(),
-      "features"_a.noconvert().none(), "variance"_a.noconvert().none(), "g_colors"_a.noconvert().none(),
-      "g_alphas"_a.noconvert().none(), "g_depths"_a.noconvert().none(), "g_features"_a.noconvert().none(),
-      "g_variance"_a.noconvert().none(), "d_means"_a.noconvert().none(), "d_quats"_a.noconvert().none(),
-      "d_scales"_a.noconvert().none(), "d_opacities"_a.noconvert().none(), "d_colors"_a.noconvert().none(),
-      "d_features"_a.noconvert().none(), "d_viewmats"_a.noconvert().none(), "d_mean2d"_a.noconvert().none(),
-      "stored"_a = false);
+  m.def(name("rasterize_backward").c_str(), &backward<T>, "inputs"_a, "frames"_a, "images"_a, "cotangents"_a,
+        "gradients"_a, "stored"_a);
 }
 
 }  // namespace

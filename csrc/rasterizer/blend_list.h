@@ -17,16 +17,15 @@ struct ColorTile {
   alignas(64) T weights[FEATURES ? kChunk + 8 : 1][16];
 };
 
-// Nothing blended yet. (x, y): the 16x16 tile relative to its 64x64 tile at (x0, y0). Returns the granules with a pixel
-// in the image.
+// Nothing blended yet. Returns the granules with a pixel in the image.
 template <class T, bool FEATURES>
-uint32_t start_tile(const Inputs<T> &in, int x0, int y0, int x, int y, ColorTile<T, FEATURES> &tile) {
+uint32_t start_tile(const Inputs<T> &in, const TileList &list, ColorTile<T, FEATURES> &tile) {
   std::memset(tile.colors, 0, sizeof tile.colors);
   uint32_t open = 0;
   for (int g = 0; g < 16; ++g) {
-    const uint32_t inside = pixels_inside(x0 + x, y0 + y, g, in.width, in.height);
+    const uint32_t inside = pixels_inside(list.x0 + list.x, list.y0 + list.y, g, in.width, in.height);
     open |= static_cast<uint32_t>(inside != 0) << g;
-    granule_pixels(x, y, g, inside, tile.px[g], tile.py[g]);
+    granule_pixels(list.x, list.y, g, inside, tile.px[g], tile.py[g]);
     for (T &t : tile.transmittance[g]) t = 1;
   }
   return open;
@@ -74,31 +73,28 @@ template <bool DEPTH, class T, bool FEATURES>
   return open;
 }
 
-// Masks of the granules that splats [begin, end) of the list touch, appended to the granules' lists.
-template <class T>
-void list_granules(const Worker<T> &w, int x, int y, const uint32_t *list, int begin, int end, uint32_t *lists,
-                   int stride, uint32_t *counts) {
-  std::memset(counts, 0, 16 * sizeof *counts);
+// Appends splats [begin, end) of the tile's list to the lists of the granules that they touch.
+template <class T, bool FEATURES>
+void list_granules(const Worker<T> &w, const TileList &list, int begin, int end, ColorTile<T, FEATURES> &tile) {
+  std::memset(tile.counts, 0, sizeof tile.counts);
   for (int i = begin; i < end; i += 16) {
     uint16_t masks[16] = {};
     for (int j = 0; j < 16 && i + j < end; ++j) {
-      const Splat<T> &s = w.splats[list[i + j]];
-      masks[j] = static_cast<uint16_t>(boxes_touched<T, 1>(s, s.x - x, s.y - y));
+      const Splat<T> &s = w.splats[list.splats[i + j]];
+      masks[j] = static_cast<uint16_t>(boxes_touched<T, 1>(s, s.x - list.x, s.y - list.y));
     }
-    append_to_lists(masks, list + i, lists, stride, counts);
+    append_to_lists(masks, list.splats + i, tile.lists[0], sizeof tile.lists[0] / sizeof(uint32_t), tile.counts);
   }
 }
 
 // Blends a tile's list chunk by chunk; body(g, count) when tile.lists[g] holds granule g's `count` splats of the chunk
-// and, with FEATURES, tile.weights their weights. (x, y): the tile relative to its 64x64 tile. open: granules with a
-// pixel in the image.
+// and, with FEATURES, tile.weights their weights. open: granules with a pixel in the image.
 template <class T, bool FEATURES, class Body>
-inline void blend_tile(Worker<T> &w, bool depth, int x, int y, const uint32_t *list, int n, uint32_t open,
-                       ColorTile<T, FEATURES> &tile, Body &&body) {
+inline void blend_tile(Worker<T> &w, bool depth, const TileList &list, uint32_t open, ColorTile<T, FEATURES> &tile,
+                       Body &&body) {
   constexpr int kChunk = ColorTile<T, FEATURES>::kChunk;
-  for (int begin = 0; begin < n && open; begin += kChunk) {
-    list_granules(w, x, y, list, begin, n < begin + kChunk ? n : begin + kChunk, tile.lists[0], kChunk + 32,
-                  tile.counts);
+  for (int begin = 0; begin < list.n && open; begin += kChunk) {
+    list_granules(w, list, begin, std::min(list.n, begin + kChunk), tile);
     for (uint32_t rest = open; rest; rest &= rest - 1) {
       const int g = __builtin_ctz(rest), count = static_cast<int>(tile.counts[g]);
       if (!count) continue;

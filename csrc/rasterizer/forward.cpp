@@ -1,5 +1,8 @@
-// Stage 4: front-to-back blending. Granule by granule, so that a granule's state stays in registers while its list
-// of splats runs by; feature channels follow as a product of the kept weights with the splats' feature rows.
+// Stage 4: front-to-back blending. With the opacity alpha_i of splat i at a pixel, the transmittance in front of it
+// T_i = Π_{j<i} (1 - alpha_j), its weight w_i = alpha_i T_i and its value x_i in a channel, the image holds
+//   Σ w_i x_i + T_final background,   A = Σ w_i = 1 - T_final,   Var = Σ w_i f_i² - (Σ w_i f_i)²  (features f).
+// Granule by granule, so that a granule's state stays in registers while its list of splats runs by; feature channels
+// follow as a product of the kept weights with the splats' feature rows.
 #include "blend_list.h"
 #include "matrix.h"
 
@@ -9,9 +12,9 @@ namespace {
 template <class T, int NF, bool VAR>
 struct ForwardTile : ColorTile<T, (NF > 0)> {
   static constexpr int kRow = kFeatureRow<T, NF, VAR>;
-  alignas(64) T features[16][NF ? 16 : 1][kRow ? kRow : 1];  // a row a pixel
-  T shift[16][NF ? NF : 1];
-  alignas(64) T rows[NF ? ColorTile<T, (NF > 0)>::kChunk : 1][kRow ? kRow : 1];
+  alignas(64) T features[16][NF ? 16 : 1][kRow ? kRow : 1];  // Σ w e, then Σ w e²: a row a pixel
+  T shift[16][NF ? NF : 1];                                  // of a granule, e = f - shift: its first splat's features
+  alignas(64) T rows[NF ? ColorTile<T, (NF > 0)>::kChunk : 1][kRow ? kRow : 1];  // e, then e²: a row a splat
 };
 
 // Adds granule g's list to its pixels' feature sums.
@@ -29,13 +32,12 @@ inline void blend_features(const T *features, int n, int g, ForwardTile<T, NF, V
   add_weighted_rows<kFeatureRow<T, NF, VAR>>(tile.weights[0], tile.rows[0], n, tile.features[g][0]);
 }
 
-// (x, y): the 16x16 tile relative to its 64x64 tile. open: granules with a pixel in the image.
+// open: granules with a pixel in the image.
 template <class T, int NF, bool VAR>
-void forward_tile(Worker<T> &w, bool depth, int x, int y, const uint32_t *list, int n, uint32_t open,
-                  ForwardTile<T, NF, VAR> &tile) {
+void forward_tile(Worker<T> &w, bool depth, const TileList &list, uint32_t open, ForwardTile<T, NF, VAR> &tile) {
   uint32_t fresh = 0xffff;  // granules that have no shift yet
   auto &colors = static_cast<ColorTile<T, (NF > 0)> &>(tile);
-  blend_tile(w, depth, x, y, list, n, open, colors, [&]([[maybe_unused]] int g, [[maybe_unused]] int count) {
+  blend_tile(w, depth, list, open, colors, [&]([[maybe_unused]] int g, [[maybe_unused]] int count) {
     if constexpr (NF > 0) {
       if (fresh >> g & 1)
         std::memcpy(tile.shift[g], w.features.data() + static_cast<std::size_t>(tile.lists[g][0]) * NF, NF * sizeof(T));
@@ -45,8 +47,8 @@ void forward_tile(Worker<T> &w, bool depth, int x, int y, const uint32_t *list, 
   });
 }
 
-// Feature sums and variances of one pixel, from the sums about a shift: with the mean m and the centred second moment
-// M2 of the weighted features, Var = Σ w f² - (Σ w f)² = M2 + A (1 - A) m², both terms non-negative.
+// Feature sums and variances of one pixel from those of e = f - shift, [Σ w e, Σ w e²] in `sums`; t: T_final. With the
+// mean m = Σ w f / A and the second moment about it, M2 = Σ w (f - m)², Var = M2 + A (1 - A) m²: no term is negative.
 template <class T, int NF, bool VAR, class Count>
 inline void write_features(const T *sums, const T *shift, T t, Count count, T *features, T *variance) {
   const T a = 1 - t;
@@ -84,56 +86,53 @@ inline void write_row(const Inputs<T> &in, const T *background, int64_t pixel, i
     }
 }
 
+// (x, y): of the tile in the image.
 template <class T, int NF, bool VAR>
-void write_tile(const Inputs<T> &in, int camera, int x, int y, Slice slice, const ForwardTile<T, NF, VAR> &tile,
-                const Outputs<T> &out) {
+void write_tile(const Pass<T> &pass, int x, int y, Slice slice, const ForwardTile<T, NF, VAR> &tile) {
+  const Inputs<T> &in = pass.in;
   T background[3] = {};
-  if (in.background) std::memcpy(background, in.background + 3 * camera, sizeof background);
+  if (in.background) std::memcpy(background, in.background + 3 * pass.camera, sizeof background);
   for (int row = 0; row < 16 && y + row < in.height; ++row) {
-    const int64_t pixel = (static_cast<int64_t>(camera) * in.height + y + row) * in.width + x;
+    const int64_t pixel = (static_cast<int64_t>(pass.camera) * in.height + y + row) * in.width + x;
     if (x + 16 <= in.width && slice.count == NF)
       write_row(in, background, pixel, row, std::integral_constant<int, 16>(), slice, std::integral_constant<int, NF>(),
-                tile, out);
+                tile, pass.out);
     else
-      write_row(in, background, pixel, row, std::min(16, in.width - x), slice, slice.count, tile, out);
+      write_row(in, background, pixel, row, std::min(16, in.width - x), slice, slice.count, tile, pass.out);
   }
 }
 
 template <class T, int NF, bool VAR>
-void forward_supertile(const Inputs<T> &in, int camera, const Frame<T> &f, int index, Slice slice, bool depth,
-                       Worker<T> &w, const Outputs<T> &out) {
+void forward_supertile(const Pass<T> &pass, int index, Slice slice, Worker<T> &w) {
   using Tile = ForwardTile<T, NF, VAR>;
-  load_supertile<NF, NF>(in, f, index, slice, w);
-  for_each_tile<Tile>(in, f, index, w, [&](int x0, int y0, int x, int y, const uint32_t *list, int n, Tile &tile) {
+  load_supertile<NF, NF>(pass.in, pass.frame, index, slice, w);
+  for_each_tile<Tile>(pass.in, pass.frame, index, w, [&](const TileList &list, Tile &tile) {
     std::memset(tile.shift, 0, sizeof tile.shift);
     if constexpr (NF > 0) std::memset(tile.features, 0, sizeof tile.features);
-    const uint32_t open = start_tile(in, x0, y0, x, y, tile);
-    forward_tile(w, depth, x, y, list, n, open, tile);
-    write_tile(in, camera, x0 + x, y0 + y, slice, tile, out);
+    const uint32_t open = start_tile(pass.in, list, tile);
+    forward_tile(w, pass.opt.depth, list, open, tile);
+    write_tile(pass, list.x0 + list.x, list.y0 + list.y, slice, tile);
   });
+  uint8_t *visible = pass.out.visible + pass.in.n * pass.camera;
   for (int j = 0; j < w.n; ++j)
-    if (w.touched[j]) __atomic_store_n(&out.visible[in.n * camera + w.splats[j].id], 1, __ATOMIC_RELAXED);
+    if (w.touched[j]) __atomic_store_n(&visible[w.splats[j].id], 1, __ATOMIC_RELAXED);
 }
 
 }  // namespace
 
 template <class T>
-void forward(const Inputs<T> &in, int camera, const Options &opt, const Frame<T> &f, Slice slice, Scratch<T> &scratch,
-             const Outputs<T> &out) {
-  with_shape<T>(slice, opt.variance, [&](auto width, auto variance) {
-    parallel_for(opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
-      forward_supertile<T, width(), variance()>(in, camera, f, f.tile_order[i], slice, opt.depth,
-                                                scratch.workers[worker], out);
+void forward(const Pass<T> &pass, Slice slice, Scratch<T> &scratch) {
+  const Frame<T> &f = pass.frame;
+  with_shape<T>(slice, pass.opt.variance, [&](auto width, auto variance) {
+    parallel_for(pass.opt.threads, f.tiles_x * f.tiles_y, [&](std::size_t i, int worker) {
+      forward_supertile<T, width(), variance()>(pass, f.tile_order[i], slice, scratch.workers[worker]);
     });
   });
 }
 
-#define INSTANTIATE(T)                                                                                  \
-  template void forward(const Inputs<T> &, int, const Options &, const Frame<T> &, Slice, Scratch<T> &, \
-                        const Outputs<T> &);
-INSTANTIATE(float)
+template void forward(const Pass<float> &, Slice, Scratch<float> &);
 #ifdef PERCEPTION_LEVEL_baseline
-INSTANTIATE(double)
+template void forward(const Pass<double> &, Slice, Scratch<double> &);
 #endif
 
 }  // namespace perception::PERCEPTION_LEVEL

@@ -15,6 +15,17 @@ struct Slice {
   bool alone = false;
 };
 
+// One camera of one call, as every kernel is given it.
+template <class T>
+struct Pass {
+  const Inputs<T> &in;
+  const Options &opt;
+  int camera;
+  const Frame<T> &frame;    // the camera's splats and tiles
+  const Outputs<T> &out;    // written by the forward pass, read by the backward pass
+  Cotangents<T> grad = {};  // of the backward pass
+};
+
 // Width of the kernel that a slice goes through.
 template <class T>
 constexpr int slice_width(Slice slice) {
@@ -56,22 +67,18 @@ inline __attribute__((always_inline)) void with_shape(Slice slice, bool variance
   uint32_t project(const Inputs<T> &, const Frame<T> &, int64_t begin, int64_t end, bool check, DepthKey<T> *keys, \
                    T *radii, int64_t &bad);                                                                        \
   template <class T>                                                                                               \
-  void forward(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Slice, Scratch<T> &,              \
-               const Outputs<T> &);                                                                                \
+  void forward(const Pass<T> &, Slice, Scratch<T> &);                                                              \
   template <class T>                                                                                               \
-  void backward(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Slice, TileRange, Scratch<T> &,  \
-                const Outputs<T> &, const Cotangents<T> &);                                                        \
+  void backward(const Pass<T> &, Slice, TileRange, Scratch<T> &);                                                  \
   template <class T>                                                                                               \
-  void backward_features(const Inputs<T> &, int camera, const Options &, const Frame<T> &, Slice, TileRange,       \
-                         Scratch<T> &, const Outputs<T> &, const Cotangents<T> &);                                 \
+  void backward_features(const Pass<T> &, Slice, TileRange, Scratch<T> &);                                         \
   template <class T>                                                                                               \
   void label_pixels(const Inputs<T> &, const Options &, const Frame<T> &, const Labels &, Scratch<T> &,            \
                     uint8_t *visible);                                                                             \
   template <class T>                                                                                               \
   void add_records(const Options &, const Frame<T> &, int size, Scratch<T> &);                                     \
   template <class T>                                                                                               \
-  void reduce(const Inputs<T> &, const Options &, const Frame<T> &, int camera, Slice, int size, Scratch<T> &,     \
-              const Gradients<T> &);
+  void reduce(const Pass<T> &, Slice, Scratch<T> &, const Gradients<T> &);
 
 PERCEPTION_DECLARE_LEVELS(PERCEPTION_RASTERIZER_KERNELS)
 

@@ -1,5 +1,5 @@
-// Every pixel's label of largest weight, for several labellings of the Gaussians at once. A label's weight in a pixel is
-// the sum of the weights of its Gaussians there, so one pass serves any number of labels.
+// Every pixel's label of largest weight, for several labellings of the Gaussians at once. A label's weight in a pixel
+// is the sum of the weights of its Gaussians there, so one pass serves any number of labels.
 #include "blend_list.h"
 #include "matrix.h"
 
@@ -30,25 +30,25 @@ Slots load_labels(const Labels &labels, int64_t n, Worker<T> &w) {
 
 // Numbers the labels of the tile's list in the order in which they appear.
 template <class T>
-void number_labels(const Labels &labels, const Worker<T> &w, const uint32_t *list, int n, Slots &slots) {
+void number_labels(const Labels &labels, const Worker<T> &w, const TileList &list, Slots &slots) {
   int used = 0;
   for (int l = 0; l < labels.count; ++l) {
     slots.begin[l] = used;
     std::memset(slots.slot, -1, labels.most * sizeof(int32_t));
-    for (int i = 0; i < n; ++i) {
-      const int32_t label = slots.own[l * w.n + list[i]];
+    for (int i = 0; i < list.n; ++i) {
+      const int32_t label = slots.own[l * w.n + list.splats[i]];
       if (label >= 0 && slots.slot[label] < 0) slots.slot[label] = used, slots.name[used++] = label;
-      slots.place[l * w.n + list[i]] = label < 0 ? -1 : slots.slot[label];
+      slots.place[l * w.n + list.splats[i]] = label < 0 ? -1 : slots.slot[label];
     }
   }
   slots.begin[labels.count] = used;
 }
 
-// (x, y): the 16x16 tile relative to its 64x64 tile. open: granules with a pixel in the image. sums: [slots, 16, 16].
+// open: granules with a pixel in the image. sums: [slots, 16, 16].
 template <class T>
-void sum_weights(const Labels &labels, Worker<T> &w, int x, int y, const uint32_t *list, int n, uint32_t open,
-                 const Slots &slots, ColorTile<T, true> &tile, T *sums) {
-  blend_tile(w, false, x, y, list, n, open, tile, [&](int g, int count) {
+void sum_weights(const Labels &labels, Worker<T> &w, const TileList &list, uint32_t open, const Slots &slots,
+                 ColorTile<T, true> &tile, T *sums) {
+  blend_tile(w, false, list, open, tile, [&](int g, int count) {
     for (int k = 0; k < count; ++k) {
       const auto weights = load_channels<16>(tile.weights[k], 16);
       for (int l = 0; l < labels.count; ++l) {
@@ -89,14 +89,14 @@ void label_supertile(const Inputs<T> &in, const Frame<T> &f, int index, const La
   using Tile = ColorTile<T, true>;
   load_supertile<0, 0>(in, f, index, Slice{0, 0, false}, w);
   Slots slots = load_labels(labels, in.n, w);
-  for_each_tile<Tile>(in, f, index, w, [&](int x0, int y0, int x, int y, const uint32_t *list, int n, Tile &tile) {
-    number_labels(labels, w, list, n, slots);
+  for_each_tile<Tile>(in, f, index, w, [&](const TileList &list, Tile &tile) {
+    number_labels(labels, w, list, slots);
     const std::size_t size = static_cast<std::size_t>(slots.begin[labels.count]) * kPixels;
     T *sums = w.records.reserve(size + 1);
     std::memset(sums, 0, size * sizeof(T));
-    const uint32_t open = start_tile(in, x0, y0, x, y, tile);
-    sum_weights(labels, w, x, y, list, n, open, slots, tile, sums);
-    write_labels(in, labels, x0 + x, y0 + y, slots, sums);
+    const uint32_t open = start_tile(in, list, tile);
+    sum_weights(labels, w, list, open, slots, tile, sums);
+    write_labels(in, labels, list.x0 + list.x, list.y0 + list.y, slots, sums);
   });
   for (int j = 0; j < w.n; ++j)
     if (w.touched[j]) __atomic_store_n(&visible[w.splats[j].id], 1, __ATOMIC_RELAXED);

@@ -174,11 +174,10 @@ void for_each_slice(int dims, Body &&body) {
 }
 
 template <class T>
-void blend(const Kernels<T> &kernels, const Inputs<T> &in, int camera, const Options &opt, const Frame<T> &f,
-           Scratch<T> &scratch, const Outputs<T> &out, Stats &stats) {
+void blend(const Kernels<T> &kernels, const Pass<T> &pass, Scratch<T> &scratch, Stats &stats) {
   for (Worker<T> &w : scratch.workers) w.evaluated = w.contributing = 0;
-  for_each_slice(in.dims, [&](Slice slice) {
-    stats.timed(kBlend, [&] { kernels.forward(in, camera, opt, f, slice, scratch, out); });
+  for_each_slice(pass.in.dims, [&](Slice slice) {
+    stats.timed(kBlend, [&] { kernels.forward(pass, slice, scratch); });
     if (slice.begin > 0) return;  // the other slices blend the same pairs again
     for (const Worker<T> &w : scratch.workers) stats.evaluated += w.evaluated, stats.contributing += w.contributing;
   });
@@ -187,8 +186,9 @@ void blend(const Kernels<T> &kernels, const Inputs<T> &in, int camera, const Opt
 // The backward pass of one slice up to its records. Where those of the whole picture are more than may be held at once
 // it takes the picture in parts and leaves the sums over them, one record a splat.
 template <class T>
-void gather_records(const Kernels<T> &kernels, const Inputs<T> &in, int camera, const Options &opt, const Frame<T> &f,
-                    Slice slice, Scratch<T> &scratch, const Outputs<T> &out, const Cotangents<T> &grad, Stats &stats) {
+void gather_records(const Kernels<T> &kernels, const Pass<T> &pass, Slice slice, Scratch<T> &scratch, Stats &stats) {
+  const Frame<T> &f = pass.frame;
+  const Options &opt = pass.opt;
   const int tiles = f.tiles_x * f.tiles_y, size = record_size<T>(slice);
   const uint64_t limit = opt.max_records > 0 ? opt.max_records : std::max<uint64_t>(1 << 20, 4 * uint64_t{f.count});
   const bool parts = next_range(f, 0, limit).end < tiles;
@@ -202,7 +202,7 @@ void gather_records(const Kernels<T> &kernels, const Inputs<T> &in, int camera, 
       const uint64_t slots = assign_slots(opt, f, range, scratch);
       std::memset(scratch.touched.reserve(slots), 0, slots);
       scratch.records.reserve(slots * size);
-      (slice.alone ? kernels.backward_features : kernels.backward)(in, camera, opt, f, slice, range, scratch, out, grad);
+      (slice.alone ? kernels.backward_features : kernels.backward)(pass, slice, range, scratch);
     });
     if (parts) stats.timed(kReduce, [&] { kernels.add_records(opt, f, size, scratch); });
   }
@@ -235,7 +235,7 @@ FramesPtr<T> rasterize_forward(const Inputs<T> &in, const Options &opt, Level le
     Frame<T> &f = *frames->cameras.back();
     bad = prepare(k, in, camera, opt, f, *scratch, out, frames->stats);
     if (bad.argument) return nullptr;
-    blend(k, in, camera, opt, f, *scratch, out, frames->stats);
+    blend(k, {in, opt, camera, f, out}, *scratch, frames->stats);
   }
   return frames;
 }
@@ -262,11 +262,10 @@ void rasterize_backward(const Inputs<T> &in, const Options &opt, Frames<T> &fram
   const ScratchPtr<T> scratch = take_scratch<T>(opt.threads);
   for (int camera = 0; camera < in.cameras; ++camera)
     for_each_slice(in.dims, [&](Slice slice) {
-      const Frame<T> &f = *frames.cameras[camera];
+      const Pass<T> pass{in, opt, camera, *frames.cameras[camera], out, grad};
       slice.alone = result.features_alone() && slice.count > 0;
-      gather_records(k, in, camera, opt, f, slice, *scratch, out, grad, frames.stats);
-      frames.stats.timed(kReduce,
-                         [&] { k.reduce(in, opt, f, camera, slice, record_size<T>(slice), *scratch, result); });
+      gather_records(k, pass, slice, *scratch, frames.stats);
+      frames.stats.timed(kReduce, [&] { k.reduce(pass, slice, *scratch, result); });
     });
 }
 

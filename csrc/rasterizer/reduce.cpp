@@ -21,11 +21,14 @@ bool sum_records(const Scratch<T> &scratch, uint32_t i, int size, T *sum) {
   return found;
 }
 
+// n Gaussians, a column each, and what project_vjp takes and gives.
 template <class T>
 struct GradientBlock {
-  alignas(64) T in[10][kBlock], picture[6][kBlock];
-  alignas(64) T out[10][kBlock], camera[12][kBlock];
-  uint32_t splat[kBlock];
+  alignas(64) T in[10][kBlock];      // mean [3], quaternion [4], scales [3]
+  alignas(64) T picture[6][kBlock];  // dL/d(x, y, z, cov_xx, cov_xy, cov_yy)
+  alignas(64) T out[10][kBlock];     // dL/d(in)
+  alignas(64) T camera[12][kBlock];  // dL/dR [9], dL/dt [3]
+  uint32_t splat[kBlock];            // index into Frame::splats
   int n = 0;
 };
 
@@ -61,11 +64,14 @@ void pad_block(GradientBlock<T> &b) {
   }
 }
 
-// From the record's moments to cotangents of the projection (see Projected for the factored form).
+// From the record's moments r to cotangents of the projection. With h = dL/d ln alpha, u = dx + k dy, and
+// ln alpha = ln opacity - (u² / var_x + dy² / var_y) / 2 (see Projected), sums over the pixels:
+//   dL/dx     = -Σ h u / var_x           dL/dy     = k dL/dx - Σ h dy / var_y     dL/dk = -Σ h u dy / var_x
+//   dL/dvar_x = Σ h u² / (2 var_x²)      dL/dvar_y = Σ h dy² / (2 var_y²)
 template <class T>
 ProjectedGrad<T> picture_gradient(const Splat<T> &s, const T *r) {
   const T precision_x = s.a * (-2 / kLog2E<T>), precision_y = s.d * (-2 / kLog2E<T>);  // 1/var_x, 1/var_y
-  const T gu = -r[1] * precision_x;
+  const T gu = -r[1] * precision_x;  // dL/dx
   ProjectedGrad<T> g;
   g.x = gu, g.y = s.k * gu - r[2] * precision_y, g.z = r[9];
   factored_vjp(T(0.5) * r[3] * precision_x * precision_x, -r[4] * precision_x,
@@ -101,9 +107,11 @@ void color_gradient(const Inputs<T> &in, const Camera<T> &cam, const Splat<T> &s
 }
 
 template <class T>
-void flush_block(const Inputs<T> &in, const Frame<T> &f, int camera, const T (*colors)[3], const Gradients<T> &out,
-                 bool write, GradientBlock<T> &b, double *camera_sum) {
+void flush_block(const Pass<T> &pass, const T (*colors)[3], const Gradients<T> &out, bool write, GradientBlock<T> &b,
+                 double *camera_sum) {
   if (!b.n) return;
+  const Inputs<T> &in = pass.in;
+  const Frame<T> &f = pass.frame;
   pad_block(b);
   vjp_block(f.camera, b);
   for (int j = 0; j < b.n; ++j) {
@@ -121,7 +129,7 @@ void flush_block(const Inputs<T> &in, const Frame<T> &f, int camera, const T (*c
       for (int c = 0; c < 3; ++c)
         put(out.scales[3 * i + c], out.stored ? b.out[7 + c][j] * b.in[7 + c][j] : b.out[7 + c][j], write);
     if (out.mean2d)
-      for (int c = 0; c < 2; ++c) put(out.mean2d[2 * (in.n * camera + i) + c], b.picture[c][j], write);
+      for (int c = 0; c < 2; ++c) put(out.mean2d[2 * (in.n * pass.camera + i) + c], b.picture[c][j], write);
     if (!out.viewmats) continue;
     for (int c = 0; c < 9; ++c) camera_sum[c] += g_R[c];
     for (int c = 0; c < 3; ++c) camera_sum[9 + c] += g_t[c];
@@ -149,12 +157,14 @@ void add_records(const Options &opt, const Frame<T> &f, int size, Scratch<T> &sc
 
 // Blocks of consecutive splats, each by one worker; the camera's gradient is summed over the blocks in order.
 template <class T>
-void reduce(const Inputs<T> &in, const Options &opt, const Frame<T> &f, int camera, Slice slice, int size,
-            Scratch<T> &scratch, const Gradients<T> &out) {
+void reduce(const Pass<T> &pass, Slice slice, Scratch<T> &scratch, const Gradients<T> &out) {
+  const Inputs<T> &in = pass.in;
+  const Frame<T> &f = pass.frame;
+  const int size = record_size<T>(slice);
   const bool write = out.stored && slice.begin == 0;  // the other slices add to the first
   const std::size_t blocks = (f.count + kBlock - 1) / kBlock;
   double *camera_sums = scratch.camera_sums.reserve(12 * (blocks + 1));
-  parallel_for(opt.threads, blocks, [&](std::size_t block, int) {
+  parallel_for(pass.opt.threads, blocks, [&](std::size_t block, int) {
     GradientBlock<T> b;
     T colors[kBlock][3], sum[kGeometry + 16];
     double *camera_sum = camera_sums + 12 * block;
@@ -177,23 +187,22 @@ void reduce(const Inputs<T> &in, const Options &opt, const Frame<T> &f, int came
         put(out.opacities[s.id], out.stored ? sum[0] * (1 - in.opacities[s.id]) : sum[0] / in.opacities[s.id], write);
       b.splat[b.n++] = i;
     }
-    flush_block(in, f, camera, colors, out, write, b, camera_sum);
+    flush_block(pass, colors, out, write, b, camera_sum);
   });
   if (!out.viewmats) return;
   double total[12] = {};
   for (std::size_t block = 0; block < blocks; ++block)
     for (int c = 0; c < 12; ++c) total[c] += camera_sums[12 * block + c];
-  T *viewmat = out.viewmats + 16 * camera;
+  T *viewmat = out.viewmats + 16 * pass.camera;
   for (int r = 0; r < 3; ++r) {
     for (int c = 0; c < 3; ++c) viewmat[4 * r + c] += static_cast<T>(total[3 * r + c]);
     viewmat[4 * r + 3] += static_cast<T>(total[9 + r]);
   }
 }
 
-#define INSTANTIATE(T)                                                                                      \
-  template void add_records(const Options &, const Frame<T> &, int size, Scratch<T> &);                     \
-  template void reduce(const Inputs<T> &, const Options &, const Frame<T> &, int, Slice, int, Scratch<T> &, \
-                       const Gradients<T> &);
+#define INSTANTIATE(T)                                                                  \
+  template void add_records(const Options &, const Frame<T> &, int size, Scratch<T> &); \
+  template void reduce(const Pass<T> &, Slice, Scratch<T> &, const Gradients<T> &);
 INSTANTIATE(float)
 #ifdef PERCEPTION_LEVEL_baseline
 INSTANTIATE(double)

@@ -16,6 +16,13 @@ inline void copy_channels(T *to, const T *from, int count) {
     std::memcpy(to, from, count * sizeof(T));
 }
 
+// A 16x16 tile, at (x, y) of the 64x64 tile at (x0, y0) of the image, and its splats from front to back.
+struct TileList {
+  int x0, y0, x, y;
+  const uint32_t *splats;  // indices into Worker::splats
+  int n;
+};
+
 // NF: the kernel's feature width, STRIDE: of worker.features.
 template <int NF, int STRIDE, class T>
 void load_supertile(const Inputs<T> &in, const Frame<T> &f, int tile, Slice slice, Worker<T> &w) {
@@ -58,8 +65,8 @@ void load_supertile(const Inputs<T> &in, const Frame<T> &f, int tile, Slice slic
   w.n = kept;
 }
 
-// Marks no splat as touched; then body(x0, y0, x, y, list, n, tile) for the 16x16 tiles in the image, at (x, y) of the
-// 64x64 tile `index` at (x0, y0), with the n splats of their list. tile: in the worker's memory.
+// Marks no splat as touched; then body(list, tile) for the 16x16 tiles of 64x64 tile `index` that lie in the image.
+// tile: in the worker's memory.
 template <class Tile, class T, class Body>
 inline void for_each_tile(const Inputs<T> &in, const Frame<T> &f, int index, Worker<T> &w, Body &&body) {
   std::memset(w.touched.reserve(w.n + 1), 0, w.n * sizeof(uint16_t));
@@ -68,7 +75,8 @@ inline void for_each_tile(const Inputs<T> &in, const Frame<T> &f, int index, Wor
   for (int q = 0; q < 16; ++q) {
     const int x = (q & 3) * 16, y = (q >> 2) * 16;
     if (x0 + x >= in.width || y0 + y >= in.height) continue;
-    body(x0, y0, x, y, w.lists.data() + q * static_cast<std::size_t>(w.stride), static_cast<int>(w.counts[q]), tile);
+    const uint32_t *splats = w.lists.data() + q * static_cast<std::size_t>(w.stride);
+    body(TileList{x0, y0, x, y, splats, static_cast<int>(w.counts[q])}, tile);
   }
 }
 

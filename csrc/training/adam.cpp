@@ -7,7 +7,7 @@
 namespace perception::training {
 
 template <class T>
-AdamResult adam(const AdamArguments<T> &a, const Execution &how) {
+int64_t adam(const AdamArguments<T> &a, const Execution &how) {
   const auto &table = kernels<T>(how.level);
   const double correction1 = 1 - std::pow(a.beta1, double(a.step)), correction2 = 1 - std::pow(a.beta2, double(a.step));
   std::vector<T> rate(a.width);
@@ -29,18 +29,15 @@ AdamResult adam(const AdamArguments<T> &a, const Execution &how) {
                          T(1 / std::sqrt(correction2)),
                          uniform};
   const Pieces pieces(a.rows, std::max<int64_t>(256, 32768 / std::max<int64_t>(1, a.width)), 64);
-  std::vector<int64_t> updated(pieces.count), skipped(pieces.count);
+  std::vector<int64_t> skipped(pieces.count);
   parallel_for(resolve_threads(how.threads), pieces.count,
-               [&](std::size_t i, int) { skipped[i] = table.adam(rows, pieces.begin(i), pieces.end(i), &updated[i]); });
-  AdamResult result{0, 0};
-  for (int64_t i = 0; i < pieces.count; ++i) {
-    result.updated += updated[i];
-    result.skipped += skipped[i];
-  }
-  return result;
+               [&](std::size_t i, int) { skipped[i] = table.adam(rows, pieces.begin(i), pieces.end(i)); });
+  int64_t total = 0;
+  for (int64_t of_piece : skipped) total += of_piece;
+  return total;
 }
 
-template AdamResult adam(const AdamArguments<float> &, const Execution &);
-template AdamResult adam(const AdamArguments<double> &, const Execution &);
+template int64_t adam(const AdamArguments<float> &, const Execution &);
+template int64_t adam(const AdamArguments<double> &, const Execution &);
 
 }  // namespace perception::training

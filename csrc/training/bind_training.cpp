@@ -68,13 +68,13 @@ auto photometric(In<T, 3> render, In<Target, 3> target, std::optional<In<T, 2>> 
   return nb::make_tuple(result.loss, result.l1, result.ssim);
 }
 
-auto assign(In<int32_t, 1> labels, double fraction, uint64_t seed, Out<int32_t, 1> slots) {
+auto assign(In<int32_t, 1> labels, Out<int32_t, 1> slots) {
   require_aligned("labels", labels, "slots", slots);
   require(same_shape(labels, slots), "slots: expected the shape of labels");
   pt::Assignment out;
   {
     nb::gil_scoped_release release;
-    out = pt::assign(labels.data(), static_cast<int64_t>(labels.size()), fraction, seed, slots.data());
+    out = pt::assign(labels.data(), static_cast<int64_t>(labels.size()), slots.data());
   }
   return nb::make_tuple(out.ids, out.counts, out.first);
 }
@@ -82,6 +82,12 @@ auto assign(In<int32_t, 1> labels, double fraction, uint64_t seed, Out<int32_t, 
 void check_slots(const int32_t *slots, size_t pixels, size_t labels) {
   for (size_t p = 0; p < pixels; ++p)
     require(slots[p] < static_cast<int64_t>(labels), "slots: an index lies outside the labels");
+}
+
+template <class T>
+pt::LabelledFeatures<T> labelled(const In<T, 2> &features, const In<int32_t, 1> &slots) {
+  return {features.data(), slots.data(), static_cast<int64_t>(features.shape(0)),
+          static_cast<int64_t>(features.shape(1))};
 }
 
 template <class T>
@@ -99,8 +105,9 @@ void prototypes(In<T, 2> features, In<int32_t, 1> slots, In<int64_t, 1> counts, 
   for (size_t i = 0; i < labels; ++i)
     require(first.data()[i] >= 0 && first.data()[i] < static_cast<int64_t>(features.shape(0)) && counts.data()[i] > 0,
             "first, counts: every label needs a pixel");
-  pt::prototypes(features.data(), slots.data(), features.shape(0), features.shape(1), counts.data(), first.data(),
-                 labels, means.data(), scatter.data(), {threads, parse_level(level)});
+  pt::prototypes(labelled(features, slots),
+                 {static_cast<int64_t>(labels), counts.data(), first.data(), means.data(), scatter.data()},
+                 {threads, parse_level(level)});
 }
 
 template <class T>
@@ -113,8 +120,8 @@ void spread(In<T, 2> features, In<int32_t, 1> slots, In<double, 2> means, In<dou
           "pull, push: expected [L] and [L, D] of means [L, D], with D of features [P, D]");
   nb::gil_scoped_release release;
   check_slots(slots.data(), slots.shape(0), means.shape(0));
-  pt::spread(features.data(), slots.data(), features.shape(0), features.shape(1), means.data(), pull.data(),
-             push.data(), out.data(), {threads, parse_level(level)});
+  pt::spread(labelled(features, slots), means.data(), pull.data(), push.data(), out.data(),
+             {threads, parse_level(level)});
 }
 
 double separation(In<double, 2> points, double margin, Out<double, 2> gradient) {
@@ -124,16 +131,15 @@ double separation(In<double, 2> points, double margin, Out<double, 2> gradient) 
   return pt::separation(points.data(), points.shape(0), points.shape(1), margin, gradient.data());
 }
 
-void add_statistics(In<float, 2> mean2d, In<float, 1> radii, In<uint8_t, 1> visible, Out<float, 1> gradient,
-                    Out<float, 1> seen, Out<float, 1> radius, double gradient_scale, double radius_scale,
-                    int threads) {
-  require_aligned("mean2d", mean2d, "radii", radii, "gradient", gradient, "seen", seen, "radius", radius);
-  require(mean2d.shape(0) == radii.shape(0) && mean2d.shape(1) == 2 && same_shape(radii, visible) &&
-              same_shape(radii, gradient) && same_shape(radii, seen) && same_shape(radii, radius),
-          "mean2d, visible, gradient, seen, radius: expected [N, 2] and [N] of radii [N]");
+void add_statistics(In<float, 2> mean2d, In<uint8_t, 1> visible, Out<float, 1> gradient, Out<float, 1> seen,
+                    double scale, int threads) {
+  require_aligned("mean2d", mean2d, "gradient", gradient, "seen", seen);
+  require(mean2d.shape(0) == visible.shape(0) && mean2d.shape(1) == 2 && same_shape(visible, gradient) &&
+              same_shape(visible, seen),
+          "mean2d, gradient, seen: expected [N, 2] and [N] of visible [N]");
   nb::gil_scoped_release release;
-  pt::add_statistics({mean2d.data(), radii.data(), visible.data(), gradient.data(), seen.data(), radius.data(),
-                      static_cast<int64_t>(radii.size()), float(gradient_scale), float(radius_scale)},
+  pt::add_statistics({mean2d.data(), visible.data(), gradient.data(), seen.data(), static_cast<int64_t>(seen.size()),
+                      static_cast<float>(scale)},
                      threads);
 }
 
@@ -153,7 +159,7 @@ void scale(In<T, 1> values, double factor, Out<T, 1> out, int threads) {
 }
 
 template <class T>
-auto adam(Out<T, 2> param, In<T, 2> grad, Out<T, 2> first, Out<T, 2> second, std::optional<In<uint8_t, 1>> visible,
+int64_t adam(Out<T, 2> param, In<T, 2> grad, Out<T, 2> first, Out<T, 2> second, std::optional<In<uint8_t, 1>> visible,
           In<double, 1> rate, int64_t step, double beta1, double beta2, double eps, int threads,
           const std::string &level) {
   require_aligned("param", param, "grad", grad, "first", first, "second", second, "rate", rate);
@@ -161,16 +167,12 @@ auto adam(Out<T, 2> param, In<T, 2> grad, Out<T, 2> first, Out<T, 2> second, std
           "grad, first, second: expected the shape of param");
   require(!visible || visible->shape(0) == param.shape(0), "visible: expected [N] of param [N, K]");
   require(rate.shape(0) == param.shape(1) && step >= 1, "rate, step: expected [K] of param [N, K], and 1 or more");
-  pt::AdamResult result;
-  {
-    nb::gil_scoped_release release;
-    result = pt::adam(
-        pt::AdamArguments<T>{param.data(), first.data(), second.data(), grad.data(),
-                             visible ? visible->data() : nullptr, rate.data(), static_cast<int64_t>(param.shape(0)),
-                             static_cast<int64_t>(param.shape(1)), step, beta1, beta2, eps},
-        {threads, parse_level(level)});
-  }
-  return nb::make_tuple(result.updated, result.skipped);
+  nb::gil_scoped_release release;
+  return pt::adam(
+      pt::AdamArguments<T>{param.data(), first.data(), second.data(), grad.data(),
+                           visible ? visible->data() : nullptr, rate.data(), static_cast<int64_t>(param.shape(0)),
+                           static_cast<int64_t>(param.shape(1)), step, beta1, beta2, eps},
+      {threads, parse_level(level)});
 }
 
 template <class T>
@@ -190,7 +192,7 @@ void bind_precision(nb::module_ &m) {
   m.def("scale", &scale<T>, arg("values"), "factor"_a, arg("out"), "threads"_a = 0, "out = factor * values.");
   m.def("adam", &adam<T>, arg("param"), arg("grad"), arg("first"), arg("second"), arg("visible").none(), arg("rate"),
         "step"_a, "beta1"_a, "beta2"_a, "eps"_a, "threads"_a = 0, "level"_a = "auto",
-        "One Adam step in place on the visible rows; (rows updated, rows skipped for a non-finite gradient).");
+        "One Adam step in place on the visible rows; the number of rows skipped for a non-finite gradient.");
 }
 
 }  // namespace
@@ -199,14 +201,13 @@ void bind_training(nb::module_ &parent) {
   nb::module_ m = parent.def_submodule("training", "Fused losses and the optimiser; float32 and float64.");
   m.def("set_threads", &perception::set_default_threads, "threads"_a,
         "Threads of calls that name none; 0 means all processors. Results do not depend on it.");
-  m.def("assign", &assign, nb::arg("labels").noconvert(), "fraction"_a, "seed"_a, nb::arg("slots").noconvert(),
+  m.def("assign", &assign, nb::arg("labels").noconvert(), nb::arg("slots").noconvert(),
         "(ids, counts, first pixel) of the labels in use; slots gets each pixel's index into ids, or -1.");
   m.def("separation", &separation, nb::arg("points").noconvert(), "margin"_a, nb::arg("gradient").noconvert(),
         "Mean relu(margin - squared distance) over the pairs of points [M, D], and its gradient.");
-  m.def("add_statistics", &add_statistics, nb::arg("mean2d").noconvert(), nb::arg("radii").noconvert(),
-        nb::arg("visible").noconvert(), nb::arg("gradient").noconvert(), nb::arg("seen").noconvert(),
-        nb::arg("radius").noconvert(), "gradient_scale"_a, "radius_scale"_a, "threads"_a = 0,
-        "Adds one view, where visible: |mean2d| to gradient, 1 to seen; radius becomes the larger one.");
+  m.def("add_statistics", &add_statistics, nb::arg("mean2d").noconvert(), nb::arg("visible").noconvert(),
+        nb::arg("gradient").noconvert(), nb::arg("seen").noconvert(), "scale"_a, "threads"_a = 0,
+        "Adds one view, where visible: scale |mean2d| to gradient, 1 to seen.");
   bind_precision<float>(m);
   bind_precision<double>(m);
 }

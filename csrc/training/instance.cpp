@@ -8,13 +8,6 @@
 namespace perception::training {
 namespace {
 
-uint64_t mix(uint64_t x) {  // splitmix64 finaliser
-  x += 0x9e3779b97f4a7c15ull;
-  x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9ull;
-  x = (x ^ (x >> 27)) * 0x94d049bb133111ebull;
-  return x ^ (x >> 31);
-}
-
 // Labels in use, ascending. Dense ids go through a table, wild ones through a sort.
 constexpr int32_t kTableLimit = 1 << 20;
 
@@ -36,15 +29,13 @@ std::vector<int32_t> used_labels(const int32_t *slots, int64_t pixels, int32_t l
 
 }  // namespace
 
-Assignment assign(const int32_t *labels, int64_t pixels, double fraction, uint64_t seed, int32_t *slots) {
-  const uint64_t offset = mix(seed);
+Assignment assign(const int32_t *labels, int64_t pixels, int32_t *slots) {
   int32_t largest = 0;
   for (int64_t p = 0; p < pixels; ++p) {
     const int32_t label = labels[p];
     if (label < 0) throw std::invalid_argument("labels must be >= 0 (0 = unlabelled), found " + std::to_string(label));
-    const bool keep = fraction >= 1 || (mix(offset ^ uint64_t(p)) >> 11) * 0x1p-53 < fraction;
-    slots[p] = keep ? label : 0;
-    largest = std::max(largest, slots[p]);
+    slots[p] = label;
+    largest = std::max(largest, label);
   }
   Assignment out;
   out.ids = used_labels(slots, pixels, largest);
@@ -69,38 +60,40 @@ Assignment assign(const int32_t *labels, int64_t pixels, double fraction, uint64
 }
 
 template <class T>
-void prototypes(const T *features, const int32_t *slots, int64_t pixels, int64_t width, const int64_t *counts,
-                const int64_t *first, int64_t labels, double *means, double *scatter, const Execution &how) {
+void prototypes(const LabelledFeatures<T> &given, const Prototypes &of, const Execution &how) {
+  const int64_t labels = of.labels, width = given.width;
   if (labels == 0) return;
   const auto &table = kernels<T>(how.level);
   // Sums are taken about a pixel of the label itself, so that features far from zero do not cancel.
   std::vector<T> reference(labels * width);
-  for (int64_t i = 0; i < labels; ++i) std::copy_n(features + first[i] * width, width, reference.begin() + i * width);
-  const Pieces pieces(pixels, 8192, labels * width > 100000 ? 4 : 16);
+  for (int64_t i = 0; i < labels; ++i) 
+    std::copy_n(given.features + of.first[i] * width, width, reference.begin() + i * width);
+  const Pieces pieces(given.pixels, 8192, labels * width > 100000 ? 4 : 16);
   const int64_t stride = labels * 2 * width;
   std::vector<double> sums(pieces.count * stride);
   parallel_for(resolve_threads(how.threads), pieces.count, [&](std::size_t i, int) {
-    table.accumulate(features, slots, reference.data(), pieces.begin(i), pieces.end(i), width, &sums[i * stride]);
+    table.accumulate(given.features, given.slots, reference.data(), pieces.begin(i), pieces.end(i), width,
+                     &sums[i * stride]);
   });
   for (int64_t i = 1; i < pieces.count; ++i)
     for (int64_t k = 0; k < stride; ++k) sums[k] += sums[i * stride + k];
   for (int64_t i = 0; i < labels; ++i) {
-    const double *sum = &sums[i * 2 * width], *squares = sum + width, n = static_cast<double>(counts[i]);
-    scatter[i] = 0;
+    const double *sum = &sums[i * 2 * width], *squares = sum + width, n = static_cast<double>(of.counts[i]);
+    of.scatter[i] = 0;
     for (int64_t k = 0; k < width; ++k) {
-      means[i * width + k] = double(reference[i * width + k]) + sum[k] / n;
-      scatter[i] += std::max(0.0, squares[k] - sum[k] * sum[k] / n);
+      of.means[i * width + k] = double(reference[i * width + k]) + sum[k] / n;
+      of.scatter[i] += std::max(0.0, squares[k] - sum[k] * sum[k] / n);
     }
   }
 }
 
 template <class T>
-void spread(const T *features, const int32_t *slots, int64_t pixels, int64_t width, const double *means,
-            const double *pull, const double *push, T *out, const Execution &how) {
+void spread(const LabelledFeatures<T> &given, const double *means, const double *pull, const double *push, T *out,
+            const Execution &how) {
   const auto &table = kernels<T>(how.level);
-  const Pieces pieces(pixels);
+  const Pieces pieces(given.pixels);
   parallel_for(resolve_threads(how.threads), pieces.count, [&](std::size_t i, int) {
-    table.spread(features, slots, means, pull, push, pieces.begin(i), pieces.end(i), width, out);
+    table.spread(given.features, given.slots, means, pull, push, pieces.begin(i), pieces.end(i), given.width, out);
   });
 }
 
@@ -128,13 +121,11 @@ double separation(const double *points, int64_t rows, int64_t width, double marg
   return rows > 1 ? total / pairs : 0;
 }
 
-template void prototypes(const float *, const int32_t *, int64_t, int64_t, const int64_t *, const int64_t *, int64_t,
-                         double *, double *, const Execution &);
-template void prototypes(const double *, const int32_t *, int64_t, int64_t, const int64_t *, const int64_t *, int64_t,
-                         double *, double *, const Execution &);
-template void spread(const float *, const int32_t *, int64_t, int64_t, const double *, const double *, const double *,
-                     float *, const Execution &);
-template void spread(const double *, const int32_t *, int64_t, int64_t, const double *, const double *, const double *,
-                     double *, const Execution &);
+template void prototypes(const LabelledFeatures<float> &, const Prototypes &, const Execution &);
+template void prototypes(const LabelledFeatures<double> &, const Prototypes &, const Execution &);
+template void spread(const LabelledFeatures<float> &, const double *, const double *, const double *, float *,
+                     const Execution &);
+template void spread(const LabelledFeatures<double> &, const double *, const double *, const double *, double *,
+                     const Execution &);
 
 }  // namespace perception::training

@@ -36,10 +36,8 @@ void add_statistics(const StatisticsArguments &a, int threads) {
   parallel_pieces(resolve_threads(threads), Pieces(a.rows), [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       const float x = a.mean2d[2 * i], y = a.mean2d[2 * i + 1], here = a.visible[i] ? 1.f : 0.f;
-      const float length = std::sqrt(x * x + y * y), radius = a.radius_scale * a.radii[i];
-      a.gradient[i] += here != 0 ? a.gradient_scale * length : 0.f;
+      a.gradient[i] += here != 0 ? a.scale * std::sqrt(x * x + y * y) : 0.f;
       a.seen[i] += here;
-      a.radius[i] = std::max(a.radius[i], here != 0 ? radius : 0.f);
     }
   });
 }

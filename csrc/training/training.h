@@ -31,35 +31,47 @@ struct PhotometricResult {
 template <class T>
 PhotometricResult photometric(const PhotometricArguments<T> &, const Execution &);
 
-// Labels in use, ascending, and for every pixel the index of its label (-1 for label 0 and for pixels left out).
+// Labels in use, ascending, and for every pixel the index of its label (-1 for label 0).
 struct Assignment {
   std::vector<int32_t> ids;
   std::vector<int64_t> counts, first;  // pixels per label; first pixel of each label
 };
-// Keeps each pixel with probability `fraction`, decided by a hash of (seed, pixel).
-Assignment assign(const int32_t *labels, int64_t pixels, double fraction, uint64_t seed, int32_t *slots);
+Assignment assign(const int32_t *labels, int64_t pixels, int32_t *slots);
 
-// means [slots, width] and scatter [slots] = sum over the label's pixels of |F - mean|^2.
+// A feature map F, and the index of each pixel's label, or -1.
 template <class T>
-void prototypes(const T *features, const int32_t *slots, int64_t pixels, int64_t width, const int64_t *counts,
-                const int64_t *first, int64_t labels, double *means, double *scatter, const Execution &);
+struct LabelledFeatures {
+  const T *features;     // [pixels, width]
+  const int32_t *slots;  // [pixels]
+  int64_t pixels, width;
+};
+
+// For each of `labels` labels the number of its pixels and the first of them (in), the mean of F over them and the sum
+// of |F - mean|^2 (out).
+struct Prototypes {
+  int64_t labels;
+  const int64_t *counts, *first;  // [labels]
+  double *means, *scatter;        // [labels, width], [labels]
+};
+template <class T>
+void prototypes(const LabelledFeatures<T> &, const Prototypes &, const Execution &);
 
 // out [pixels, width] = pull[slot] (F - mean[slot]) + push[slot]; 0 for slot -1.
 template <class T>
-void spread(const T *features, const int32_t *slots, int64_t pixels, int64_t width, const double *means,
-            const double *pull, const double *push, T *out, const Execution &);
+void spread(const LabelledFeatures<T> &, const double *means, const double *pull, const double *push, T *out,
+            const Execution &);
 
 // Mean over pairs i < j of relu(margin - |p_i - p_j|^2) of points [rows, width]; its gradient is written. No pair: 0.
 double separation(const double *points, int64_t rows, int64_t width, double margin, double *gradient);
 
-// Adds one view to the statistics of `rows` Gaussians, where visible: gradient += gradient_scale |mean2d|, seen += 1,
-// radius = max(radius, radius_scale radii). mean2d [rows, 2], all others [rows].
+// Adds one view to the statistics of `rows` Gaussians, where visible: gradient += scale |mean2d|, seen += 1.
+// mean2d [rows, 2], all others [rows].
 struct StatisticsArguments {
-  const float *mean2d, *radii;
+  const float *mean2d;
   const uint8_t *visible;
-  float *gradient, *seen, *radius;
+  float *gradient, *seen;
   int64_t rows;
-  float gradient_scale, radius_scale;
+  float scale;
 };
 void add_statistics(const StatisticsArguments &, int threads);
 
@@ -69,10 +81,6 @@ double sum(const T *values, int64_t n, bool squared, const Execution &);
 // out = factor values; out may be values.
 template <class T>
 void scale(const T *values, int64_t n, double factor, T *out, const Execution &);
-
-struct AdamResult {
-  int64_t updated, skipped;  // rows
-};
 
 template <class T>
 struct AdamArguments {
@@ -84,7 +92,8 @@ struct AdamArguments {
   double beta1, beta2, eps;
 };
 
+// Returns the number of rows skipped for a gradient that is not finite.
 template <class T>
-AdamResult adam(const AdamArguments<T> &, const Execution &);
+int64_t adam(const AdamArguments<T> &, const Execution &);
 
 }  // namespace perception::training

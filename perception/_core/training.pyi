@@ -11,7 +11,7 @@ def set_threads(threads: int) -> None:
     Threads of calls that name none; 0 means all processors. Results do not depend on it.
     """
 
-def assign(labels: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu', writable=False)], fraction: float, seed: int, slots: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu')]) -> tuple:
+def assign(labels: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu', writable=False)], slots: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu')]) -> tuple:
     """
     (ids, counts, first pixel) of the labels in use; slots gets each pixel's index into ids, or -1.
     """
@@ -21,10 +21,8 @@ def separation(points: Annotated[NDArray[numpy.float64], dict(shape=(None, None)
     Mean relu(margin - squared distance) over the pairs of points [M, D], and its gradient.
     """
 
-def add_statistics(mean2d: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)], radii: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], visible: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu', writable=False)], gradient: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], seen: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], radius: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], gradient_scale: float, radius_scale: float, threads: int = 0) -> None:
-    """
-    Adds one view, where visible: |mean2d| to gradient, 1 to seen; radius becomes the larger one.
-    """
+def add_statistics(mean2d: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)], visible: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu', writable=False)], gradient: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], seen: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], scale: float, threads: int = 0) -> None:
+    """Adds one view, where visible: scale |mean2d| to gradient, 1 to seen."""
 
 @overload
 def photometric(render: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], target: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], weight: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)] | None, gradient: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], beta: float, threads: int = 0, level: str = 'auto') -> tuple: ...
@@ -69,10 +67,10 @@ def scale(values: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C
     """out = factor * values."""
 
 @overload
-def adam(param: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')], grad: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)], first: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')], second: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')], visible: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu', writable=False)] | None, rate: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu', writable=False)], step: int, beta1: float, beta2: float, eps: float, threads: int = 0, level: str = 'auto') -> tuple: ...
+def adam(param: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')], grad: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)], first: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')], second: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu')], visible: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu', writable=False)] | None, rate: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu', writable=False)], step: int, beta1: float, beta2: float, eps: float, threads: int = 0, level: str = 'auto') -> int: ...
 
 @overload
-def adam(param: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu')], grad: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu', writable=False)], first: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu')], second: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu')], visible: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu', writable=False)] | None, rate: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu', writable=False)], step: int, beta1: float, beta2: float, eps: float, threads: int = 0, level: str = 'auto') -> tuple:
+def adam(param: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu')], grad: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu', writable=False)], first: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu')], second: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu')], visible: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu', writable=False)] | None, rate: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu', writable=False)], step: int, beta1: float, beta2: float, eps: float, threads: int = 0, level: str = 'auto') -> int:
     """
-    One Adam step in place on the visible rows; (rows updated, rows skipped for a non-finite gradient).
+    One Adam step in place on the visible rows; the number of rows skipped for a non-finite gradient.
     """

@@ -14,6 +14,7 @@ from perception.bags.poses import Poses
 from perception.bags.read import CAMERA_INFO, DEPTH_TRANSPORT, IMAGES, Bag, camera_of, raw_rows, stamp_of
 from perception.errors import InputError
 from perception.photos.camera_file import read_camera, write_camera_info
+from perception.photos.decode import read_picture
 from perception.photos.lens import camera_from_lens, rescale_lens
 from perception.types import Lens
 
@@ -57,15 +58,15 @@ def choose_depth(bag: Bag, topics: list[str], wanted: str | None, frame: str) ->
 def decode_depth(message: Any, where: str) -> np.ndarray:
     """Depth [h, w] float32 in metres, 0 = nothing measured. 16UC1 holds millimetres, 32FC1 metres (ROS REP 118)."""
     kind = str(getattr(message, "encoding", None) or message.format)
-    image: np.ndarray | None
+    what = f"depth image of format '{kind}'; expected png of one channel"
     if hasattr(message, "encoding"):
         image = _raw(message, kind, where)
     elif DEPTH_TRANSPORT in kind:
-        image = _compressed(bytes(message.data), kind)
+        image = _compressed(bytes(message.data), kind, where, what)
     else:
-        image = cv2.imdecode(np.frombuffer(bytes(message.data) or b"\0", np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 2:
-        raise InputError(f"{where}: a depth image of format '{kind}' cannot be decoded; expected png")
+        image = read_picture(bytes(message.data), where, what)
+    if image.ndim != 2:
+        raise InputError(f"{where}: not a readable {what}")
     metres = image.astype(np.float32) / (np.float32(1) if image.dtype.kind == "f" else np.float32(MILLIMETRES))
     metres[~np.isfinite(metres) | (metres < 0) | ((image == 65535) & (image.dtype == np.uint16))] = 0
     return metres
@@ -78,14 +79,12 @@ def _raw(message: Any, kind: str, where: str) -> np.ndarray:
     return np.asarray(raw_rows(message, dtype.itemsize, where).view(dtype))
 
 
-def _compressed(data: bytes, kind: str) -> np.ndarray | None:
+def _compressed(data: bytes, kind: str, where: str, what: str) -> np.ndarray:
     """ROS's compressedDepth: a header (int32, float a, float b), then PNG; 32FC1 stores v = a / depth + b."""
-    if len(data) <= _HEADER:
-        return None
-    _, a, b = struct.unpack("<iff", data[:_HEADER])
-    image = cv2.imdecode(np.frombuffer(data, np.uint8, offset=_HEADER), cv2.IMREAD_UNCHANGED)
-    if image is None or not kind.startswith("32FC1"):
+    image = read_picture(data[_HEADER:], where, what)
+    if not kind.startswith("32FC1"):
         return image
+    _, a, b = struct.unpack("<iff", data[:_HEADER])
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(image > 0, a / (image.astype(np.float32) - b), 0).astype(np.float32)
 

@@ -11,12 +11,15 @@ import cv2
 import numpy as np
 
 from perception.errors import InputError, missing_extra
+from perception.io.documents import brief, read_yaml, refusing
+from perception.photos.decode import read_picture
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 ODOMETRY = "nav_msgs/msg/Odometry"
 DEPTH_TRANSPORT = "compressedDepth"
+METADATA = "metadata.yaml"
 
 
 class Bag:
@@ -39,15 +42,13 @@ class Bag:
         return wanted or topics[0]
 
     def messages(self, topics: list[str]) -> Iterator[tuple[str, int, Any]]:
-        """(topic, recording time in ns, message) in order of time. Raises InputError for a corrupt message."""
+        """(topic, recording time in ns, message) in order of time. InputError where the bag is damaged."""
         chosen = [c for c in self._reader.connections if c.topic in topics]
         if not chosen:
             return
-        for connection, time, raw in self._reader.messages(connections=chosen):
-            try:
+        with refusing(f"{self.path}: a message on {', '.join(topics)} cannot be read ({{why}}); record the bag again"):
+            for connection, time, raw in self._reader.messages(connections=chosen):
                 yield connection.topic, time, self._reader.deserialize(raw, connection.msgtype)
-            except Exception as error:  # the library's exceptions have no common base class
-                raise InputError(f"{self.path}: a message on {connection.topic} cannot be read ({error})") from error
 
 
 def camera_of(topic: str) -> tuple[str, bool]:
@@ -63,21 +64,24 @@ def camera_of(topic: str) -> tuple[str, bool]:
 def open_bag(path: Path) -> Iterator[Bag]:
     """Opens a ROS 1 .bag, a ROS 2 bag folder (SQLite or MCAP) or an .mcap file. InputError if it is none of these."""
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise missing_extra("rosbags", "ros") from error
     if not path.exists():
         raise InputError(f"{path}: no such bag; expected a .bag, an .mcap, or the folder of a ROS 2 bag")
-    try:
+    if (path / METADATA).is_file():
+        read_yaml(path / METADATA, "the description of a ROS 2 bag")  # the library's reader takes aliases
+    with refusing(f"{path}: is no bag that can be read ({{why}}); expected ROS 1, ROS 2 or MCAP"):
         store = None if path.suffix == ".bag" else get_typestore(Stores.LATEST)  # old ROS 2 bags lack definitions
         reader = AnyReader([path], default_typestore=store)
         reader.open()
-    except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
-        what = str(error) or type(error).__name__
-        raise InputError(f"{path}: is no bag that can be read ({what}); expected ROS 1, ROS 2 or MCAP") from error
     try:
         yield Bag(reader, path)
+    except (InputError, OSError):  # of writing: what reading raises is an InputError
+        raise
+    except Exception as error:  # fields of other types or without sense, in what is done with them
+        raise InputError(f"{path}: holds damaged messages ({brief(error)}); record the bag again") from error
     finally:
         reader.close()
 
@@ -114,10 +118,8 @@ def decode_image(message: Any, where: str) -> np.ndarray:
     """An Image or CompressedImage as [H, W, 3] uint8 BGR. InputError naming `where` if it is not an 8-bit image."""
     if hasattr(message, "encoding"):
         return _raw(message, where)
-    picture = cv2.imdecode(np.frombuffer(bytes(message.data) or b"\0", np.uint8), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise InputError(f"{where}: a compressed image of format '{message.format}' cannot be decoded (jpeg, png can)")
-    return np.asarray(picture)
+    what = f"compressed image of format '{message.format}' (jpeg, png are)"
+    return read_picture(bytes(message.data), where, what, cv2.IMREAD_COLOR)
 
 
 def _raw(message: Any, where: str) -> np.ndarray:

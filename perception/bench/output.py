@@ -46,7 +46,7 @@ def table(rows: Sequence[dict[str, Any]], columns: Sequence[Column], heads: Sequ
 
 def machine() -> dict[str, Any]:
     """Processor, cores, and the widest SIMD level that our kernels use on it."""
-    from perception.gaussians.rasterize import simd_levels
+    from perception.rasterizer.cpu import simd_levels
 
     name = platform.processor() or platform.machine()
     with suppress(OSError, StopIteration):  # not Linux, or no model name in /proc/cpuinfo

@@ -11,7 +11,6 @@ from __future__ import annotations
 import importlib.util
 import statistics
 import time
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy as np
 
 from perception.bench.output import Column, bench_parser, finish, table
 from perception.errors import InputError
+from perception.io.arrays import read_npz
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -71,13 +71,13 @@ def load_scene(path: Path) -> dict[str, Any]:
     """
     import torch
 
+    expected = f"an .npz with {', '.join(SPLAT_KEYS)}, viewmat, K, width, height"
     try:
-        data = np.load(path)
+        data = read_npz(path, path, f"expected {expected}")
         scene: dict[str, Any] = {k: torch.from_numpy(data[k].astype(np.float32)) for k in SPLAT_KEYS}
         scene["viewmats"], scene["Ks"] = (torch.from_numpy(data[k].astype(np.float32))[None] for k in ("viewmat", "K"))
         return {**scene, "width": int(data["width"]), "height": int(data["height"])}
-    except (OSError, KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
-        expected = f"an .npz with {', '.join(SPLAT_KEYS)}, viewmat, K, width, height"
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: not a splats file ({error}); expected {expected}") from None
 
 
@@ -105,7 +105,7 @@ def _run(scene: dict[str, Any], case: Case, dtype: str) -> tuple[Turn, Any, list
     """One pass: its times, the rasterizer's statistics, and images and gradients, flattened to float64."""
     import torch
 
-    from perception.gaussians.rasterize import RasterizationStats, rasterize
+    from perception.rasterizer.rasterize import RasterizationStats, rasterize
 
     on_gpu = case.simd in ON_GPU and dtype == case.dtype
     device = torch.device(GPU if on_gpu else "cpu")
@@ -153,7 +153,7 @@ def _gsplat(inputs: dict[str, Any]) -> list[Tensor]:
 def cases(threads: Sequence[int], dtypes: Sequence[str], device: str = "cpu") -> list[Case]:
     """Every SIMD level × precision × {RGB, rich} × number of threads; float32 on the GPU."""
     from perception.gaussians.device import choose_device
-    from perception.gaussians.rasterize import simd_levels
+    from perception.rasterizer.cpu import simd_levels
 
     both = (False, True)
     chosen = [Case(s, d, rich, t) for d in dtypes for rich in both for s in simd_levels() for t in threads]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import os
 import shlex
@@ -48,6 +49,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     limit_threads()
     args = argparse.Namespace()
     warnings.showwarning = _warn  # type: ignore[assignment]
+    if isinstance(sys.stdout, io.TextIOWrapper):  # not every path can be written as UTF-8
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         args = build_parser().parse_args(argv)
         result, text = args.run(args)

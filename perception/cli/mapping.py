@@ -97,7 +97,7 @@ _SHORTCUTS = {
     "train.budget": ("N", "most Gaussians the map may have"),
     "train.iterations": ("N", None),
     "train.time_limit": ("S", "seconds of training; all schedules shrink to fit"),
-    "photos.memory": ("SIZE", "such as 8G: that photos, labels and depth may fill; others are on disk"),
+    "photos.memory": ("SIZE", "such as 8G: memory for photos, labels and depth; what does not fit is on disk"),
     "photos.holdout": ("N", "every N-th view is kept for scoring, 0 trains on all"),
     "seed": ("S", None),
     "device": ("DEVICE", "auto, cpu or cuda"),

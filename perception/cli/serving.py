@@ -25,6 +25,7 @@ def register(commands: Any) -> None:
     p.set_defaults(interrupted="stopped")
     p.add_argument("--http", metavar="HOST:PORT", help="streamable HTTP at http://HOST:PORT/mcp instead of stdio")
     p.add_argument("--token-file", type=Path, metavar="FILE", help="HTTP clients send its content as a bearer token")
+    _add_photos(p)
 
     p = map_command(commands, "node", _node, "serve a map on ROS 2 (rclpy): prompts in; points, boxes and markers out")
     p.add_argument("--namespace", metavar="NAME", help="before all topics; default: perception")
@@ -35,6 +36,18 @@ def register(commands: Any) -> None:
     p.add_argument("--host", default="127.0.0.1", help="other than this machine only with a token")
     p.add_argument("--port", type=int, default=8090, help="0: any free one")
     p.add_argument("--token-file", type=Path, metavar="FILE", help="its content opens the page; default: a new token")
+    _add_photos(p)
+
+
+def _add_photos(command: Any) -> None:
+    told = "also show photos in this folder; else only those in the map's own: a map from others may name any file"
+    command.add_argument("--photos", type=_folder, metavar="DIR", help=told)
+
+
+def _folder(text: str) -> Path:
+    if not Path(text).is_dir():
+        raise argparse.ArgumentTypeError(f"{text} is no folder; give the one that holds the map's photos")
+    return Path(text)
 
 
 def _settings(args: argparse.Namespace, **given: Any) -> Any:
@@ -58,10 +71,10 @@ def _mcp(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from perception.serve.mcp import serve_http, serve_stdio
 
     if args.http is None:
-        serve_stdio(args.map)
+        serve_stdio(args.map, photos=args.photos)
     else:
         host, _, port = args.http.rpartition(":")
-        serve_http(args.map, _settings(args, host=host.strip("[]"), port=port))
+        serve_http(args.map, _settings(args, host=host.strip("[]"), port=port), photos=args.photos)
     return {}, ""
 
 
@@ -91,7 +104,7 @@ def _view(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     token = None if args.token_file is None else read_token(args.token_file)
     from perception.viewer import Viewer
 
-    viewer = Viewer(args.map, args.host, args.port, token)
+    viewer = Viewer(args.map, args.host, args.port, token, args.photos)
     port = viewer.address.rpartition(":")[2]
     shown = viewer.url if token is None else f"{viewer.address}/?token=CONTENT-OF-{args.token_file.name}"
     hint = f"; over SSH: ssh -L {port}:localhost:{port} THIS-MACHINE, then open it there"

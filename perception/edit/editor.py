@@ -23,6 +23,7 @@ from perception.boxes import instance_entry
 from perception.config import FrameConfig, InstanceConfig
 from perception.edit.scale import scale_map
 from perception.errors import InputError
+from perception.io.json_shapes import LARGEST
 from perception.language.description import InstanceDescription, from_arrays, to_arrays
 from perception.map.files import map_signature, read_info
 from perception.map.map import Map, language_in, prefixed
@@ -54,7 +55,20 @@ def _step(method: F) -> F:
 
 
 class Editor:
-    """A map and its edit history. Instances are named by their `id`, which never changes; merged ones get a new id."""
+    """A map and its edit history. Instances are named by their `id`, which never changes; merged ones get a new id.
+
+    Edits raise InputError for an id that the map does not have.
+
+    >>> editor = Editor(Path("kitchen.gsmap"))
+    >>> editor.rename(1, "breakfast")
+    >>> editor.merge([2, 3])
+    9
+    >>> editor.undo()
+    'merged 2, 3 into 9'
+    >>> editor.save()
+    >>> perception.load_map("kitchen.gsmap").get(1).label
+    'breakfast'
+    """
 
     def __init__(self, path: Path):
         self.path = Path(path)
@@ -280,7 +294,10 @@ class Editor:
 
     def _next_id(self) -> int:
         entries = [entry for state in (*self._past, *self._future) for entry in state.instances]
-        return 1 + max((e["id"] for entry in entries for e in (entry, *entry.get("parts", []))), default=-1)
+        number = 1 + max((e["id"] for entry in entries for e in (entry, *entry.get("parts", []))), default=-1)
+        if number > LARGEST:
+            raise InputError(f"{self.path}: has the id {LARGEST}, the largest; there is none left for another instance")
+        return number
 
     def _entry(self, instance: int, ids: np.ndarray, score: float, views: int, label: Any = None) -> dict[str, Any]:
         gmap, rows = self.original, ids == instance

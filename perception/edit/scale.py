@@ -10,9 +10,9 @@ import numpy as np
 from perception.boxes import move_box
 from perception.config import FrameConfig
 from perception.errors import InputError
-from perception.frame.place import measured_scale
 from perception.frame.recentre import map_from_input, moved
 from perception.frame.scale import KnownLength, Measurement, combined, known_length
+from perception.frame.world_frame import measured_scale
 from perception.geometry import move_points
 from perception.map.map import Map
 from perception.map.replace import writing

@@ -19,11 +19,12 @@ from perception.language.base import Encoder, reading_of
 from perception.language.description import from_arrays, to_arrays
 from perception.language.encoders import make_encoder
 from perception.language.ocr import TextReader, make_reader
-from perception.map.map import Map, language_in, prefixed
+from perception.map.map import MAX_SIDE, Map, language_in, prefixed
 from perception.map.replace import writing
 from perception.map.write import read_map, write_map
 from perception.photos.view_json import locate_photo
 from perception.progress import QUIET, Progress
+from perception.query.text_ranking import encoder_of
 
 
 def upgrade_map(
@@ -46,19 +47,17 @@ def upgrade_map(
     with writing(target):
         gmap = read_map(path)
         old = str(gmap.language["encoder"]) if gmap.language else None
-        settings = gmap.info.get("config", {}).get("language", {})
-        spec = settings.get("encoder", "auto")
-        encoder = encoders("conse" if spec == "auto" else spec) if gmap.language else None
+        encoder = encoder_of(gmap, encoders) if gmap.language else None
         if encoder is not None and encoder.identity != old:
-            _embed_again(gmap, encoder, int(settings.get("zooms") or reading_of(encoder).zooms), progress)
-        _read_again(gmap, make_reader(settings.get("texts", "auto")), progress)
+            _embed_again(gmap, encoder, progress)
+        _read_again(gmap, make_reader(gmap.setting("language", "texts", "auto")), progress)
         write_map(target, gmap, keep_report=True, fresh=output is not None)
     new = str(gmap.language["encoder"]) if gmap.language else None
     return {"map": str(target), "encoder": [old, new]}
 
 
-def _embed_again(gmap: Map, encoder: Encoder, zooms: int, progress: Progress) -> None:
-    """Replaces `language`, from `zooms` crops a view, and, if present, that of the parts and groups, from one."""
+def _embed_again(gmap: Map, encoder: Encoder, progress: Progress) -> None:
+    """Replaces `language` and, if present, that of the parts and groups."""
     names = [view.name for view in gmap.views]
 
     def described(
@@ -68,6 +67,7 @@ def _embed_again(gmap: Map, encoder: Encoder, zooms: int, progress: Progress) ->
         choices, load = _shown(gmap, stored, owners, ids)
         return to_arrays(describe_instances(encoder, choices, load, names, zooms, progress), encoder.identity)
 
+    zooms = gmap.setting("language", "zooms", 0) or reading_of(encoder).zooms
     gmap.language = described(gmap.language, gmap.instance_ids, [entry["id"] for entry in gmap.instances], zooms)
     if stored := language_in(gmap.parts):
         owners = gmap.parts["ids"]
@@ -106,7 +106,7 @@ def _shown(
         raise InputError(f"{gmap.path}: {found}; build the map again")
     wanted = sorted({number[name] for d in descriptions for name in d.views})
     located = {n: replace(gmap.views[n], photo=locate_photo(gmap.views[n], gmap.path)) for n in wanted}
-    gaussians, side = as_gaussians(gmap), int(gmap.info["config"]["photos"]["max_side"])
+    gaussians, side = as_gaussians(gmap), gmap.setting("photos", "max_side", MAX_SIDE)
     rank = {instance: n for n, instance in enumerate(ids)}
     positions = np.array([rank.get(int(i), -1) for i in owners], np.int32)
 

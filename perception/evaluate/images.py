@@ -6,10 +6,10 @@ import math
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from perception.errors import InputError
+from perception.photos.decode import read_picture
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"}
 _WINDOW = 11  # pixels a side
@@ -53,9 +53,9 @@ def ssim(prediction: np.ndarray, truth: np.ndarray, weight: np.ndarray | None = 
 
 def read_rgb(path: Path) -> np.ndarray:
     """An image as [H, W, 3] float64 in [0, 1]. 8 or 16 bit; grey is repeated to 3 channels, alpha is dropped."""
-    raw = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), cv2.IMREAD_UNCHANGED)
-    if raw is None or raw.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{path}: is not a readable 8 or 16 bit picture")
+    raw = read_picture(path, path, "8 or 16 bit picture")
+    if raw.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path}: holds {raw.dtype}, expected an 8 or 16 bit picture")
     image = raw[..., None] if raw.ndim == 2 else raw
     image = np.repeat(image[..., :1], 3, axis=2) if image.shape[2] < 3 else image[..., 2::-1]
     return image / (255.0 if raw.dtype == np.uint8 else 65535.0)

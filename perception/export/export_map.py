@@ -42,6 +42,9 @@ class ExportOptions:
     max_distance: in map units, beyond which points stay unlabelled; None = no limit.
     smooth: superpoint vote, on or off. segments: a ScanNet *.segs.json to use instead of our own segmentation, or
     SCANNET for the one that ScanNet's segmentator makes of a mesh.
+
+    >>> ExportOptions(max_distance=0.05, smooth=False)
+    ExportOptions(max_distance=0.05, smooth=False, segments=None)
     """
 
     max_distance: float | None = None
@@ -113,6 +116,12 @@ def export_map(
     color: of the written points, "original" or "instance". pose: `points` lie in a frame of their own: True registers
     them (`export.align`), a path names a file with map_from_scan [4, 4]. The result keeps that frame; the sidecar and
     the facts hold `map_from_scan`. granularity: see `at_granularity`.
+
+    InputError for a kind of file that is not written, and for a scan that does not overlap the map or is not aligned.
+
+    >>> facts, table = export_map(Path("kitchen.gsmap"), Path("labelled.ply"), Path("scan.ply"), ExportOptions())
+    >>> facts["points"], facts["labelled"], sorted(facts["instances"])[:3]
+    (900, 900, ['0', '1', '2'])
     """
     if output.suffix.lower() == ".spz":
         return _export_spz(map_path, output, points)

@@ -48,7 +48,12 @@ def export_mesh(
 
     The surface: rendered depth fused in a truncated signed distance field (`io.open3d.fuse_depth`), labelled as a scan
     is. One instance: `closed_body`. voxel: None = two pixels at the median depth; of an instance
-    at least a 64th of its longest side. color: "original" or "instance".
+    at least a 64th of its longest side. color: "original" or "instance". InputError for a map without views, and for an
+    instance that it does not have.
+
+    >>> facts, line = export_mesh(Map.open(Path("room.gsmap")), Path("crate.ply"), 1, 0.05, "original")
+    >>> facts["method"], facts["voxel_size"], facts["unit"]
+    ('space carving by rendered depth', 0.05, 'm')
     """
     views = rendered_depth(gmap, MOST_VIEWS, LONG_SIDE)
     if instance is None:
@@ -84,7 +89,12 @@ def export_voxels(gmap: Map, output: Path, voxel: float | None) -> tuple[dict[st
     """Writes occupancy [X, Y, Z] uint8 (0 unknown, 1 free, 2 occupied), esdf [X, Y, Z] float32 (`signed_distance`),
     origin [3] (the corner of voxel 0, 0, 0), voxel_size, frame and unit ("m" or "unknown") as .npz.
 
-    voxel: None = 5 cm in a metric map, else a 128th of the extent. The grid lies along the map's axes.
+    voxel: None = 5 cm in a metric map, else a 128th of the extent. The grid lies along the map's axes. InputError for a
+    map without views.
+
+    >>> facts, line = export_voxels(Map.open(Path("room.gsmap")), Path("space.npz"), 0.1)
+    >>> np.load("space.npz")["esdf"].shape == tuple(facts["shape"]), facts["unit"]
+    (True, 'm')
     """
     views = rendered_depth(gmap, MOST_VIEWS, LONG_SIDE // 2)
     eyes = camera_centres(np.stack([view.camera_from_world for view in views]))

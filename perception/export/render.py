@@ -25,7 +25,7 @@ from perception.map.outputs import refuse_inputs
 from perception.map.write import Map, read_map
 from perception.photos.decode import SUFFIXES
 from perception.photos.lens import camera_from_lens
-from perception.photos.reading import make_view
+from perception.photos.views import make_view
 from perception.pictures import features_to_rgb
 from perception.query.crops import cut_out
 from perception.query.query_map import QueryMap

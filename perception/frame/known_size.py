@@ -18,7 +18,7 @@ from perception.frame.scale import LARGEST_ERROR, KnownLength, Measurement
 from perception.geometry import align_similarity
 from perception.photos.decode import read_grey
 from perception.photos.lens import camera_from_lens
-from perception.photos.reading import view_lens
+from perception.photos.views import view_lens
 from perception.types import View
 
 TAG_FAMILIES = ("APRILTAG_36h11", "4X4_50", "5X5_100", "6X6_250")
@@ -122,7 +122,7 @@ def scale_of_sightings(
         if error < LARGEST_ERROR * metres and off < MISSHAPEN:  # false for NaN
             usable.append((thing.corners, rays, error))
     if not usable:
-        raise InputError(f"{source}: its corners cannot be triangulated to its shape; see it from farther apart places")
+        raise InputError(f"{source}: its corners cannot be triangulated to its shape; see it from farther apart")
     weights = np.array([error**-2 for _, _, error in usable])
 
     def mean(kept: np.ndarray) -> float:

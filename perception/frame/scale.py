@@ -12,7 +12,8 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import align_similarity, camera_centres
-from perception.photos.decode import DECODE_ERRORS, exif_of, open_photo
+from perception.io.documents import DAMAGE
+from perception.photos.decode import exif_folder, open_photo
 from perception.photos.depth import load_depth
 from perception.photos.lens import load_pycolmap
 from perception.types import View
@@ -101,7 +102,7 @@ def _depth_ratios(view: View, points: np.ndarray, rng: np.random.Generator) -> n
 
 @dataclass(frozen=True)
 class KnownLength:
-    """A length in metres between two places: instances by name, map points [2, 3], or pixels [2, 2] of photos."""
+    """A length in metres between two ends: instances by name, map points [2, 3], or pixels [2, 2] of photos."""
 
     metres: float
     names: tuple[str, str] | None = None
@@ -111,22 +112,22 @@ class KnownLength:
 
 _NUMBER = r"[-+.\deE]+"
 _POINTS = re.compile(rf"({_NUMBER},{_NUMBER},{_NUMBER})\s+({_NUMBER},{_NUMBER},{_NUMBER})")
-_PIXELS = re.compile(rf"(.+?)\s+({_NUMBER},{_NUMBER})\s+({_NUMBER},{_NUMBER})")
+_PIXEL = re.compile(f"{_NUMBER},{_NUMBER}")
 
 
 def known_length(text: str) -> KnownLength:
     """Reads "METRES: A, B" (labels or ids), "METRES: X,Y,Z X,Y,Z" or "METRES: PHOTO X,Y X,Y; PHOTO X,Y X,Y"."""
     expected = 'expected "METRES: LABEL, LABEL", "METRES: X,Y,Z X,Y,Z" or "METRES: PHOTO X,Y X,Y; PHOTO X,Y X,Y"'
     length, _, rest = (part.strip() for part in text.partition(":"))
-    entries = [_PIXELS.fullmatch(entry.strip()) for entry in rest.split(";") if entry.strip()]
+    entries = [entry.rsplit(maxsplit=2) for entry in rest.split(";") if entry.strip()]
     names = [name.strip() for name in rest.split(",")]
     try:
         if np.isnan(metres := float(length)):
             raise ValueError("its length is no number")
         if places := _POINTS.fullmatch(rest):
             found = KnownLength(metres, points=_finite([places[1], places[2]]))
-        elif entries and all(entries):
-            found = KnownLength(metres, pixels={e[1]: _finite([e[2], e[3]]) for e in entries if e})
+        elif entries and all(len(e) == 3 and all(map(_PIXEL.fullmatch, e[1:])) for e in entries):
+            found = KnownLength(metres, pixels={photo.strip(): _finite(ends) for photo, *ends in entries})
         elif len(names) == 2 and all(names) and ";" not in rest:
             found = KnownLength(metres, names=(names[0], names[1]))
         else:
@@ -153,34 +154,34 @@ def photo_position(photo: Path) -> np.ndarray | None:
     """Latitude and longitude in degrees and altitude in metres [3] from EXIF; None without them or out of range."""
     try:
         with open_photo(photo) as image:
-            tags = exif_of(image, photo).get_ifd(_GPS_FOLDER)
+            tags = exif_folder(image, photo, _GPS_FOLDER)
         angles = []
         for tag, negative in ((_LATITUDE, "S"), (_LONGITUDE, "W")):
             degrees, minutes, seconds = (float(x) for x in tags[tag + 1])
             angle = degrees + minutes / 60 + seconds / 3600
             angles.append(-angle if str(tags[tag]).strip("\0 ").upper() == negative else angle)
         below = tags.get(_ALTITUDE) in (1, b"\x01")
-        place = np.array([*angles, float(tags[_ALTITUDE + 1]) * (-1 if below else 1)])
-    except (InputError, *DECODE_ERRORS):
+        position = np.array([*angles, float(tags[_ALTITUDE + 1]) * (-1 if below else 1)])
+    except DAMAGE:  # InputError among them
         return None
-    known = np.isfinite(place).all() and abs(place[0]) <= 90 and abs(place[1]) <= 180 and place[:2].any()
-    return place if known else None
+    latitude, longitude, _ = position
+    known = np.isfinite(position).all() and abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
+    return position if known else None
 
 
-def earth_positions(places: np.ndarray) -> np.ndarray:
-    """Metres [N, 3] from the first of places [N, 3] (WGS84 degrees and metres), in axes fixed to the Earth."""
-    metres = np.asarray(load_pycolmap().GPSTransform().ellipsoid_to_ecef(places))
+def earth_positions(positions: np.ndarray) -> np.ndarray:
+    """Metres [N, 3] from the first of positions [N, 3] (WGS84 degrees and metres), in axes fixed to the Earth."""
+    metres = np.asarray(load_pycolmap().GPSTransform().ellipsoid_to_ecef(positions))
     return metres - metres[0]
 
 
 def scale_of_gps(views: Sequence[View], seed: int = 0) -> tuple[Measurement | None, list[str]]:
     """Metres per unit from the photos' GPS positions, and notes; None with too few, or of too large an error."""
-    places = [photo_position(view.photo) for view in views]
-    rows = [row for row, place in enumerate(places) if place is not None]
-    if len(rows) < LEAST:
+    known = [(view, position) for view in views if (position := photo_position(view.photo)) is not None]
+    if len(known) < LEAST:
         return None, []
-    centres = camera_centres(np.stack([views[row].camera_from_world for row in rows]))
-    return scale_of_positions(centres, earth_positions(np.stack([p for p in places if p is not None])), seed)
+    centres = camera_centres(np.stack([view.camera_from_world for view, _ in known]))
+    return scale_of_positions(centres, earth_positions(np.stack([position for _, position in known])), seed)
 
 
 def scale_of_positions(centres: np.ndarray, metres: np.ndarray, seed: int = 0) -> tuple[Measurement | None, list[str]]:

@@ -31,22 +31,20 @@ later, and is needed only for what photos show behind or beside the box."""
 @dataclass
 class Statistics:
     """Sums since the last densification, all [N]: gradient norms of the 2D mean (in units of half the image's long
-    side), how often a Gaussian was seen, and its largest radius as a share of the image's long side."""
+    side), and how often a Gaussian was seen."""
 
     gradient: torch.Tensor
     seen: torch.Tensor
-    radius: torch.Tensor
 
     @staticmethod
     def zeros(count: int, device: torch.device | None = None) -> Statistics:
-        return Statistics(*(torch.zeros(count, device=device) for _ in range(3)))
+        return Statistics(torch.zeros(count, device=device), torch.zeros(count, device=device))
 
-    def add(self, gradient_px: torch.Tensor, radius_px: torch.Tensor, visible: torch.Tensor, long_side: int) -> None:
-        """Adds one view: gradient_px [N, 2] of the 2D mean per pixel, radius_px [N] pixels, visible [N] uint8,
-        long_side in pixels. Rows that are not visible are not looked at."""
-        sums = (self.gradient, self.seen, self.radius)
-        kernels = training_kernels(visible.device)
-        kernels.add_statistics(gradient_px, radius_px, visible, *sums, 0.5 * long_side, 1 / long_side)
+    def add(self, gradient_px: torch.Tensor, visible: torch.Tensor, long_side: int) -> None:
+        """Adds one view: gradient_px [N, 2] of the 2D mean per pixel, visible [N] uint8, long_side in pixels. Rows that
+        are not visible are not looked at."""
+        add_statistics = training_kernels(visible.device).add_statistics
+        add_statistics(gradient_px, visible, self.gradient, self.seen, 0.5 * long_side)
 
     def mean_gradient(self) -> torch.Tensor:
         return self.gradient / self.seen.clamp(min=1)

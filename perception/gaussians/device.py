@@ -18,7 +18,7 @@ def training_kernels(device: torch.device) -> Any:
     """Losses and Adam for tensors on `device`; the stub of `_core.training` says what they do."""
     if device.type == "cpu":
         return _core.training
-    from perception.gaussians.cuda import training
+    from perception.rasterizer.cuda import training
 
     return training
 
@@ -40,7 +40,7 @@ def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> tuple[torch.device,
 
 
 def _has_driver() -> bool:
-    from perception.gaussians.cuda.launch import load_driver
+    from perception.rasterizer.cuda.launch import load_driver
 
     with suppress(InputError):
         load_driver()
@@ -57,7 +57,7 @@ def _usable_gpu() -> str:
     name, free = torch.cuda.get_device_name(), torch.cuda.mem_get_info()[0]
     if free < _LEAST_MEMORY:
         raise InputError(f"{name} has {free >> 20} MiB free, expected at least {_LEAST_MEMORY >> 20} MiB")
-    from perception.gaussians.rasterize import rasterize
+    from perception.rasterizer.rasterize import rasterize
 
     def picture(device: torch.device) -> torch.Tensor:
         """Of a red Gaussian two units in front of a camera, and the gradient of its brightness."""

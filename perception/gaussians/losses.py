@@ -143,7 +143,7 @@ def assign_labels(labels: Tensor | np.ndarray, keep: Keep = np.asarray) -> Label
     flat = torch.from_numpy(np.ascontiguousarray(image, dtype=np.int32).reshape(-1))
     slots = torch.empty_like(flat)
     try:
-        ids, counts, first = training_kernels(flat.device).assign(flat, 1.0, 0, slots)
+        ids, counts, first = training_kernels(flat.device).assign(flat, slots)
     except ValueError as error:  # an id below 0
         raise InputError(str(error)) from None
     long = torch.int64

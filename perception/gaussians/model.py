@@ -9,8 +9,7 @@ import numpy as np
 import torch
 
 from perception.colors import rgb_from_sh, sh_from_rgb
-
-Inputs = tuple[torch.Tensor | None, ...]
+from perception.rasterizer.types import Inputs
 
 
 def sigmoid(logits: torch.Tensor) -> torch.Tensor:
@@ -20,6 +19,17 @@ def sigmoid(logits: torch.Tensor) -> torch.Tensor:
     Logits are clamped to ±80, where float32 still holds exp(x). Opacities near 1e-35 need no gradient.
     """
     return 1 / (1 + torch.exp(-logits.clamp(-80, 80)))
+
+
+STORED = {
+    "means": "means",
+    "quats": "quats",
+    "scales": "log_scales",
+    "opacities": "opacity_logits",
+    "colors": "sh",
+    "features": "features",
+}
+"""The tensors of the rasterizer's inputs -> those of `Gaussians` that they are made of."""
 
 
 @dataclass
@@ -40,18 +50,22 @@ class Gaussians:
     def __len__(self) -> int:
         return int(self.means.shape[0])
 
+    def named(self) -> dict[str, torch.Tensor]:
+        """The tensors by name: what is optimised, and what a checkpoint holds."""
+        return {name: getattr(self, name) for name in STORED.values()}
+
     def to(self, device: torch.device | str) -> Gaussians:
         """The same Gaussians on `device`; tensors that are there already are not copied."""
-        return Gaussians(**{name: tensor.to(device) for name, tensor in vars(self).items()})
+        return Gaussians(**{name: tensor.to(device) for name, tensor in self.named().items()})
 
     def rows(self, index: torch.Tensor) -> Gaussians:
         """Copies of the rows `index` [M] int64 selects, in its order."""
-        return Gaussians(**{name: tensor[index].clone() for name, tensor in vars(self).items()})
+        return Gaussians(**{name: tensor[index].clone() for name, tensor in self.named().items()})
 
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:
         """All rows of `parts`, in order."""
-        return Gaussians(**{name: torch.cat([vars(part)[name] for part in parts]) for name in vars(parts[0])})
+        return Gaussians(**{name: torch.cat([part.named()[name] for part in parts]) for name in parts[0].named()})
 
     @property
     def scales(self) -> torch.Tensor:
@@ -71,10 +85,19 @@ class Gaussians:
         return rgb_from_sh(self.sh[:, 0])
 
     def inputs(self, camera_from_world: torch.Tensor, K: torch.Tensor, features: torch.Tensor | None = None) -> Inputs:
-        """The inputs of `rasterize_forward` for one camera, with colours that do not depend on the view.
+        """The inputs of the rasterizer for one camera, with colours that do not depend on the view.
         camera_from_world [4, 4], K [3, 3] pixels, on any device; features [N, D], where the Gaussians are."""
-        camera = (of[None].contiguous().to(self.means.device) for of in (camera_from_world, K))
-        return (self.means, self.quats, self.scales, self.opacities, self.base_colors, features, *camera)
+        device = self.means.device
+        return Inputs(
+            means=self.means,
+            quats=self.quats,
+            scales=self.scales,
+            opacities=self.opacities,
+            colors=self.base_colors,
+            viewmats=camera_from_world[None].contiguous().to(device),
+            Ks=K[None].contiguous().to(device),
+            features=features,
+        )
 
 
 def from_points(

@@ -19,7 +19,7 @@ BETAS, EPS = (0.9, 0.999), 1e-15
 class SparseAdam:
     """Adam (Kingma & Ba 2015) on the rows a mask selects, for tensors that grow and shrink together.
 
-    params: name -> [N, ...] float32 or float64 leaf tensors on one device, the same N for all; updated in place.
+    params: name -> [N, ...] float32 or float64 tensors on one device, the same N for all; updated in place.
     rates: name -> learning rate, or a tensor of one rate per column, shaped like a row ([...]), so that for
     example the DC and the higher spherical harmonics share a tensor and still learn at different speeds.
 
@@ -35,21 +35,18 @@ class SparseAdam:
     """
 
     def __init__(self, params: Mapping[str, Tensor], rates: Mapping[str, Rate]) -> None:
-        if set(params) != set(rates):
-            raise InputError(f"SparseAdam: params {sorted(params)} and rates {sorted(rates)} name different tensors")
         self.params = {name: _checked(name, tensor) for name, tensor in params.items()}
         self.rates: dict[str, Rate] = dict(rates)
         self.steps = 0
-        self._first = {name: torch.zeros_like(t, requires_grad=False) for name, t in self.params.items()}
-        self._second = {name: torch.zeros_like(t, requires_grad=False) for name, t in self.params.items()}
-        self._check_rows()
+        self._first = {name: torch.zeros_like(t) for name, t in self.params.items()}
+        self._second = {name: torch.zeros_like(t) for name, t in self.params.items()}
 
     def __len__(self) -> int:
         """N, the number of rows."""
         return len(next(iter(self.params.values()))) if self.params else 0
 
-    def step(self, visible: Tensor | None = None, grads: Mapping[str, Tensor] | None = None) -> dict[str, int]:
-        """One step. visible: [N] bool or uint8, None for all. grads: name -> [N, ...], by default each .grad.
+    def step(self, visible: Tensor | None, grads: Mapping[str, Tensor | None]) -> dict[str, int]:
+        """One step. visible: [N] bool or uint8, None for all. grads: name -> [N, ...].
 
         Tensors without a gradient are not updated; the global step count increases by one for all. Returns how many
         rows of each other one were skipped for a gradient with NaN or infinity, as a tensor where it is not on the CPU.
@@ -61,8 +58,7 @@ class SparseAdam:
         self.steps += 1
         skipped = {}
         for name, param in self.params.items():
-            grad = param.grad if grads is None else grads.get(name)
-            if grad is not None:
+            if (grad := grads.get(name)) is not None:
                 skipped[name] = self._step_one(name, param, grad, visible)
         return skipped
 
@@ -74,75 +70,59 @@ class SparseAdam:
             return 0
         rows = (len(param), -1)
         tensors = (param, grad.contiguous(), self._first[name], self._second[name])
-        matrices = [t.detach().view(rows) for t in tensors]
+        matrices = [t.view(rows) for t in tensors]
         width = matrices[0].shape[1]
         rate = np.asarray(self.rates[name], dtype=np.float64).reshape(-1)
         if rate.size not in (1, width):
             raise InputError(f"SparseAdam: rates of {name} are {rate.size}, expected 1 or {width}")
         rate = np.ascontiguousarray(np.broadcast_to(rate, width))
         adam = training_kernels(param.device).adam
-        _, skipped = adam(*matrices, visible, rate, self.steps, *BETAS, EPS)
+        skipped: int = adam(*matrices, visible, rate, self.steps, *BETAS, EPS)
         return skipped
 
     def keep(self, index: Tensor) -> None:
         """Keeps the rows `index` selects, in its order: [N] bool, or int64 row numbers (repeats allowed)."""
         for table in (self.params, self._first, self._second):
             for name, tensor in table.items():
-                table[name] = _leaf_like(tensor, tensor.detach()[index].contiguous())
+                table[name] = tensor[index].contiguous()
 
     def resize(self, name: str, count: int) -> None:
         """Cuts the rows of `name`, [N, K, ...], to K = count, or extends them by zeros, and their moments alike."""
         for table in (self.params, self._first, self._second):
-            old = table[name].detach()
+            old = table[name]
             more = old.new_zeros(len(old), max(0, count - old.shape[1]), *old.shape[2:])
-            table[name] = _leaf_like(table[name], torch.cat([old[:, :count], more], dim=1))
+            table[name] = torch.cat([old[:, :count], more], dim=1)
 
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Appends rows (name -> [M, ...], the same M for all) with zero moments."""
-        if set(rows) != set(self.params):
-            raise InputError(f"SparseAdam: append got {sorted(rows)}, expected {sorted(self.params)}")
         for name, new in rows.items():
             old = self.params[name]
-            new = new.detach().to(old)
-            self.params[name] = _leaf_like(old, torch.cat([old.detach(), new]))
+            new = new.to(old)
+            self.params[name] = torch.cat([old, new])
             for table in (self._first, self._second):
                 table[name] = torch.cat([table[name], torch.zeros_like(new)])
-        self._check_rows()
 
     def state_dict(self, copy: bool = True) -> dict[str, Any]:
         """Everything needed to continue: params and moments on the CPU, rates, step count. copy: of what is there now,
         else, on the CPU, the tensors themselves, which the next step changes."""
         tables = {"params": self.params, "first": self._first, "second": self._second}
         copies: dict[str, Any] = {
-            key: {name: t.detach().to("cpu", copy=copy) for name, t in table.items()} for key, table in tables.items()
+            key: {name: t.to("cpu", copy=copy) for name, t in table.items()} for key, table in tables.items()
         }
         return copies | {"rates": dict(self.rates), "steps": self.steps}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restores a `state_dict`; the number of rows may differ, different names raise InputError."""
-        if set(state["params"]) != set(self.params):
-            raise InputError(f"SparseAdam: state has {sorted(state['params'])}, expected {sorted(self.params)}")
+        """Restores a `state_dict` of the same names; the number of rows may differ."""
         for table, key in ((self.params, "params"), (self._first, "first"), (self._second, "second")):
             for name, tensor in state[key].items():
-                fresh = tensor.detach().to(table[name].device, copy=True).contiguous()
-                table[name] = _leaf_like(table[name], fresh)
+                table[name] = tensor.to(table[name].device, copy=True).contiguous()
         self.rates = dict(state["rates"])
         self.steps = state["steps"]
-        self._check_rows()
-
-    def _check_rows(self) -> None:
-        rows = {name: len(tensor) for name, tensor in self.params.items()}
-        if len(set(rows.values())) > 1:
-            raise InputError(f"SparseAdam: tensors differ in their number of rows: {rows}")
-
-
-def _leaf_like(old: Tensor, new: Tensor) -> Tensor:
-    return new.requires_grad_(old.requires_grad)
 
 
 def _checked(name: str, tensor: Tensor) -> Tensor:
-    fine = tensor.is_leaf and tensor.dtype in (torch.float32, torch.float64)
+    fine = tensor.dtype in (torch.float32, torch.float64) and not tensor.requires_grad
     if not fine or tensor.ndim < 1 or not tensor.is_contiguous():
-        found = f"{tensor.dtype} {list(tensor.shape)}, leaf={tensor.is_leaf}"
-        raise InputError(f"SparseAdam: {name} is {found}, expected a contiguous float leaf [N, ...]")
+        found = f"{tensor.dtype} {list(tensor.shape)}, requires_grad={tensor.requires_grad}"
+        raise InputError(f"SparseAdam: {name} is {found}, expected contiguous floats [N, ...] without a gradient")
     return tensor

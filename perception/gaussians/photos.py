@@ -11,7 +11,7 @@ import torch
 
 from perception.config import PhotoConfig
 from perception.errors import InputError
-from perception.gaussians.train import TrainingView
+from perception.gaussians.views import TrainingView
 from perception.io.memory import Keep
 from perception.masks.label_files import load_labels
 from perception.photos.decode import load_photo, scaled_K

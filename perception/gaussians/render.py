@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.rasterize import Rasterization, rasterize
+from perception.rasterizer.rasterize import Rasterization, rasterize
 
 
 def render(

@@ -12,37 +12,22 @@ run resumed from a checkpoint takes the same steps as one without interruption.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field
-from typing import Any, Protocol
+from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 import torch
 
-from perception.config import MapConfig
 from perception.errors import InputError
-from perception.gaussians.densify import Statistics
-from perception.gaussians.losses import (
-    LabelAssignment,
-    assign_labels,
-    depth_loss,
-    instance_loss,
-    photometric,
-    variance_loss,
-)
-from perception.gaussians.model import Gaussians
-from perception.gaussians.optimiser import SparseAdam
-from perception.gaussians.rasterize import Forward, Settings, passes
-from perception.gaussians.rates import learning_rates
-from perception.gaussians.schedule import Schedule
-from perception.gaussians.size import sized
-from perception.gaussians.views import TrainingView, scene_extent, target_photo
+from perception.gaussians import schedule
+from perception.gaussians.losses import depth_loss, instance_loss, photometric, variance_loss
+from perception.gaussians.model import STORED
+from perception.gaussians.state import TrainingState, TrainRecord
+from perception.gaussians.views import TrainingView, target_photo
 from perception.interrupts import uninterrupted
 from perception.machine import torch_on_one_thread
-from perception.progress import timed
-
-__all__ = ["TrainRecord", "Trainer", "TrainingView", "scene_extent"]
+from perception.rasterizer.rasterize import rasterizer_for
+from perception.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 
 SSIM_WEIGHT = 0.2
 """β of the photometric loss (eq. 4), as in Kerbl et al. 2023."""
@@ -50,37 +35,6 @@ _LEAST_RECORDS = 1 << 18
 """Gradient records that a GPU must have room for at once (see `Settings.max_records`)."""
 INSTANCE_WEIGHT = 0.1
 """λ_inst2d of eq. 14; w_p = w_n = 1 in eq. 9."""
-
-
-@dataclass
-class TrainRecord:
-    """JSON-able. profile: wall-clock seconds by part.
-
-    pairs: (Gaussian, pixel) pairs of all training steps that contributed.
-    """
-
-    curve: list[dict[str, float]] = field(default_factory=list)
-    decisions: list[str] = field(default_factory=list)
-    profile: dict[str, float] = field(default_factory=dict)
-    pairs: int = 0
-    seconds: float = 0.0
-    iterations: int = 0
-    skipped_gradients: int = 0
-
-    @staticmethod
-    def joined(records: Sequence[TrainRecord]) -> TrainRecord:
-        """The record of a model that was trained in blocks: sums, and the decisions of each; it has no curve."""
-        whole = TrainRecord()
-        for number, record in enumerate(records, start=1):
-            whole.decisions += [f"block {number}: {told}" for told in record.decisions]
-            whole.profile = {part: whole.profile.get(part, 0.0) + s for part, s in record.profile.items()}
-            for name in ("pairs", "seconds", "iterations", "skipped_gradients"):
-                setattr(whole, name, getattr(whole, name) + getattr(record, name))
-        return whole
-
-    def timed(self, part: str) -> AbstractContextManager[None]:
-        """Adds the wall-clock seconds of its block to `part` of the profile. A nested block counts in both parts."""
-        return timed(self.profile, part)
 
 
 class Observer(Protocol):
@@ -93,48 +47,10 @@ class Observer(Protocol):
         """Called when `Trainer.run` returns or is interrupted; not when a step failed."""
 
 
-class Trainer:
-    """All state of one optimisation; `state` exports it for a checkpoint, and `load` restores it.
+class Trainer(TrainingState):
+    """Takes the steps of a training on its own state, and between them those of the schedule."""
 
-    gaussians, views, held_out: on the CPU. Gaussians, optimiser and training views are then kept on `device`. box:
-    [2, 3] corners of the space that matters, in which most Gaussians are added; None: all.
-    """
-
-    def __init__(
-        self,
-        gaussians: Gaussians,
-        views: list[TrainingView],
-        config: MapConfig,
-        held_out: list[TrainingView],
-        device: torch.device | None = None,
-        box: np.ndarray | None = None,
-    ):
-        self.config = sized(config, len(views))
-        self.device = device or torch.device("cpu")
-        self._forward, self._backward = passes(self.device)
-        self._max_records = 0
-        self.held_out = held_out
-        self.box = None if box is None else torch.tensor(box, dtype=torch.float32, device=self.device)
-        self.extent = scene_extent(views)
-        self.record = TrainRecord()
-        self.iteration = 0
-        self.complete = False  # finished, unless a longer training is requested
-        self.skipped = 0.0  # share of training progress skipped by early stopping
-        self.initial_count = len(gaussians)
-        self.gaussians = gaussians.to(self.device)
-        self.statistics = Statistics.zeros(len(gaussians), self.device)
-        self.optimiser = SparseAdam(vars(self.gaussians), self._rates(0.0))
-        self._sync()
-        self.schedule = Schedule(self)
-        self.show(views)
-        self._since: float | None = None  # time.monotonic() at the start of `run`, None outside
-
-    def show(self, views: list[TrainingView]) -> None:
-        """Sets the training views: the same photos as before, possibly with labels added."""
-        self.views, self.coarse = views, [view.halved().stored() for view in views]
-        self._placed: dict[tuple[str, int], TrainingView] = {}  # those seen so far, on the device
-        self._assigned: dict[str, LabelAssignment] = {}  # of the views seen so far
-        self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
+    _max_records = 0  # see `Settings`
 
     def run(self, observer: Observer | None = None, until: float = 1.0) -> TrainRecord:
         """Trains until progress `until`. Early stopping is allowed only with until = 1."""
@@ -151,14 +67,14 @@ class Trainer:
                         except RuntimeError as error:
                             self._recover(error)
                             continue
-                        self.schedule.after_step(progress, may_stop=until >= 1.0)
+                        schedule.after_step(self, progress, may_stop=until >= 1.0)
                         whole = True
                     if observer is not None:
                         observer.after_step(self, loss)
                 if until >= 1.0 and not self.complete:
                     with uninterrupted():
                         whole = False
-                        self.schedule.finish()
+                        schedule.finish(self)
                         self.complete = whole = True
         finally:
             self.record.seconds, self.record.iterations = self.elapsed, self.iteration
@@ -182,56 +98,63 @@ class Trainer:
         torch.cuda.empty_cache()
         self.record.decisions.append(f"memory: at most {self._max_records} gradient records at once")
 
-    # -------------------------------------------------------------------- step
-
     def step(self, progress: float) -> float:
         """One iteration: renders a view, computes the loss and its gradient, takes an Adam step. Returns the loss."""
-        chosen, with_features = self.schedule.next_view(progress)
-        view = self._on_device(chosen)
+        chosen, with_features = schedule.next_view(self, progress)
+        view = self.placed(chosen)
         height, width = view.photo.shape[:2]
-        g, measured = self.gaussians, view.depth is not None
         settings = Settings(
-            width, height, g.sh_degree, eps2d=view.eps2d, variance=with_features, depth=measured,
+            width,
+            height,
+            sh_degree=self.gaussians.sh_degree,
+            eps2d=view.eps2d,
+            variance=with_features,
+            depth=view.depth is not None,
             max_records=self._max_records,
-        )  # fmt: skip
-        # On a random background colour, so that an empty region cannot fit the photo.
-        colors = np.random.default_rng([self.config.seed, self.iteration, 1]).random((1, 3), dtype=np.float32)
-        background = torch.from_numpy(colors).to(self.device)
+        )
+        rasterizer = rasterizer_for(self.device)
         with self.record.timed("rasterizer forward"):
-            cameras = (view.camera_from_world[None], view.K[None])
-            features = g.features if with_features else None
-            inputs = (g.means, g.quats, g.scales, g.opacities, g.sh, features, *cameras)
-            out = self._forward(inputs, background, settings)  # I (eq. 3), F (eq. 5) and Var F (eq. 12)
+            inputs = self._inputs(view, with_features)
+            out = rasterizer.rasterize_forward(inputs, settings)  # I (eq. 3), F (eq. 5) and Var F (eq. 12)
         with self.record.timed("losses"):
             loss, cotangents = self._losses(view, out)
         with self.record.timed("rasterizer backward"):
-            gradients = {
-                name: buffer for name, buffer in self._gradients.items() if with_features or name != "features"
-            }
-            stored = [gradients.get(name) for name in (*vars(g), "viewmats", "mean2d")]
-            self._backward(inputs, background, settings, out, cotangents, (), stored)
+            gradients = self.gradients if with_features else replace(self.gradients, features=None)
+            rasterizer.rasterize_backward(inputs, settings, out, cotangents, gradients, stored=True)
         with self.record.timed("Adam"):
-            self.optimiser.rates = self._rates(progress)
-            self.record.skipped_gradients += int(sum(self.optimiser.step(out.visible[0], gradients).values()))
-        if self.schedule.grows_at(progress):
+            self._update(progress, gradients, out.visible[0])
+        if schedule.grows_at(self, progress):
             with self.record.timed("densification"):
-                mean2d, long_side = self._gradients["mean2d"][0], max(height, width)
-                self.statistics.add(mean2d, out.radii[0], out.visible[0], long_side)
+                assert gradients.mean2d is not None  # for the type checker
+                self.statistics.add(gradients.mean2d[0], out.visible[0], max(height, width))
         self.record.pairs += out.frames.contributing
         self.iteration += 1
         return float(loss)
 
-    def _on_device(self, view: TrainingView) -> TrainingView:
-        """The view on the device, where it stays."""
-        if self.device.type == "cpu":
-            return view
-        key = view.name, len(view.photo)
-        if key not in self._placed:
-            self._placed[key] = view.to(self.device)
-        return self._placed[key]
+    def _inputs(self, view: TrainingView, with_features: bool) -> Inputs:
+        g = self.gaussians
+        # A random background colour, so that an empty region cannot fit the photo.
+        background = np.random.default_rng([self.config.seed, self.iteration, 1]).random((1, 3), dtype=np.float32)
+        return Inputs(
+            means=g.means,
+            quats=g.quats,
+            scales=g.scales,
+            opacities=g.opacities,
+            colors=g.sh,
+            viewmats=view.camera_from_world[None],
+            Ks=view.K[None],
+            features=g.features if with_features else None,
+            background=torch.from_numpy(background).to(self.device),
+        )
 
-    def _losses(self, view: TrainingView, out: Forward) -> tuple[float, tuple[torch.Tensor | None, ...]]:
-        """L (eq. 14) and its gradients with respect to colors, alphas, depths, features and their variance."""
+    def _update(self, progress: float, gradients: Gradients, visible: torch.Tensor) -> None:
+        """One step of Adam, for the visible Gaussians."""
+        self.optimiser.rates = self.rates(progress)
+        of_stored = {stored: getattr(gradients, name) for name, stored in STORED.items()}
+        self.record.skipped_gradients += int(sum(self.optimiser.step(visible, of_stored).values()))
+
+    def _losses(self, view: TrainingView, out: Forward) -> tuple[float, Cotangents]:
+        """L (eq. 14) and its gradients with respect to the images."""
         losses, image = self.config.losses, view.exposed(out.colors[0])
         rgb = photometric(image, target_photo(view, image), SSIM_WEIGHT, view.weight)  # L_RGB, eq. 4
         total, colors = rgb.value, view.exposed(rgb.gradient)[None]
@@ -245,88 +168,8 @@ class Trainer:
             spread = out.feature_variance[0] if view.weight is None else out.feature_variance[0] * weight
             value, variance = variance_loss(spread, losses.variance_weight)  # λ_var L_var, eq. 13
             total, variance = total + value, (variance if view.weight is None else variance * weight)[None]
-            if view.labels is not None:
-                labels = self._assigned.get(view.name) or assign_labels(view.labels, view.keep).to(self.device)
-                self._assigned[view.name] = labels
+            if (labels := self.assigned(view)) is not None:
                 w = INSTANCE_WEIGHT
                 found = instance_loss(out.features[0], labels, margin=losses.margin, w_pos=w, w_neg=w)  # eqs. 6 to 9
                 total, features = total + found.value, found.gradient[None]
-        return total, (colors, alphas, depths, features, variance)
-
-    def _rates(self, progress: float) -> dict[str, float | torch.Tensor]:
-        return learning_rates(progress, self.extent, self.gaussians.sh.shape[1], self.config.train.iterations)
-
-    # ---------------------------------------------------------------- progress
-
-    @property
-    def elapsed(self) -> float:
-        """Seconds of training, including those before a resume, without the time between two calls of `run`."""
-        return self.record.seconds + (0.0 if self._since is None else time.monotonic() - self._since)
-
-    @property
-    def progress(self) -> float:
-        share = self.iteration / self.config.train.iterations + self.skipped
-        limit = self.config.train.time_limit
-        return min(1.0, share if limit is None else max(share, self.elapsed / limit))
-
-    @property
-    def expected_iterations(self) -> int:
-        """Estimate of the total number of iterations of the run."""
-        share = self.iteration / self.config.train.iterations + self.skipped
-        if self.progress > share:  # the time limit determines progress
-            return max(self.iteration, round(self.iteration / max(self.progress, 1e-6)))
-        return round(self.iteration + (1 - self.progress) * self.config.train.iterations)
-
-    # ------------------------------------------------------------------- model
-
-    def keep(self, rows: torch.Tensor) -> None:
-        """Keeps the Gaussians that `rows` [M] int64 selects, with their Adam moments."""
-        self.optimiser.keep(rows)
-        self._sync()
-
-    def append(self, born: Gaussians) -> None:
-        """Adds Gaussians with zero Adam moments."""
-        self.optimiser.append(vars(born))
-        self._sync()
-
-    def set_degree(self, degree: int) -> None:
-        """Truncates the spherical harmonics to `degree`, or adds zero coefficients up to it."""
-        self.optimiser.resize("sh", (degree + 1) ** 2)
-        self._sync()
-
-    def _sync(self) -> None:
-        """Makes `gaussians` share the optimiser's tensors, which are replaced when rows are added or removed.
-
-        The gradients' memory is kept from step to step: rows that a step does not see hold old values, not read.
-        """
-        self.gaussians = Gaussians(**{name: tensor.detach() for name, tensor in self.optimiser.params.items()})
-        self._gradients = {name: torch.zeros_like(tensor) for name, tensor in vars(self.gaussians).items()}
-        self._gradients["mean2d"] = self.gaussians.means.new_zeros(1, len(self.gaussians), 2)
-
-    # -------------------------------------------------------------- checkpoint
-
-    def state(self, copy: bool = True) -> dict[str, Any]:
-        """All values needed to resume, for a checkpoint; without `copy` they are those of now until the next step."""
-        return {
-            "iteration": self.iteration,
-            "initial_count": self.initial_count,
-            "optimiser": self.optimiser.state_dict(copy),
-            "statistics": {name: tensor.cpu() for name, tensor in vars(self.statistics).items()},
-            "record": dict(vars(self.record), seconds=self.elapsed, iterations=self.iteration),
-            "stopping": asdict(self.schedule.stopping),
-            "skipped": self.skipped,
-            "complete": self.complete,
-        }
-
-    def load(self, state: dict[str, Any]) -> None:
-        """Restores the result of `state`."""
-        self.gaussians = Gaussians(**state["optimiser"]["params"]).to(self.device)
-        self.optimiser = SparseAdam(vars(self.gaussians), self._rates(0.0))
-        self.optimiser.load_state_dict(state["optimiser"])
-        self._sync()
-        sums = {name: tensor.to(self.device) for name, tensor in state["statistics"].items()}
-        self.statistics = Statistics(**sums)
-        self.record = TrainRecord(**state["record"])
-        self.iteration, self.initial_count = state["iteration"], state["initial_count"]
-        vars(self.schedule.stopping).update(state["stopping"])
-        self.skipped, self.complete = state["skipped"], state["complete"]
+        return total, Cotangents(colors, alphas, depths, features, variance)

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.rasterize import Rasterization
 from perception.gaussians.render import render
 from perception.io.memory import Keep
+from perception.rasterizer.rasterize import Rasterization
 
 _ON_DEVICE = ("photo", "K", "camera_from_world", "weight", "depth", "gain")
 BEST_PSNR = 100.0

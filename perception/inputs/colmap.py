@@ -8,7 +8,6 @@ Format"; little endian. Rigs and frames came with COLMAP 3.12.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from struct import Struct
 from typing import Any
@@ -17,14 +16,11 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.documents import safe_name
-from perception.photos.decode import why_left_out
-from perception.photos.ignore_masks import mask_of
-from perception.photos.lens import lens_from_camera, load_pycolmap
-from perception.photos.reading import Reading, fit_lens, make_view
-from perception.sfm.exposure import with_gains
-from perception.sfm.tracks import tracks_of_model
-from perception.sfm.triangulate import MIN_POINTS, cloud_of, posed_scene
-from perception.types import Scene, View
+from perception.photos.lens import load_pycolmap
+from perception.sfm.model import cloud_of, views_of_model
+from perception.sfm.options import ReadOptions
+from perception.sfm.triangulate import MIN_POINTS, posed_scene
+from perception.types import Scene
 
 _PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
 """Number of parameters of a camera, by COLMAP's model id."""
@@ -44,7 +40,7 @@ def is_workspace(folder: Path) -> bool:
     return (folder / "images").is_dir() and bool(_models(folder))
 
 
-def read_workspace(folder: Path, how: Reading) -> Scene:
+def read_workspace(folder: Path, options: ReadOptions) -> Scene:
     """The largest sparse model of a workspace as a Scene, in COLMAP's world.
 
     Photos that are missing or damaged are left out and reported. Image names that point outside the photo folder raise
@@ -56,43 +52,15 @@ def read_workspace(folder: Path, how: Reading) -> Scene:
         raise InputError(f"{path}: the sparse model is empty (no registered photo); run structure from motion again")
     names = {image_id: safe_name(model.images[image_id].name, path) for image_id in model.reg_image_ids()}
     located = {image_id: (name, folder / "images" / name) for image_id, name in names.items()}
-    views, facts = views_of_model(model, located, path, how)
+    views, facts = views_of_model(model, located, path, options)
     if len(found) > 1:
         sizes = ", ".join(f"{p.name}: {m.num_reg_images()}" for p, m in found.items())
         facts["warnings"].append(f"{folder}: {len(found)} sparse models (photos in {sizes}); the largest is used")
-    cloud = how.cloud or cloud_of(model)
+    cloud = options.cloud or cloud_of(model)
     if len(cloud[0]) < MIN_POINTS:
         facts["warnings"].append(f"{path}: the sparse model holds {len(cloud[0])} points; new ones are triangulated")
     facts |= {"model": path.relative_to(folder).as_posix(), "mean_reprojection_error_px": _reprojection_error(model)}
-    return posed_scene(views, cloud, {"input": "colmap", **facts}, how, MIN_POINTS)
-
-
-def views_of_model(
-    model: Any, located: dict[int, tuple[str, Path]], source: Path, how: Reading
-) -> tuple[list[View], dict[str, Any]]:
-    """Views sorted by name, and facts: "left_out" with reasons, "warnings", "exposure". located: view name and photo by
-    image id. InputError when no photo is left."""
-    views, missing, notes = [], [], set()
-    lenses = {camera_id: lens_from_camera(camera) for camera_id, camera in model.cameras.items()}
-    for image_id, (name, photo) in located.items():
-        image = model.images[image_id]
-        there = photo.is_file()
-        why = why_left_out(photo, how.strict) if there else "in the sparse model, but the photo is missing"
-        if why is not None:
-            missing.append({"name": name, "why": why})
-            continue
-        lens, note = fit_lens(lenses[image.camera_id], photo, source)
-        pose = np.eye(4)
-        pose[:3] = image.cam_from_world().matrix()
-        views.append(replace(make_view(name, photo, lens, pose, source), mask=mask_of(how.masks, name)))
-        if note:
-            notes.add(note)
-    if not views:
-        raise InputError(f"{source}: none of the {len(located)} photos of the sparse model is there")
-    names = {image_id: name for image_id, (name, _) in located.items()}
-    views.sort(key=lambda view: view.name)
-    views, exposure = with_gains(views, tracks_of_model(model, views, names))
-    return views, {"left_out": sorted(missing, key=lambda item: item["name"]), "warnings": sorted(notes), **exposure}
+    return posed_scene(views, cloud, {"input": "colmap", **facts}, options, MIN_POINTS)
 
 
 def _reprojection_error(model: Any) -> float | None:

@@ -36,17 +36,29 @@ _TEXTS = (
 _COLOR_FOLDERS = ("color", "image", "rgb")
 
 
-def find_recording(source: Path) -> Recording | None:
-    """The recording in folder `source`, or None when it has none of the layouts. InputError for one that is damaged."""
+def is_recording(source: Path) -> bool:
+    """Whether folder `source` has one of the layouts."""
+    return _layout(source) is not None
+
+
+def open_recording(source: Path) -> Recording:
+    """The recording in folder `source`. InputError for one that is damaged, or without a layout."""
+    read = _layout(source)
+    if read is None:
+        raise InputError(f"{source}: no RGB-D recording; expected the files of TUM, ScanNet, 7-Scenes or Redwood")
+    return read(source)
+
+
+def _layout(source: Path) -> Callable[[Path], Recording] | None:
+    """What reads the layout that the folder has, recognised by its names; None where it has none."""
     if (source / "rgb.txt").is_file() and (source / "depth.txt").is_file():
-        return _tum(source)
+        return _tum
     if (source / "color").is_dir() and (source / "pose").is_dir():
-        return _scannet(source)
+        return _scannet
     if any(source.glob("frame-*.color.*")) or any(source.glob("seq*/frame-*.color.*")):
-        return _seven_scenes(source)
-    color = next((source / name for name in _COLOR_FOLDERS if (source / name).is_dir()), None)
-    if color is not None and (source / "depth").is_dir() and any(source.glob("*.log")):
-        return _redwood(source, color)
+        return _seven_scenes
+    if _color_folder(source) and (source / "depth").is_dir() and any(source.glob("*.log")):
+        return _redwood
     return None
 
 
@@ -54,6 +66,10 @@ def text_files(source: Path) -> list[Path]:
     """The files with poses, cameras and lists of photos in folder `source`, or of 3DMatch above it."""
     found = [file for pattern in _TEXTS for file in source.glob(pattern)]
     return [file for file in [*found, source.parent / "camera-intrinsics.txt"] if file.is_file()]
+
+
+def _color_folder(source: Path) -> Path | None:
+    return next((source / name for name in _COLOR_FOLDERS if (source / name).is_dir()), None)
 
 
 def refuse_depth_without_poses(source: Path) -> None:
@@ -160,8 +176,9 @@ def _posed(source: Path, photos: list[Path], beside: Callable[[Path, str], Path]
     return frames
 
 
-def _redwood(source: Path, folder: Path) -> Recording:
+def _redwood(source: Path) -> Recording:
     """color/ (or image/, rgb/) and depth/ in mm in equal order, and a .log of world_from_camera matrices."""
+    folder = _color_folder(source) or source
     photos, depths = _images(folder), _images(source / "depth")
     if len(photos) != len(depths):
         raise InputError(f"{source}: {len(photos)} photos in {folder.name}/, {len(depths)} images in depth/; pair them")
@@ -187,12 +204,12 @@ def _trajectory(file: Path, photos: int) -> dict[int, np.ndarray]:
     try:
         numbers = [int(row[0]) for row in rows[::5]]
         matrices = np.array([row for index, row in enumerate(rows) if index % 5], np.float64).reshape(-1, 4, 4)
-        places = list(range(photos)) if len(numbers) == photos else numbers
-        poses = dict(zip(places, matrices, strict=True))
+        numbers = list(range(photos)) if len(numbers) == photos else numbers
+        poses = dict(zip(numbers, matrices, strict=True))
     except ValueError as error:
         raise InputError(f"{file}: expected blocks of a line 'i i i+1' and four rows of four numbers") from error
-    if min(places) < 0 or max(places) >= photos:
-        raise InputError(f"{file}: tells the pose of photo {max(places)} (counted from 0), there are {photos} photos")
+    if min(numbers) < 0 or max(numbers) >= photos:
+        raise InputError(f"{file}: holds a pose of photo {max(numbers)} (counted from 0), there are {photos} photos")
     return poses
 
 
@@ -216,7 +233,7 @@ def _numbers(file: Path, columns: int) -> np.ndarray:
 
 
 def _rows(file: Path) -> list[list[str]]:
-    """The words of each line that is not empty and no comment; InputError where there is none."""
+    """The fields of each line that is not empty and no comment; InputError where there is none."""
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -12,11 +12,13 @@ import numpy as np
 from perception.errors import InputError
 from perception.geometry import inverse_se3
 from perception.io.documents import safe_name
+from perception.photos.decode import read_picture
 from perception.photos.depth import read_depth
 from perception.photos.ignore_masks import mask_of
-from perception.photos.reading import NO_CLOUD, Reading, fit_lens, make_view, rigid_pose
 from perception.photos.video import Chooser
+from perception.photos.views import fit_lens, make_view, rigid_pose
 from perception.progress import Progress
+from perception.sfm.options import NO_CLOUD, ReadOptions
 from perception.sfm.triangulate import posed_scene
 from perception.types import DepthImage, Lens, Scene, View
 
@@ -39,7 +41,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Recording:
-    """kind: for messages. frames: in order of time. lens: of all photos, None when the folder does not tell.
+    """kind: for messages. frames: in order of time. lens: of all photos, None when the folder has no intrinsics.
 
     metre: stored units of depth per metre. depth_lens: of the depth camera, at the photo's pose; None when depth shows
     what the photo shows. notes, warnings: one line each.
@@ -55,18 +57,18 @@ class Recording:
     warnings: list[str] = field(default_factory=list)
 
 
-def recorded_scene(recording: Recording, how: Reading) -> Scene:
+def recorded_scene(recording: Recording, options: ReadOptions) -> Scene:
     """The chosen frames of a recording as a Scene in its own world, whose unit is the metre.
     InputError for poses that are not rigid, a missing lens, and depth whose unit cannot be right."""
-    source, kind, lens = recording.source, recording.kind, recording.lens
+    source, kind, lens = recording.source, recording.kind, options.lens or recording.lens
     if not recording.frames:
         raise InputError(f"{source}: a recording as of {kind}, but no frame has both photo and pose")
     if lens is None:
         raise InputError(f"{source}: a recording as of {kind} without the intrinsics of its photos; give --camera FILE")
     for frame in recording.frames:
         rigid_pose(frame.world_from_camera, f"{source}: the pose of {frame.name}")
-    chosen, damaged = choose_frames(recording, lens, how.progress, how.strict)
-    views = [_view(recording, frame, lens, how.masks) for frame in chosen]
+    chosen, damaged = choose_frames(recording, lens, options.progress, options.strict)
+    views = [_view(recording, frame, lens, options.masks) for frame in chosen]
     taken = f"{len(chosen)} of {len(recording.frames)} frames chosen, sharp and well spaced"
     facts: dict[str, Any] = {
         "input": kind,
@@ -77,7 +79,7 @@ def recorded_scene(recording: Recording, how: Reading) -> Scene:
         "scale": {"source": f"poses and depth of {kind}, in metres by definition"},
     }
     views.sort(key=lambda view: view.name)
-    return replace(posed_scene(views, how.cloud or NO_CLOUD, facts, how, least=1), metric=True)
+    return replace(posed_scene(views, options.cloud or NO_CLOUD, facts, options, least=1), metric=True)
 
 
 def choose_frames(
@@ -92,10 +94,12 @@ def choose_frames(
     shown: list[Frame] = []
     damaged: list[str] = []
     for done, frame in enumerate(recording.frames, start=1):
-        picture = cv2.imdecode(np.fromfile(frame.photo, np.uint8), cv2.IMREAD_REDUCED_COLOR_2)
-        if picture is None:
+        try:
+            what = "photo; replace or remove it"
+            picture = read_picture(frame.photo, frame.photo, what, cv2.IMREAD_REDUCED_COLOR_2)
+        except InputError:
             if strict:
-                raise InputError(f"{frame.photo}: not a readable photo; replace or remove it")
+                raise
             damaged.append(frame.name)
             continue
         motion = 0.0

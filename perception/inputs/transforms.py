@@ -13,12 +13,14 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.geometry import OPENCV_FROM_OPENGL, inverse_se3
+from perception.inputs.start_cloud import start_points
 from perception.io.documents import brief, read_json, safe_name
 from perception.photos.decode import SUFFIXES, photo_size, why_left_out
 from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import FISHEYE, PERSPECTIVE, opencv_lens
-from perception.photos.reading import NO_CLOUD, Reading, fit_lens, make_view, rigid_pose, start_points
 from perception.photos.view_json import absolute
+from perception.photos.views import fit_lens, make_view, rigid_pose
+from perception.sfm.options import NO_CLOUD, ReadOptions
 from perception.sfm.triangulate import posed_scene
 from perception.types import DepthImage, Lens, Scene, View
 
@@ -31,7 +33,7 @@ GRAVITY_ERROR = 1.0
 """Standard error in degrees of a `gravity` without `gravity_std_deg`, as of a phone's motion sensors."""
 
 
-def read_transforms(file: Path, how: Reading) -> Scene:
+def read_transforms(file: Path, options: ReadOptions) -> Scene:
     """The frames of a transforms.json whose photos exist, as a Scene in the file's own world.
 
     Intrinsics of a frame override global ones. Without fl_x the focal length is computed from camera_angle_x; without w
@@ -43,12 +45,12 @@ def read_transforms(file: Path, how: Reading) -> Scene:
     frames = data["frames"]
     if not frames:
         raise InputError(f"{file}: 'frames' is empty; expected at least one posed photo")
-    photos, missing = _photos(file, frames, how.strict)
+    photos, missing = _photos(file, frames, options.strict)
     if not photos:
         first = f"{missing[0]['name']}: {missing[0]['why']}"
         raise InputError(f"{file}: none of the {len(frames)} photos it lists can be read (first: {first})")
-    views, notes = _views(file, data, photos, how.masks)
-    listed = how.cloud
+    views, notes = _views(file, data, photos, options.masks)
+    listed = options.cloud
     if listed is None and data.get("ply_file_path"):
         listed = start_points(_listed(file, "ply_file_path", data["ply_file_path"]))
     facts: dict[str, Any] = {
@@ -57,12 +59,22 @@ def read_transforms(file: Path, how: Reading) -> Scene:
         "warnings": notes,
         "mean_reprojection_error_px": None,
     }
-    if how.cloud is None and listed is not None:
+    if options.cloud is None and listed is not None:
         facts["points_from"] = str(data["ply_file_path"])
     facts |= _gravity(file, data)
-    scene = posed_scene(views, listed or NO_CLOUD, facts, how, least=1)
+    scene = posed_scene(views, listed or NO_CLOUD, facts, options, least=1)
     scene.metric = data.get("metric") is True
     return scene
+
+
+def transforms_file(source: Path) -> Path:
+    """The transforms.json in a folder, or `source` itself."""
+    return source / "transforms.json" if source.is_dir() else source
+
+
+def is_transforms(source: Path) -> bool:
+    """Whether `source` is a JSON file, or a folder with a transforms.json."""
+    return transforms_file(source).suffix.lower() == ".json" and transforms_file(source).is_file()
 
 
 def read_frames(file: Path) -> list[tuple[str, np.ndarray, Lens]]:

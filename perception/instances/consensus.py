@@ -136,7 +136,7 @@ def node_evidence(tree: MergeTree, table: Table) -> Evidence:
         leaves.append(np.concatenate([leaves[a], leaves[b]]))
     some = min(AT_ONCE, ENTRIES // max(1, len(table.area)) + 1)
     found = [evidence(table.pooled(leaves[at : at + some])) for at in range(0, len(leaves), some)]
-    numbers = {name: np.concatenate([vars(part)[name] for part in found]) for name in ("pixels", "matched", "views")}
+    numbers = {name: np.concatenate([getattr(part, name) for part in found]) for name in ("pixels", "matched", "views")}
     return Evidence(**numbers, fit=sparse.vstack([part.fit for part in found], format="csr"))
 
 

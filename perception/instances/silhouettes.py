@@ -10,7 +10,11 @@ import numpy as np
 import torch
 
 from perception.gaussians.model import Gaussians
-from perception.gaussians.rasterize import Settings, label_images
+from perception.rasterizer.rasterize import rasterizer_for
+from perception.rasterizer.types import Settings
+
+MOST_LABELS = 1 << 24
+"""The rasterizer takes smaller ids only; larger ones are numbered anew."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +47,22 @@ def render_silhouettes(
 ) -> list[Silhouettes]:
     """The silhouettes of each of up to 8 levels, such as instances and parts, in one pass over the Gaussians.
 
-    levels: ids [N] int32, −1 = none, 0 … M − 1. An instance's weight in a pixel is the sum of the weights of its
+    levels: ids [N] int32, −1 = none. An instance's weight in a pixel is the sum of the weights of its
     Gaussians; all other Gaussians occlude it. camera_from_world [4, 4], K [3, 3] float32. eps2d: see `rasterize`.
     """
     inputs = gaussians.inputs(camera_from_world, K)
-    owners = np.stack([np.asarray(ids, np.int32) for ids in levels])
+    owners, known = np.stack([np.asarray(ids, np.int32) for ids in levels]), None
+    if owners.max(initial=-1) >= MOST_LABELS:
+        known = np.unique(owners[owners >= 0])
+        owners = np.where(owners < 0, -1, np.searchsorted(known, owners)).astype(np.int32)
+    label_images = rasterizer_for(gaussians.means.device).label_images
     images, visible = label_images(inputs, owners, threshold, Settings(width, height, depth=False, eps2d=eps2d))
     found = []
     for ids, image in zip(owners, images, strict=True):
         shown, pixels = np.unique(image[image >= 0], return_counts=True)
         seen = np.bincount(ids[visible & (ids >= 0)])[shown]
+        if known is not None:
+            shown, image = known[shown], np.where(image < 0, -1, known[image])
         packed = zlib.compress(image.astype(np.int32).tobytes(), 1)
         found.append(Silhouettes(packed, image.shape, shown, pixels, seen))
     return found

@@ -8,18 +8,19 @@ the mask. One backward pass computes 16 masks for all Gaussians.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy import sparse
 
 from perception.gaussians.nearby import Nearby
-from perception.gaussians.rasterize import Settings, passes
-from perception.gaussians.train import TrainingView
+from perception.gaussians.views import TrainingView
 from perception.io.memory import Keep
 from perception.machine import return_free_memory, torch_on_one_thread
 from perception.progress import Progress
+from perception.rasterizer.rasterize import rasterizer_for
+from perception.rasterizer.types import Cotangents, Gradients, Settings
 
 BLOCK = 16  # masks per pass: a feature width that the kernel is specialised for
 TRIM = 16  # views between which freed memory is returned: the kept votes split what one view's arrays filled
@@ -164,10 +165,10 @@ def _of_view(nearby: Nearby, view: TrainingView) -> tuple[sparse.csc_matrix, np.
     masks = range(len(names))
     gaussians, rows = nearby.of(view.name)
     device = gaussians.means.device
-    run_forward, run_backward = passes(device)
+    rasterizer = rasterizer_for(device)
     inputs = gaussians.inputs(view.camera_from_world, view.K, torch.zeros(len(gaussians), BLOCK, device=device))
     settings = Settings(width, height, variance=False, depth=False, eps2d=view.eps2d)
-    forward = run_forward((*inputs[:5], None, *inputs[6:]), None, settings)
+    forward = rasterizer.rasterize_forward(replace(inputs, features=None), settings)
     seen = forward.visible[0].cpu().numpy().nonzero()[0]
     found: list[tuple[np.ndarray, ...]] = []
     for first in range(0, len(masks), BLOCK):
@@ -175,9 +176,10 @@ def _of_view(nearby: Nearby, view: TrainingView) -> tuple[sparse.csc_matrix, np.
         inside = torch.zeros(1, height, width, BLOCK)
         for channel, mask in enumerate(block):
             inside[0, ..., channel] = labels == mask
-        wanted = tuple(name == 5 for name in range(7))  # the gradient of features, and no other
-        cotangents = (None, None, None, inside.to(device), None)
-        weights = run_backward(inputs, None, settings, forward, cotangents, wanted)[5].cpu().numpy()[seen]
+        gradients = Gradients.zeros(inputs, ["features"])
+        rasterizer.rasterize_backward(inputs, settings, forward, Cotangents(features=inside.to(device)), gradients)
+        assert gradients.features is not None  # for the type checker
+        weights = gradients.features.cpu().numpy()[seen]
         row, column = np.nonzero(weights > FAINTEST)
         found.append((weights[row, column], rows[seen[row]], column + first))
     weights, row, column = map(np.concatenate, zip(*found, strict=True))

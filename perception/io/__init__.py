@@ -1,1 +1,1 @@
-"""Reading and writing: photos, camera files, COLMAP workspaces, transforms.json, structure from motion."""
+"""Reading and writing of bytes: arrays, clouds, PLY, JSON and YAML, atomic files."""

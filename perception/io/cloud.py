@@ -155,14 +155,14 @@ def _read_npz(path: Path) -> PointCloud:
     if points is None or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
         found = "none" if points is None else f"{points.dtype} {list(points.shape)}"
         raise InputError(f"{path}: expected an array 'points' [P, 3], found {found}")
-    cloud = PointCloud(points if points.dtype == np.float64 else points.astype(np.float32))
+    cloud = PointCloud(points if points.dtype == np.float64 else points.astype(np.float32, copy=False))
     for name, values in arrays.items():
         if name == "colors" and values.shape == points.shape:
             cloud.colors = to_uint8(values)
         elif name == "normals" and values.shape == points.shape:
-            cloud.normals = values.astype(np.float32)
+            cloud.normals = values.astype(np.float32, copy=False)
         elif name == "faces" and values.ndim == 2 and values.shape[1] == 3:
-            cloud.faces = values.astype(np.int32)
+            cloud.faces = values.astype(np.int32, copy=False)
         elif values.shape == (len(points),) and values.dtype.kind in "iu":
             cloud.labels[name] = to_int32(values, f"{path}: array '{name}'")
     return cloud

@@ -10,6 +10,8 @@ import struct
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +65,18 @@ def read_yaml(file: Path, expected: str) -> Any:
         raise InputError(f"{file}: not readable YAML ({brief(error)}); expected {expected}") from error
 
 
+@contextmanager
+def refusing(message: str) -> Iterator[None]:
+    """For the calls of a library that decodes untrusted bytes: whatever it raises becomes an InputError.
+    message: of that error; "{why}" in it stands for what the library said. An InputError passes as it is."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # libraries have no common base class of errors, and raise others' too
+        raise InputError(message.replace("{why}", brief(error))) from error
+
+
 def brief(value: object, most: int = 120) -> str:
     """An error's text, or a value as Python writes it, on one line of bounded length."""
     import reprlib
@@ -83,7 +97,7 @@ def safe_name(name: object, source: object) -> str:
     InputError if it is not a string, for an empty name, an absolute path, a drive letter, a part "..", and for control
     characters (NUL, newline) and lone surrogates, which line-based files and terminals cannot hold.
     """
-    wrong = _what_is_wrong(name)
+    wrong = what_is_wrong(name)
     if wrong is None:
         return str(name)
     raise InputError(
@@ -92,7 +106,8 @@ def safe_name(name: object, source: object) -> str:
     )
 
 
-def _what_is_wrong(name: object) -> str | None:
+def what_is_wrong(name: object) -> str | None:
+    """Why `safe_name` refuses a name; None if it does not."""
     if not isinstance(name, str):
         return f"is {type(name).__name__}, not text"
     parts = _SEPARATOR.split(name)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import dropwhile
 
 import numpy as np
 
@@ -79,9 +80,7 @@ def without_color_words(text: str) -> str:
         name = "many" if bare in _MANY else _SYNONYMS.get(bare, bare)
         return name not in drop
 
-    words = [word for word in text.split() if keep(word)]
-    while words and words[0].lower() == "and":
-        words = words[1:]
+    words = dropwhile(lambda word: word.lower() == "and", filter(keep, text.split()))
     return " ".join(words) or text
 
 

@@ -24,7 +24,9 @@ from typing import Any
 import numpy as np
 
 from perception.errors import InputError
+from perception.io.arrays import map_npy
 from perception.io.atomic import atomic_file
+from perception.io.documents import DAMAGE
 from perception.language import minilm
 from perception.language.base import Part, Reading, check_images, check_texts, packaged_file, unit_rows
 from perception.language.household import household_thing
@@ -148,10 +150,10 @@ def _cached(names: list[list[str]], encode: Any) -> np.ndarray:
     key = hashlib.sha256("\n".join(flat).encode()).hexdigest()[:16]
     path = cache_folder() / f"conse-minilm-{key}.npy"
     try:
-        known = np.load(path)
+        known = np.array(map_npy(path))
         if known.shape == (len(names), MiniLM.dim) and known.dtype == np.float32:
             return known
-    except (OSError, ValueError):
+    except DAMAGE:
         pass  # missing or damaged: recomputed below
     embedded = encode(flat)
     starts = np.cumsum([0] + [len(group) for group in names[:-1]])

@@ -29,7 +29,7 @@ def household_thing(text: str) -> Household | None:
     """What the table says of the thing that a text names: its longest known ending, as "game controller" of "the red
     game controller"; None if there is none."""
     words = thing_words(text)
-    endings = (" ".join(words[start:]) for start in range(len(words)))
+    endings = (" ".join(words[start:]) for start in range(max(0, len(words) - _longest()), len(words)))
     return next((known for ending in endings if (known := _table().get(ending))), None)
 
 
@@ -39,6 +39,12 @@ def size_misfits(sides: np.ndarray, known: Household) -> tuple[np.ndarray, np.nd
     longest, shortest = np.maximum(sides.max(axis=1), 1e-6), np.maximum(sides.min(axis=1), 1e-6)
     length = np.maximum(np.log2(known.size[0] / longest), np.log2(longest / known.size[1]))
     return np.maximum(length, 0.0), np.maximum(np.log2(shortest / known.thickness), 0.0)
+
+
+@lru_cache(maxsize=1)
+def _longest() -> int:
+    """The number of words of the longest name in the table."""
+    return max(name.count(" ") + 1 for name in _table())
 
 
 @lru_cache(maxsize=1)

@@ -22,13 +22,13 @@ PART = 0.6  # least share of a word that a text cut off at either end must hold
 SHORT = 3  # up to so many characters a word must be equal
 LONG = 5  # from so many on, spaces missing in the text do not matter
 RIVAL = 4  # a match counts by (its quality / that of the map's best)^RIVAL: where BUTTER is, BATTERY is not it
-_SAYS = re.compile(
-    r"^(?P<thing>.*?\w.*?)[,\s]+(?:(?:that|which)\s+)?(?:(?:says?|saying|titled|labell?ed)(?:\s+(?:as|with))?|"
-    r"(?:reads?|reading|marked)(?=\s+[\"'“«A-Z0-9])|"
-    r"(?:with|bears?|has|bearing|having)\s+(?:the\s+)?(?:words?|texts?|titles?|labels?|letters|names?|print|inscription))"
-    r"\s+(?P<text>.*\w.*)$"
+_SAYS = re.compile(  # in a text of single spaces, so that every repeat has an end
+    r"(?<=[, ])(?:(?:that|which) )?(?:(?:says?|saying|titled|labell?ed)(?: (?:as|with))?|"
+    r"(?:reads?|reading|marked)(?= [\"'“«A-Z0-9])|"
+    r"(?:with|bears?|has|bearing|having) (?:the )?(?:words?|texts?|titles?|labels?|letters|names?|print|inscription)) "
+    r"(?=.*\w)"
 )
-_QUOTED = re.compile(r"[\"“”«»]([^\"“”«»]*\w[^\"“”«»]*)[\"“”«»]")
+_QUOTED = re.compile(r"[\"“”«»]([^\"“”«»\w]*\w[^\"“”«»]*)[\"“”«»]")
 _WORDS = {
     "article": "a an the some any this that my our your",
     "stop": "of on in with and or for to at by from near next left right under over above below behind front top "
@@ -40,19 +40,26 @@ _WORDS = {
 }
 _KIND = {word: kind for kind, words in _WORDS.items() for word in words.split()}
 _SAME = str.maketrans({"0": "o", "1": "l", "i": "l", "|": "l", "5": "s", "8": "b", "2": "z"})
-_WORD = re.compile(r"\w+")
+_WORD, _LETTER = re.compile(r"\w+"), re.compile(r"\w")
 
 
 def quoted_text(prompt: str) -> tuple[str, str] | None:
     """(thing, text) of a prompt that quotes what is printed: "the book that says BIRDS" → ("the book", "BIRDS")."""
-    said = _SAYS.match(prompt)
-    thing, text = (said["thing"], said["text"]) if said else (prompt, "")
+    prompt = " ".join(prompt.split())
+    said = found_after_a_word(_SAYS, prompt)
+    thing, text = (prompt[: said.start()].rstrip(", "), prompt[said.end() :]) if said else (prompt, "")
     if quote := _QUOTED.search(prompt):
         thing, text = (thing if said else _QUOTED.sub(" ", prompt)), quote[1]
     words = [word for word in _WORD.findall(thing.lower()) if _KIND.get(word) != "article"]
     if not text or (said and not quote and not words):
         return None
     return " ".join(thing.split()) if words else "thing", text.strip(" .,;:!?'")
+
+
+def found_after_a_word(pattern: re.Pattern[str], text: str) -> re.Match[str] | None:
+    """The first match of the pattern that has a letter or a digit before it."""
+    word = _LETTER.search(text)
+    return pattern.search(text, word.end()) if word else None
 
 
 class Printed:
@@ -103,8 +110,9 @@ def match_quality(word: str, line: Sequence[str]) -> float:
             best = max(best, len(other) / len(word) * (len(other) >= PART * len(word)))
         elif min(len(word), len(other)) > SHORT:
             best = max(best, _quality(edit_distance(word, other), len(word)))
-    if len(word) >= LONG:
-        best = max(best, _quality(edit_distance(word, "".join(line), inside=True), len(word)))
+    joined = "".join(line)
+    if len(word) >= LONG and len(joined) >= QUALITY * len(word):  # a shorter text lacks too many characters
+        best = max(best, _quality(edit_distance(word, joined, inside=True), len(word)))
     return best
 
 

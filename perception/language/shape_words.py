@@ -36,9 +36,9 @@ _WORD = re.compile(r"[^\W\d_]+")
 def thing_words(text: str) -> list[str]:
     """The words that name the object, in lower case: "a framed picture of a forest" → ["a", "framed", "picture"]."""
     thing = _MEASURES.sub(" ", text.lower())
-    words = _WORD.findall(_RELATIONS.split(thing)[0]) or _WORD.findall(thing)
+    words = _WORD.findall(_RELATIONS.split(thing, maxsplit=1)[0]) or _WORD.findall(thing)
     while len(words) > 1 and len(words[-1]) == 1:  # "wall E": a single letter is an identifier
-        words = words[:-1]
+        words.pop()
     return words
 
 

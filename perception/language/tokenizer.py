@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import string
 from collections.abc import Sequence
 from pathlib import Path
@@ -43,7 +42,7 @@ class Tokenizer:
 
     def _cleaned(self, text: str) -> str:
         if self.clean == "canonicalize":  # as in big_vision, with which SigLIP was trained
-            text = re.sub(r"\s+", " ", text.replace("_", " ").translate(_PUNCTUATION)).strip()
+            text = " ".join(text.replace("_", " ").translate(_PUNCTUATION).split())
         return text.lower() if self.clean else text
 
 

@@ -84,7 +84,7 @@ def seal(info: dict[str, Any]) -> dict[str, Any]:
 
 def check_sizes(folder: Path, info: dict[str, Any]) -> None:
     """InputError naming the first file of map.json's list that is missing or of another size."""
-    for name, facts in listed(folder, info).items():
+    for name, facts in info.get("files", {}).items():
         if name == EDITABLE:
             continue
         file = folder / name
@@ -96,7 +96,7 @@ def check_sizes(folder: Path, info: dict[str, Any]) -> None:
 
 def check_file(folder: Path, info: dict[str, Any], name: str) -> None:
     """InputError when the file's SHA-256 is not the one recorded; a file without a record passes."""
-    facts = listed(folder, info).get(name)
+    facts = info.get("files", {}).get(name)
     if facts is not None and sha256(folder / name) != facts["sha256"]:
         raise damaged(folder / name, "its bytes are not those that were written (SHA-256 differs)")
 
@@ -108,7 +108,7 @@ def verify(folder: Path, info: dict[str, Any]) -> dict[str, str]:
     made before checksums were recorded.
     """
     check_sizes(folder, info)
-    known = listed(folder, info)
+    known = info.get("files", {})
     if "sha256" in info and seal(info)["sha256"] != info["sha256"]:
         raise InputError(f"{folder / FACTS}: its own checksum differs; it was edited or is damaged")
     states = {FACTS: "ok" if "sha256" in info else "no checksum"}
@@ -121,13 +121,3 @@ def verify(folder: Path, info: dict[str, Any]) -> dict[str, str]:
             check_file(folder, info, file.name)
             states[file.name] = "ok"
     return states
-
-
-def listed(folder: Path, info: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The file table of map.json; {} for older maps without one. InputError when the table is malformed."""
-    files = info.get("files", {})
-    for name, facts in files.items() if isinstance(files, dict) else [("", None)]:
-        known = isinstance(facts, dict) and isinstance(facts.get("bytes"), int) and isinstance(facts.get("sha256"), str)
-        if not known or Path(name).name != name:
-            raise damaged(folder / FACTS, "its list of files cannot be understood")
-    return dict(files)

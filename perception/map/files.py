@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,11 @@ from perception.errors import InputError
 from perception.io.arrays import map_npy, read_npz
 from perception.io.atomic import current
 from perception.io.documents import DAMAGE, brief
+from perception.io.json_shapes import parsed
 from perception.io.ply import map_ply
 from perception.map.checksums import EDITABLE, FACTS, STORE, check_file, check_sizes, damaged
-from perception.photos.view_json import check_names, views_of_facts
+from perception.map.model import check_archive, check_facts, check_ids, check_instances
+from perception.photos.view_json import views_of_facts
 
 FORMAT_VERSION = 2
 _ARRAYS = {"features": 2, "instance_ids": 1, "membership": 1}
@@ -59,7 +61,7 @@ class MapFiles:
                 raise damaged(file, "is no file")
         self.facts = facts
         self.info = {key: value for key, value in facts.items() if key != "views"}
-        self.instances, raw = _read_instances(self.path / EDITABLE)
+        self.instances, raw = _read_instances(self.path / EDITABLE, facts)
         self.map_id = hashlib.sha256(raw_facts + b"\0" + raw).hexdigest()[:12]
         try:
             self._rows = map_ply(self.path / "gaussians.ply", "vertex")
@@ -68,6 +70,9 @@ class MapFiles:
             self._archives = {name: file.read_bytes() for name, file in archives.items() if file.is_file()}
         except OSError as error:
             raise damaged(self.path, str(error)) from error
+        if len(self._rows) != facts["num_gaussians"]:
+            found = f"num_gaussians: gaussians.ply holds {len(self._rows)}, found {facts['num_gaussians']}"
+            raise damaged(self.path / FACTS, found)
         for name, array in self._arrays.items():
             if len(array) != len(self._rows):
                 found = f"holds {len(array)} rows, expected {len(self._rows)} as in gaussians.ply"
@@ -82,7 +87,7 @@ class MapFiles:
         except DAMAGE as error:
             raise damaged(file, f"cannot be read ({brief(error)})") from error
         kind = "i" if name == "instance_ids" else "f"
-        if array.ndim != sides or array.dtype.kind != kind:
+        if array.ndim != sides or array.dtype.kind != kind or array.dtype.itemsize > 4:
             raise damaged(file, f"holds {array.dtype} of shape {list(array.shape)}")
         return array
 
@@ -94,8 +99,14 @@ class MapFiles:
         if name == "views":
             return views_of_facts(self.facts, self.path / FACTS)
         if name in ("language", "parts", "groups"):
-            return self._unpack(name)
+            arrays = self._unpack(name)
+            with _telling(self.path / f"{name}.npz"):
+                check_archive(name, arrays, self.instances, len(self._rows))
+            return arrays
         self._check_contents()
+        if name == "instance_ids":
+            with _telling(self.path / f"{name}.npy"):
+                check_ids(self._arrays[name], [entry["id"] for entry in self.instances])
         if name in _ARRAYS:
             return np.array(self._arrays[name])
         try:
@@ -177,52 +188,39 @@ def _read_facts(path: Path) -> tuple[dict[str, Any], bytes]:
         raise InputError(f"{path}: is no map (no map.json inside); give a directory made by `perception map`")
     try:
         raw = file.read_bytes()
-        info = json.loads(raw)
+        info = parsed(raw)
         version = info["format_version"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{file}: cannot be read as a map's facts ({error})") from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{file}: cannot be read as a map's facts ({brief(error)})") from error
     if isinstance(version, bool) or not isinstance(version, int):
-        raise damaged(file, f"format_version is {version!r}, expected {FORMAT_VERSION}")
+        raise damaged(file, f"format_version is {brief(version)}, expected {FORMAT_VERSION}")
     if version != FORMAT_VERSION:
         advice = (
-            f"it was made by an older perception; build the map again from {info.get('source', 'its photos')}"
+            f"it was made by an older perception; build the map again from {brief(info.get('source', 'its photos'))}"
             if version < FORMAT_VERSION
             else "it was made by a newer perception; update this one"
         )
-        raise InputError(f"{file}: format_version is {version}, this program reads {FORMAT_VERSION}: {advice}")
-    check_names(info, file)
+        raise InputError(f"{file}: format_version is {brief(version)}, this program reads {FORMAT_VERSION}: {advice}")
+    with _telling(file):
+        check_facts(info)
     return info, raw
 
 
-def _read_instances(file: Path) -> tuple[list[dict[str, Any]], bytes]:
+def _read_instances(file: Path, facts: dict[str, Any]) -> tuple[list[dict[str, Any]], bytes]:
     try:
         raw = file.read_bytes()
-        instances = json.loads(raw)["instances"]
-        for entry in instances:
-            _check_instance(entry)
-        if len({entry["id"] for entry in instances}) != len(instances):
-            raise ValueError("an id occurs twice")
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        problem = f"no {error}" if isinstance(error, KeyError) else str(error)
-        raise damaged(file, f"cannot be read as instances ({problem})") from error
-    return instances, raw
+    except OSError as error:
+        raise damaged(file, f"cannot be read ({error})") from error
+    with _telling(file):
+        value = parsed(raw)
+        check_instances(value, facts)
+    return value["instances"], raw
 
 
-def _check_instance(entry: dict[str, Any]) -> None:
-    """ValueError unless the id is an integer, numbers are finite and shaped as expected, the label a text or null."""
-    if isinstance(entry["id"], bool) or not isinstance(entry["id"], int):
-        raise ValueError(f"id {entry['id']!r} is no whole number")
-    box = entry["obb"]
-    for name, value, shape in (
-        ("centroid", entry["centroid"], (3,)),
-        ("obb.center", box["center"], (3,)),
-        ("obb.rotation", box["rotation"], (3, 3)),
-        ("obb.extent", box["extent"], (3,)),
-        ("score", entry["score"], ()),
-    ):
-        numbers = np.asarray(value, np.float64)
-        if numbers.shape != shape or not np.isfinite(numbers).all():
-            raise ValueError(f"instance {entry['id']}: {name} is not {'a number' if not shape else list(shape)}")
-    label = entry.get("label")
-    if label is not None and not isinstance(label, str):
-        raise ValueError(f"instance {entry['id']}: label is {type(label).__name__}, expected a text or null")
+@contextmanager
+def _telling(file: Path) -> Iterator[None]:
+    """Turns a ValueError of `map_model` into the InputError for `file`."""
+    try:
+        yield
+    except ValueError as error:
+        raise damaged(file, str(error)) from error

@@ -12,6 +12,7 @@ import numpy as np
 from perception.colors import rgb8_from_sh
 from perception.errors import InputError
 from perception.map.files import MapFiles
+from perception.map.model import PREFIX
 from perception.photos.view_json import locate_photo
 from perception.types import View
 
@@ -51,17 +52,18 @@ GAUSSIANS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features",
 """Fields with one row per Gaussian."""
 
 
-_PREFIX = "language_"  # of the arrays in `parts` and `groups` that correspond to those in `language`
-
-
 def language_in(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """As `Map.language`, of the parts or groups: one row per part in ascending id; {} without embeddings."""
-    return {name.removeprefix(_PREFIX): array for name, array in arrays.items() if name.startswith(_PREFIX)}
+    return {name.removeprefix(PREFIX): array for name, array in arrays.items() if name.startswith(PREFIX)}
 
 
 def prefixed(language: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Inverse of `language_in`."""
-    return {_PREFIX + name: array for name, array in language.items()}
+    return {PREFIX + name: array for name, array in language.items()}
+
+
+MAX_SIDE = 800
+"""Pixels of the long side of photos, for maps that do not record at which size they were trained."""
 
 
 class PhotosMoved(UserWarning):
@@ -79,6 +81,10 @@ class Map:
     of each instance. Reading a field raises InputError naming the file when it is damaged. The folder may be replaced
     by another map meanwhile. This type needs no torch; training uses `gaussians.model.Gaussians`, which holds the same
     values as torch tensors.
+
+    >>> gmap = Map.open(Path("kitchen.gsmap"))
+    >>> gmap.means.shape, gmap.means.dtype, gmap.instance_ids.min()
+    ((3000, 3), dtype('float32'), np.int32(-1))
     """
 
     means: np.ndarray
@@ -155,20 +161,21 @@ class Map:
 
     @property
     def group_ids(self) -> np.ndarray:
-        """[N] int32 group of each Gaussian, −1 = none. InputError when the groups do not fit the instances."""
-        ids = [entry["id"] for entry in self.instances]
-        owner = np.full(max(ids, default=0) + 2, -1, np.int32)
-        if self.groups:
-            of, scores = (self.groups.get(name, np.zeros(0)) for name in ("of", "scores"))
-            if of.shape != (len(ids),) or of.dtype.kind != "i" or not set(range(len(scores))) <= set(of.tolist()):
-                raise InputError(f"{self.path}: groups.npz does not fit the instances; the map is damaged")
-            owner[ids] = of
-        return owner[self.instance_ids]
+        """[N] int32 group of each Gaussian, −1 = none."""
+        ids = np.array([-1, *(entry["id"] for entry in self.instances)])
+        owner = np.array([-1, *self.groups.get("of", np.full(len(ids) - 1, -1))], np.int32)
+        order = np.argsort(ids)
+        return owner[order[np.searchsorted(ids, self.instance_ids, sorter=order)]]
 
     @property
     def map_id(self) -> str:
         """Short identifier of the map and its labels; it changes when either changes."""
         return "unsaved" if self._files is None else self._files.map_id
+
+    def setting(self, group: str, name: str, default: Any) -> Any:
+        """The setting GROUP.NAME that the map was made with; `default` where it is not recorded, or is none."""
+        value = self.info.get("config", {}).get(group, {}).get(name)
+        return default if value is None else value
 
     @property
     def frame(self) -> str:

@@ -41,6 +41,10 @@ def write_map(path: Path, gmap: Map, keep_report: bool = False, fresh: bool = Fa
     manual corrections. fresh: nothing is replaced. A link at `path` stays, and its target is written.
 
     InputError when another writer holds the map, or `path` cannot be written, or holds something else than a map.
+
+    >>> write_map(Path("copy.gsmap"), read_map(Path("kitchen.gsmap")))
+    >>> len(read_map(Path("copy.gsmap")))
+    3000
     """
     info = {**gmap.info, "format_version": FORMAT_VERSION, "num_gaussians": len(gmap)}
     info["num_instances"] = len(gmap.instances)
@@ -73,7 +77,11 @@ def _recorded(view: View, path: Path, before: Path | None) -> StoredView:
 
 def read_map(path: Path) -> Map:
     """Reads a whole map into memory and verifies its checksums.
-    InputError naming the file when it is not a map, of an unknown version, or damaged."""
+    InputError naming the file when it is not a map, of an unknown version, or damaged.
+
+    >>> len(read_map(Path("kitchen.gsmap")).instances)
+    9
+    """
     return Map.open(path).load()
 
 
@@ -87,6 +95,9 @@ def set_labels(path: Path, labels: dict[int, str | None]) -> dict[int, str | Non
 
     Returns the written labels, with white space normalised. InputError for an unknown id, a label that is empty or too
     long, and while another writer holds the map.
+
+    >>> set_labels(Path("kitchen.gsmap"), {0: "grandma's  cup"})
+    {0: "grandma's cup"}
     """
     tidied = {i: None if label is None else tidy_label(label) for i, label in labels.items()}
     with writing(path):

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from perception.io.arrays import read_npz
 from perception.io.memory import Keep
 from perception.masks.base import LoadImage, MaskSource
 from perception.masks.label_files import label_file, load_labels, stored_key, write_labels
@@ -90,8 +91,7 @@ def load_segmentation(folder: Path) -> Segmentation | None:
     file = folder / SEGMENTATION
     if not file.is_file():
         return None
-    with np.load(file) as stored:
-        return Segmentation(**stored)
+    return Segmentation(**read_npz(file, file, "remove it"))  # type: ignore[arg-type]
 
 
 def _key(view: View, source: MaskSource, depth_key: str) -> str:

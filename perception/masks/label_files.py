@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.errors import InputError
-from perception.io.documents import brief, safe_name
+from perception.io.documents import safe_name
 from perception.types import View
 
 _KEY = "perception-masks"
@@ -59,17 +59,13 @@ def write_labels(file: Path, labels: np.ndarray, key: str = "") -> None:
 
 def stored_key(file: Path) -> str | None:
     """The key that a label image was written with; None if the file or the key cannot be read."""
-    from PIL import Image
+    from perception.photos.decode import decode, open_photo
 
-    from perception.photos.decode import DECODE_ERRORS
-
-    if not file.is_file():
-        return None
     try:
-        with Image.open(file) as image:
-            image.load()
+        with open_photo(file) as image:
+            decode(image, file)
             return str(image.info.get(_KEY))
-    except DECODE_ERRORS:
+    except InputError:
         return None
 
 
@@ -85,15 +81,11 @@ def read_png_header(file: Path) -> tuple[int, int, int, int]:
 
 def read_labels(file: Path) -> np.ndarray:
     """[H, W] int32. Pillow keeps palette indices, whereas OpenCV converts them to colours."""
-    from PIL import Image
+    from perception.photos.decode import decode, open_photo
 
-    from perception.photos.decode import DECODE_ERRORS
-
-    try:
-        with Image.open(file, formats=["PNG"]) as image:
-            labels = np.asarray(image)
-    except DECODE_ERRORS as error:
-        raise InputError(f"{file}: cannot be read ({brief(error)}); the PNG is damaged or cut short") from error
+    with open_photo(file) as image:
+        decode(image, file)
+        labels = np.asarray(image)
     if labels.ndim != 2 or labels.dtype.kind not in "biu":
         raise InputError(f"{file}: {labels.dtype} of shape {list(labels.shape)}; a label image has one channel")
     return labels.astype(np.int32)

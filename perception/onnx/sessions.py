@@ -25,7 +25,11 @@ _DTYPES: dict[str, type] = {
 }
 # Suffixes that name the precision of a graph in public exports, the most precise first.
 _PRECISIONS = ("", "_fp16", "_quantized", "_q8", "_int8", "_uint8", "_q4f16", "_q4", "_bnb4")
-_LOCATION = re.compile(rb"\x0a\x08location\x12([\x01-\x7f])")  # StringStringEntryProto of TensorProto.external_data
+# StringStringEntryProto of TensorProto.external_data, up to the length of its value, in 7 bits a byte.
+_LOCATION = re.compile(rb"\x0a\x08location\x12([\x80-\xff]{0,4}[\x00-\x7f])")
+_LONGEST = 4096  # bytes of a path
+# Absolute, with a drive letter, or with a part "..": by the rules of any operating system.
+_LEADS_OUT = re.compile(r"[/\\]|[A-Za-z]:|(.*[/\\])?\.\.([/\\]|$)|$|.*\0", re.DOTALL)
 _EDGE = 1 << 20
 
 
@@ -59,13 +63,35 @@ def _precision(path: Path) -> str:
 
 
 def side_files(path: Path) -> list[Path]:
-    """The files beside an ONNX file that hold its weights, as the graph names them (`external_data`)."""
-    if not path.stat().st_size:
-        return []
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        ends = [(match.end(), match[1][0]) for match in _LOCATION.finditer(data)]
-        names = dict.fromkeys(data[end : end + size].decode("utf-8", "replace") for end, size in ends)
-    return [path.parent / name for name in names if not {"..", "/"} & set(Path(name).parts)]
+    """The files beside an ONNX file that hold its weights, as the graph names them (`external_data`).
+    What lies outside the model's folder is not among them."""
+    return [path.parent / name for name in _weights(path) if _lies_beside(path, name)]
+
+
+def refuse_outside_weights(path: Path) -> None:
+    """InputError for an ONNX file whose weights lie outside its folder, as no public export has them."""
+    outside = next((name for name in _weights(path) if not _lies_beside(path, name)), None)
+    if outside is not None:
+        raise InputError(f"{path}: its weights are in {outside[:200]!r}, outside its folder; expected a file beside it")
+
+
+def _weights(path: Path) -> list[str]:
+    names = dict[str, None]()
+    if path.stat().st_size:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            for match in _LOCATION.finditer(data):
+                size = sum((byte & 127) << 7 * place for place, byte in enumerate(match[1]))
+                names[data[match.end() : match.end() + min(size, _LONGEST)].decode("utf-8", "replace")] = None
+    return list(names)
+
+
+def _lies_beside(path: Path, name: str) -> bool:
+    """Whether a side file is in the folder of the model, also where links lead; in the cache of Hugging Face the model
+    and its side files are links into one folder."""
+    if _LEADS_OUT.match(name):
+        return False
+    folders, parents = (path.parent.resolve(), path.resolve().parent), (path.parent / name).resolve().parents
+    return any(folder in parents for folder in folders)
 
 
 def read_config(model: Path, name: str) -> dict[str, Any]:
@@ -88,6 +114,7 @@ def open_session(path: Path, threads: int = 0) -> Any:
         raise missing_extra("onnxruntime", "demo") from error
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected an ONNX model")
+    refuse_outside_weights(path)
     missing = ", ".join(side.name for side in side_files(path) if not side.is_file())
     if missing:
         raise InputError(f"{path}: its weights are in {missing}, not beside it; fetch that file too, by this name")

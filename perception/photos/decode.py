@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import threading
+import warnings
 from pathlib import Path
 from stat import S_ISREG
+from typing import Any
 
 import cv2
 import numpy as np
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
 
 from perception.errors import InputError, missing_extra
-from perception.io.documents import DAMAGE
+from perception.io.documents import refusing
 from perception.photos.lens import warp_grid
 from perception.types import View
 
@@ -21,8 +24,12 @@ LARGE_PIXELS = 200_000_000
 """Photos of more pixels are read at 1/2, 1/4 or 1/8 of their size; `photo_size` returns the reduced size."""
 MOST_DECODED = 400_000_000
 """Maximum number of pixels to decode; JPEG is decoded at the reduced size, other formats at full size."""
-DECODE_ERRORS = (*DAMAGE, Image.DecompressionBombError)
-"""Exceptions that Pillow raises on bytes that are not an image, or on a truncated image."""
+_DENSEST = 8 * 1032
+"""Most pixels that a byte of a file in one of _BOUNDED can hold: deflate's densest code, at one bit a pixel."""
+_BOUNDED = ("PNG", "JPEG", "MPO", "BMP", "GIF")
+# What these libraries say of a damaged file on the standard error, an InputError says.
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+warnings.filterwarnings("ignore", category=UserWarning, module="PIL")
 
 
 def photo_size(path: Path) -> tuple[int, int]:
@@ -53,24 +60,25 @@ def _reduction(image: Image.Image) -> int:
     return factor
 
 
+_BAD_EXIF = "the photo's EXIF data are damaged; save it anew without them, or remove it"
+
+
 def exif_of(image: Image.Image, path: Path) -> Image.Exif:
     """The EXIF data of an open photo, empty if it has none. Raises InputError if they are damaged."""
-    try:
+    with refusing(f"{path}: {_BAD_EXIF}"):
         return image.getexif()
-    except DECODE_ERRORS as error:
-        raise _bad_exif(path) from error
+
+
+def exif_folder(image: Image.Image, path: Path, tag: int) -> dict[int, Any]:
+    """One of the folders of `exif_of` by its tag, empty if it is not there."""
+    with refusing(f"{path}: {_BAD_EXIF}"):
+        return image.getexif().get_ifd(tag)
 
 
 def upright(image: Image.Image, path: Path) -> Image.Image:
     """An open photo rotated according to its EXIF data. Raises InputError if they are damaged."""
-    try:
+    with refusing(f"{path}: {_BAD_EXIF}"):  # it decodes the EXIF data and rewrites them without the rotation
         return ImageOps.exif_transpose(image)
-    except DECODE_ERRORS as error:  # it decodes the EXIF data and rewrites them without the rotation
-        raise _bad_exif(path) from error
-
-
-def _bad_exif(path: Path) -> InputError:
-    return InputError(f"{path}: the photo's EXIF data are damaged; save it anew without them, or remove it")
 
 
 def why_left_out(path: Path, strict: bool = False) -> str | None:
@@ -196,38 +204,79 @@ _HEADER = 1 << 16
 
 
 def open_photo(path: Path) -> Image.Image:
-    """The photo opened by Pillow, not decoded. InputError if it is missing or Pillow cannot read it."""
+    """The picture opened by Pillow, not decoded. InputError if it is missing or Pillow cannot read it."""
     if path.suffix.lower() in HEIF_SUFFIXES:
         try:
             import pillow_heif
         except ImportError as error:
             raise missing_extra("pillow-heif", "heic") from error
         pillow_heif.register_heif_opener(thumbnails=False)
-    try:
-        if not S_ISREG(path.stat().st_mode):
+    with refusing(f"{path}: not a readable image; replace or remove it"):
+        try:
+            regular = S_ISREG(path.stat().st_mode)
+        except FileNotFoundError as error:
+            raise InputError(f"{path}: no such photo") from error
+        if not regular:
             raise ValueError("no file")  # to open a FIFO would mean to wait for its writer
         with path.open("rb") as file:
             file.read(_HEADER)  # on a disk that hangs, this waits, without the lock that other photos need
-        with _OPENING:  # Pillow's limit is global and lies below LARGE_PIXELS; MOST_DECODED is checked instead
-            limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-            try:
-                return Image.open(path)
-            finally:
-                Image.MAX_IMAGE_PIXELS = limit
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such photo") from error
-    except (UnidentifiedImageError, *DECODE_ERRORS) as error:
-        raise InputError(f"{path}: not a readable image; replace or remove it") from error
+        return _open(path)
+
+
+def _open(source: Path | io.BytesIO) -> Image.Image:
+    with _OPENING:  # Pillow's limit is global and lies below LARGE_PIXELS; MOST_DECODED is checked instead
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            return Image.open(source)
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
 
 
 def decode(image: Image.Image, path: Path) -> None:
-    """Decodes an open photo. Raises InputError if the file is damaged or has more than MOST_DECODED pixels."""
-    if image.width * image.height > MOST_DECODED:
-        raise InputError(f"{path}: {image.width}×{image.height} pixels, at most {MOST_DECODED} are read; shrink it")
-    try:
+    """Decodes an open picture. InputError if it is damaged, or `check_size` refuses it."""
+    check_size(path, image.size, image.format, path.stat().st_size)
+    with refusing(f"{path}: the picture is damaged or cut short; replace or remove it"):
         image.load()
-    except DECODE_ERRORS as error:
-        raise InputError(f"{path}: the photo is truncated or damaged; replace or remove it") from error
+
+
+def check_size(where: object, size: tuple[int, int], kind: str | None, held: int) -> None:
+    """InputError for a header that claims more than MOST_DECODED pixels, or more than `held` bytes of that format can
+    hold: before memory is taken for them."""
+    width, height = size
+    if width * height > MOST_DECODED:
+        raise InputError(f"{where}: {width}×{height} pixels, at most {MOST_DECODED} are read; shrink it")
+    if kind in _BOUNDED and width * height > _DENSEST * held:
+        raise InputError(f"{where}: {held} bytes cannot hold {width}×{height} pixels; the picture is damaged")
+
+
+def read_picture(source: Path | bytes, where: object, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray:
+    """A file or the bytes of one, as OpenCV decodes it: BGR, or with its own depth and channels by IMREAD_UNCHANGED.
+    InputError "`where`: not a readable `what`" for a file that is missing, of an unknown format, or damaged."""
+    wrong = f"{where}: not a readable {what}"
+    with refusing(wrong):
+        if isinstance(source, Path) and not source.is_file():
+            raise InputError(wrong)
+        data = source.read_bytes() if isinstance(source, Path) else source
+        check_size(where, *_claims(data), len(data))
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        if picture is None:
+            raise InputError(wrong)
+        return np.asarray(picture)
+
+
+def _claims(data: bytes) -> tuple[tuple[int, int], str | None]:
+    """(width, height) in a picture's header, and Pillow's name of its format. The checksums of a PNG are verified."""
+    try:
+        with _open(io.BytesIO(data)) as image:
+            size, kind = image.size, image.format
+            image.verify()
+            return size, kind
+    except UnidentifiedImageError:  # a TIFF of numbers that Pillow has no mode for, such as float64
+        tags = TiffImagePlugin.ImageFileDirectory_v2(data[:8])
+        stream = io.BytesIO(data)
+        stream.seek(tags.next)
+        tags.load(stream)
+        return (int(tags[0x0100]), int(tags[0x0101])), "TIFF"
 
 
 def to_rgb(image: Image.Image, path: Path) -> np.ndarray:

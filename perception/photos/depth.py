@@ -9,10 +9,10 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.arrays import map_npy
-from perception.io.documents import DAMAGE
-from perception.photos.decode import scaled_K
+from perception.io.documents import refusing
+from perception.photos.decode import read_picture, scaled_K
 from perception.photos.lens import rescale_lens, warp_grid
-from perception.photos.reading import view_lens
+from perception.photos.views import view_lens
 from perception.types import DepthImage, Lens, View
 
 SATURATED = 65535
@@ -28,13 +28,9 @@ def read_depth(path: Path) -> np.ndarray:
     InputError when the file is missing, damaged, empty or not of one channel."""
     if not path.is_file():
         raise InputError(f"{path}: no such depth image")
-    try:
-        npy = path.suffix.lower() == ".npy"
-        image = map_npy(path) if npy else cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (*DAMAGE, cv2.error):
-        image = None
-    if image is None:
-        raise InputError(f"{path}: not a readable depth image; expected PNG or TIFF of one channel, or .npy")
+    what = "depth image; expected PNG or TIFF of one channel, or .npy"
+    with refusing(f"{path}: not a readable {what}"):
+        image = map_npy(path) if path.suffix.lower() == ".npy" else read_picture(path, path, what)
     if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "uif":
         raise InputError(f"{path}: found {image.dtype} {list(image.shape)}, expected a depth image of one channel")
     depth = image.astype(np.float32)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from perception.errors import InputError
-from perception.photos.decode import photo_size, warp_labels
+from perception.photos.decode import photo_size, read_picture, warp_labels
 from perception.types import Scene, View
 
 _ASPECT = 0.02
@@ -23,8 +23,8 @@ def mask_of(folder: Path | None, name: str) -> Path | None:
     """The mask of photo `name` in `folder`: "a/1.png" or "a/1.jpg.png" for "a/1.jpg"; None without one."""
     if folder is None:
         return None
-    places = (folder / Path(name).with_suffix(".png"), folder / f"{name}.png")
-    return next((place for place in places if place.is_file()), None)
+    paths = (folder / Path(name).with_suffix(".png"), folder / f"{name}.png")
+    return next((path for path in paths if path.is_file()), None)
 
 
 def read_mask(path: Path, width: int, height: int) -> np.ndarray:
@@ -33,9 +33,7 @@ def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     Ignored are pixels that are black in all channels, or transparent. InputError for a file that is missing, no image,
     or of another aspect ratio.
     """
-    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) if path.is_file() else None
-    if image is None:
-        raise InputError(f"{path}: not a readable mask; expected a PNG in which black (0) pixels are ignored")
+    image = read_picture(path, path, "mask; expected a PNG in which black (0) pixels are ignored")
     channels = image.reshape(*image.shape[:2], -1)
     used: np.ndarray = np.any(channels[..., :3] > 0, axis=2)
     if channels.shape[2] in (2, 4):
@@ -67,7 +65,7 @@ def stage_masks(folder: Path, photos: list[Path], names: list[str], masks: list[
 def with_checked_masks(scene: Scene, folder: Path | None) -> Scene:
     """The scene without the photos that their masks ignore completely, and a note on what is ignored.
 
-    folder: where the user said masks are. InputError when it holds none for these photos, a mask is unreadable, or
+    folder: of masks, as the user named it. InputError when it holds none for these photos, a mask is unreadable, or
     nothing is left.
     """
     masked = [view for view in scene.views if view.mask is not None]

@@ -14,11 +14,13 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.atomic import atomic_directory
-from perception.io.documents import read_json
+from perception.io.documents import read_json, refusing
+from perception.photos.decode import check_size
 from perception.progress import Progress
 
 THUMBNAIL = 320  # long side in pixels at which motion and sharpness are measured
 _MIN_TRACKS, SHARP_SHARE = 20, 0.3
+_UNREADABLE = "not a readable video; expected .mp4, .mov or another that OpenCV's FFmpeg decodes"
 
 
 @dataclass
@@ -106,7 +108,7 @@ def video_frames(video: Path, folder: Path, progress: Progress) -> dict[str, obj
         progress.update("poses: choosing frames", round(100 * share), 100)
     chosen = [numbers[index] for index in chooser.chosen(MOST_FRAMES)]
     if not chosen:
-        raise InputError(f"{video}: not a readable video; expected .mp4, .mov or another that OpenCV's FFmpeg decodes")
+        raise InputError(f"{video}: {_UNREADABLE}")
     record |= {"frames": numbers[-1] + 1, "chosen": len(chosen)}
     with atomic_directory(folder, fresh=True) as aside:
         for number, share, frame in frames(video, set(chosen)):
@@ -123,17 +125,20 @@ def frames(
     Without `wanted`, every n-th frame: LOOKS_PER_SECOND, or about `most` in all. None where the video is unreadable."""
     capture = cv2.VideoCapture(str(video))
     try:
-        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
-        rate, total = capture.get(cv2.CAP_PROP_FPS), max(1.0, capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        step = max(1, round(rate / LOOKS_PER_SECOND)) if np.isfinite(rate) else 1
-        step = step if most is None else max(1, int(total) // most)
-        number = 0
-        while capture.grab():
-            if number in wanted if wanted is not None else number % step == 0:
-                good, frame = capture.retrieve()
-                if good:
-                    yield number, min(1.0, (number + 1) / total), frame
-            number += 1
+        with refusing(f"{video}: {_UNREADABLE}"):
+            width, height = (int(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+            check_size(video, (width, height), None, 0)
+            capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+            rate, total = capture.get(cv2.CAP_PROP_FPS), max(1.0, capture.get(cv2.CAP_PROP_FRAME_COUNT))
+            step = max(1, round(rate / LOOKS_PER_SECOND)) if np.isfinite(rate) else 1
+            step = step if most is None else max(1, int(total) // most)
+            number = 0
+            while capture.grab():
+                if number in wanted if wanted is not None else number % step == 0:
+                    good, frame = capture.retrieve()
+                    if good:
+                        yield number, min(1.0, (number + 1) / total), frame
+                number += 1
     finally:
         capture.release()
 
@@ -142,4 +147,4 @@ def frame_size(video: Path) -> tuple[int, int]:
     """(width, height) of the video's frames, upright. InputError where there are none."""
     for _, _, frame in frames(video, {0}):
         return frame.shape[1], frame.shape[0]
-    raise InputError(f"{video}: not a readable video; expected .mp4, .mov or another that OpenCV's FFmpeg decodes")
+    raise InputError(f"{video}: {_UNREADABLE}")

@@ -10,14 +10,49 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Len
+from pydantic import AfterValidator, Field, Strict
 
 from perception.errors import InputError
 from perception.io.atomic import pointed
-from perception.io.documents import safe_name
+from perception.io.json_shapes import (
+    Bytes,
+    Intrinsics,
+    Number,
+    PathText,
+    PhotoName,
+    Pose,
+    Positive,
+    Side,
+    Text,
+    check,
+    typed,
+)
 from perception.types import DepthImage, Lens, View
+
+MOST_PIXELS = 4 * 10**8
+"""Of a view: no photo with more is read."""
+
+
+def _pixels(view: dict[str, Any]) -> dict[str, Any]:
+    if view["width"] * view["height"] > MOST_PIXELS:
+        raise ValueError(f"expected at most {MOST_PIXELS} pixels")
+    return view
+
+
+_LENS = Annotated[tuple[Text, list[Number], Side, Side], Strict(False)]
+_DEPTH = Annotated[tuple[PathText, Positive, _LENS | None], Strict(False)]
+_GAIN = Annotated[list[Annotated[float, Field(gt=0, lt=1e3)]], Len(3, 3)]
+_VIEW = {
+    "name": PhotoName, "photo": PathText, "K": Intrinsics, "width": Side, "height": Side, "camera_from_world": Pose,
+    "lens?": _LENS | None, "held_out?": bool, "photo_beside?": PathText | None, "photo_bytes?": Bytes | None,
+    "depth?": _DEPTH | None, "mask?": PathText | None, "gain?": _GAIN | None,
+}  # fmt: skip
+VIEW: Any = Annotated[typed(_VIEW), AfterValidator(_pixels)]
+"""A view in map.json."""
 
 
 @dataclass(frozen=True)
@@ -52,22 +87,22 @@ def moved_record(view: StoredView, before: Path, after: Path) -> StoredView:
 def locate_photo(view: View, folder: Path | None) -> Path:
     """The path of the photo of `view`: relative to the map, else its absolute path when the map was made.
     folder: of the map, None when it is not on disk. InputError when there is no file, or only one of another size."""
-    places = [Path(view.photo)]
+    paths = [Path(view.photo)]
     size = None
     if isinstance(view, StoredView):
         size = view.photo_bytes
         if folder is not None and view.photo_beside is not None:
-            places.insert(0, absolute(pointed(folder) / view.photo_beside))
+            paths.insert(0, absolute(pointed(folder) / view.photo_beside))
     other = None
-    for place in places:
+    for path in paths:
         try:
-            found = place.stat().st_size if place.is_file() else None
+            found = path.stat().st_size if path.is_file() else None
         except OSError:
             found = None
         if found is not None and size in (None, found):
-            return place
-        other = other or (found is not None and f"{place}: has {found} bytes, the photo of the map had {size}") or None
-    raise InputError(f"{other or f'{places[0]}: the photo is missing'}; tell where the photos are: perception relink")
+            return path
+        other = other or (found is not None and f"{path}: has {found} bytes, the photo of the map had {size}") or None
+    raise InputError(f"{other or f'{paths[0]}: the photo is missing'}; tell where the photos are: perception relink")
 
 
 def absolute(path: Path) -> Path:
@@ -102,30 +137,23 @@ def view_json(view: View) -> dict[str, Any]:
 
 
 def view_from_json(entry: dict[str, Any]) -> StoredView:
-    """The inverse of `view_json`. ValueError, TypeError or KeyError for an invalid entry."""
+    """The inverse of `view_json`. ValueError for an invalid entry."""
+    check(VIEW, entry)
     beside, size, depth, mask, gain = map(entry.get, ("photo_beside", "photo_bytes", "depth", "mask", "gain"))
-    K, pose = (np.array(entry[name], np.float64) for name in ("K", "camera_from_world"))
-    if K.shape != (3, 3) or pose.shape != (4, 4) or not (np.isfinite(K).all() and np.isfinite(pose).all()):
-        raise ValueError(f"{entry['name']}: K or camera_from_world is no finite matrix")
-    if gain is not None and not (len(gain) == 3 and all(0 < value < 1e3 for value in gain)):
-        raise ValueError(f"{entry['name']}: gain is not three numbers above 0")
-    width, height = int(entry["width"]), int(entry["height"])
-    if min(width, height) < 1:
-        raise ValueError(f"{entry['name']}: {width}×{height} pixels")
     return StoredView(
-        str(entry["name"]),
+        entry["name"],
         Path(entry["photo"]),
-        K,
-        width,
-        height,
-        pose,
+        np.array(entry["K"], np.float64),
+        entry["width"],
+        entry["height"],
+        np.array(entry["camera_from_world"], np.float64),
         _lens_of(entry.get("lens")),
-        bool(entry.get("held_out", False)),
+        entry.get("held_out", False),
         None if depth is None else DepthImage(Path(depth[0]), float(depth[1]), _lens_of(depth[2])),
         None if mask is None else Path(mask),
         None if gain is None else (float(gain[0]), float(gain[1]), float(gain[2])),
-        None if beside is None else str(beside),
-        None if size is None else int(size),
+        beside,
+        size,
     )
 
 
@@ -134,7 +162,7 @@ def _lens_json(lens: Lens | None) -> list[Any] | None:
 
 
 def _lens_of(entry: list[Any] | None) -> Lens | None:
-    return None if entry is None else Lens(str(entry[0]), tuple(map(float, entry[1])), int(entry[2]), int(entry[3]))
+    return None if entry is None else Lens(entry[0], tuple(map(float, entry[1])), *entry[2:])
 
 
 def views_of_facts(info: dict[str, Any], file: Path) -> list[StoredView]:
@@ -144,10 +172,3 @@ def views_of_facts(info: dict[str, Any], file: Path) -> list[StoredView]:
         return [view_from_json(entry) for entry in info.get("views", [])]
     except (ValueError, TypeError, KeyError, IndexError, OverflowError, AttributeError) as error:
         raise InputError(f"{file}: its views cannot be understood ({error}); the map is damaged") from error
-
-
-def check_names(info: dict[str, Any], file: Path) -> None:
-    """InputError for a recorded name that would leave the folder it is joined to (see `safe_name`)."""
-    views = info.get("views", [])
-    for entry in views if isinstance(views, list) else []:
-        safe_name(entry.get("name") if isinstance(entry, dict) else entry, file)

@@ -21,7 +21,7 @@ from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians
 from perception.gaussians.nearby import Nearby
 from perception.gaussians.size import sized
-from perception.gaussians.train import TrainRecord
+from perception.gaussians.state import TrainRecord
 from perception.gaussians.views import surface_depth
 from perception.geometry import camera_centres
 from perception.machine import memory_limit
@@ -29,7 +29,7 @@ from perception.map.replace import writing
 from perception.masks import MaskSource, make_source
 from perception.pipeline.checkpoint import BEFORE_MASKS, CHECKPOINT, digest, load_checkpoint, save_checkpoint
 from perception.pipeline.estimate import largest_budget
-from perception.pipeline.optimise import PARAMETERS, Optimised, Photos, Run, label_by_tasks, label_photos, optimise
+from perception.pipeline.optimise import Optimised, Photos, Run, label_by_tasks, label_photos, optimise
 from perception.progress import QUIET, Progress
 from perception.tasks.folder import has_task, read_task, write_task
 from perception.types import Scene, View
@@ -237,7 +237,7 @@ def optimise_block(folder: str, progress: Progress = QUIET) -> None:
         source, box = make_source(config.masks, config.sam), np.array(facts["box"])
         optimised = optimise(run, scene, training, held_out, source, box)
         gaussians = optimised.nearby.gaussians.to("cpu")
-        tensors = {name: getattr(gaussians, name).contiguous() for name in PARAMETERS}
-        save_checkpoint(work / RESULT, {"gaussians": tensors, "record": asdict(optimised.record)}, work.name)
+        state = {name: tensor.contiguous() for name, tensor in gaussians.named().items()}
+        save_checkpoint(work / RESULT, {"gaussians": state, "record": asdict(optimised.record)}, work.name)
         for name in (CHECKPOINT, BEFORE_MASKS):
             (work / name).unlink(missing_ok=True)

@@ -30,7 +30,7 @@ from typing import Any, BinaryIO, cast
 from perception.config import MapConfig
 from perception.errors import InputError
 from perception.gaussians.train import Trainer
-from perception.inputs.load import EXPECTED
+from perception.inputs.readers import EXPECTED
 from perception.io.atomic import atomic_file
 from perception.machine import peak_memory_mib
 from perception.map.replace import writing

@@ -14,12 +14,12 @@ import numpy as np
 
 from perception.config import MapConfig
 from perception.errors import InputError
-from perception.frame.place import placed_scene
 from perception.frame.recentre import recentred
+from perception.frame.world_frame import in_world_frame
 from perception.gaussians.device import choose_device
 from perception.gaussians.model import Gaussians
 from perception.gaussians.photos import split_scene
-from perception.inputs.load import load_saved_scene, load_scene, save_scene
+from perception.inputs.load import load_scene
 from perception.language.base import Encoder
 from perception.language.ocr import TextReader, make_reader
 from perception.map.checksums import is_map
@@ -27,17 +27,18 @@ from perception.map.files import read_info
 from perception.map.write import Map, read_map, write_map
 from perception.masks import MaskSource, make_source
 from perception.masks.compute import load_segmentation
-from perception.photos.reading import Reading
+from perception.photos.scene_file import load_saved_scene, save_scene
 from perception.photos.view_json import stored_view
 from perception.pipeline.blocks import optimise_scene
 from perception.pipeline.changes import hold_inputs, inputs_of, refuse_changed
 from perception.pipeline.checkpoint import check_name, clear_work, fingerprint, frames_folder, poses_mark, working
 from perception.pipeline.estimate import log_estimate
 from perception.pipeline.instances import DescribedInstances, describe, group_gaussians
-from perception.pipeline.optimise import PARAMETERS, Run
+from perception.pipeline.optimise import Run
 from perception.pipeline.record import finite, run_record, scored
 from perception.progress import QUIET, Progress
 from perception.report.text import depth_text, frame_lines
+from perception.sfm.options import ReadOptions
 from perception.tasks.engine import LOCAL, Engine
 from perception.types import Scene, View
 
@@ -55,6 +56,12 @@ def build_map(
 
     Raises InputError for bad input. What a run has made is kept beside `output` until the map is written; `resume` goes
     on from there (see `pipeline.checkpoint`), or returns a finished map. engine: where tasks run.
+
+    >>> from perception.config import load_config
+    >>> config = load_config(pairs=["masks=labels:table/labels", "train.iterations=20", "language.encoder=none"])
+    >>> gmap = build_map(Path("table"), Path("table.gsmap"), config)
+    >>> len(gmap.views), gmap.means.shape == (len(gmap), 3)
+    (12, True)
     """
     started = time.monotonic()
     check_name(output)
@@ -135,10 +142,10 @@ def _posed_scene(output: Path, run: Run) -> Scene:
             photos = config.photos
             files = (photos.ignore_masks, photos.camera, photos.init_points)
             masks, camera, cloud = (Path(file) if file else None for file in files)
-            reading = Reading(work / "sfm", config.seed, progress, photos.strict, poses=photos.poses, engine=run.engine)
-            reading = replace(reading, masks=masks, camera=camera, frames=frames_folder(output), init_points=cloud)
-            scene = load_scene(source, reading)
-            save_scene(kept, scene := placed_scene(recentred(scene), config.frame, config.seed))
+            options = ReadOptions(work / "sfm", config.seed, progress, photos.strict, masks, camera)
+            options = replace(options, frames=frames_folder(output), init_points=cloud, poses=photos.poses)
+            scene = load_scene(source, replace(options, engine=run.engine))
+            save_scene(kept, scene := in_world_frame(recentred(scene), config.frame, config.seed))
         if config.losses.depth_weight == 0:
             scene = replace(scene, views=[replace(view, depth=None) for view in scene.views])
     _log_scene(scene, progress)
@@ -155,7 +162,7 @@ def _assemble(
 ) -> Map:
     """The map to write; in JSON values, None replaces NaN and infinity."""
     held = {view.name: view for view in held_out}
-    arrays = {name: getattr(gaussians, name).detach().numpy() for name in PARAMETERS}
+    arrays: dict[str, Any] = {name: tensor.detach().numpy() for name, tensor in gaussians.named().items()}
     arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)
     return Map(
         **arrays,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
@@ -19,8 +18,9 @@ from perception.gaussians.model import Gaussians, from_points
 from perception.gaussians.nearby import Nearby
 from perception.gaussians.photos import load_all, with_labels
 from perception.gaussians.size import sized
-from perception.gaussians.train import Trainer, TrainingView, TrainRecord
-from perception.gaussians.views import surface_depth
+from perception.gaussians.state import TrainRecord
+from perception.gaussians.train import Trainer
+from perception.gaussians.views import TrainingView, surface_depth
 from perception.io.memory import DiskArrays, Keep
 from perception.machine import memory_limit, return_free_memory
 from perception.masks import MaskSource, compute_masks, make_source
@@ -34,8 +34,6 @@ from perception.types import Scene, View
 
 GEOMETRY_START = 0.3
 """Training progress at which masks that use the depth of the map (the built-in ones) are made."""
-PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
-"""The tensors of `Gaussians`, as maps and results of blocks name them."""
 PHOTOS_A_TASK = 8
 """Photos whose masks one task makes: minutes with SAM on a CPU, and reading the model takes seconds."""
 
@@ -136,7 +134,6 @@ def optimise(
         trainer.run(observer)
     optimised = Optimised(Nearby(trainer.gaussians), photos, trainer.record, report)
     del trainer, observer
-    gc.collect()  # a trainer and its schedule refer to each other, and to all photos
     return_free_memory()
     return optimised
 

@@ -1,7 +1,10 @@
-"""Crops of instances from the photos that show them best."""
+"""Crops of instances from the photos that show them best, for servers: a received map may name any file of this machine
+as its photo, so only photos in the map's own folder are read, and in a folder that the user allows.
+"""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,21 +12,26 @@ import cv2
 import numpy as np
 
 from perception.errors import InputError
-from perception.map.map import Map
+from perception.map.map import MAX_SIDE, Map
+from perception.photos.view_json import StoredView, absolute, locate_photo
 from perception.query.query_map import QueryMap
-from perception.query.requests import UnknownInstance
 from perception.types import View
 
 MARGIN = 0.15
 """Margin around the bounding box, as a share of its longer side."""
+OUTSIDE = "photos outside the map's folder are not shown; --photos DIR shows those in DIR"
+"""What a server tells of a map that names such photos."""
 
 
-def best_crop(gmap: QueryMap, instance_id: int, side: int = 320, inside: Path | None = None) -> np.ndarray | None:
+class PhotoOutside(InputError):
+    """The photo is in no folder where photos may be read."""
+
+
+def best_crop(gmap: QueryMap, instance_id: int, side: int = 320, photos: Path | None = None) -> np.ndarray | None:
     """The crop of an instance from its best photo, [h, w, 3] uint8 RGB, longer side at most `side` pixels.
 
-    None when no photo shows the instance or its photo is missing or unreadable. InputError for an unknown id.
-    inside: the folder where photos may be read, None = anywhere. An untrusted map may name any file as its photo, so
-    UnknownInstance is raised for a photo outside this folder. Symbolic links are resolved first.
+    None when no photo shows the instance or its photo is missing or unreadable. photos: a folder where photos may be
+    read beside the map's own. InputError for an unknown id, PhotoOutside for a photo elsewhere (`readable_view`).
     """
     from perception.photos.decode import load_photo
 
@@ -31,10 +39,10 @@ def best_crop(gmap: QueryMap, instance_id: int, side: int = 320, inside: Path | 
     if found is None:
         return None
     try:
-        photo = load_photo(readable_view(gmap, found[0], inside), int(gmap.info["config"]["photos"]["max_side"]))
-    except UnknownInstance:
+        photo = load_photo(readable_view(gmap, found[0], photos), gmap.setting("photos", "max_side", MAX_SIDE))
+    except PhotoOutside:
         raise
-    except (InputError, OSError, ValueError, KeyError):
+    except (InputError, OSError, ValueError, KeyError, TypeError):
         return None
     return cut_out(photo, found[1], side)
 
@@ -53,17 +61,33 @@ def cut_out(picture: np.ndarray, box: tuple[int, int, int, int], side: int) -> n
     return cut if scale == 1 else np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA))
 
 
-def readable_view(gmap: Map, view: View, inside: Path | None) -> View:
-    """`view` with the path of its photo, symbolic links resolved if `inside` is given. Raises InputError when the
-    photo is missing, UnknownInstance when it is not a file below `inside` (None: anywhere)."""
-    located = gmap.with_photo(view)
-    if inside is None:
-        return located
-    try:
-        real = located.photo.resolve()
-        known = real.is_relative_to(inside.resolve()) and real.is_file()
-    except (OSError, ValueError, RuntimeError):  # an invalid path, or a cycle of symbolic links
-        known = False
-    if not known:
-        raise UnknownInstance(f"{view.name}: this photo is not in the map's folder")
-    return replace(located, photo=real)
+def readable_view(gmap: Map, view: View, photos: Path | None = None) -> View:
+    """`view` with the real path of its photo. Raises InputError when the photo is missing or has changed, PhotoOutside
+    when it is neither in the map's folder nor in `photos`, links followed; nothing is read elsewhere."""
+    allowed = _allowed(gmap, view, photos)
+    if not allowed:
+        raise PhotoOutside(f"{view.name}: {OUTSIDE}")
+    view = replace(view, photo_beside=None) if isinstance(view, StoredView) else view
+    for place in allowed[:-1]:
+        with suppress(InputError):  # missing, or another file
+            return replace(view, photo=locate_photo(replace(view, photo=place), None))
+    return gmap.with_photo(replace(view, photo=allowed[-1]))
+
+
+def photos_outside(gmap: Map, photos: Path | None = None) -> str | None:
+    """One line when photos of the map are not shown because of where they are; else None."""
+    return None if all(_allowed(gmap, view, photos) for view in gmap.views) else f"{gmap.path}: {OUTSIDE}"
+
+
+def _allowed(gmap: Map, view: View, photos: Path | None) -> list[Path]:
+    """The real paths that the map states for a photo, of those in its folder or in `photos`, by name and by links."""
+    folders = [folder for folder in (gmap.path, photos) if folder is not None]
+    beside = getattr(view, "photo_beside", None)
+    places = [*([] if beside is None or gmap.path is None else [gmap.path / beside]), view.photo]
+    real = [folder.resolve() for folder in folders]
+    found = []
+    for place in places:
+        with suppress(OSError, ValueError, RuntimeError):  # an invalid path, or a cycle of symbolic links
+            if any(absolute(place).is_relative_to(folder) for folder in (*map(absolute, folders), *real)):
+                found.append(place.resolve())
+    return [place for place in found if any(place.is_relative_to(folder) for folder in real)]

@@ -81,5 +81,9 @@ def floor_grid(gmap: Map, resolution: float, step: float = STEP) -> tuple[np.nda
 
     "Something" is a point of `level_surface`; discs with a radius above two cells leave gaps. InputError for a map
     without metric scale, gravity, cameras or floor, or of more than 16 million cells.
+
+    >>> cells, map_from_grid = floor_grid(perception.load_map("room.gsmap"), 0.1)
+    >>> sorted({int(value) for value in cells.ravel()}), map_from_grid.shape  # unknown, free, occupied
+    ([-1, 0, 100], (4, 4))
     """
     return level_surface(gmap).grid(resolution, step)

@@ -39,6 +39,12 @@ class Hit:
 
     A hit of a store also has the path of its `map`, `map_id`, and whether that is `metric`. Its points are read from
     the map's folder when asked for: InputError when that is gone or holds another map.
+
+    >>> mug = perception.load_map("kitchen.gsmap").query("red mug")[0]
+    >>> mug.instance_id, mug.label, mug.frame, mug.points.shape == (mug.num_points, 3)
+    (0, None, 'map', True)
+    >>> bool(np.allclose(mug.centroid, 0, atol=0.05) and (mug.obb.extent < 0.6).all())
+    True
     """
 
     instance_id: int
@@ -115,7 +121,11 @@ Hit.points = _Points()  # type: ignore[assignment]
 
 @dataclass(frozen=True)
 class Neighbor:
-    """An instance near another one; gap: the smallest distance between points of the two."""
+    """An instance near another one; gap: the smallest distance between points of the two, in the unit of the frame.
+
+    >>> sorted(neighbor.instance_id for neighbor in perception.load_map("kitchen.gsmap").describe(0).neighbors)
+    [1, 3, 4]
+    """
 
     instance_id: int
     label: str | None
@@ -130,7 +140,12 @@ def printed_texts(entry: dict[str, Any]) -> list[str]:
 @dataclass(frozen=True)
 class Description:
     """All properties of one instance. confidence: the mapper's score in [0, 1]; aabb: [2, 3] lowest and highest corner
-    in the frame of `hit`; colors: names of its main colours with their shares, largest first."""
+    in the frame of `hit`; colors: names of its main colours with their shares, largest first.
+
+    >>> known = perception.load_map("kitchen.gsmap").describe(0)
+    >>> known.confidence, known.aabb.shape, known.hit.instance_id
+    (0.9, (2, 3), 0)
+    """
 
     hit: Hit
     confidence: float

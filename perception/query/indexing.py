@@ -24,7 +24,7 @@ from perception.progress import QUIET, Progress
 from perception.query.map_store import FORMAT_VERSION, TOLD, read_store
 from perception.query.query_map import QueryMap, load_map
 from perception.query.relations import Places
-from perception.query.text_ranking import Encoders, printed_on
+from perception.query.text_ranking import Encoders, encoder_name, printed_on
 
 _NAME = re.compile(r"\.?[0-9a-f]{32}\.npz(?P<unfinished>\.new-\d+-\w{8})?")
 
@@ -43,6 +43,12 @@ def index_maps(
     interrupted run has prepared is used by the next one. InputError, and no change, for a folder that is no map, a map
     without embeddings or of another encoder than the store's, a path to remove that the store does not hold, a folder
     that is no store, and while another process writes the store.
+
+    >>> counts = index_maps(Path("all.store"), [Path("kitchen.gsmap")])
+    >>> counts["added"], counts["instances"]
+    (1, 9)
+    >>> perception.load_map("all.store").query("red mug")[0].map_id == load_map("kitchen.gsmap").map_id
+    True
     """
     encoders = lru_cache(encoders or make_encoder)
     with writing(store):
@@ -108,9 +114,8 @@ def _indexed(store: Path, gmap: QueryMap, facts: dict[str, Any]) -> dict[str, An
     path = Path(str(gmap.path))
     if (problem := gmap.problem) is not None:
         raise InputError(problem if str(path) in problem else f"{path}: {problem}")
-    spec = gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
     identity = str(gmap.language["encoder"])
-    known = facts["encoder"] = facts["encoder"] or {"name": "conse" if spec == "auto" else spec, "identity": identity}
+    known = facts["encoder"] = facts["encoder"] or {"name": encoder_name(gmap), "identity": identity}
     if known["identity"] != identity:
         found = f"its embeddings were made by '{identity}', those of {store} by '{known['identity']}'"
         raise InputError(f"{path}: {found}; run: perception upgrade MAP, or give another store")

@@ -17,12 +17,15 @@ import numpy as np
 
 from perception.errors import InputError
 from perception.io.arrays import read_npz
+from perception.io.documents import brief
+from perception.io.json_shapes import check, parsed
 from perception.language.description import check_encoder
 from perception.language.encoders import make_encoder
 from perception.language.printed import Printed, quoted_text
 from perception.machine import torch_on_one_thread
 from perception.map.checksums import STORE
 from perception.map.map import Map
+from perception.map.model import NAMES, STORED
 from perception.query.hit import Hit
 from perception.query.query_map import QueryMap
 from perception.query.ranking import THING, Ranker, least_score
@@ -132,7 +135,10 @@ class MapStore(QueryMap):
     @cached_property
     def ranker(self) -> Ranker:  # type: ignore[override]
         name, identity = self._facts["encoder"]["name"], self._facts["encoder"]["identity"]
-        encoder = (self.encoders or make_encoder)(name)
+        try:
+            encoder = (self.encoders or make_encoder)(name)
+        except InputError as error:
+            raise InputError(f"{self.path / STORE}: encoder.name: {error}") from error
         if encoder is None:
             raise InputError(f"{self.path}: names no encoder; index its maps anew")
         check_encoder(identity, encoder.identity)
@@ -201,6 +207,11 @@ class MapStore(QueryMap):
 
     def _read(self) -> None:
         """Reads all arrays; those with a row per instance are put after each other."""
+        for entry in self.maps:  # before memory is taken for so many
+            file = self.path / "maps" / entry["file"]
+            if file.is_file() and entry["instances"] * TOLD.itemsize > file.stat().st_size:
+                found = f"maps: {file.name} is too small for its {entry['instances']} instances"
+                raise _damaged(self.path / STORE, ValueError(found))
         counts = [entry["instances"] for entry in self.maps]
         self._groups = np.repeat(np.arange(len(counts)), counts)
         stops = np.cumsum(counts).tolist()
@@ -214,6 +225,8 @@ class MapStore(QueryMap):
                 for name, many in ragged.items():
                     many.append(arrays.pop(name, None))
                 for name, array in arrays.items():
+                    if len(array) != entry["instances"]:
+                        raise ValueError(f"{name}: {len(array)} rows, {STORE} says {entry['instances']} instances")
                     if name not in rows:
                         rows[name] = np.empty((sum(counts), *array.shape[1:]), array.dtype)
                     rows[name][own] = array
@@ -224,8 +237,12 @@ class MapStore(QueryMap):
             self._told = records["told"]
             labels = {name: np.concatenate(ragged[name]) for name in ("label_rows", "label_null")}
             self._arrays = {**rows, **labels, "things": records["things"]}
-            self._names = [json.loads(names.tobytes()) for names in ragged["names"]]
-        except (ValueError, TypeError, KeyError) as error:
+            self._names = [parsed(names.tobytes()) for names in ragged["names"]]
+            for names, count in zip(self._names, counts, strict=True):
+                check(NAMES, names)
+                if not len(names["labels"]) == count == len(names["texts"] or names["labels"]):
+                    raise ValueError(f"names: expected those of {count} instances")
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise _damaged(self.path / STORE, error) from error
         self._photos, poses = ragged["views"], ragged["poses"]
         self._places_of = [
@@ -238,23 +255,14 @@ def read_store(path: Path) -> tuple[dict[str, Any], bytes]:
     file = path / STORE
     try:
         raw = file.read_bytes()
-        facts = json.loads(raw)
-        if facts["format_version"] != FORMAT_VERSION:
-            raise InputError(
-                f"{file}: format_version is {facts['format_version']!r}, this program reads {FORMAT_VERSION}; "
-                "index the maps into a new store"
-            )
-        _ = facts["encoder"]["name"], facts["encoder"]["identity"]
-        if not facts["maps"]:
-            raise ValueError("it holds no map")
-        for entry in facts["maps"]:
-            kinds = {"map": str, "map_id": str, "frame": str, "metric": bool, "instances": int, "file": str}
-            wrong = [key for key, kind in kinds.items() if not isinstance(entry[key], kind)]
-            if wrong or Path(entry["file"]).name != entry["file"] or entry["instances"] < 0:
-                raise ValueError(f"an entry of maps has a wrong {', '.join(wrong) or 'file or count'}")
+        facts = parsed(raw)
+        if isinstance(facts, dict) and (version := facts.get("format_version")) != FORMAT_VERSION:
+            found = f"format_version is {brief(version)}, this program reads {FORMAT_VERSION}"
+            raise InputError(f"{file}: {found}; index the maps into a new store")
+        check(STORED, facts)
     except InputError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise _damaged(file, error) from error
     return facts, raw
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from perception.language.printed import quoted_text
+from perception.language.printed import found_after_a_word, quoted_text
 from perception.query.ranking import PRESENT
 from perception.query.shapes import ramp
 
@@ -25,10 +25,11 @@ if TYPE_CHECKING:
 
 TRIM = 0.02  # share of an instance's points left out of its box at either end of each axis
 WEIGHT = 3.0  # added to z for a full match, in standard deviations of the map's probes
-_RELATION = re.compile(
-    r"^(?P<thing>.*?\w.*?)\s+(?:(?:that|which)\s+)?(?:(?:is|are|stand|sit|lie|hang|lean)(?:s|ing)?\s+)?(?:to\s+the\s+)?"
+NESTED = 3  # relations that are read in what a thing stands in relation to; each costs as much as a prompt
+_RELATION = re.compile(  # in a text of single spaces, so that every repeat has an end
+    r"(?<= )(?:(?:that|which) )?(?:(?:is|are|stand|sit|lie|hang|lean)(?:s|ing)? )?(?:to the )?"
     r"(?P<relation>on top of|on|upon|under|underneath|beneath|below|above|over|next to|beside|near|close to|by|inside|"
-    r"in|left of|right of|in front of|behind)\s+(?P<other>.*\w.*)$",
+    r"in|left of|right of|in front of|behind) (?=.*\w)",
     re.IGNORECASE,
 )
 _KINDS = {
@@ -60,10 +61,12 @@ def parse(prompt: str) -> Relation | None:
 
     What follows "with" or "of" describes the thing itself: "magazine with a shell on the cover" has no relation.
     """
-    found = _RELATION.match(" ".join(prompt.split()))
-    if found is None or _DETAIL.search(found["thing"]):
+    text = " ".join(prompt.split())
+    found = found_after_a_word(_RELATION, text)
+    kind = None if found is None else _KIND.get(found["relation"].lower())  # None too for "İn", as i without its case
+    if found is None or kind is None or _DETAIL.search(text, 0, found.start()):
         return None
-    return Relation(found["thing"], _KIND[found["relation"].lower()], found["other"])
+    return Relation(text[: found.start() - 1], kind, text[found.end() :])
 
 
 def ranked(ranker: Ranker, places: Places | None, text: str) -> Answer:
@@ -75,12 +78,15 @@ def ranked(ranker: Ranker, places: Places | None, text: str) -> Answer:
     return replace(ranker.rank(relation.thing, gain), text=" ".join(text.split()))
 
 
-def standing(ranker: Ranker, maps: Sequence[tuple[slice, Places]], relation: Relation) -> np.ndarray:
+def standing(
+    ranker: Ranker, maps: Sequence[tuple[slice, Places]], relation: Relation, nested_most: int = NESTED
+) -> np.ndarray:
     """[I] in [0, 1]: how well each instance stands in the relation to what its other words mean, "the desk next to the
-    monitor" for one. maps: of each map whose places are known, its slice of the ranker's instances, and the places."""
-    nested = parse(relation.other)
+    monitor" for one. maps: of each map whose places are known, its slice of the ranker's instances, and the places.
+    nested_most: relations that are read in the other words; further ones are taken as part of a name."""
+    nested = parse(relation.other) if nested_most else None
     score = ranker.scores(relation.other if nested is None else nested.thing)
-    further = np.ones(len(score)) if nested is None else standing(ranker, maps, nested)
+    further = np.ones(len(score)) if nested is None else standing(ranker, maps, nested, nested_most - 1)
     found = np.zeros(len(score))
     for own, places in maps:
         if score[own].max(initial=0.0) >= PRESENT:

@@ -56,15 +56,27 @@ class NoScale(InputError):
 
 
 class EngineBusy(RuntimeError):
-    """The request queue is full: retry later, or use another server."""
+    """The request queue is full: retry later, or use another server.
+
+    >>> error_kind(EngineBusy("64 questions are waiting already; ask again later"))
+    'busy'
+    """
 
 
 class AnswerTimeout(TimeoutError):
-    """No answer within the time-out; a request that had not started is dropped."""
+    """No answer within the time-out; a request that had not started is dropped.
+
+    >>> error_kind(AnswerTimeout("no answer within 10 s"))
+    'timeout'
+    """
 
 
 class EngineClosed(RuntimeError):
-    """The engine has been closed."""
+    """The engine has been closed.
+
+    >>> error_kind(EngineClosed("kitchen.gsmap: the engine has been closed"))
+    'closed'
+    """
 
 
 KINDS: dict[type[BaseException], str] = {
@@ -99,7 +111,13 @@ def source(gmap: QueryMap, frame: Frame | None = None) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Request:
-    """One prompt with its filters; its coordinates and those of the reply are in `frame`, None = the map's."""
+    """One prompt with its filters; its coordinates and those of the reply are in `frame`, None = the map's.
+
+    InputError for an empty or overlong text, and for numbers out of range.
+
+    >>> Request("red mug", top_k=1, where=Where(max_size=0.6)).text
+    'red mug'
+    """
 
     text: str
     top_k: int = TOP
@@ -133,7 +151,12 @@ class Request:
 @dataclass(frozen=True)
 class Reply:
     """The answer to a request, computed on the map map_id alone. seconds: from submission to answer. A store's frame
-    and metric are None."""
+    and metric are None.
+
+    >>> reply = Request("red mug").answered(perception.load_map("kitchen.gsmap"), time.monotonic())
+    >>> reply.to_json()["present"], reply.frame, reply.metric
+    (True, 'map', True)
+    """
 
     request: Request
     hits: tuple[Hit, ...]

@@ -55,12 +55,17 @@ def scene_graph(gmap: Map) -> networkx.DiGraph:
     it has one its label, score, centroid [3], box (`obb`) and lengths in the map's frame. Edges as above, with
     `relation` and `score`. Graph attributes: frame, metric, map_id. Rooms need a metric map with gravity and a floor;
     otherwise there is one. InputError when it is not known which way is up.
+
+    >>> graph = scene_graph(perception.load_map("room.gsmap"))
+    >>> graph.nodes[4]["kind"], graph.edges[4, "room 0"]["relation"]
+    ('object', 'in')
     """
     import networkx
 
     places, level = Places.of(gmap), level_from_map(gmap)
     if places is None or level is None:
-        raise InputError(f"{gmap.path}: which way is up is not known, and a scene graph needs it; see frame.up")
+        advice = "map photos of a level camera, or a transforms.json with 'gravity'"
+        raise InputError(f"{gmap.path}: which way is up is not known, and a scene graph needs it; {advice}")
     points = [_thinned(gmap.index.of(entry["id"])) @ level.T for entry in gmap.instances]
     held = holders(points, places)
     beside, rooms = places.match("beside"), _rooms(gmap)

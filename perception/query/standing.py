@@ -30,8 +30,11 @@ class Stand:
     """A place on the floor beside an instance. position [3] and map_from_robot [4, 4], rigid, in `frame`; the robot's
     frame is that of REP 103: origin on the floor below its centre, x forward to the instance, z up.
 
-    yaw: of x about the z axis of `frame`, radians. distance: level, to the nearest point of the instance, metres.
+    distance: level, to the nearest point of the instance, metres.
     seen: share of the rays to the instance that nothing blocks.
+
+    >>> Stand(4, np.eye(4), distance=0.6, seen=1.0, frame="map").yaw
+    0.0
     """
 
     instance_id: int
@@ -42,10 +45,12 @@ class Stand:
 
     @property
     def position(self) -> np.ndarray:
+        """[3] of the robot, on the floor."""
         return self.map_from_robot[:3, 3]
 
     @property
     def yaw(self) -> float:
+        """Of the robot's x about the z axis of `frame`, radians."""
         return float(np.arctan2(self.map_from_robot[1, 0], self.map_from_robot[0, 0]))
 
 
@@ -71,6 +76,10 @@ def where_to_stand(
 
     Raises UnknownInstance; InputError for a map without metric scale, gravity, cameras or floor, for lengths that are
     not positive, and when no place is free or none of them has line of sight.
+
+    >>> stand = where_to_stand(perception.load_map("room.gsmap"), 1, radius=0.25, distance=0.6)
+    >>> stand.map_from_robot.shape, bool(abs(stand.distance - 0.6) < 0.05), stand.seen
+    ((4, 4), True, 1.0)
     """
     lengths = {"radius": radius, "distance": distance, "within": within, "sensor_height": sensor_height}
     for name, value in lengths.items():

@@ -77,8 +77,7 @@ class TextRanking:
                 f"{self._gmap.path}: holds no language embeddings; map again with an encoder (language.encoder=…)"
             )
         descriptions, identity = from_arrays(self._gmap.language)
-        spec = self._gmap.info.get("config", {}).get("language", {}).get("encoder", "auto")
-        encoder = self._encoders("conse" if spec == "auto" else spec)
+        encoder = encoder_of(self._gmap, self._encoders)
         if encoder is None:
             raise InputError(f"{self._gmap.path}: was mapped without an encoder; map again with language.encoder=conse")
         check_encoder(identity, encoder.identity)
@@ -101,6 +100,20 @@ class TextRanking:
         gravity = self._gmap.info.get("gravity")
         down = None if gravity is None else Gravity.from_json(gravity)
         return shape_scores(index.points, owners, [entry["id"] for entry in self._gmap.instances], poses, down)
+
+
+def encoder_name(gmap: Map) -> str:
+    """The encoder that the map was made with, as `make_encoder` takes it."""
+    spec = gmap.setting("language", "encoder", "auto")
+    return "conse" if spec == "auto" else str(spec)
+
+
+def encoder_of(gmap: Map, encoders: Encoders) -> Encoder | None:
+    """The encoder that the map was made with, None if with none; InputError when it cannot be made."""
+    try:
+        return encoders(encoder_name(gmap))
+    except InputError as error:
+        raise InputError(f"{gmap.path}: config.language.encoder: {error}") from error
 
 
 def extents(gmap: Map) -> np.ndarray:

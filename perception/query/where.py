@@ -18,7 +18,13 @@ from perception.types import OrientedBox
 class Frame:
     """A named frame. from_map [4, 4]: the transform frame_from_map, rigid or a similarity.
 
-    A scale other than 1 converts units, for example those of a reconstruction into metres.
+    A scale other than 1 converts units, for example those of a reconstruction into metres. InputError for a matrix that
+    shears or mirrors.
+
+    >>> base = Frame("base_link", np.array([[0, 1, 0, -1], [-1, 0, 0, 2], [0, 0, 1, -0.4], [0, 0, 0, 1]]))
+    >>> hit = perception.load_map("kitchen.gsmap").get(0, frame=base)
+    >>> hit.frame, bool(np.allclose(hit.centroid, [-1, 2, -0.4], atol=0.05))
+    ('base_link', True)
     """
 
     name: str
@@ -40,7 +46,11 @@ class Where:
     region: at least `share` of its points lie in this box. near: a point [3], or a pose [4, 4] of which only
     the origin is used; hits then carry their distance. within: largest distance of its nearest point from `near`.
     min_size, max_size: bounds on the longest side of its box. labels: it has one of these labels (case-insensitive).
-    Lengths are in the unit of the query's frame.
+    Lengths are in the unit of the query's frame. InputError for a value that is no such condition.
+
+    >>> small = Where(max_size=0.6, near=[0.0, 0.0, 0.0], within=0.9)
+    >>> [hit.instance_id for hit in perception.load_map("kitchen.gsmap").find(small)]
+    [0, 1, 3]
     """
 
     region: OrientedBox | None = None
@@ -105,7 +115,14 @@ def tidy(text: str) -> str:
 
 
 def axis_box(low: Sequence[float] | np.ndarray, high: Sequence[float] | np.ndarray) -> OrientedBox:
-    """The box along the axes between two corners [3]; InputError unless low <= high."""
+    """The box along the axes between two corners [3]; InputError unless low <= high.
+
+    >>> counter = axis_box([-0.5, -0.5, -0.5], [2.5, 0.5, 0.5])
+    >>> counter.center.tolist(), counter.extent.tolist()
+    ([1.0, 0.0, 0.0], [3.0, 1.0, 1.0])
+    >>> [hit.instance_id for hit in perception.load_map("kitchen.gsmap").in_box(counter)]
+    [0, 1, 2]
+    """
     a, b = numbers(low, "region: low corner"), numbers(high, "region: high corner")
     if a.shape != (3,) or b.shape != (3,) or (a > b).any():
         raise InputError(f"region: corners {a.tolist()} and {b.tolist()}, expected two [3] points with low <= high")

@@ -25,7 +25,8 @@ from perception.instances.crops import expand_box, mask_box
 from perception.instances.silhouettes import render_silhouettes
 from perception.io.atomic import atomic_file
 from perception.map.files import read_info
-from perception.map.write import REPORT, Map
+from perception.map.map import MAX_SIDE, Map
+from perception.map.write import REPORT
 from perception.photos.decode import load_photo, scaled_K
 from perception.pictures import error_map, features_to_rgb, outline, overlay, titled_row
 from perception.progress import Progress
@@ -56,16 +57,16 @@ def write_map_report(opened: QueryMap, path: Path, queries: list[str]) -> Path:
     info, album = opened.info, _Album(opened)
     data = {
         "title": (opened.path or path).stem,
-        "subtitle": f"from {info['source']}",
+        "subtitle": f"from {info.get('source', 'unknown photos')}",
         "figures": _figures(opened),
-        "seconds": {name: value for name, value in info["seconds"].items() if name != "total" and value > 0},
-        "views": _view_rows(opened, album),
+        "seconds": {name: value for name, value in info.get("seconds", {}).items() if name != "total" and value > 0},
+        "views": _view_rows(album),
         "overview": _overview(opened, album),
         "instances": _instance_rows(opened, album),
         "metric": opened.metric,
         "queries": [_query_row(opened, text, album) for text in queries],
-        "warnings": _warnings(info),
-        "settings": dict(flat(info["config"])),
+        "warnings": _warnings(info, album.scored),
+        "settings": dict(flat(info.get("config", {}))),
     }
     return write_page(path, data)
 
@@ -119,13 +120,12 @@ def clock(seconds: float) -> str:
     return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
 
 
-def _warnings(info: dict[str, Any]) -> list[str]:
+def _warnings(info: dict[str, Any], scored: dict[str, dict[str, float]]) -> list[str]:
     """Warnings on the quality of the map, most severe first."""
-    scored = info["quality"].get("views", {})
-    mean = info["quality"].get("psnr")
+    mean, scene = info.get("quality", {}).get("psnr") or 0.0, info.get("scene", {})
     bad = [f"{name} ({figures['psnr']:.1f} dB)" for name, figures in scored.items() if mean - figures["psnr"] > 6]
-    lines = [*_left_out(info["scene"]), *info["scene"].get("warnings", []), *info["masks"].get("warnings", [])]
-    if skipped := info["training"].get("skipped_gradients"):
+    lines = [*_left_out(scene), *scene.get("warnings", []), *info.get("masks", {}).get("warnings", [])]
+    if skipped := info.get("training", {}).get("skipped_gradients"):
         lines.append(f"{skipped} gradients were not finite and were skipped")
     if bad:
         lines.append(f"held-out views far below the mean of {mean:.1f} dB: {', '.join(bad)}")
@@ -148,20 +148,22 @@ def _left_out(scene: dict[str, Any], most: int = 12) -> list[str]:
 class _Album:
     """Photos, renders and silhouettes of the map's views at training size, computed on first use.
 
-    `render`, `ids` and `features` are for views whose `photo` can be read.
+    `render`, `ids` and `features` are for views whose `photo` can be read. scored: the held-out views with figures.
     """
 
     def __init__(self, gmap: Map):
         self.gmap, self.gaussians = gmap, as_gaussians(gmap)
-        self.side = int(gmap.info["config"]["photos"]["max_side"])
+        self.side = gmap.setting("photos", "max_side", MAX_SIDE)
         self.views = {view.name: view for view in gmap.views}
+        figures = gmap.info.get("quality", {}).get("views", {})
+        self.scored = {name: own for name, own in figures.items() if name in self.views and None not in own.values()}
         self.photo, self.ids = cache(self._photo), cache(self._ids)
 
     def _photo(self, name: str) -> np.ndarray | None:
-        """[h, w, 3] uint8; None when it can no longer be read."""
+        """[h, w, 3] uint8; None when it can no longer be read, or is none of the map's."""
         try:
             return load_photo(self.gmap.with_photo(self.views[name]), self.side)
-        except InputError:
+        except (InputError, KeyError):
             return None
 
     def _camera(self, name: str) -> tuple[torch.Tensor, torch.Tensor, int, int]:
@@ -207,21 +209,21 @@ def map_picture(opened: QueryMap, text: str) -> np.ndarray:
 
 
 def _figures(gmap: Map) -> dict[str, str]:
-    info = gmap.info
+    info, quality = gmap.info, gmap.info.get("quality", {})
     figures = {"Gaussians": f"{len(gmap):,}", "Instances": str(len(gmap.instances))}
-    if "psnr" in info["quality"]:
-        figures |= {"Held-out PSNR": f"{info['quality']['psnr']:.2f} dB", "SSIM": f"{info['quality']['ssim']:.3f}"}
-    if info["quality"].get("depth"):
-        median, share, tolerance = depth_figures(info["quality"]["depth"])
+    if None not in (psnr := quality.get("psnr"), similarity := quality.get("ssim")):
+        figures |= {"Held-out PSNR": f"{psnr:.2f} dB", "SSIM": f"{similarity:.3f}"}
+    if quality.get("depth"):
+        median, share, tolerance = depth_figures(quality["depth"])
         figures |= {"Median depth error": median, f"Depth within {tolerance}": share}
-    figures["Time"] = f"{info['seconds']['total']:.0f} s"
-    figures["Peak memory"] = f"{info['peak_memory_mib']:.0f} MiB"
+    figures["Time"] = f"{info.get('seconds', {}).get('total', 0):.0f} s"
+    figures["Peak memory"] = f"{info.get('peak_memory_mib', 0):.0f} MiB"
     return figures
 
 
-def _view_rows(gmap: Map, album: _Album) -> list[dict[str, np.ndarray]]:
+def _view_rows(album: _Album) -> list[dict[str, np.ndarray]]:
     """{caption: image} of the held-out views in SHOWN: the photo, the render, their difference."""
-    scored = gmap.info["quality"].get("views", {})
+    scored = album.scored
     by_psnr = sorted(scored, key=lambda name: float(scored[name]["psnr"]))
     chosen = dict.fromkeys(by_psnr[i] for i in (0, len(by_psnr) // 2, -1) if by_psnr)
     rows = []
@@ -244,7 +246,7 @@ def _view_rows(gmap: Map, album: _Album) -> list[dict[str, np.ndarray]]:
 def _overview(gmap: Map, album: _Album) -> dict[str, np.ndarray]:
     """Instances and features of the middle photo of the sequence."""
     names = list(album.views)
-    name = names[len(names) // 2]
+    name = names[len(names) // 2] if names else ""
     photo = album.photo(name)
     if photo is None or not gmap.instances:
         return {}

@@ -6,6 +6,7 @@ Servers (HTTP, ROS) only convert messages. Queueing, rejection, time-outs and re
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 import time
 from collections import Counter, deque
@@ -26,9 +27,19 @@ from perception.language.base import Encoder
 from perception.language.encoders import make_encoder
 from perception.map.files import map_signature
 from perception.query.query_map import QueryMap, load_map
-from perception.query.requests import AnswerTimeout, EngineBusy, EngineClosed, EngineSettings, OtherMap, Reply, Request
+from perception.query.requests import (
+    AnswerTimeout,
+    EngineBusy,
+    EngineClosed,
+    EngineSettings,
+    OtherMap,
+    Reply,
+    Request,
+    error_line,
+)
 
 T = TypeVar("T")
+_log = logging.getLogger("perception.query")
 _SELDOM = 32
 """Largest interval between attempts to open an unreadable new map, in multiples of `watch`."""
 _REMEMBERED = 1000
@@ -43,6 +54,11 @@ class QueryEngine:
     map, or changed labels, is loaded beside the current map and then swapped in atomically: each answer comes from one
     map only. When a new map cannot be read, `health` reports it and the current map stays in use. The directory may be
     deleted meanwhile: queries use only data in memory. Thread-safe; a context manager.
+
+    >>> with QueryEngine("kitchen.gsmap", workers=2, timeout=30.0) as engine:
+    ...     reply = engine.ask(Request("red mug", top_k=1))
+    >>> [hit.instance_id for hit in reply.hits]
+    [0]
     """
 
     def __init__(
@@ -52,7 +68,8 @@ class QueryEngine:
         encoders: Callable[[str], Encoder | None] | None = None,
         **settings: Any,
     ) -> None:
-        """settings: the fields of `EngineSettings`; InputError when one is unknown or out of range."""
+        """settings: the fields of `EngineSettings`; InputError when one is unknown or out of range, or for a folder
+        that is no map."""
         chosen = settings_from(EngineSettings, {name: (value, "engine") for name, value in settings.items()})
         self.path, self.timeout = Path(path), chosen.timeout
         self._encoders = lru_cache(encoders or make_encoder)  # shared by the current map and a reloaded one
@@ -63,6 +80,7 @@ class QueryEngine:
         self._reloading = threading.Lock()
         self._listeners: list[Callable[[QueryMap], object]] = []
         self._problem: str | None = None
+        self._unserved: str | None = None
         self._busy_since: dict[int, float] = {}
         self._closed = threading.Event()
         tasks = {f"query-{n}": self._work for n in range(chosen.workers)}
@@ -137,7 +155,7 @@ class QueryEngine:
     def reload(self) -> bool:
         """Loads the map now at the path and swaps it in; False when it is the current map already.
 
-        Raises InputError when it cannot be loaded; the current map then stays in use.
+        Raises InputError when it cannot be loaded, whatever the reason; the current map then stays in use.
         """
         with self._reloading:
             try:
@@ -145,20 +163,33 @@ class QueryEngine:
                 if signature == self._signature and self._problem is None:
                     return False
                 fresh = self.open_map()
-            except InputError as error:
-                self._problem = str(error)
-                raise
+            except Exception as error:  # of any class: people edit instances.json by hand
+                raise self._told(error) from error
             self._signature, self._problem, old = signature, None, self._map
             self._map = fresh
             self._counters.count("reloads")
             if fresh.map_id == old.map_id:
                 return False
+            self._unserved = None
             for listener in list(self._listeners):
-                listener(fresh)
+                try:
+                    listener(fresh)
+                except Exception as error:
+                    _log.error("%s: not all of the new map can be served", self.path, exc_info=error)
+                    self._unserved = f"{self.path}: not all of the map can be served ({_brief(error)})"
             return True
 
+    def _told(self, error: Exception) -> InputError:
+        """The error as an InputError, which `health` tells from now on; logged when it is a new one."""
+        known = isinstance(error, InputError)
+        line = error_line(error) if known else f"{self.path}: cannot be opened ({_brief(error)}); mend or replace it"
+        if line != self._problem:
+            _log.warning("%s; the map opened before stays in use", line, exc_info=None if known else error)
+        self._problem = line
+        return InputError(line)
+
     def on_reload(self, listener: Callable[[QueryMap], object]) -> None:
-        """Registers `listener(new map)`, called after each swap by the thread that reloaded; it must not raise."""
+        """Registers `listener(new map)`, called after each swap by the reloading thread; `health` tells its errors."""
         self._listeners.append(listener)
 
     def open_map(self) -> QueryMap:
@@ -169,15 +200,16 @@ class QueryEngine:
 
     def _watch(self, every: float) -> None:
         """Reloads the map when its signature changes. A map that cannot be opened may still be being copied file by
-        file, so it is tried again, at intervals that double up to _SELDOM times `every`."""
+        file, so it is tried again, at intervals that double up to _SELDOM times `every`. No error ends this."""
         tried: Any = None
         wait, left = every, 0.0
         while not self._closed.wait(every):
             left -= every
             try:
                 signature = map_signature(self.path)
-            except InputError as error:
-                self._problem, tried = str(error), None
+            except Exception as error:
+                self._told(error)
+                tried = None
                 continue
             if signature == self._signature:
                 self._problem = None
@@ -191,13 +223,14 @@ class QueryEngine:
 
     def health(self) -> dict[str, Any]:
         """The state of the engine. status: "ok", "closed", or "degraded" with the reason in `problem`: the map on disk
-        is missing or unreadable, prompts cannot be answered, or answers are overdue. Further: the map's identity and
-        counts, the queue, totals since the start, and the latency of the last thousand answers in ms."""
+        is missing or unreadable, not all of it can be served, prompts cannot be answered, or answers are overdue.
+        Further: the map's identity and counts, the queue, totals since the start, and the latency of the last thousand
+        answers in ms."""
         gmap = self._map
         now = time.monotonic()
         late = sum(now - since > self.timeout for since in list(self._busy_since.values()))
         overdue = f"{late} answers take longer than {self.timeout:g} s" if late else None
-        problem = self._problem or gmap.problem or overdue
+        problem = self._problem or self._unserved or gmap.problem or overdue
         return {
             "status": "closed" if self._closed.is_set() else "degraded" if problem else "ok",
             "problem": problem,
@@ -259,6 +292,10 @@ class QueryEngine:
         else:
             self._counters.answered(time.monotonic() - job.asked)
             job.future.set_result(result)
+
+
+def _brief(error: Exception) -> str:
+    return f"{type(error).__name__}: {error_line(error)[:200]}"
 
 
 @dataclass(eq=False)

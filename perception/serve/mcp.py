@@ -24,14 +24,13 @@ from perception import __version__
 from perception.errors import InputError, missing_extra
 from perception.geometry import scale_of
 from perception.query import Frame, Hit, QueryMap, Where
-from perception.query.crops import best_crop
+from perception.query.crops import OUTSIDE, PhotoOutside, best_crop, photos_outside
 from perception.query.hit import printed_texts
-from perception.query.requests import MAX_TOP, NoScale, UnknownFrame, UnknownInstance, error_kind, error_line, source
+from perception.query.requests import MAX_TOP, NoScale, UnknownFrame, error_kind, error_line, source
 from perception.query.scene_graph import scene_graph
 from perception.query.standing import where_to_stand
 from perception.serve.bodies import AnyRegion, Body, FrameBody, Length, Place, Prompt, Text, parse
 from perception.serve.engine import QueryEngine
-from perception.serve.listening import is_local
 from perception.serve.server import ServeSettings, serve
 
 try:
@@ -93,6 +92,7 @@ class DescribeAnswer(Answer, Instance):
     neighbors: list[dict[str, Any]] = Field(description="instance_id, label, gap between the nearest points")
     relations: list[dict[str, str]] = Field(description="of the scene graph: thing, relation (on, in, …), other")
     picture: Literal["photo", "render"] | None = Field(description="of what the picture is; null: there is none")
+    note: str | None = Field(None, description="why the picture is no photo")
 
 
 class MeasureAnswer(Answer):
@@ -117,8 +117,8 @@ class Tool(Body):
     unit: Literal["m"] | None = Field(None, description="m: an error unless lengths are metres")
     map_id: Text | None = Field(None, description="of an earlier answer: an error if the map was replaced")
 
-    def answered(self, gmap: QueryMap, inside: Path | None) -> tuple[dict[str, Any], bytes | None]:
-        """The answer as JSON, and its picture as JPEG if it has one. inside: see `best_crop`. Raises UnknownFrame for a
+    def answered(self, gmap: QueryMap, photos: Path | None) -> tuple[dict[str, Any], bytes | None]:
+        """The answer as JSON, and its picture as JPEG if it has one. photos: see `best_crop`. Raises UnknownFrame for a
         mere name that is not of the map's frame, NoScale when lengths are to be metres and are not."""
         if isinstance(self.frame, str) and self.frame != gmap.frame:
             known = f"'{gmap.frame}' or an object with name and from_map"
@@ -129,12 +129,12 @@ class Tool(Body):
         if self.unit == "m" and not facts["metric"]:
             raise NoScale(f"unit: lengths in frame '{facts['frame']}' are not known to be metres; ask without unit")
         unit = "m" if facts["metric"] else f"unit of frame {facts['frame']}"
-        fields = self.fields_of(gmap, frame, inside)
+        fields = self.fields_of(gmap, frame, photos)
         image = fields.pop("image", None)
         jpeg = None if image is None else cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]))[1].tobytes()
         return self.answer(**{**facts, "unit": unit, **fields}).model_dump(mode="json"), jpeg
 
-    def fields_of(self, gmap: QueryMap, frame: Frame | None, inside: Path | None) -> dict[str, Any]:
+    def fields_of(self, gmap: QueryMap, frame: Frame | None, photos: Path | None) -> dict[str, Any]:
         """The fields of the answer but those of its map, frame and unit; "image": [h, w, 3] uint8 RGB, if any."""
         raise NotImplementedError
 
@@ -145,7 +145,7 @@ class Find(Tool):
     text: Prompt = Field(description='a thing, such as "red mug" or "the book on the desk"')
     top_k: Top = 5
 
-    def fields_of(self, gmap: QueryMap, frame: Frame | None, inside: Path | None) -> dict[str, Any]:
+    def fields_of(self, gmap: QueryMap, frame: Frame | None, photos: Path | None) -> dict[str, Any]:
         return _listed(gmap, gmap.query(self.text, self.top_k, frame=frame))
 
 
@@ -154,7 +154,7 @@ class ListObjects(Tool):
 
     region: AnyRegion | None = None
 
-    def fields_of(self, gmap: QueryMap, frame: Frame | None, inside: Path | None) -> dict[str, Any]:
+    def fields_of(self, gmap: QueryMap, frame: Frame | None, photos: Path | None) -> dict[str, Any]:
         hits = gmap.find(None if self.region is None else Where(self.region.region()), frame=frame)
         return {**_listed(gmap, hits), "confidence": min((hit.score for hit in hits), default=None)}
 
@@ -165,7 +165,7 @@ class Nearest(Tool):
     point: Place
     top_k: Top = 1
 
-    def fields_of(self, gmap: QueryMap, frame: Frame | None, inside: Path | None) -> dict[str, Any]:
+    def fields_of(self, gmap: QueryMap, frame: Frame | None, photos: Path | None) -> dict[str, Any]:
         return _listed(gmap, gmap.nearest(np.array(self.point), self.top_k, frame=frame))
 
 
@@ -175,18 +175,20 @@ class Describe(Tool):
     answer = DescribeAnswer
     id: Id
 
-    def fields_of(self, gmap: QueryMap, frame: Frame | None, inside: Path | None) -> dict[str, Any]:
+    def fields_of(self, gmap: QueryMap, frame: Frame | None, photos: Path | None) -> dict[str, Any]:
         told, place = gmap.describe(self.id, frame=frame), gmap.position(self.id)
-        kind, image = "photo", None
-        with suppress(UnknownInstance):  # its photo may not be read
-            image = best_crop(gmap, self.id, CROP_SIDE, inside)
+        kind, image, note = "photo", None, None
+        try:
+            image = best_crop(gmap, self.id, CROP_SIDE, photos)
+        except PhotoOutside:
+            note = OUTSIDE
         if image is None:
             from perception.export.render import rendered_crop
 
             kind, image = "render", rendered_crop(gmap, self.id, CROP_SIDE)
         fields: dict[str, Any] = {"colors": dict(told.colors), "texts": printed_texts(gmap.instances[place])}
         fields["relations"] = [edge for edge in _relations(gmap) if str(self.id) in (edge["thing"], edge["other"])]
-        picture = {"picture": None if image is None else kind, "image": image}
+        picture = {"picture": None if image is None else kind, "image": image, "note": note}
         return {**told.to_json(), "names": _names(gmap)[place], **fields, **picture}
 
 
@@ -197,7 +199,7 @@ class Measure(Tool):
     a: Id
     b: Id
 
-    def fields_of(self, gmap: QueryMap, frame: Frame | None, inside: Path | None) -> dict[str, Any]:
+    def fields_of(self, gmap: QueryMap, frame: Frame | None, photos: Path | None) -> dict[str, Any]:
         a, b = (gmap.get(number, frame=frame) for number in (self.a, self.b))
         if not len(a.points) or not len(b.points):
             raise InputError("measure: one of the two instances has no points")
@@ -218,7 +220,7 @@ class WhereToStand(Tool):
     radius: Annotated[Length, Field(description="of the robot, metres")] = 0.25
     distance: Annotated[Length, Field(description="wanted from the robot's centre to the instance, metres")] = 0.6
 
-    def fields_of(self, gmap: QueryMap, frame: Frame | None, inside: Path | None) -> dict[str, Any]:
+    def fields_of(self, gmap: QueryMap, frame: Frame | None, photos: Path | None) -> dict[str, Any]:
         score = gmap.get(self.id).score
         if not gmap.metric:
             raise NoScale("where_to_stand: this map's scale is not known, and a robot's size is in metres")
@@ -252,8 +254,8 @@ def _listed(gmap: QueryMap, hits: list[Hit]) -> dict[str, Any]:
     return {"hits": entries, "confidence": hits[0].score if hits else None}
 
 
-def make_server(engine: QueryEngine, inside: Path | None) -> Server[Any]:
-    """The server that answers from `engine`. inside: see `best_crop`."""
+def make_server(engine: QueryEngine, photos: Path | None = None) -> Server[Any]:
+    """The server that answers from `engine`. photos: see `best_crop`."""
     hints = types.ToolAnnotations(read_only_hint=True, idempotent_hint=True, open_world_hint=False)
     listed = [
         types.Tool(
@@ -275,7 +277,7 @@ def make_server(engine: QueryEngine, inside: Path | None) -> Server[Any]:
         jpeg = None
         try:
             asked = parse(TOOLS[params.name], params.arguments or {})
-            future = engine.run(partial(asked.answered, inside=inside), map_id=asked.map_id)
+            future = engine.run(partial(asked.answered, photos=photos), map_id=asked.map_id)
             result, jpeg = await engine.awaited(future)
         except Exception as error:
             kind, line = error_kind(error), error_line(error)
@@ -291,14 +293,17 @@ def make_server(engine: QueryEngine, inside: Path | None) -> Server[Any]:
     for learn in (_names, _relations):  # which may take longer than an answer
         learn(engine.current)
         engine.on_reload(learn)
+    if outside := photos_outside(engine.current, photos):
+        _log.warning("%s", outside)
     schemas = {tool.name: tool.input_schema for tool in listed}
     handlers: dict[str, Any] = {"on_list_tools": list_tools, "on_call_tool": call_tool}
     about: dict[str, Any] = {"version": __version__, "instructions": _ABOUT}
     return Server("perception", get_tool_input_schema=schemas.get, **handlers, **about)
 
 
-def serve_stdio(path: Path, encoders: Any = None) -> None:
-    """Serves the map at `path` over standard input and output until the client ends. encoders: of QueryEngine."""
+def serve_stdio(path: Path, encoders: Any = None, photos: Path | None = None) -> None:
+    """Serves the map at `path` over standard input and output until the client ends. encoders: of QueryEngine;
+    photos: see `best_crop`."""
 
     async def session(server: Server[Any]) -> None:
         async with stdio_server() as (read, write):
@@ -312,12 +317,12 @@ def serve_stdio(path: Path, encoders: Any = None) -> None:
                 raise
 
     with QueryEngine(path, encoders=encoders) as engine:  # Ctrl-C cannot end the thread, which waits for input
-        thread = threading.Thread(target=work, args=(make_server(engine, None),), daemon=True)
+        thread = threading.Thread(target=work, args=(make_server(engine, photos),), daemon=True)
         thread.start()
         thread.join()
 
 
-def serve_http(path: Path, settings: ServeSettings, encoders: Any = None) -> None:
+def serve_http(path: Path, settings: ServeSettings, encoders: Any = None, photos: Path | None = None) -> None:
     """Serves the map at `path` over streamable HTTP until SIGINT or SIGTERM, with the checks of `serve`.
 
     No session is kept: each request is answered by itself, so a client may vanish at any time.
@@ -325,7 +330,7 @@ def serve_http(path: Path, settings: ServeSettings, encoders: Any = None) -> Non
     from perception.serve.guard import Guard
 
     def build(engine: QueryEngine, settings: ServeSettings) -> Any:
-        server, host = make_server(engine, None if is_local(settings.host) else path), settings.host
+        server, host = make_server(engine, photos), settings.host
         app = server.streamable_http_app(stateless_http=True, max_request_body_size=settings.max_body, host=host)
         app.add_middleware(Guard, settings=settings)
         return app

@@ -75,8 +75,8 @@ def residuals(tracks: Tracks, poses: Poses, points: np.ndarray) -> tuple[np.ndar
     return error, np.where(known, x[:, 2] / np.where(known, tracks.depth, 1.0) - 1.0, 0.0), x
 
 
-def adjust(tracks: Tracks, given: Poses, poses: Poses, prior: tuple[float, float]) -> tuple[Poses, np.ndarray]:
-    """`poses` adjusted, and points [P, 3]. given: the poses that the priors pull to.
+def adjust(tracks: Tracks, given: Poses, poses: Poses, prior: tuple[float, float]) -> Poses:
+    """`poses` adjusted, together with the points of the tracks. given: the poses that the priors pull to.
 
     prior: standard errors of a given pose relative to that of the next view: angle in radians, centre in scene units.
     The priors keep the world frame, and hold views that have no features.
@@ -90,7 +90,7 @@ def adjust(tracks: Tracks, given: Poses, poses: Poses, prior: tuple[float, float
         depth_sigma = max(float(np.median(known)) / 0.6745 if len(known) else 0.0, LEAST_DEPTH)
         problem = _Problem(tracks, given, prior, sigma, depth_sigma)
         poses, points = _round(problem, poses, points)
-    return poses, points
+    return poses
 
 
 @dataclass(frozen=True)

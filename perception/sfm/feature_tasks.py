@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
-from perception.errors import InputError
 from perception.io.atomic import atomic_directory
 from perception.photos.ignore_masks import stage_masks
 from perception.photos.lens import load_pycolmap
@@ -18,11 +17,11 @@ from perception.progress import QUIET, Progress
 from perception.sfm.features import extract, import_photos, match
 from perception.sfm.staging import stage_photos
 from perception.tasks.engine import Engine
-from perception.tasks.folder import has_task, read_facts, write_task
+from perception.tasks.folder import RESULT, has_task, read_facts, run_tasks, write_task
 
 PHOTOS_A_TASK, PAIRS_A_TASK = 64, 2000
 """About half a minute on two cores each."""
-RESULT, DATABASE = "result", "database.db"
+DATABASE = "database.db"
 _IMAGES = ("rigs", "rig_sensors", "cameras", "frames", "frame_data", "images")
 _FEATURES, _MATCHES = ("keypoints", "descriptors"), ("matches", "two_view_geometries")
 _PAIR = 2147483647
@@ -37,19 +36,19 @@ class FeatureTasks:
 
     def extract(self, database: Path, photos: Sequence[Path], masks: Sequence[Path | None] | None) -> None:
         """Fills the database of imported photos with their features."""
-        homes = []
+        folders = []
         for first in range(0, len(photos), PHOTOS_A_TASK):
             some = slice(first, first + PHOTOS_A_TASK)
-            homes.append(self.folder / f"photos-{first}")
-            if not has_task(homes[-1]):
+            folders.append(self.folder / f"photos-{first}")
+            if not has_task(folders[-1]):
                 paths = [str(photo.resolve()) for photo in photos[some]]
                 covered = None if masks is None else [mask and str(mask.resolve()) for mask in masks[some]]
-                write_task(homes[-1], photos=paths, masks=covered)
-        self._run(extract_task, homes, "feature set")
+                write_task(folders[-1], photos=paths, masks=covered)
+        results = run_tasks(self.engine, extract_task, folders, "feature set", self.progress)
         with closing(sqlite3.connect(database)) as own, own:
             ids = _ids_by_name(own)
-            for home in homes:
-                with closing(sqlite3.connect(home / RESULT / DATABASE)) as theirs:
+            for result in results:
+                with closing(sqlite3.connect(result / DATABASE)) as theirs:
                     theirs_ids = _ids_by_name(theirs)
                     mine = dict(zip(theirs_ids, ids[: len(theirs_ids)], strict=True))
                     del ids[: len(theirs_ids)]
@@ -59,36 +58,30 @@ class FeatureTasks:
 
     def match(self, database: Path, chosen: Sequence[tuple[str, str]], seed: int) -> None:
         """Adds the matches of the chosen pairs to a database with features."""
-        homes = []
+        folders = []
         for first in range(0, len(chosen), PAIRS_A_TASK):
             some = chosen[first : first + PAIRS_A_TASK]
-            homes.append(self.folder / f"pairs-{first}")
-            if not has_task(homes[-1]):
-                homes[-1].mkdir(parents=True, exist_ok=True)
-                write_part(database, _ids(database, {name for pair in some for name in pair}), homes[-1] / DATABASE)
-                write_task(homes[-1], pairs=some, seed=seed)
-        self._run(match_task, homes, "pair set")
+            folders.append(self.folder / f"pairs-{first}")
+            if not has_task(folders[-1]):
+                folders[-1].mkdir(parents=True, exist_ok=True)
+                write_part(database, _ids(database, {name for pair in some for name in pair}), folders[-1] / DATABASE)
+                write_task(folders[-1], pairs=some, seed=seed)
+        results = run_tasks(self.engine, match_task, folders, "pair set", self.progress)
         with closing(sqlite3.connect(database)) as own, own:
-            for home in homes:
-                with closing(sqlite3.connect(home / RESULT / DATABASE)) as theirs:
+            for result in results:
+                with closing(sqlite3.connect(result / DATABASE)) as theirs:
                     for table in _MATCHES:
                         for row in theirs.execute(f"SELECT * FROM {table}"):
                             own.execute(_insert(table, len(row)), row)
 
-    def _run(self, task: object, homes: list[Path], what: str) -> None:
-        self.engine.run(task, [str(home.resolve()) for home in homes], what, self.progress)  # type: ignore[arg-type]
-        for home in homes:
-            if not (home / RESULT / DATABASE).is_file():
-                raise InputError(f"{home}: has no {RESULT} after its task; workers must share the output's folder")
 
-
-def extract_task(folder: str, progress: Progress = QUIET) -> None:
-    """Extracts the features of the photos whose task lies in `folder`, unless it is done."""
-    home, facts = Path(folder), read_facts(Path(folder))
-    if (home / RESULT).is_dir():
+def extract_task(task: str, progress: Progress = QUIET) -> None:
+    """Extracts the features of the photos whose task lies in folder `task`, unless it is done."""
+    folder, facts = Path(task), read_facts(Path(task))
+    if (folder / RESULT).is_dir():
         return
     photos, masks = [Path(photo) for photo in facts["photos"]], facts["masks"]
-    with atomic_directory(home / RESULT) as new:
+    with atomic_directory(folder / RESULT) as new:
         names = stage_photos(new / "photos", photos, progress)
         if masks is not None:
             stage_masks(new / "masks", photos, names, [mask and Path(mask) for mask in masks])
@@ -96,13 +89,13 @@ def extract_task(folder: str, progress: Progress = QUIET) -> None:
         extract(new / DATABASE, new / "photos", groups, progress)
 
 
-def match_task(folder: str, progress: Progress = QUIET) -> None:
-    """Matches the pairs whose task and database lie in `folder`, unless it is done."""
-    home, facts = Path(folder), read_facts(Path(folder))
-    if (home / RESULT).is_dir():
+def match_task(task: str, progress: Progress = QUIET) -> None:
+    """Matches the pairs whose task and database lie in folder `task`, unless it is done."""
+    folder, facts = Path(task), read_facts(Path(task))
+    if (folder / RESULT).is_dir():
         return
-    with atomic_directory(home / RESULT) as new:
-        with closing(sqlite3.connect(home / DATABASE)) as given, closing(sqlite3.connect(new / DATABASE)) as copy:
+    with atomic_directory(folder / RESULT) as new:
+        with closing(sqlite3.connect(folder / DATABASE)) as given, closing(sqlite3.connect(new / DATABASE)) as copy:
             given.backup(copy)
         chosen = [(one, other) for one, other in facts["pairs"]]
         match(new / DATABASE, chosen, facts["seed"], progress)

@@ -1,8 +1,4 @@
-"""Incremental structure from motion (pycolmap), with checks and retries against errors from repeated textures.
-
-Repeated textures can merge different places of a scene although nearly every photo registers. The matches of each
-verified pair satisfy one epipolar geometry, which the model either agrees with or contradicts.
-"""
+"""Incremental structure from motion (pycolmap), with retries against errors from repeated textures."""
 
 from __future__ import annotations
 
@@ -12,150 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from scipy.spatial import cKDTree
-
 from perception.photos.lens import load_pycolmap
 from perception.progress import Progress
-from perception.sfm.features import MIN_INLIERS, FeatureStore, verified_matches
-
-MAX_UNREGISTERED, MAX_SECOND_MODEL, MAX_CONTRADICTED, MAX_UNMATCHED = 0.15, 0.30, 0.005, 0.30
-MOST_CONTRADICTED = 4
-"""Pairs. Right models of up to 1,200 photos had none, two wrong ones of 1,200 photos 14 and 35 of 18,887."""
-EPIPOLAR_TOLERANCE, TOLERANCE_PIXELS = 4.0 / 1000, 4.0
-"""Largest Sampson distance of a match that agrees, in normalised image coordinates; TOLERANCE_PIXELS (the error that
-verification allows) divided by the focal length where that is larger."""
-
-
-@dataclass(frozen=True)
-class Pair:
-    """Two registered photos with `inliers` verified matches; `share` of them satisfy the model's epipolar geometry."""
-
-    i: int
-    j: int
-    inliers: int
-    share: float
-
-    @property
-    def agrees(self) -> bool:
-        """Whether at least half of the matches satisfy the model's epipolar geometry."""
-        return self.share >= 0.5
-
-
-def model_warnings(models: list[Any], database: Path, photos: int) -> list[str]:
-    """Warnings, one line each, on pycolmap models sorted by size, of which models[0] is used; photos: number."""
-    best = models[0]
-    warnings = []
-    registered = best.num_reg_images()
-    if registered < (1 - MAX_UNREGISTERED) * photos:
-        warnings.append(f"only {registered} of {photos} photos are registered")
-    if len(models) > 1 and models[1].num_reg_images() > MAX_SECOND_MODEL * registered:
-        sizes = ", ".join(str(model.num_reg_images()) for model in models)
-        split = f"the photos split into {len(models)} unconnected models ({sizes}); the largest is mapped"
-        warnings.append(f"{split}; for another, put the photos that are left out into a folder of their own")
-    pairs = verified_pairs(best, database)
-    if len(pairs) >= 5 and is_contradicted(pairs):
-        wrong = f"{len(stronger_contradictions(pairs))} of {len(pairs)} matched photo pairs contradict the model"
-        warnings.append(f"{wrong} and are stronger than the pairs it rests on: it may be folded (equal textures?)")
-    unmatched, near = _unmatched_neighbors(best, {(pair.i, pair.j) for pair in pairs})
-    if near >= 5 and unmatched > MAX_UNMATCHED * near:
-        warnings.append(
-            f"{unmatched} of {near} photo pairs that the model puts at one place, looking the same way, do not match: "
-            "it may be folded (equal textures?)"
-        )
-    return warnings
-
-
-def stronger_contradictions(pairs: list[Pair]) -> list[Pair]:
-    """The contradicted pairs whose photos are not connected by agreeing pairs that are all at least as strong.
-
-    Repeated textures also give verified pairs, so a contradicted pair alone is not an error. It is one if the model
-    depends on weaker pairs instead.
-    """
-    parent: dict[int, int] = {}
-
-    def root(image: int) -> int:
-        while parent.setdefault(image, image) != image:
-            parent[image] = parent[parent[image]]
-            image = parent[image]
-        return image
-
-    found = []
-    for pair in sorted(pairs, key=lambda p: (-p.inliers, not p.agrees)):
-        if pair.agrees:
-            parent[root(pair.i)] = root(pair.j)
-        elif root(pair.i) != root(pair.j):
-            found.append(pair)
-    return found
-
-
-def is_contradicted(pairs: list[Pair]) -> bool:
-    """Whether a share of over MAX_CONTRADICTED of the pairs, or over MOST_CONTRADICTED, contradict and are stronger."""
-    return len(stronger_contradictions(pairs)) > min(MAX_CONTRADICTED * len(pairs), MOST_CONTRADICTED)
-
-
-def outvoted_photos(pairs: list[Pair]) -> set[int]:
-    """Photos most of whose verified matches lie in pairs that contradict the model."""
-    votes: dict[int, int] = {}
-    for pair in pairs:
-        for image in (pair.i, pair.j):
-            votes[image] = votes.get(image, 0) + (pair.inliers if pair.agrees else -pair.inliers)
-    return {image for image, vote in votes.items() if vote < 0}
-
-
-def verified_pairs(model: Any, database: Path) -> list[Pair]:
-    """The verified pairs between registered photos, judged by the model."""
-    registered = set(model.reg_image_ids())
-    poses = {i: model.images[i].cam_from_world().matrix() for i in registered}
-    rays: dict[int, np.ndarray] = {i: _normalised(model.images[i]) for i in registered}
-    focal = {i: model.images[i].camera.mean_focal_length() for i in registered}
-    tolerance = {i: max(EPIPOLAR_TOLERANCE, TOLERANCE_PIXELS / focal[i]) for i in registered}
-    pairs = []
-    for (i, j), found in verified_matches(database).items():
-        if i in registered and j in registered and len(found):
-            distance = _sampson(rays[i][found[:, 0]], rays[j][found[:, 1]], poses[i], poses[j])
-            pairs.append(Pair(i, j, len(found), float((distance < max(tolerance[i], tolerance[j])).mean())))
-    return pairs
-
-
-def _normalised(image: Any) -> np.ndarray:
-    pixels = np.array([point.xy for point in image.points2D], dtype=np.float64).reshape(-1, 2)
-    return np.c_[np.asarray(image.camera.cam_from_img(pixels)).reshape(-1, 2), np.ones(len(pixels))]
-
-
-def _sampson(a: np.ndarray, b: np.ndarray, a_from_w: np.ndarray, b_from_w: np.ndarray) -> np.ndarray:
-    """First-order distance of matches a, b [M, 3] from the epipolar geometry (Hartley & Zisserman, eq. 11.9)."""
-    rotation = b_from_w[:, :3] @ a_from_w[:, :3].T
-    x, y, z = b_from_w[:, 3] - rotation @ a_from_w[:, 3]
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-    line_b, line_a = a @ essential.T, b @ essential
-    slope = (line_b[:, :2] ** 2).sum(1) + (line_a[:, :2] ** 2).sum(1)
-    return np.abs((b * line_b).sum(1)) / np.sqrt(np.maximum(slope, 1e-30))
-
-
-def _unmatched_neighbors(model: Any, matched: set[tuple[int, int]]) -> tuple[int, int]:
-    """(pairs without matches, all pairs) among cameras that are close relative to depth and differ by less than 15°."""
-    ids = sorted(model.reg_image_ids())
-    centers = np.stack([model.images[i].projection_center() for i in ids])
-    forward = np.stack([model.images[i].viewing_direction() for i in ids])
-    xyz = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-    if len(xyz) == 0:
-        return 0, 0
-    some = xyz[:: max(1, len(xyz) // 2000)]
-    depth = np.array([np.median(np.linalg.norm(some - center, axis=1)) for center in centers])
-    pairs = cKDTree(centers).query_pairs(0.1 * depth.max(), output_type="ndarray")
-    distances = np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1)
-    cosines = (forward[pairs[:, 0]] * forward[pairs[:, 1]]).sum(axis=1)
-    close = (distances < 0.1 * depth[pairs].min(axis=1)) & (cosines > np.cos(np.radians(15)))
-    near = [(ids[r], ids[c]) for r, c in pairs[close].tolist()]
-    unmatched = sum((i, j) not in matched and (j, i) not in matched for i, j in near)
-    return unmatched, len(near)
-
+from perception.sfm.consistency import Pair, is_contradicted, outvoted_photos, verified_pairs
+from perception.sfm.database import FeatureStore
+from perception.sfm.features import MIN_INLIERS
 
 MIN_MODEL_SIZE = 3
 REPEATABLE_PHOTOS = 150
 """Up to this many photos are mapped by one thread, which makes the result repeatable bit for bit."""
-Found = tuple[list[Any], set[str]]
+Mapped = tuple[list[Any], set[str]]
 """Models, largest first, and the names of the photos left out because most of their matches contradict the largest."""
 LEVELS = (MIN_INLIERS, 2 * MIN_INLIERS, 4 * MIN_INLIERS, 8 * MIN_INLIERS)
 """Least verified matches of a pair, tried in turn until the model contradicts no pair stronger than those it uses."""
@@ -179,7 +41,7 @@ def pipeline_options(fixed: bool, seed: int, one_thread: bool) -> Any:
 
 def map_photos(
     store: FeatureStore, fixed: bool, seed: int, count: int, progress: Progress, one_thread: bool = False
-) -> Found:
+) -> Mapped:
     """All models, largest first (pycolmap does not sort them), and names of photos left out as contradicted.
     fixed: the intrinsics in the database are not refined. one_thread: also for more than REPEATABLE_PHOTOS photos."""
     folder = store.folder / "mapping"
@@ -205,9 +67,9 @@ class _Mapping:
     shown: float = 0.0
     runs: int = 0
 
-    def run(self) -> Found:
+    def run(self) -> Mapped:
         """The first model that is not contradicted, else the one with most agreeing matches."""
-        tried: list[tuple[int, Found]] = []
+        tried: list[tuple[int, Mapped]] = []
         for found in self._candidates():
             pairs = verified_pairs(found[0][0], self.store.database)
             tried.append((sum(pair.inliers for pair in pairs if pair.agrees), found))
@@ -217,7 +79,7 @@ class _Mapping:
             return [], set()
         return max(tried, key=lambda item: item[0])[1]
 
-    def _candidates(self) -> Iterator[Found]:
+    def _candidates(self) -> Iterator[Mapped]:
         """For each level: a model from its pairs, then one from all pairs except those that the first contradicts."""
         for level in LEVELS:
             models = self._map(self.store.database, level)
@@ -234,14 +96,13 @@ class _Mapping:
     def _database_without(self, pairs: list[Pair]) -> Path:
         copy = self.folder / f"pairs-{self.runs}.db"
         shutil.copyfile(self.store.database, copy)
-        db = load_pycolmap().Database.open(copy)
-        for pair in pairs:
-            db.delete_matches(pair.i, pair.j)
-            db.delete_two_view_geometry(pair.i, pair.j)
-        db.close()
+        with load_pycolmap().Database.open(copy) as db:
+            for pair in pairs:
+                db.delete_matches(pair.i, pair.j)
+                db.delete_two_view_geometry(pair.i, pair.j)
         return copy
 
-    def _without_outvoted(self, models: list[Any]) -> Found:
+    def _without_outvoted(self, models: list[Any]) -> Mapped:
         """Removes photos most of whose matches contradict the model, tries them again, leaves out those that fail."""
         best = models[0]
         pairs = verified_pairs(best, self.store.database)

@@ -69,9 +69,9 @@ def similar_photos(descriptors: list[np.ndarray]) -> np.ndarray:
         some = descriptors[first : first + AT_ONCE]
         features = np.concatenate(some)
         word = (features @ centres.T - half).argmax(axis=1)  # the nearest centre
-        place = np.repeat(np.arange(len(some)), [len(each) for each in some]) * WORDS + word
-        entries = (np.ones(len(place), np.float32), (place, np.arange(len(place))))
-        sums = sparse.csr_matrix(entries, shape=(len(some) * WORDS, len(place))) @ (features - centres[word])
+        row = np.repeat(np.arange(len(some)), [len(each) for each in some]) * WORDS + word
+        entries = (np.ones(len(row), np.float32), (row, np.arange(len(row))))
+        sums = sparse.csr_matrix(entries, shape=(len(some) * WORDS, len(row))) @ (features - centres[word])
         vlads[first : first + AT_ONCE] = sums.reshape(-1, WORDS, 128)
     vlads /= np.maximum(np.linalg.norm(vlads, axis=2, keepdims=True), 1e-9)
     rows = vlads.reshape(count, -1)
@@ -86,17 +86,16 @@ def similar_photos(descriptors: list[np.ndarray]) -> np.ndarray:
 def _largest_features(database: Path, names: list[str]) -> list[np.ndarray]:
     pycolmap = load_pycolmap()
     result = []
-    db = pycolmap.Database.open(database)
-    for name in names:
-        image = db.read_image_with_name(name)
-        keypoints = db.read_keypoints(image.image_id)
-        keypoints = keypoints if isinstance(keypoints, np.ndarray) else pycolmap.keypoints_to_matrix(keypoints)
-        data = np.asarray(db.read_descriptors(image.image_id).data, dtype=np.float32)
-        area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
-        top = np.argsort(-area, kind="stable")[:COARSE_FEATURES]
-        norms = np.linalg.norm(data[top], axis=1, keepdims=True)
-        result.append(data[top] / np.maximum(norms, 1e-9))
-    db.close()
+    with pycolmap.Database.open(database) as db:
+        for name in names:
+            image = db.read_image_with_name(name)
+            keypoints = db.read_keypoints(image.image_id)
+            keypoints = keypoints if isinstance(keypoints, np.ndarray) else pycolmap.keypoints_to_matrix(keypoints)
+            data = np.asarray(db.read_descriptors(image.image_id).data, dtype=np.float32)
+            area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
+            top = np.argsort(-area, kind="stable")[:COARSE_FEATURES]
+            norms = np.linalg.norm(data[top], axis=1, keepdims=True)
+            result.append(data[top] / np.maximum(norms, 1e-9))
     return result
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from perception.geometry import camera_centres, nearest_rotation
-from perception.photos.reading import view_lens
+from perception.photos.views import view_lens
 from perception.sfm.bundle_adjustment import Poses, adjust, residuals, starting_points
 from perception.sfm.tracks import Features, tracks_of
 from perception.types import View
@@ -50,10 +50,10 @@ def match_errors(features: Features, poses: Poses) -> tuple[np.ndarray, np.ndarr
     return np.concatenate(lines), np.concatenate(carried)
 
 
-def checked_poses(views: list[View], features: Features, how: str) -> tuple[list[View], dict[str, Any]]:
+def checked_poses(views: list[View], features: Features, mode: str) -> tuple[list[View], dict[str, Any]]:
     """`views` as given or with refined poses, and the report's entries: "poses", "notes", "warnings".
 
-    how: "auto" refines poses that are worse than TOLERANCE, "refine" any that gain by it. Views that are held out for
+    mode: "auto" refines poses that are worse than TOLERANCE, "refine" any that gain by it. Views that are held out for
     scoring are refined as well, by features and depth alone.
     """
     given = poses_of(views)
@@ -73,7 +73,7 @@ def checked_poses(views: list[View], features: Features, how: str) -> tuple[list
         what = f"features triangulate at {unit:.3g} times their measured depth, as if in another unit than the poses"
         report["warnings"] = [f"{what}; depth is not used"]
         usable, features = [replace(v, depth=None) for v in views], replace(features, depth=0 * features.depth)
-    if how == "auto" and before["epipolar"] <= good:
+    if mode == "auto" and before["epipolar"] <= good:
         return usable, report
     refined = refine(features, given)
     after = _medians(features, refined)
@@ -100,18 +100,18 @@ def refine(features: Features, given: Poses) -> Poses:
             if not (depth > 0).any():
                 return given
             prior = angle, angle * float(np.median(depth[depth > 0]))
-        poses = adjust(tracks, given, poses, prior)[0]
+        poses = adjust(tracks, given, poses, prior)
     return moved_back(poses, given, prior[1] / prior[0])
 
 
 def moved_back(poses: Poses, given: Poses, distance: float) -> Poses:
     """`poses` moved as a whole to where what the cameras see, at `distance`, lies as by the given ones.
-    Least sum of the displacements of five places ahead of each camera, by reweighting: the priors hold them loosely."""
+    Least sum of the displacements of five points ahead of each camera, by reweighting: the priors hold them loosely."""
     ahead = distance * np.array([[0, 0, 1], [0.4, 0, 1], [-0.4, 0, 1], [0, 0.4, 1], [0, -0.4, 1]])
     a, b = ((np.einsum("nji,kj->nki", p.rotation, ahead) + p.center[:, None]).reshape(-1, 3) for p in (poses, given))
     weights = np.ones((len(a), 1))
     for _ in range(20):
-        mean_a, mean_b = ((weights * places).sum(axis=0) / weights.sum() for places in (a, b))
+        mean_a, mean_b = ((weights * points).sum(axis=0) / weights.sum() for points in (a, b))
         turn = nearest_rotation(np.einsum("ni,nj->ij", weights * (b - mean_b), a - mean_a))
         off = np.einsum("nj,ij->ni", a - mean_a, turn) - (b - mean_b)
         weights = 1 / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), 1e-3 * distance)

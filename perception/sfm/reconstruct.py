@@ -1,7 +1,7 @@
 """Structure from motion from a folder of photos: features, matches, a model (pycolmap), checks, report.
 
 The seed fixes every random choice: the same machine gives the same poses bit for bit up to
-incremental_sfm.REPEATABLE_PHOTOS photos. More are mapped place by place, where cameras of 1,200 photos differed by
+incremental.REPEATABLE_PHOTOS photos. More are mapped by submodels, where cameras of 1,200 photos differed by
 micrometres from run to run, or in one piece by several threads.
 """
 
@@ -13,31 +13,31 @@ from pathlib import Path
 from typing import Any
 
 from perception.errors import InputError
-from perception.inputs.colmap import views_of_model
 from perception.io.atomic import atomic_directory, recover
 from perception.photos.decode import photo_size
 from perception.photos.folder import PhotoSet, choose_photos
 from perception.photos.ignore_masks import mask_of
 from perception.photos.lens import lens_from_camera, lens_text, load_pycolmap
-from perception.photos.reading import Reading
-from perception.sfm.features import FeatureStore, build_features, verified_matches
-from perception.sfm.incremental import REPEATABLE_PHOTOS, map_photos, model_warnings
-from perception.sfm.submodels import map_places
-from perception.sfm.triangulate import cloud_of
-from perception.tasks.engine import Engine
-from perception.types import Lens, Scene
+from perception.sfm.consistency import model_warnings
+from perception.sfm.database import FeatureStore, build_features, verified_matches
+from perception.sfm.incremental import REPEATABLE_PHOTOS, map_photos
+from perception.sfm.model import cloud_of, views_of_model
+from perception.sfm.options import ReadOptions
+from perception.sfm.submodels import map_submodels
+from perception.types import Scene
 
 MIN_PHOTOS = 3
 
 
-def reconstruct(folder: Path, lens: Lens | None, how: Reading) -> Scene:
+def reconstruct(folder: Path, options: ReadOptions) -> Scene:
     """Poses and a sparse cloud of the photos in `folder`, from the largest model; unit and orientation are arbitrary.
 
-    lens: known intrinsics shared by all photos, kept fixed; None estimates focal length and radial distortion.
+    options.lens: known intrinsics shared by all photos, kept fixed; None estimates focal length and radial distortion.
     Results in the workdir are reused for unchanged photos, lens and seed. `choose_photos` decides which photos are left
     out.
     """
-    chosen = choose_photos(folder, how.strict, how.progress)
+    lens = options.lens
+    chosen = choose_photos(folder, options.strict, options.progress)
     photos = chosen.photos
     if len(photos) < MIN_PHOTOS:
         raise _too_few(folder, chosen)
@@ -45,14 +45,12 @@ def reconstruct(folder: Path, lens: Lens | None, how: Reading) -> Scene:
         if lens and photo_size(photo) != (lens.width, lens.height):
             found = "×".join(map(str, photo_size(photo)))
             raise InputError(f"{photo}: the photo is {found}, the camera file says {lens.width}×{lens.height}")
-    ignored = [mask_of(how.masks, name) for name in chosen.names]
-    store = build_features(
-        photos, [lens] * len(photos), how.workdir, how.seed, how.progress, ignored, engine=how.engine
-    )
-    model, report = _map(store, chosen, folder, lens is not None, how)
+    ignored = [mask_of(options.masks, name) for name in chosen.names]
+    store = build_features(photos, [lens] * len(photos), options, ignored)
+    model, report = _map(store, chosen, folder, options)
     staged = dict(zip(store.names, zip(chosen.names, photos, strict=True), strict=True))
     located = {image_id: staged[model.images[image_id].name] for image_id in model.reg_image_ids()}
-    views, facts = views_of_model(model, located, folder, how)
+    views, facts = views_of_model(model, located, folder, options)
     points, colors = cloud_of(model)
     report["left_out"] = sorted([*chosen.left_out, *report["left_out"]], key=lambda entry: entry["name"])
     return Scene(views, points, colors, report={**report, "exposure": facts["exposure"], "notes": chosen.notes})
@@ -68,25 +66,25 @@ def _too_few(folder: Path, chosen: PhotoSet) -> InputError:
     return InputError(f"{found}; at least {MIN_PHOTOS} are needed, 20 or more give good maps")
 
 
-def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, fixed: bool, how: Reading) -> tuple[Any, dict[str, Any]]:
-    pycolmap = load_pycolmap()
-    done = store.folder / "model"
+def _map(store: FeatureStore, chosen: PhotoSet, folder: Path, options: ReadOptions) -> tuple[Any, dict[str, Any]]:
+    """The largest model, kept in the store's folder, and its report."""
+    done, fixed = store.folder / "model", options.lens is not None
     recover(done)
     if not done.is_dir():
         started = time.perf_counter()
         found = None
         if len(chosen.photos) > REPEATABLE_PHOTOS:
-            found = map_places(store, fixed, how.seed, how.engine or Engine(), how.progress)
-        models, contradicted = found or map_photos(store, fixed, how.seed, len(chosen.photos), how.progress)
+            found = map_submodels(store, fixed, options)
+        models, contradicted = found or map_photos(store, fixed, options.seed, len(chosen.photos), options.progress)
         if not models:
-            advice = "take sharp, overlapping photos of a textured scene from different places"
+            advice = "take sharp, overlapping photos of a textured scene from different positions"
             raise InputError(f"{folder}: none of the {len(chosen.photos)} photos could be registered; {advice}")
         seconds = {**store.facts["seconds"], "mapping": time.perf_counter() - started}
         report = _report(models, contradicted, store, chosen.names, seconds)
         with atomic_directory(done) as new:
             models[0].write(new)
             (new / "report.json").write_text(json.dumps(report))
-    return pycolmap.Reconstruction(done), json.loads((done / "report.json").read_text())
+    return load_pycolmap().Reconstruction(done), json.loads((done / "report.json").read_text())
 
 
 def _report(
@@ -118,14 +116,13 @@ def _report(
 
 def _best_partners(store: FeatureStore) -> dict[str, tuple[int, int]]:
     """name -> (features, geometrically verified matches with the best partner)."""
-    db = load_pycolmap().Database.open(store.database)
-    images = {image.image_id: image.name for image in db.read_all_images()}
-    features = {number: (name, db.num_keypoints_for_image(number)) for number, name in images.items()}
-    db.close()
+    with load_pycolmap().Database.open(store.database) as db:
+        ids = {image.image_id: image.name for image in db.read_all_images()}
+        features = {image_id: (name, db.num_keypoints_for_image(image_id)) for image_id, name in ids.items()}
     best = dict.fromkeys(features, 0)
-    for pair, found in verified_matches(store.database).items():
+    for pair, matches in verified_matches(store.database).items():
         for image_id in pair:
-            best[image_id] = max(best[image_id], len(found))
+            best[image_id] = max(best[image_id], len(matches))
     return {name: (count, best[image_id]) for image_id, (name, count) in features.items()}
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from PIL import Image
 
 from perception.machine import cores
-from perception.photos.decode import LARGE_PIXELS, exif_of, open_photo, read_photo
+from perception.photos.decode import LARGE_PIXELS, exif_folder, exif_of, open_photo, read_photo
 from perception.progress import Progress
 
 _PLAIN = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}
@@ -55,6 +55,6 @@ def _convert(photo: Path, target: Path) -> None:
     with open_photo(photo) as image:
         exif = exif_of(image, photo)
         kept.update({tag: exif[tag] for tag in _MAKE_AND_MODEL if tag in exif})
-        lens = exif.get_ifd(_EXIF_FOLDER)
+        lens = exif_folder(image, photo, _EXIF_FOLDER)
         kept.get_ifd(_EXIF_FOLDER).update({tag: lens[tag] for tag in _FOCAL_LENGTH if tag in lens})
     Image.fromarray(read_photo(photo)).save(target, compress_level=1, exif=kept)

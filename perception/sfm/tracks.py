@@ -9,8 +9,8 @@ import numpy as np
 
 from perception.photos.depth import load_depth
 from perception.photos.lens import camera_from_lens, load_pycolmap
-from perception.photos.reading import view_lens
-from perception.sfm.features import FeatureStore, verified_matches
+from perception.photos.views import view_lens
+from perception.sfm.database import FeatureStore, verified_matches
 from perception.types import View
 
 FLAT = 0.03
@@ -52,10 +52,9 @@ class Tracks:
 
 def features_of(views: list[View], store: FeatureStore) -> Features:
     """The matched features of `views` in `store`, which was made of the same photos in the same order."""
-    db = load_pycolmap().Database.open(store.database)
-    images = [db.read_image_with_name(name).image_id for name in store.names]
-    keypoints = [np.asarray(db.read_keypoints(image), np.float64)[:, :2] for image in images]
-    db.close()
+    with load_pycolmap().Database.open(store.database) as db:
+        images = [db.read_image_with_name(name).image_id for name in store.names]
+        keypoints = [np.asarray(db.read_keypoints(image), np.float64)[:, :2] for image in images]
     starts = dict(zip(images, np.cumsum([0, *map(len, keypoints)]), strict=False))
     matches = [np.empty((0, 2), np.int64)]
     for (a, b), found in verified_matches(store.database).items():
@@ -90,8 +89,8 @@ def tracks_of(features: Features, pairs: np.ndarray) -> Tracks:
     view = features.view
     links = coo_matrix((np.ones(len(pairs), np.int8), pairs.T), shape=(len(view), len(view)))
     component = connected_components(links, directed=False)[1].astype(np.int64)
-    _, place, count = np.unique(component * (view.max(initial=0) + 1) + view, return_inverse=True, return_counts=True)
-    single = count[place] == 1
+    _, group, count = np.unique(component * (view.max(initial=0) + 1) + view, return_inverse=True, return_counts=True)
+    single = count[group] == 1
     single &= np.bincount(component, single)[component] >= 2
     kept = np.flatnonzero(single)
     kept = kept[np.argsort(component[kept], kind="stable")]
@@ -103,7 +102,7 @@ def tracks_of_model(model: Any, views: list[View], names: dict[int, str], most: 
     """At most `most` of the tracks of a COLMAP model, without depth. names: image id to name of the view."""
     number = {view.name: index for index, view in enumerate(views)}
     ids = sorted(model.points3D)
-    rank = {point: place for place, point in enumerate(ids[:: max(1, -(-len(ids) // most))])}
+    rank = {point: row for row, point in enumerate(ids[:: max(1, -(-len(ids) // most))])}
     parts = [(np.empty((0, 2), np.int64), np.empty((0, 3)))]
     for image_id, name in names.items():
         if name not in number:

@@ -10,9 +10,11 @@ import numpy as np
 
 from perception.geometry import inverse_se3
 from perception.photos.lens import camera_from_lens, lens_text, load_pycolmap
-from perception.photos.reading import Reading, view_lens
+from perception.photos.views import view_lens
+from perception.sfm.database import FeatureStore, build_features
 from perception.sfm.exposure import with_gains
-from perception.sfm.features import build_features
+from perception.sfm.model import cloud_of
+from perception.sfm.options import Cloud, ReadOptions
 from perception.sfm.pose_refinement import checked_poses
 from perception.sfm.tracks import features_of, tracks_of
 from perception.types import Scene, View
@@ -21,42 +23,41 @@ MIN_POINTS = 50
 FALLBACK_POINTS = 5000
 
 
-def posed_scene(
-    views: list[View], cloud: tuple[np.ndarray, np.ndarray], facts: dict[str, Any], how: Reading, least: int
-) -> Scene:
+def posed_scene(views: list[View], cloud: Cloud, facts: dict[str, Any], options: ReadOptions, least: int) -> Scene:
     """The Scene of views with known poses. cloud: points [P, 3] and colors [P, 3] from the input.
     With fewer than `least` points, triangulated points are used instead. facts: report entries, with "warnings"."""
     cameras = sorted({lens_text(view_lens(view)) for view in views})
     report = {**facts, "registered": len(views), "cameras": cameras, "seconds": {}}
     points, colors = cloud
     few = len(points) < least
-    check = how.poses == "refine" or (how.poses == "auto" and (few or any(view.depth is not None for view in views)))
+    doubted = options.poses == "auto" and (few or any(view.depth is not None for view in views))
+    check = doubted or options.poses == "refine"
     if few or check:
         photos, lenses, masks = zip(*((view.photo, view_lens(view), view.mask) for view in views), strict=True)
-        store = build_features(
-            list(photos), list(lenses), how.workdir, how.seed, how.progress, list(masks), posed=True, engine=how.engine
-        )
+        store = build_features(list(photos), list(lenses), options, list(masks), posed=True)
         report["seconds"] = store.facts["seconds"]
         features = features_of(views, store)
         if check:
             started = time.perf_counter()
-            views, found = checked_poses(views, features, how.poses)
+            views, found = checked_poses(views, features, options.poses)
             report |= {key: [*report.get(key, []), *found[key]] for key in ("notes", "warnings")}
             report["poses"] = found["poses"]
             report["seconds"]["refinement"] = time.perf_counter() - started
         views, found = with_gains(views, tracks_of(features, features.pairs))
         report |= found
         if few:
-            points, colors, found = triangulated_cloud(views, store, how.seed)
+            points, colors, found = triangulated_cloud(views, store, options.seed)
             report |= {**found, "warnings": [*report["warnings"], *found["warnings"]]}
     report["points"] = len(points)
     return Scene(views, points, colors, report=report)
 
 
-def triangulated_cloud(views: list[View], store: Any, seed: int) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+def triangulated_cloud(
+    views: list[View], store: FeatureStore, seed: int
+) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
     """points [P, 3] float64 in the world of the views, colors [P, 3] uint8, facts for the report.
 
-    store: the matched features of the views (see io.features). With fewer than MIN_POINTS points, random points in the
+    store: the matched features of the views (see sfm.database). With fewer than MIN_POINTS points, random points in the
     view frusta are returned, with a warning.
     """
     points, colors, error = _triangulate(views, store, seed)
@@ -73,7 +74,7 @@ def triangulated_cloud(views: list[View], store: Any, seed: int) -> tuple[np.nda
     return points, colors, facts
 
 
-def random_cloud(views: list[View], seed: int) -> tuple[np.ndarray, np.ndarray]:
+def random_cloud(views: list[View], seed: int) -> Cloud:
     """Random grey points in the frusta of the views, at 0.5 to 2.5 times the spread of the cameras."""
     rng = np.random.default_rng(seed)
     worlds = np.stack([inverse_se3(v.camera_from_world) for v in views])
@@ -89,19 +90,16 @@ def random_cloud(views: list[View], seed: int) -> tuple[np.ndarray, np.ndarray]:
     return points, np.full((FALLBACK_POINTS, 3), 128, np.uint8)
 
 
-def _triangulate(views: list[View], store: Any, seed: int) -> tuple[np.ndarray, np.ndarray, float | None]:
+def _triangulate(views: list[View], store: FeatureStore, seed: int) -> tuple[np.ndarray, np.ndarray, float | None]:
     pycolmap = load_pycolmap()
     model = pycolmap.Reconstruction()
-    db = pycolmap.Database.open(store.database)
-    cameras: set[int] = set()
-    for view, name in zip(views, store.names, strict=True):
-        image = db.read_image_with_name(name)
-        if image.camera_id not in cameras:
+    with pycolmap.Database.open(store.database) as db:
+        images = [db.read_image_with_name(name) for name in store.names]
+    for view, image in zip(views, images, strict=True):
+        if image.camera_id not in model.cameras:
             model.add_camera_with_trivial_rig(camera_from_lens(view_lens(view), image.camera_id))
-            cameras.add(image.camera_id)
-        plain = pycolmap.Image(name=name, camera_id=image.camera_id, image_id=image.image_id)
+        plain = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
         model.add_image_with_trivial_frame(plain, pycolmap.Rigid3d(view.camera_from_world[:3]))
-    db.close()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
     options.num_threads = 1  # the order of sums in several threads is not repeatable
@@ -110,12 +108,3 @@ def _triangulate(views: list[View], store: Any, seed: int) -> tuple[np.ndarray, 
         model = pycolmap.triangulate_points(model, store.database, store.image_root, out, True, options)
     points, colors = cloud_of(model)
     return points, colors, float(model.compute_mean_reprojection_error()) if len(points) else None
-
-
-def cloud_of(model: Any) -> tuple[np.ndarray, np.ndarray]:
-    """points [P, 3] float64 and colors [P, 3] uint8 of a pycolmap reconstruction, in the order of point ids."""
-    ids = sorted(model.points3D)
-    points = np.array([model.points3D[i].xyz for i in ids], dtype=np.float64).reshape(-1, 3)
-    colors = np.array([model.points3D[i].color for i in ids], dtype=np.uint8).reshape(-1, 3)
-    finite = np.isfinite(points).all(1)
-    return points[finite], colors[finite]

@@ -5,11 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import socket
-import tempfile
+import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,14 +24,25 @@ RETRIES = 5
 """How often a task is run again whose worker was lost."""
 
 
-@contextmanager
-def _elsewhere() -> Iterator[None]:
-    """Another current folder: workers import from the driver's first, which in a clone has no compiled core."""
-    before = Path.cwd()
-    os.chdir(tempfile.gettempdir())
+def _join(ray: Any, address: str | None) -> None:
+    """Connects this process to the cluster at `address`, or starts one, which no other machine reaches.
+
+    Workers import from the driver's current folder first. It may be a clone without compiled core, or writable for
+    others; so it is Python's own meanwhile, which holds no modules. The sockets of a cluster that Ray starts listen on
+    the loopback address where its clusters are of one machine, as by default on all systems but Linux.
+    """
+    options = {"ignore_reinit_error": True, "log_to_driver": False, "logging_level": logging.ERROR}
+    before, constants = Path.cwd(), ray._private.ray_constants
+    many = constants.ENABLE_RAY_CLUSTER
+    os.chdir(sys.prefix)
     try:
-        yield
+        if address is not None:
+            ray.init(address, **options)
+            return
+        constants.ENABLE_RAY_CLUSTER = False
+        ray.init("local", include_dashboard=False, **options)  # without an address, it takes up what another run left
     finally:
+        constants.ENABLE_RAY_CLUSTER = many
         os.chdir(before)
 
 
@@ -78,13 +88,20 @@ class Engine:
             if self.address not in (None, "auto"):  # Ray itself tries for seven minutes
                 host, _, port = str(self.address).rpartition(":")
                 socket.create_connection((host, int(port)), timeout=CONNECT).close()
-            with _elsewhere():
-                address = self.address or "local"  # without one, Ray takes up what another run left
-                ray.init(address=address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR)
+            if started:
+                _join(ray, self.address)
         except (OSError, ValueError) as error:
-            told = f"--address {self.address}: no Ray cluster there ({str(error).splitlines()[0]})"
+            why = str(error).splitlines()[0]
+            if self.address is None:
+                raise InputError(
+                    f"Ray cannot start a cluster here ({why}); start one, and give its --address"
+                ) from error
+            told = f"--address {self.address}: no Ray cluster there ({why})"
             raise InputError(f"{told}; start one: ray start --head, and give its HOST:PORT") from error
         try:
+            host = ray.util.get_node_ip_address()
+            if started and self.address is None and not host.startswith("127."):
+                raise InputError(f"Ray {ray.__version__} listens on {host}, not on the loopback address; take another")
             # Where a task uses all cores of its machine, each machine has one task at a time.
             # A head of a cluster often has no CPU to give, and no entry then.
             offered = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]

@@ -1,19 +1,22 @@
-"""Tasks in folders that every worker of an engine reaches: what it must know, and maybe a part of the scene."""
+"""Task folders, which every worker of an engine reaches: what a task must know, part of the scene, its result."""
 
 from __future__ import annotations
 
 import json
 import platform
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from perception.errors import InputError
-from perception.inputs.load import load_saved_scene, save_scene
 from perception.io.atomic import atomic_file
+from perception.photos.scene_file import load_saved_scene, save_scene
+from perception.progress import Progress
+from perception.tasks.engine import Engine
 from perception.types import Scene
 
-TASK, SCENE = "task.json", "scene"
+TASK, SCENE, RESULT = "task.json", "scene", "result"
 
 
 def write_task(folder: Path, scene: Scene | None = None, **facts: Any) -> None:
@@ -48,6 +51,23 @@ def read_task(folder: Path) -> tuple[Scene, dict[str, Any]]:
     if scene is None:
         raise InputError(f"{folder}: the part of the scene is missing; delete the folder and run again")
     return scene, facts
+
+
+def run_tasks(
+    engine: Engine,
+    task: Callable[..., Any],
+    folders: Sequence[Path],
+    what: str,
+    progress: Progress,
+    each_core: bool = False,
+) -> list[Path]:
+    """Runs the task in each folder, which leaves a folder RESULT there; returns those. See `Engine.run`.
+    InputError where a result is missing."""
+    engine.run(task, [str(folder.resolve()) for folder in folders], what, progress, each_core)
+    for folder in folders:
+        if not (folder / RESULT).is_dir():
+            raise InputError(f"{folder}: has no {RESULT} after its task; workers must share the output's folder")
+    return [folder / RESULT for folder in folders]
 
 
 def versions() -> dict[str, str]:

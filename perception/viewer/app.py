@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import io
+import logging
 import secrets
 import threading
 from collections.abc import Callable
@@ -16,13 +17,14 @@ import numpy as np
 
 from perception.colors import instance_palette
 from perception.errors import InputError, missing_extra
-from perception.serve.listening import check_address, is_local, listen, url_host
+from perception.serve.listening import check_address, listen, url_host
 from perception.viewer.guard import Guard, guarded_server
 from perception.viewer.levels import MOST, Level, level
 from perception.viewer.panel import Panel
 from perception.viewer.picking import covariances
 from perception.viewer.session import HIGHLIGHT, Session
 
+_log = logging.getLogger("perception.viewer")
 WATCH = 1.0
 """Seconds between checks whether another program changed the map."""
 CORNERS = np.array([[i >> a & 1 for a in range(3)] for i in range(8)]) - 0.5  # of a unit box
@@ -33,19 +35,26 @@ class Viewer:
     """A map in a page at http://host:port (port 0: any free one). `address`: its URL; `url`: the same with the access
     token; `stop` closes it.
 
-    token: the access token; None generates one, which is refused where other machines can reach `host`.
+    token: the access token; None generates one, which is refused where other machines can reach `host`. photos: a
+    folder whose photos are shown too, beside those in the map's own.
     Raises InputError when `path` is no map, the port is in use, the token is missing, or viser is not installed.
     """
 
-    def __init__(self, path: Path, host: str = "127.0.0.1", port: int = 8090, token: str | None = None):
+    def __init__(
+        self,
+        path: Path,
+        host: str = "127.0.0.1",
+        port: int = 8090,
+        token: str | None = None,
+        photos: Path | None = None,
+    ):
         check_address(host, port, token)
         if importlib.util.find_spec("viser") is None:
             raise missing_extra("viser", "view")
         token = token or secrets.token_urlsafe(24)
         with contextlib.ExitStack() as undo:
             sock = undo.enter_context(listen(host, port))
-            # Local users may see any photo. Remote users see only those in the map's folder: a map may name any file.
-            self.session = Session(path, None if is_local(host) else path)
+            self.session = Session(path, photos)
             label = f"perception · {path.name}"
             self.server = guarded_server(Guard(token, host), sock, host=host, port=port, label=label, verbose=False)
             undo.pop_all()  # the server owns the socket from here on
@@ -162,21 +171,32 @@ class Viewer:
             self.redraw()
 
     def _watch(self) -> None:
-        """Reopens a map that another program changed; with unsaved edits here, the page offers to drop them."""
+        """Reopens a map that another program changed, as often as it changes: no error ends this. With unsaved edits
+        here, the page offers to drop them."""
         while not self._stopped.wait(WATCH):
             with self._one:
-                problem, editor = "", self.session.editor
                 try:
-                    if editor.outdated and editor.dirty:
-                        problem = "the map was changed by another program; the corrections here cannot be saved into it"
-                    elif editor.outdated:
-                        self.session.reopen()
-                        self.panel.notify(None, "the map was changed by another program; this is the new one")
-                        self.panel.refresh()
-                        self.redraw()
+                    problem = self._reopened()
                 except InputError as error:  # missing; for an instant also between the two renames of a save
                     problem = str(error)
-                self.panel.renew.visible = bool(problem) and editor.dirty
-            if problem and problem != self._problem:
-                self.panel.notify(None, problem)
+                except Exception as error:  # of any class: people edit instances.json by hand
+                    problem = f"{self.session.editor.path}: cannot be shown ({type(error).__name__}: {error})"
+                    if problem != self._problem:
+                        _log.error("%s", problem, exc_info=error)
+                with contextlib.suppress(Exception):  # a page that closes meanwhile
+                    self.panel.renew.visible = bool(problem) and self.session.editor.dirty
+                    if problem and problem != self._problem:
+                        self.panel.notify(None, problem)
             self._problem = problem
+
+    def _reopened(self) -> str:
+        """Opens the map anew if another program changed it; returns why not, if there are unsaved edits."""
+        editor = self.session.editor
+        if editor.outdated and editor.dirty:
+            return "the map was changed by another program; the corrections here cannot be saved into it"
+        if editor.outdated:
+            self.session.reopen()
+            self.panel.notify(None, "the map was changed by another program; this is the new one")
+            self.panel.refresh()
+            self.redraw()
+        return ""

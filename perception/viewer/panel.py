@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import string
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,8 @@ from perception.viewer.session import MODES
 if TYPE_CHECKING:
     from perception.viewer.app import Viewer
 
+_OF_ADDRESSES = {f"&#{ord(c)};" for c in ".:@"}
+
 
 def escaped(text: str) -> str:
     """`text` as Markdown that shows exactly these characters: viser renders HTML in it, and names are untrusted.
@@ -22,7 +23,7 @@ def escaped(text: str) -> str:
     invisible element precedes the characters of web and mail addresses (. : @), else viser makes links of these.
     """
     shown = (f"&#{ord(c)};" if c in string.punctuation else c for c in " ".join(text.split()))
-    return re.sub("(&#(?:46|58|64);)", r"<wbr>\1", "".join(shown))  # . : @
+    return "".join(f"<wbr>{c}" if c in _OF_ADDRESSES else c for c in shown)
 
 
 class Panel:
@@ -150,7 +151,8 @@ class Panel:
             if named != self._named:  # else keep what a user is typing there
                 self._named = named
                 self._name.value = entry.get("label") or ""
-            photo = session.crop(entry["id"])
+            photo, why = session.crop(entry["id"])
+            self._words.content += f"  \n{escaped(why)}" if why else ""
         self._show_photo(photo)
         wanted = f"click end {len(session.ends) + 1} of 2" if session.measuring else session.length
         lines = [wanted, *frame_lines(editor.original.info), *session.notes]

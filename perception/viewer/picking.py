@@ -49,7 +49,7 @@ def _weights(gmap: Map, shown: np.ndarray, origin: np.ndarray, direction: np.nda
     """Rows of the Gaussians near a ray, and the weight of each in the pixel rendered along it; empty for none."""
     import torch
 
-    from perception.gaussians.rasterize import rasterize
+    from perception.rasterizer.rasterize import rasterize
 
     origin, direction = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
     usable = np.isfinite([origin, direction]).all() and direction.any()

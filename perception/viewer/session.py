@@ -14,7 +14,7 @@ from perception.errors import InputError
 from perception.map.write import Map
 from perception.pictures import features_to_rgb
 from perception.query import Hit, QueryMap
-from perception.query.crops import best_crop
+from perception.query.crops import OUTSIDE, PhotoOutside, best_crop
 from perception.viewer.picking import pick, pick_point
 
 MODES = ("photo", "instances", "parts", "features")
@@ -47,10 +47,10 @@ CROP_SIDE = 320
 class Session:
     """The state shared by all browsers of one viewer, which see the same map. Not for concurrent threads."""
 
-    def __init__(self, path: Path, inside: Path | None = None):
-        """inside: the folder where photos may be read, None = anywhere (see `best_crop`)."""
+    def __init__(self, path: Path, photos: Path | None = None):
+        """photos: a folder where photos may be read beside the map's own (see `best_crop`)."""
         self.editor = Editor(path)
-        self.inside = inside
+        self.photos = photos
         self.mode = "photo"
         self.selected: list[int] = []
         self.part: int | None = None
@@ -187,9 +187,11 @@ class Session:
         """The name of an instance in the viewer: its label, else its id."""
         return entry.get("label") or f"instance {entry['id']}"
 
-    def crop(self, instance: int) -> np.ndarray | None:
-        """The crop of an instance from its best photo; None when no photo of it can be read."""
+    def crop(self, instance: int) -> tuple[np.ndarray | None, str]:
+        """The crop of an instance from its best photo, None when no photo of it can be read; why it may not be read."""
         try:
-            return best_crop(self._loaded(), instance, CROP_SIDE, self.inside)
+            return best_crop(self._loaded(), instance, CROP_SIDE, self.photos), ""
+        except PhotoOutside:
+            return None, OUTSIDE
         except InputError:
-            return None
+            return None, ""

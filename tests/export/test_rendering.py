@@ -45,7 +45,7 @@ def files(folder: Path) -> set[str]:
 @pytest.mark.parametrize("name", [*OUTSIDE, "/tmp/outside", ""])
 def test_a_view_name_of_a_received_map_never_leaves_the_output_folder(name: str, tmp_path: Path) -> None:
     path = received_map(tmp_path, name)
-    with pytest.raises(InputError, match=r"map\.json: the photo name"):
+    with pytest.raises(InputError, match=r"map\.json: views\[0\]\.name: the photo name"):
         render_map(path, tmp_path / "a" / "b", None, ["rgb"])
     assert files(tmp_path) == set()
 

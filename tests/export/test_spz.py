@@ -12,8 +12,8 @@ import torch
 from perception.cli import main
 from perception.errors import InputError
 from perception.export.spz import FLIPS, spz_bytes
-from perception.gaussians.rasterize import rasterize
 from perception.map.write import Map, read_map
+from perception.rasterizer.rasterize import rasterize
 from support.compressed import read_spz
 from support.query_maps import write_map_of
 

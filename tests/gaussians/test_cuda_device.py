@@ -5,25 +5,27 @@ from __future__ import annotations
 import pytest
 import torch
 
-from perception.gaussians import rasterize as cpu
-from perception.gaussians.cuda import rasterize as on_device
-from support.rasterizer import cast, scene
+from perception.rasterizer import cpu
+from perception.rasterizer import device as on_device
+from perception.rasterizer.types import Cotangents, Gradients, Settings
+from support.rasterizer import EVERY_GRADIENT, IMAGES, cast, passed, scene
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")
-NAMES = ("means", "quats", "scales", "opacities", "colors", "features", "viewmats", "Ks")
 
 
 def both_passes(inputs, device, dtype):
     """Images, radii, visible and all gradients of fixed cotangents, on the CPU in float64."""
-    given = {name: t.to(device, dtype) for name, t in inputs.items() if isinstance(t, torch.Tensor)}
-    arguments, background = tuple(given[name] for name in NAMES), given["background"]
-    settings = cpu.Settings(inputs["width"], inputs["height"], inputs["sh_degree"])
+    given = passed({name: t.to(device, dtype) for name, t in inputs.items() if isinstance(t, torch.Tensor)})
+    settings = Settings(inputs["width"], inputs["height"], inputs["sh_degree"])
     module = on_device if device == "cuda" else cpu
-    out = module.rasterize_forward(arguments, background, settings)
-    images = (out.colors, out.alphas, out.depths, out.features, out.feature_variance)
+    out = module.rasterize_forward(given, settings)
+    images = [getattr(out, name) for name in IMAGES]
     waves = [torch.sin(torch.arange(t.numel(), dtype=torch.float64)).view(t.shape).to(t) for t in images]
-    *grads, mean2d = module.rasterize_backward(arguments, background, settings, out, tuple(waves), (True,) * 7)
-    return [t.cpu() for t in (*images, out.radii, out.visible, *grads, mean2d)]
+    gradients = Gradients.zeros(given, EVERY_GRADIENT)
+    cotangents = Cotangents(**dict(zip(IMAGES, waves, strict=True)))
+    module.rasterize_backward(given, settings, out, cotangents, gradients)
+    grads = [getattr(gradients, name) for name in EVERY_GRADIENT]
+    return [t.cpu() for t in (*images, out.radii, out.visible, *grads)]
 
 
 @pytest.mark.parametrize(("n", "size", "dims", "sh_degree"), [(300, (70, 50), 5, 0), (20_000, (640, 480), 8, 3)])

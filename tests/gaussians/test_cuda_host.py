@@ -11,13 +11,15 @@ import pytest
 import torch
 
 import perception
-from perception.gaussians import rasterize as cpu
-from perception.gaussians.cuda import compile as compiling
-from perception.gaussians.cuda import launch
-from perception.gaussians.cuda import rasterize as on_device
-from perception.gaussians.cuda.compile import KernelOptions, compile_kernels, nvrtc_version
+from perception.rasterizer import cpu
+from perception.rasterizer import device as on_device
+from perception.rasterizer.cuda import compile as compiling
+from perception.rasterizer.cuda import launch
+from perception.rasterizer.cuda.compile import KernelOptions, compile_kernels, nvrtc_version
+from perception.rasterizer.rasterize import rasterizer_for
+from perception.rasterizer.types import Settings
 from support.cuda_emulator import build
-from support.rasterizer import scene
+from support.rasterizer import passed, scene
 
 OPTIONS = KernelOptions(8, True, True)
 KERNELS = {"project_kernel", "count_kernel", "emit_kernel", "forward_kernel", "backward_kernel", "reduce_kernel"}
@@ -95,9 +97,7 @@ def test_a_real_cubin_goes_through_the_driver_path(nvrtc):
     cubin, _ = compile_kernels(nvrtc, OPTIONS, 89)
     kernels = launch.Kernels(build(KernelOptions(5, True, True, double=True), None), cubin, lambda: nullcontext(0))
     inputs = scene(n=50)
-    given = [inputs[name] for name in ("means", "quats", "scales", "opacities", "colors", "features")]
-    settings = cpu.Settings(inputs["width"], inputs["height"])
-    arguments = ((*given, inputs["viewmats"], inputs["Ks"]), inputs["background"], settings)
+    arguments = passed(inputs), Settings(inputs["width"], inputs["height"])
     found = on_device.rasterize_forward(*arguments, lambda *_: kernels)
     torch.testing.assert_close(found.colors, cpu.rasterize_forward(*arguments).colors, rtol=1e-12, atol=1e-12)
 
@@ -112,7 +112,7 @@ def test_the_drivers_errors_are_told():
 
 def test_what_a_device_cannot_do_is_refused(monkeypatch):
     cuda = torch.device("cuda", 0)
-    assert cpu.passes(cuda) == (on_device.rasterize_forward, on_device.rasterize_backward)
+    assert rasterizer_for(cuda) is on_device and rasterizer_for(torch.device("cpu")) is cpu
     with pytest.raises(perception.InputError, match="the tensors are float64, expected float32 on a CUDA device"):
         launch.device_kernels(KernelOptions(8, True, True, double=True), cuda)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _: (6, 1))

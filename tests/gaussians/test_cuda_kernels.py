@@ -8,13 +8,13 @@ import pytest
 import torch
 
 import perception
-from perception.gaussians import rasterize as cpu
-from perception.gaussians.cuda import rasterize as on_device
-from perception.gaussians.cuda.compile import KernelOptions
-from perception.gaussians.rasterize import Settings
+from perception.rasterizer import cpu
+from perception.rasterizer import device as on_device
+from perception.rasterizer.cuda.compile import KernelOptions
+from perception.rasterizer.types import Cotangents, Gradients, Settings
 from support.cuda_emulator import REVERSED, build, emulate, emulated, find_compiler, on_emulator, wide_scene, worst
 from support.hard_scenes import SCENES
-from support.rasterizer import cast, grads_and_images, leaves, loss_of, scene
+from support.rasterizer import EVERY_GRADIENT, cast, grads_and_images, leaves, loss_of, passed, scene
 
 BOUND = 1e-12
 """Of the largest value of each image and gradient."""
@@ -80,17 +80,16 @@ def test_the_float_build_follows_the_double_build():
 def test_memory_is_bounded_by_strips():
     inputs = wide_scene()
     settings = [Settings(200, 150, max_records=limit) for limit in (0, 1, 600)]
-    given = [inputs[name] for name in ("means", "quats", "scales", "opacities", "colors", "features")]
-    given = (*given, inputs["viewmats"], inputs["Ks"])
+    given = passed(inputs)
     results = []
     for setting in settings:
-        out = on_device.rasterize_forward(given, inputs["background"], setting, emulated())
-        cotangents = (torch.sin(out.colors * 40), out.alphas, out.depths, torch.cos(out.features * 30), None)
-        *grads, mean2d = on_device.rasterize_backward(
-            given, inputs["background"], setting, out, cotangents, (True,) * 7
-        )
+        out = on_device.rasterize_forward(given, setting, emulated())
+        cotangents = Cotangents(torch.sin(out.colors * 40), out.alphas, out.depths, torch.cos(out.features * 30))
+        gradients = Gradients.zeros(given, EVERY_GRADIENT)
+        on_device.rasterize_backward(given, setting, out, cotangents, gradients)
+        grads = [getattr(gradients, name) for name in EVERY_GRADIENT]
         strips = [strip.range for strip in out.frames.views[0]]
-        results.append([len(strips), out.colors, out.features, out.feature_variance, *grads, mean2d])
+        results.append([len(strips), out.colors, out.features, out.feature_variance, *grads])
         assert [s.first_row for s in strips[1:]] == [s.end_row for s in strips[:-1]] and strips[-1].end_row == 10
     assert [r[0] for r in results][:2] == [1, 10] and 1 < results[2][0] < 10
     for other in results[1:]:

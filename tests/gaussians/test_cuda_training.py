@@ -13,15 +13,18 @@ from perception import _core
 from perception.config import load_config
 from perception.errors import InputError
 from perception.gaussians import device as devices
-from perception.gaussians import rasterize as cpu
-from perception.gaussians.cuda import rasterize as on_device
-from perception.gaussians.cuda import training
+from perception.gaussians import schedule
 from perception.gaussians.losses import assign_labels, instance_loss
 from perception.gaussians.model import from_points
 from perception.gaussians.nearby import Nearby
 from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView, surface_depth
 from perception.instances.votes import mask_votes
+from perception.rasterizer import cpu
+from perception.rasterizer import device as on_device
+from perception.rasterizer import rasterize as public
+from perception.rasterizer.cuda import training
+from perception.rasterizer.types import Settings
 from support import pretend_device
 from support.cuda_emulator import emulated
 from support.pretend_device import pretended_device
@@ -84,18 +87,18 @@ def test_adam(masked):
         reports = []
         for kernels, (param, first, second) in zip((compiled, training), both, strict=True):
             reports.append(kernels.adam(param, gradient, first, second, visible, rates, step, 0.9, 0.999, 1e-15))
-        assert tuple(map(int, reports[1])) == reports[0]
+        assert int(reports[1]) == reports[0]
     for a, b in zip(*both, strict=True):
         torch.testing.assert_close(b, a, **CLOSE)
 
 
 def test_statistics_of_growth():
-    mean2d, radii = random(200, 2).float(), random(200, seed=1).float()
+    mean2d = random(200, 2).float()
     visible = (random(200, seed=2) > 0.5).to(torch.uint8)
     mean2d[visible == 0] = torch.nan  # not looked at
-    both = [[random(200, seed=s).float() for s in (3, 4, 5)] for _ in range(2)]
+    both = [[random(200, seed=s).float() for s in (3, 4)] for _ in range(2)]
     for kernels, sums in zip((compiled, training), both, strict=True):
-        kernels.add_statistics(mean2d, radii, visible, *sums, 32.0, 1 / 64)
+        kernels.add_statistics(mean2d, visible, *sums, 32.0)
     for a, b in zip(*both, strict=True):
         torch.testing.assert_close(b, a, rtol=1e-6, atol=0)
 
@@ -133,7 +136,7 @@ def pretended(monkeypatch):
     """The pretended device, with the emulator as its rasterizer."""
     forward = on_device.rasterize_forward
     monkeypatch.setattr(on_device, "rasterize_forward", lambda *given: forward(*given, emulated()))
-    monkeypatch.setattr(cpu, "_DEVICES", ("cpu", pretend_device.NAME))
+    monkeypatch.setattr(public, "_DEVICES", ("cpu", pretend_device.NAME))
     with pretended_device() as device:
         yield device
 
@@ -154,7 +157,7 @@ def test_the_first_steps_are_those_of_the_cpu(pretended):
         progress = 0.3 if step % 2 else 0.0  # with features, and without
         losses = [of.step(progress) for of in (here, there)]
         assert losses[1] == pytest.approx(losses[0], rel=1e-4)
-    for name, tensor in vars(here.gaussians).items():
+    for name, tensor in here.gaussians.named().items():
         found = getattr(there.gaussians, name)
         assert found.device == pretended
         difference = (found.cpu() - tensor).abs()
@@ -170,7 +173,7 @@ def test_a_whole_training_runs_there_and_resumes_with_the_same_bits(pretended):
     assert len(whole.gaussians) > 60 and record.curve and record.skipped_gradients == 0
     expected = trainer(None, *pairs)
     expected.run()
-    ours, theirs = (of.score(8)["psnr"] for of in (whole.schedule, expected.schedule))
+    ours, theirs = (schedule.score(of, 8)["psnr"] for of in (whole, expected))
     assert ours > 10 and ours == pytest.approx(theirs, abs=0.1)  # two runs of other rounding
     first = trainer(pretended, *pairs)
     first.run(until=0.5)
@@ -179,7 +182,7 @@ def test_a_whole_training_runs_there_and_resumes_with_the_same_bits(pretended):
     second = trainer(pretended, *pairs)
     second.load(state)
     second.run()
-    for name, tensor in vars(whole.gaussians).items():
+    for name, tensor in whole.gaussians.named().items():
         assert torch.equal(tensor.cpu(), getattr(second.gaussians, name).cpu()), name
     assert surface_depth(whole.gaussians, whole.views[0]).shape == (32, 40)
 
@@ -188,12 +191,12 @@ def test_labels_and_votes_of_a_photo_are_those_of_the_cpu(pretended, monkeypatch
     monkeypatch.setattr(on_device, "_AT_ONCE", 2)  # several times
     of, view = trainer(None), painted_wall(0.0)
     g = of.gaussians
-    settings = cpu.Settings(40, 32, depth=False)
+    settings = Settings(40, 32, depth=False)
     labels = np.stack([np.arange(60) % 7 - 1, np.full(60, -1), np.zeros(60)]).astype(np.int32)
     for least in (0.0, 0.1):
         (expected, seen), (found, seen_there) = (
-            cpu.label_images(where.inputs(view.camera_from_world, view.K), labels, least, settings)
-            for where in (g, g.to(pretended))
+            module.label_images(where.inputs(view.camera_from_world, view.K), labels, least, settings)
+            for module, where in ((cpu, g), (on_device, g.to(pretended)))
         )
         np.testing.assert_array_equal(seen_there, seen)
         assert found.dtype == expected.dtype and (found != expected).mean() < 0.002  # single precision at near ties
@@ -205,32 +208,32 @@ def test_labels_and_votes_of_a_photo_are_those_of_the_cpu(pretended, monkeypatch
 
 def test_a_full_memory_is_met_with_fewer_records_then_refused(pretended, monkeypatch):
     of, limits = trainer(pretended, "train.iterations=1000"), []
-    backward = of._backward
+    backward = on_device.rasterize_backward
 
-    def full(inputs, background, settings, *rest):
+    def full(inputs, settings, *rest, **more):
         limits.append(settings.max_records)
         if len(limits) < 3:
             raise torch.OutOfMemoryError("CUDA out of memory")
-        return backward(inputs, background, settings, *rest)
+        return backward(inputs, settings, *rest, **more)
 
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
-    of._backward = full
+    monkeypatch.setattr(on_device, "rasterize_backward", full)
     of.run(until=(of.iteration + 1) / 1000)
     assert limits == [0, 1 << 22, 1 << 20] and of.iteration == 1 and len(of.record.decisions) == 2
 
-    def always_full(*_: object) -> None:
+    def always_full(*_: object, **__: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
-    of._backward = always_full
+    monkeypatch.setattr(on_device, "rasterize_backward", always_full)
     before = of.gaussians.means.cpu()
     with pytest.raises(InputError, match="memory is full with 60 Gaussians; use a smaller --budget"):
         of.run(until=(of.iteration + 1) / 1000)
     assert of.iteration == 1 and torch.equal(before, of.gaussians.means.cpu())
 
-    def gone(*_: object) -> None:
+    def gone(*_: object, **__: object) -> None:
         raise RuntimeError("CUDA error: device-side assert\nmore lines")
 
-    of._backward = gone
+    monkeypatch.setattr(on_device, "rasterize_backward", gone)
     with pytest.raises(InputError, match=r"failed at iteration 1 \(CUDA error: device-side assert\); continue from"):
         of.run(until=(of.iteration + 1) / 1000)
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import gc
 import json
 import shutil
 import signal
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,11 +18,11 @@ import torch
 
 from perception.cli import _resume, main
 from perception.config import PAPER, load_config
+from perception.gaussians import schedule
 from perception.gaussians.early_stopping import COST_EXPONENT, EarlyStopping
 from perception.gaussians.model import from_points
 from perception.gaussians.optimiser import SparseAdam
 from perception.gaussians.rates import cooling, learning_rates
-from perception.gaussians.schedule import Schedule
 from perception.gaussians.train import Trainer
 from perception.gaussians.views import TrainingView
 from perception.io.cloud import read_cloud, write_cloud
@@ -148,7 +150,7 @@ def small_trainer(*pairs: str) -> Trainer:
 def test_a_trial_is_scored_before_growth_sets_the_picture_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scored after it, most trials of a short run gained nothing, and growth ended .6 dB too early (tabletop_a)."""
     trainer = small_trainer("train.iterations=40", "densify.every=4", "train.exchange_db=0")
-    order = follow(monkeypatch, trainer.schedule, "score", "_grow", "_end_trial")
+    order = follow(monkeypatch, "score", "_grow", "_end_trial")
     trainer.run()
     grown = [n for n in range(40) if {"_grow", "_end_trial"} <= set(order.get(n, []))]
     assert len(grown) > 3 and all(order[n][:3] == ["score", "_grow", "_end_trial"] for n in grown)
@@ -159,32 +161,48 @@ def test_the_papers_preset_trains_features_in_every_step_at_full_resolution() ->
     usual = small_trainer()
     trainer.has_labels = usual.has_labels = True
     for trainer.iteration, progress in enumerate((0.0, 0.1, 0.5, 0.99)):
-        view, with_features = trainer.schedule.next_view(progress)
+        view, with_features = schedule.next_view(trainer, progress)
         assert with_features and view.photo.shape == (12, 16, 3)
-    view, with_features = usual.schedule.next_view(0.0)
+    view, with_features = schedule.next_view(usual, 0.0)
     assert not with_features and view.photo.shape == (6, 8, 3)
 
 
 def test_holes_are_filled_after_growth_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = small_trainer("train.iterations=40", "densify.every=4", "train.exchange_db=0")
-    trainer.schedule.stopping.growing = False
-    order = follow(monkeypatch, trainer.schedule, "_grow", "_fill")
+    trainer.stopping.growing = False
+    order = follow(monkeypatch, "_grow", "_fill")
     trainer.run()
     assert [name for names in order.values() for name in names] == ["_fill"] * 2  # turns 0 and 5 of .05 to .6
 
 
-def follow(monkeypatch: pytest.MonkeyPatch, schedule: Schedule, *names: str) -> dict[int, list[str]]:
-    """The calls of these methods from now on, by iteration."""
+def follow(monkeypatch: pytest.MonkeyPatch, *names: str) -> dict[int, list[str]]:
+    """The calls of these functions of the schedule from now on, by iteration."""
     told: dict[int, list[str]] = {}
     for name in names:
         original = getattr(schedule, name)
 
-        def called(*args: Any, name: str = name, original: Callable[..., Any] = original, **more: Any) -> Any:
-            told.setdefault(schedule.trainer.iteration, []).append(name)
-            return original(*args, **more)
+        def called(
+            state: Trainer, *args: Any, name: str = name, original: Callable[..., Any] = original, **more: Any
+        ) -> Any:
+            told.setdefault(state.iteration, []).append(name)
+            return original(state, *args, **more)
 
         monkeypatch.setattr(schedule, name, called)
     return told
+
+
+def test_a_trainer_is_freed_with_its_photos_when_it_is_let_go() -> None:
+    """Without a collection of cycles: a place of many photos holds gigabytes while the next block is trained."""
+    trainer = small_trainer("train.iterations=20", "densify.every=4", "train.exchange_db=0")
+    held = weakref.ref(trainer), weakref.ref(trainer.views[0].photo), weakref.ref(trainer.gaussians.means)
+    gc.collect()
+    gc.disable()
+    try:
+        trainer.run()
+        del trainer
+        assert [of() for of in held] == [None, None, None]
+    finally:
+        gc.enable()
 
 
 def test_the_time_between_two_legs_is_not_training(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -237,5 +255,5 @@ def test_only_whole_steps_are_kept(monkeypatch: pytest.MonkeyPatch, how: str) ->
     for state in saved:
         resumed.load(state)
     resumed.run()
-    for name, tensor in vars(undisturbed.gaussians).items():
-        assert torch.equal(tensor, vars(resumed.gaussians)[name]), name
+    for name, tensor in undisturbed.gaussians.named().items():
+        assert torch.equal(tensor, getattr(resumed.gaussians, name)), name

@@ -86,8 +86,8 @@ def test_filling_repeats(threads: int) -> None:
         one, two = (fill_holes(wall(HOLE), [view(), view(0.1)], 1000, seed=7)[0] for _ in range(2))
     finally:
         torch.set_num_threads(before)
-    for name, tensor in vars(one).items():
-        assert torch.equal(tensor, vars(two)[name])
+    for name, tensor in one.named().items():
+        assert torch.equal(tensor, getattr(two, name))
 
 
 def test_what_no_view_sees_is_known() -> None:

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 import perception
-from perception.gaussians import rasterize as module
+from perception.rasterizer import cpu
+from perception.rasterizer.types import Cotangents, Gradients, Settings
 from support import reference_rasterizer as reference
-from support.rasterizer import IMAGES, cast, every_simd_level, grads_and_images, leaves, loss_of, scene  # noqa: F401
+from support.rasterizer import IMAGES, cast, every_simd_level, grads_and_images, leaves, loss_of, passed, scene  # noqa: F401
 
 
 @pytest.mark.parametrize(
@@ -90,32 +91,26 @@ def test_stored_gradients_are_those_of_logarithms_and_logits_in_visible_rows(dim
     )
     torch.autograd.backward([theirs[name] for name in images], pulls)
 
-    arrays = [activated[n].detach() if n in activated else None for n in names]
-    arrays = (*arrays, inputs["viewmats"], inputs["Ks"])
-    settings = module.Settings(70, 45, -1 if sh_degree is None else sh_degree, threads=2)
-    out = module.rasterize_forward(arrays, inputs["background"], settings)
-    stored = [None if t is None else torch.full_like(t, 7.0) for t in arrays[:6]] + [
-        None,
-        torch.full((1, 80, 2), 7.0).double(),
-    ]
-    module.rasterize_backward(arrays, inputs["background"], settings, out, (*pulls, None, None)[:5], (), stored)
+    given = passed({**inputs, **{name: tensor.detach() for name, tensor in activated.items()}})
+    settings = Settings(70, 45, -1 if sh_degree is None else sh_degree, threads=2)
+    out = cpu.rasterize_forward(given, settings)
+    stored = Gradients(**{name: torch.full_like(t, 7.0) for name, t in leaf.items()})
+    stored.mean2d = torch.full((1, 80, 2), 7.0).double()
+    cotangents = Cotangents(**dict(zip(images, pulls, strict=True)))
+    cpu.rasterize_backward(given, settings, out, cotangents, stored, stored=True)
     seen = theirs["visible"][0]
     assert 0 < int(seen.sum()) < 80
-    for name, ours in zip(names, stored, strict=False):
-        if ours is not None:
-            expected = leaf[name].grad
-            atol = 1e-9 * float(expected.abs().max())
-            torch.testing.assert_close(ours[seen], expected[seen], rtol=1e-8, atol=atol, msg=name)
-            assert (ours[~seen] == 7).all()
-    assert (stored[7][0][~seen] == 7).all() and (stored[7][0][seen] != 7).any()
+    for name, of in leaf.items():
+        ours, expected = getattr(stored, name), of.grad
+        atol = 1e-9 * float(expected.abs().max())
+        torch.testing.assert_close(ours[seen], expected[seen], rtol=1e-8, atol=atol, msg=name)
+        assert (ours[~seen] == 7).all()
+    assert (stored.mean2d[0][~seen] == 7).all() and (stored.mean2d[0][seen] != 7).any()
 
 
 def test_label_images_are_the_largest_sums_of_the_naive_rasterizer():
-    from perception.gaussians.rasterize import Settings, label_images, simd_levels
-
     count, width, height, least = 90, 70, 45, 0.2
     given = scene(n=count, width=width, height=height, dims=0, cameras=1)
-    names = ("means", "quats", "scales", "opacities", "colors", "features", "viewmats", "Ks")
     rng = np.random.default_rng(5)
     labels = np.stack([rng.integers(-1, 40, count), rng.integers(-1, 3, count), np.full(count, -1)]).astype(np.int32)
     one_hot = torch.from_numpy(labels[:2, :, None] == np.arange(40)).permute(1, 0, 2).reshape(count, 80).double()
@@ -126,13 +121,13 @@ def test_label_images_are_the_largest_sums_of_the_naive_rasterizer():
     clear = (best - sums.topk(2, dim=-1).values[..., 1] > 1e-5) | (best < least)  # of sums in other orders too
     clear &= (best - least).abs() > 1e-5
     assert clear.double().mean() > 0.9 and len(torch.unique(expected)) > 20
-    images, visible = label_images([given.get(name) for name in names], labels, least, Settings(width, height))
+    images, visible = cpu.label_images(passed(given), labels, least, Settings(width, height))
     assert (images[2] == -1).all() and np.array_equal(visible, naive["visible"][0].numpy())
     assert torch.equal(torch.from_numpy(images[:2]).long()[clear], expected[clear])
-    single = [None if given.get(name) is None else given[name].float() for name in names]
-    for simd in simd_levels():
+    single = passed(cast(given))
+    for simd in cpu.simd_levels():
         for threads in (1, 3):
-            found, _ = label_images(single, labels, least, Settings(width, height, threads=threads, simd=simd))
+            found, _ = cpu.label_images(single, labels, least, Settings(width, height, threads=threads, simd=simd))
             assert torch.equal(torch.from_numpy(found[:2]).long()[clear], expected[clear]), simd
 
 
@@ -145,10 +140,8 @@ def test_same_bits_for_any_number_of_threads():
 
 
 def test_levels_agree():
-    from perception.gaussians.rasterize import simd_levels
-
     inputs = scene(n=2000, width=150, height=110, dims=8, dtype=torch.float32)
-    results = [grads_and_images(inputs, simd=level) for level in simd_levels()]
+    results = [grads_and_images(inputs, simd=level) for level in cpu.simd_levels()]
     for other in results[1:]:
         for a, b in zip(results[0], other, strict=True):
             error = (a.double() - b.double()).abs() / (1e-3 + b.double().abs().mean())
@@ -236,11 +229,9 @@ def test_statistics_are_the_2d_mean_gradient_in_pixels():
 
 
 def test_pairs_are_those_the_naive_rasterizer_blends():
-    from perception.gaussians.rasterize import simd_levels
-
     inputs = scene(n=300, width=70, height=45, dims=21)
     expected = reference.rasterize(**inputs)["pairs"]
-    for simd in simd_levels():
+    for simd in cpu.simd_levels():
         out = perception.rasterize(**inputs, simd=simd)
         assert out.stats.contributing_pairs == int(expected.sum())
         assert out.stats.contributing_pairs <= out.stats.evaluated_pairs <= 2 * 300 * 80 * 48

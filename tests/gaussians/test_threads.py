@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from perception.gaussians import rasterize as module
 from perception.machine import torch_on_one_thread
+from perception.rasterizer import cpu as module
 
 
 @pytest.fixture
@@ -15,15 +15,15 @@ def asked(monkeypatch: pytest.MonkeyPatch):
     import perception
 
     before, found = torch.get_num_threads(), []
-    construct = module._core_function
+    construct = module._compiled
 
     def spy(name: str, tensor: torch.Tensor):
         function = construct(name, tensor)
         if name != "RasterizerInputs":
             return function
-        return lambda *arguments: (found.append(arguments[14]), function(*arguments))[1]
+        return lambda **arguments: (found.append(arguments["threads"]), function(**arguments))[1]
 
-    monkeypatch.setattr(module, "_core_function", spy)
+    monkeypatch.setattr(module, "_compiled", spy)
 
     def render(**given) -> int:
         one = torch.ones(1, 3)

@@ -18,14 +18,10 @@ def tensors(rows, seed=0, dtype=torch.float64, scale=1.0):
     return {n: torch.from_numpy(random.normal(size=(rows, *s)) * scale).to(dtype) for n, s in SHAPES.items()}
 
 
-def leaves(rows, **options):
-    return {n: t.requires_grad_() for n, t in tensors(rows, **options).items()}
-
-
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float64, 1e-13), (torch.float32, 2e-6)])
 def test_all_rows_is_torch_adam(dtype, tolerance):
-    ours = SparseAdam(leaves(700, dtype=dtype), RATES)
-    reference = leaves(700, dtype=dtype)
+    ours = SparseAdam(tensors(700, dtype=dtype), RATES)
+    reference = {n: t.requires_grad_() for n, t in tensors(700, dtype=dtype).items()}
     theirs = torch.optim.Adam([{"params": [p], "lr": RATES[n]} for n, p in reference.items()], eps=1e-15)
     for step in range(5):
         grads = tensors(700, seed=step + 1, dtype=dtype, scale=1e-3)
@@ -41,9 +37,9 @@ def test_all_rows_is_torch_adam(dtype, tolerance):
 def test_only_visible_rows_change_and_they_change_as_if_alone(share):
     rows = 3000
     visible = torch.from_numpy(np.random.default_rng(9).random(rows) < share)
-    sparse, alone = SparseAdam(leaves(rows), RATES), SparseAdam(leaves(rows), RATES)
+    sparse, alone = SparseAdam(tensors(rows), RATES), SparseAdam(tensors(rows), RATES)
     alone.keep(visible)
-    before = {n: p.detach().clone() for n, p in sparse.params.items()}
+    before = {n: p.clone() for n, p in sparse.params.items()}
     for step in range(3):
         grads = tensors(rows, seed=step + 1)
         skipped = sparse.step(visible, grads)
@@ -69,7 +65,7 @@ def test_one_rate_per_column():
 
 @pytest.mark.parametrize("poison", [float("nan"), float("inf"), -float("inf")])
 def test_a_gradient_that_is_not_finite_is_skipped_and_counted(poison):
-    ours, clean = SparseAdam(leaves(400), RATES), SparseAdam(leaves(400), RATES)
+    ours, clean = SparseAdam(tensors(400), RATES), SparseAdam(tensors(400), RATES)
     good = torch.ones(400, dtype=torch.bool)
     good[[0, 17, 399]] = False
     grads = tensors(400, seed=1)
@@ -85,7 +81,7 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted(poison):
 @pytest.mark.parametrize("share", [0.2, 0.8])
 def test_a_bad_gradient_in_an_invisible_row_is_nobodys_concern(share):
     visible = torch.from_numpy(np.random.default_rng(2).random(500) < share)
-    ours, clean = SparseAdam(leaves(500), RATES), SparseAdam(leaves(500), RATES)
+    ours, clean = SparseAdam(tensors(500), RATES), SparseAdam(tensors(500), RATES)
     grads = tensors(500, seed=1)
     clean.step(visible, grads)
     skipped = ours.step(visible, {n: torch.where(_rows(visible, g), g, torch.inf) for n, g in grads.items()})
@@ -109,21 +105,21 @@ def test_zero_gradient_moves_on_by_momentum():
 
 
 def test_keep_and_append_carry_the_state():
-    ours, long = SparseAdam(leaves(30), RATES), SparseAdam(leaves(30), RATES)
+    ours, long = SparseAdam(tensors(30), RATES), SparseAdam(tensors(30), RATES)
     grads = tensors(30, seed=1)
     ours.step(None, grads)
     long.step(None, grads)
     order = torch.tensor([5, 5, 29, 0])
     ours.keep(order)
     ours.append(tensors(2, seed=8))
-    assert len(ours) == 6 and all(p.requires_grad and p.is_leaf for p in ours.params.values())
+    assert len(ours) == 6
     more = tensors(30, seed=2)
     long.step(None, more)
     ours.step(None, {n: torch.cat([g[order], torch.ones(2, *SHAPES[n], dtype=g.dtype)]) for n, g in more.items()})
     for name, param in ours.params.items():
         assert torch.equal(param[:4], long.params[name][order])
     # Zero state at global step 2, unit gradient: m = .1 / (1 − .9²), v = .001 / (1 − .999²).
-    moved = tensors(2, seed=8)["means"] - ours.params["means"][4:].detach()
+    moved = tensors(2, seed=8)["means"] - ours.params["means"][4:]
     assert torch.allclose(moved, torch.full_like(moved, 1.6e-4 * (0.1 / 0.19) / (0.001 / (1 - 0.999**2)) ** 0.5))
 
 
@@ -146,12 +142,12 @@ def test_resized_columns_go_on_as_if_the_others_had_never_been_there():
 
 
 def test_resume_goes_on_with_the_same_bits():
-    whole = SparseAdam(leaves(100), RATES)
+    whole = SparseAdam(tensors(100), RATES)
     for step in range(4):
         if step == 2:
             state = whole.state_dict()
         whole.step(None, tensors(100, seed=step))
-    resumed = SparseAdam(leaves(3), RATES)
+    resumed = SparseAdam(tensors(3), RATES)
     resumed.load_state_dict(state)
     for step in (2, 3):
         resumed.step(None, tensors(100, seed=step))
@@ -178,11 +174,9 @@ def test_threads_same_bits_and_instruction_sets_agree(width):
 
 
 def test_empty_and_bad_input():
-    empty = SparseAdam(leaves(0), RATES)
+    empty = SparseAdam(tensors(0), RATES)
     assert empty.step(None, tensors(0))["sh"] == 0
-    with pytest.raises(InputError, match="number of rows"):
-        SparseAdam({"a": torch.zeros(2, 1), "b": torch.zeros(3, 1)}, {"a": 1e-3, "b": 1e-3})
-    ours = SparseAdam(leaves(4), RATES)
+    ours = SparseAdam(tensors(4), RATES)
     with pytest.raises(InputError, match="visible"):
         ours.step(torch.ones(3, dtype=torch.bool), tensors(4))
     with pytest.raises(InputError, match="gradient of means"):
@@ -190,5 +184,3 @@ def test_empty_and_bad_input():
     ours.rates["sh"] = torch.ones(7)
     with pytest.raises(InputError, match="rates of sh are 7, expected 1 or 48"):
         ours.step(None, tensors(4))
-    with pytest.raises(InputError, match="append"):
-        ours.append({"means": torch.zeros(1, 3)})

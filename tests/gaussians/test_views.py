@@ -108,7 +108,7 @@ def test_ignored_pixels_do_not_change_the_map() -> None:
         start = from_points(points, np.full((60, 3), 90, np.uint8), feature_dim=1, seed=0)
         trainer = Trainer(start, views, load_config(None, pairs), views[:1])
         trainer.run()
-        return vars(trainer.gaussians)
+        return trainer.gaussians.named()
 
     dark, bright = map_of(0), map_of(255)
     assert all(torch.equal(dark[name], bright[name]) for name in dark)

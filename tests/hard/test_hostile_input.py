@@ -26,8 +26,9 @@ from perception.io.ply import read_ply
 from perception.masks.label_files import load_labels, stored_key
 from perception.photos.camera_file import read_camera
 from perception.photos.decode import photo_size, read_photo
-from perception.photos.reading import Reading, rigid_pose
+from perception.photos.views import rigid_pose
 from perception.progress import Progress
+from perception.sfm.options import ReadOptions
 from perception.types import PointCloud, View
 
 
@@ -53,8 +54,16 @@ def scene(n: int, dtype: Any, size: int = 8) -> Any:
         means, *(a.astype(dtype) for a in arrays), None, np.eye(4, dtype=dtype)[None], K, None,
         size, size, -1, 0.01, 0.3, 1, True, False, 0,
     )  # fmt: skip
-    images = [np.zeros((1, size, size, 3), dtype), np.zeros((1, size, size), dtype), None, None, None]
+    images = getattr(_core, f"RasterizerImages_{kind}")(
+        np.zeros((1, size, size, 3), dtype), np.zeros((1, size, size), dtype), None, None, None
+    )
     return kind, inputs, images, (np.zeros((1, n), np.uint8), np.zeros((1, n), dtype))
+
+
+def backward(kind: str, inputs: Any, frames: Any, images: Any, depths: np.ndarray | None = None) -> None:
+    cotangents = getattr(_core, f"RasterizerCotangents_{kind}")(None, None, depths, None, None)
+    gradients = getattr(_core, f"RasterizerGradients_{kind}")(*[None] * 8)
+    getattr(_core, f"rasterize_backward_{kind}")(inputs, frames, images, cotangents, gradients, False)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -62,20 +71,19 @@ def scene(n: int, dtype: Any, size: int = 8) -> Any:
 def test_backward_refuses_the_frames_of_another_scene(dtype: Any, other: dict[str, int]) -> None:
     """It wrote gradients of 40 Gaussians into arrays of 2: heap corruption."""
     kind, inputs, images, seen = scene(40, dtype)
-    frames = getattr(_core, f"rasterize_forward_{kind}")(inputs, *images, *seen, "auto")
+    frames = getattr(_core, f"rasterize_forward_{kind}")(inputs, images, *seen, "auto")
     _, inputs, images, _ = scene(dtype=dtype, **other)
     with pytest.raises(ValueError, match="frames: not of inputs"):
-        getattr(_core, f"rasterize_backward_{kind}")(inputs, frames, *images, *[None] * 13)
+        backward(kind, inputs, frames, images)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_backward_refuses_a_gradient_of_depths_that_are_missing(dtype: Any) -> None:
     """It read them through a null pointer."""
     kind, inputs, images, seen = scene(40, dtype)
-    frames = getattr(_core, f"rasterize_forward_{kind}")(inputs, *images, *seen, "auto")
-    gradients = [None, None, np.ones((1, 8, 8), dtype), *[None] * 10]
+    frames = getattr(_core, f"rasterize_forward_{kind}")(inputs, images, *seen, "auto")
     with pytest.raises(ValueError, match="depths: missing"):
-        getattr(_core, f"rasterize_backward_{kind}")(inputs, frames, *images, *gradients)
+        backward(kind, inputs, frames, images, depths=np.ones((1, 8, 8), dtype))
 
 
 def unaligned(array: np.ndarray) -> np.ndarray:
@@ -334,9 +342,9 @@ def test_transforms_that_no_camera_wrote(tmp_path: Path, change: dict[str, Any])
     good["frames"] = [{"file_path": "a.png", "transform_matrix": IDENTITY}]
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps(good))
-    assert len(read_transforms(file, Reading(tmp_path, progress=quiet)).views) == 1
+    assert len(read_transforms(file, ReadOptions(tmp_path, progress=quiet)).views) == 1
     file.write_text(json.dumps({**good, **change}))
-    refused(read_transforms, file, Reading(tmp_path, progress=quiet), match=r"transforms.json|camera PINHOLE")
+    refused(read_transforms, file, ReadOptions(tmp_path, progress=quiet), match=r"transforms.json|camera PINHOLE")
 
 
 @pytest.mark.parametrize("text", ["[" * 200_000, '{"frames": [' + "1" * 5000 + "]}"])
@@ -408,9 +416,9 @@ def image(name: bytes, pose: tuple = (1, 0, 0, 0, 0, 0, 1), camera: int = 1, poi
 )
 def test_damaged_binary_models(tmp_path: Path, file: str, content: bytes) -> None:
     folder = workspace(tmp_path)
-    assert len(read_workspace(folder, Reading(folder / "work", progress=quiet)).points) == 60
+    assert len(read_workspace(folder, ReadOptions(folder / "work", progress=quiet)).points) == 60
     (folder / "sparse/0" / file).write_bytes(content)
-    refused(read_workspace, folder, Reading(folder / "work", progress=quiet), match=r"sparse|camera")
+    refused(read_workspace, folder, ReadOptions(folder / "work", progress=quiet), match=r"sparse|camera")
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.webp", "a.tif"])
@@ -450,5 +458,5 @@ def test_damaged_label_images_of_an_earlier_run(tmp_path: Path) -> None:
 def test_an_error_is_one_line_whatever_a_file_is_called(tmp_path: Path) -> None:
     frame = {"file_path": "a\nb\x1b[31m\u2028.png", "transform_matrix": np.eye(4).tolist()}
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 7, "w": 8, "h": 6, "frames": [frame]}))
-    refused(load_scene, tmp_path, Reading(tmp_path / "work"), match=r"a\\nb\\x1b\[31m\\u2028\.png")
+    refused(load_scene, tmp_path, ReadOptions(tmp_path / "work"), match=r"a\\nb\\x1b\[31m\\u2028\.png")
     assert str(InputError("grand-mère’s 杯子 🍵")) == "grand-mère’s 杯子 🍵"

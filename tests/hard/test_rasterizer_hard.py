@@ -6,8 +6,10 @@ import pytest
 import torch
 
 import perception
+from perception.rasterizer import cpu
+from perception.rasterizer.types import Cotangents, Gradients, Settings
 from support import reference_rasterizer as reference
-from support.rasterizer import IMAGES, every_simd_level, leaves, loss_of, scene  # noqa: F401
+from support.rasterizer import EVERY_GRADIENT, IMAGES, every_simd_level, leaves, loss_of, passed, scene  # noqa: F401
 
 DTYPES = [torch.float32, torch.float64]
 
@@ -223,42 +225,45 @@ def test_non_contiguous_input_is_accepted():
 
 
 def huge_gaussians(n, width, height):
-    """Faint Gaussians that each cover the whole picture; inputs of the low-level functions."""
+    """Faint Gaussians that each cover the whole picture."""
     g = torch.Generator().manual_seed(4)
     uniform = lambda *shape: torch.rand(shape, generator=g, dtype=torch.float64)  # noqa: E731
     means = (uniform(n, 3) - 0.5) * 0.5 + torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64)
     k = torch.tensor([[[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]], dtype=torch.float64)
     view = torch.eye(4, dtype=torch.float64)[None]
-    return (
-        means,
-        uniform(n, 4) - 0.5,
-        3 + uniform(n, 3),
-        0.01 * uniform(n) + 0.01,
-        uniform(n, 3),
-        uniform(n, 3),
-        view,
-        k,
-    )
+    return {
+        "means": means,
+        "quats": uniform(n, 4) - 0.5,
+        "scales": 3 + uniform(n, 3),
+        "opacities": 0.01 * uniform(n) + 0.01,
+        "colors": uniform(n, 3),
+        "features": uniform(n, 3),
+        "viewmats": view,
+        "Ks": k,
+    }
 
 
 def test_gradients_do_not_depend_on_the_records_held_at_once():
-    from perception.gaussians.rasterize import Settings, rasterize_backward, rasterize_forward
-
-    inputs, results = huge_gaussians(90, 300, 200), []
+    inputs, results = passed(huge_gaussians(90, 300, 200)), []
     for max_records in (0, 1, 100, 700):  # 20 tiles × 90 Gaussians: in one part, a tile a part, several
         settings = Settings(300, 200, threads=2, max_records=max_records)
-        out = rasterize_forward(inputs, None, settings)
-        cotangents = (torch.sin(out.colors * 40), None, None, torch.cos(out.features * 30), out.feature_variance)
-        results.append(rasterize_backward(inputs, None, settings, out, cotangents, (True,) * 7))
+        out = cpu.rasterize_forward(inputs, settings)
+        cotangents = Cotangents(
+            colors=torch.sin(out.colors * 40),
+            features=torch.cos(out.features * 30),
+            feature_variance=out.feature_variance,
+        )
+        gradients = Gradients.zeros(inputs, EVERY_GRADIENT)
+        cpu.rasterize_backward(inputs, settings, out, cotangents, gradients)
+        results.append([getattr(gradients, name) for name in EVERY_GRADIENT])
     for other in results[1:]:
         for a, b in zip(results[0], other, strict=True):
             torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10 * float(a.abs().max()))
 
 
 def test_more_tiles_than_the_lists_hold_are_refused_before_they_take_memory():
-    inputs = [t.float() for t in huge_gaussians(20_000, 1 << 14, 1 << 14)]
-    means, quats, scales, opacities, colors, _, viewmats, ks = inputs
+    inputs = cast({**huge_gaussians(20_000, 1 << 14, 1 << 14), "features": None}, torch.float32)
     with pytest.raises(
         perception.InputError, match=r"20000 Gaussians in view touch 1310720000 tiles .* at most 536870912"
     ):
-        perception.rasterize(means, quats, scales, opacities, colors, viewmats, ks, 1 << 14, 1 << 14, depth=False)
+        perception.rasterize(**inputs, width=1 << 14, height=1 << 14, depth=False)

@@ -10,16 +10,17 @@ from PIL import Image
 
 from perception.errors import InputError
 from perception.geometry import align_similarity, inverse_se3
-from perception.inputs.load import load_scene
+from perception.inputs.load import load_scene, photo_sizes
 from perception.inputs.transforms import read_frames
 from perception.io import atomic
 from perception.io.atomic import atomic_directory, atomic_file, recover
 from perception.photos.camera_file import read_camera
 from perception.photos.decode import load_photo, read_photo, scaled_K, warp_labels
 from perception.photos.lens import camera_from_lens, load_pycolmap, pinhole_from_lens
-from perception.photos.reading import Reading, make_view
+from perception.photos.views import make_view
 from perception.progress import Progress
 from perception.sfm import pairs, triangulate
+from perception.sfm.options import ReadOptions
 from perception.types import Lens, View
 from support.aimed import look_at
 from support.rotations import rotation_from_quaternion
@@ -66,7 +67,7 @@ def test_transforms_poses_and_intrinsics_survive(tmp_path, monkeypatch):
     data["frames"][1]["fl_x"] = 70.0
     data["frames"].append({"file_path": "images/gone.png", "transform_matrix": np.eye(4)})
     file.write_text(json.dumps(data, default=lambda matrix: matrix.tolist()))
-    scene = load_scene(tmp_path, Reading(tmp_path / "work"))
+    scene = load_scene(tmp_path, ReadOptions(tmp_path / "work"))
     assert [view.name for view in scene.views] == ["0.png", "1.png", "2.png"]
     assert scene.report["left_out"][0]["name"] == "images/gone.png"
     assert [view.K[0, 0] for view in scene.views] == [50.0, 70.0, 50.0]
@@ -94,7 +95,7 @@ def test_transforms_angle_gives_the_focal_length(tmp_path):
 def test_bad_transforms_are_one_clear_line(tmp_path, changes, words):
     file, _ = write_transforms(tmp_path, **changes)
     with pytest.raises(InputError, match=words) as error:
-        load_scene(file, Reading(tmp_path / "work"))
+        load_scene(file, ReadOptions(tmp_path / "work"))
     assert "\n" not in str(error.value)
 
 
@@ -103,7 +104,7 @@ def test_nan_pose_is_refused(tmp_path):
     data["frames"][2]["transform_matrix"][0, 3] = np.nan
     file.write_text(json.dumps(data, default=lambda matrix: matrix.tolist()))
     with pytest.raises(InputError, match=r"images/2.png.*NaN"):
-        load_scene(file, Reading(tmp_path / "work"))
+        load_scene(file, ReadOptions(tmp_path / "work"))
 
 
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
@@ -119,7 +120,7 @@ def test_colmap_workspace_round_trip(tmp_path, suffix):
     for image in truth.images.values():
         picture(tmp_path / "images" / image.name)
     (tmp_path / "transforms.json").write_text("{}")  # a workspace is read as one even if it holds more
-    scene = load_scene(tmp_path, Reading(tmp_path / "work"))
+    scene = load_scene(tmp_path, ReadOptions(tmp_path / "work"))
     assert [v.name for v in scene.views] == sorted(image.name for image in truth.images.values())
     for view in scene.views:
         expected = truth.find_image_with_name(view.name).cam_from_world().matrix()
@@ -132,30 +133,32 @@ def test_empty_sparse_model(tmp_path):
     (tmp_path / "sparse").mkdir()
     load_pycolmap().Reconstruction().write_text(tmp_path / "sparse")
     with pytest.raises(InputError, match="empty"):
-        load_scene(tmp_path, Reading(tmp_path / "work"))
+        load_scene(tmp_path, ReadOptions(tmp_path / "work"))
 
 
 def test_folders_that_are_no_scene(tmp_path):
-    with pytest.raises(InputError, match="no such"):
-        load_scene(tmp_path / "gone", Reading(tmp_path / "work"))
+    for read in (lambda path: load_scene(path, ReadOptions(tmp_path / "work")), photo_sizes):
+        for name in ("gone", "gone.json", "gone.mp4"):
+            with pytest.raises(InputError, match=f"{name}: no such file or folder; expected a folder of photos"):
+                read(tmp_path / name)
     (tmp_path / "photos").mkdir()
     with pytest.raises(InputError, match="no photos"):
-        load_scene(tmp_path / "photos", Reading(tmp_path / "work"))
+        load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work"))
     picture(tmp_path / "photos" / "a.png")
     picture(tmp_path / "photos" / "b.png", seed=1)
     with pytest.raises(InputError, match="at least 3"):
-        load_scene(tmp_path / "photos", Reading(tmp_path / "work"))
+        load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work"))
     picture(tmp_path / "photos" / "c.png", seed=2)
     with pytest.raises(InputError, match="could be registered"):
-        load_scene(tmp_path / "photos", Reading(tmp_path / "work"))
+        load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work"))
     camera = tmp_path / "camera.yaml"
     camera.write_text(CAMERA)
     with pytest.raises(InputError, match="camera file says 100×80"):
-        load_scene(tmp_path / "photos", Reading(tmp_path / "work", camera=camera))
+        load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work", camera=camera))
     data = (tmp_path / "photos" / "c.png").read_bytes()
     (tmp_path / "photos" / "c.png").write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match=r"c.png.*(truncated|damaged)"):
-        load_scene(tmp_path / "photos", Reading(tmp_path / "work"))
+        load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work"))
 
 
 CAMERA = """

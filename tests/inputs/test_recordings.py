@@ -12,12 +12,12 @@ import pytest
 
 from perception.errors import InputError
 from perception.geometry import inverse_se3
-from perception.inputs.layouts import find_recording
+from perception.inputs.layouts import open_recording
 from perception.inputs.load import load_scene, photo_sizes
 from perception.io.cloud import write_cloud
 from perception.photos.depth import load_depth
 from perception.photos.lens import camera_from_lens
-from perception.photos.reading import Reading
+from perception.sfm.options import ReadOptions
 from perception.types import PointCloud, Scene
 from support.rgbd_folders import COUNT, NAMED, SLOPE, pose, wall_depth, write_recording
 
@@ -35,7 +35,7 @@ def loaded(source: Path, folder: Path, camera: Path | None = None) -> Scene:
     """The scene, started from a cloud on the wall so that no features are needed."""
     x, y = np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9))
     write_cloud(folder / "c.ply", PointCloud(np.stack([x, y, 2 + SLOPE * x], axis=-1).reshape(-1, 3)))
-    return load_scene(source, Reading(folder / "work", init_points=folder / "c.ply", camera=camera, poses="keep"))
+    return load_scene(source, ReadOptions(folder / "work", init_points=folder / "c.ply", camera=camera, poses="keep"))
 
 
 def number(name: str, layout: str) -> int:
@@ -76,7 +76,7 @@ def test_the_order_and_number_of_frames_do_not_depend_on_the_run(tmp_path: Path)
 
 def test_published_lenses_of_tum_equal_opencv(tmp_path: Path) -> None:
     source = write_recording(tmp_path, "tum").rename(tmp_path / "freiburg1_x")
-    lens = find_recording(source).lens  # type: ignore[union-attr]
+    lens = open_recording(source).lens
     ray = np.array([[0.2, -0.1, 1.0]])
     K, D = np.array([[517.3, 0, 318.6], [0, 516.5, 255.3], [0, 0, 1]]), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
     expected, _ = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), K, np.array(D))
@@ -136,7 +136,7 @@ def test_bad_recordings_are_one_line(layout: str, damage, words: str, tmp_path: 
     damage(source)
     with pytest.raises(InputError, match=words) as caught:
         if words == "has depth images but no poses":
-            load_scene(source, Reading(tmp_path / "work"))
+            load_scene(source, ReadOptions(tmp_path / "work"))
         loaded(source, tmp_path)
     assert "\n" not in str(caught.value)
 

@@ -15,10 +15,10 @@ pytest.importorskip("perception._core")
 from perception.config import InstanceConfig
 from perception.gaussians.model import from_points
 from perception.gaussians.nearby import Nearby
-from perception.gaussians.rasterize import rasterize
 from perception.gaussians.views import TrainingView
 from perception.instances.group import Grouping, group
 from perception.instances.votes import beside, mask_votes
+from perception.rasterizer.rasterize import rasterize
 from support.blob_scenes import BlobScene, make_scene, orbit, random_scene, with_errors
 
 

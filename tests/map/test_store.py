@@ -165,7 +165,7 @@ def test_truncated_maps_without_checksums_are_told_too(original: Path, tmp_path:
     ("text", "words"),
     [
         ("[]", "instances"),
-        ('{"instances": [{"id": "x"}]}', "whole number"),
+        ('{"instances": [{"id": "x"}]}', "valid integer"),
         ('{"instances": [{}]}', "id"),
         ('{"instances": 3}', "instances"),
         ("[" * 100_000, "instances"),

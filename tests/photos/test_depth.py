@@ -13,8 +13,9 @@ import pytest
 from perception.errors import InputError
 from perception.inputs.transforms import read_transforms
 from perception.photos.depth import load_depth, read_depth
-from perception.photos.reading import Reading, make_view
 from perception.photos.view_json import stored_view, view_from_json, view_json
+from perception.photos.views import make_view
+from perception.sfm.options import ReadOptions
 from perception.types import DepthImage, Lens
 
 PINHOLE = Lens("PINHOLE", (50.0, 50.0, 32.0, 24.0), 64, 48)
@@ -106,7 +107,7 @@ def test_transforms_name_depth_images_and_their_unit(keys, scale, tmp_path):
 
     def read(frame: dict[str, object]):  # type: ignore[no-untyped-def]
         file.write_text(json.dumps({**head, "frames": [frame]}))
-        return read_transforms(file, Reading(tmp_path / "w")).views[0]
+        return read_transforms(file, ReadOptions(tmp_path / "w")).views[0]
 
     view = read(frame)
     assert view.depth == DepthImage(tmp_path / "d.png", scale)

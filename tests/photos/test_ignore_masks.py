@@ -11,11 +11,12 @@ import pytest
 
 from perception.errors import InputError
 from perception.geometry import inverse_se3
-from perception.inputs.load import load_saved_scene, load_scene, save_scene
+from perception.inputs.load import load_scene
 from perception.io.cloud import write_cloud
 from perception.photos.ignore_masks import load_weight, read_mask
 from perception.photos.lens import load_pycolmap
-from perception.photos.reading import Reading
+from perception.photos.scene_file import load_saved_scene, save_scene
+from perception.sfm.options import ReadOptions
 from perception.types import PointCloud
 from support.aimed import look_at
 
@@ -61,7 +62,7 @@ def test_masks_of_a_folder_and_of_transforms_reach_features_and_weights(tmp_path
     left_black(tmp_path / "s" / "masks" / "own.png")
     folder = made(tmp_path / "s", mask_path="masks/own.png")
     left_black(tmp_path / "given" / "1.png", 80, 60)
-    scene = load_scene(folder, Reading(tmp_path / "work", masks=tmp_path / "given"))
+    scene = load_scene(folder, ReadOptions(tmp_path / "work", masks=tmp_path / "given"))
     own, given, none = scene.views
     assert (own.mask, given.mask, none.mask) == (folder / "masks/own.png", tmp_path / "given/1.png", None)
     half = np.repeat([0.0, 1.0], [40, 40])[None].repeat(60, axis=0)
@@ -83,13 +84,13 @@ def test_a_photo_that_is_ignored_completely_is_left_out(tmp_path: Path) -> None:
     for name in ("0.png", "1.png", "2.png"):
         cv2.imwrite(str(tmp_path / "given" / name), np.full((120, 160), 0 if name == "1.png" else 255, np.uint8))
     write_cloud(tmp_path / "c.ply", PointCloud(np.zeros((1, 3))))
-    scene = load_scene(folder, Reading(tmp_path / "work", masks=tmp_path / "given", init_points=tmp_path / "c.ply"))
+    scene = load_scene(folder, ReadOptions(tmp_path / "work", masks=tmp_path / "given", init_points=tmp_path / "c.ply"))
     assert [view.name for view in scene.views] == ["0.png", "2.png"]
     assert scene.report["left_out"][0]["name"] == "1.png"
     for name in ("0.png", "2.png"):
         cv2.imwrite(str(tmp_path / "given" / name), np.zeros((120, 160), np.uint8))
     with pytest.raises(InputError, match="inverted"):
-        load_scene(folder, Reading(tmp_path / "work", masks=tmp_path / "given", init_points=tmp_path / "c.ply"))
+        load_scene(folder, ReadOptions(tmp_path / "work", masks=tmp_path / "given", init_points=tmp_path / "c.ply"))
 
 
 def test_a_cloud_to_start_from_replaces_the_points(tmp_path: Path) -> None:
@@ -98,7 +99,7 @@ def test_a_cloud_to_start_from_replaces_the_points(tmp_path: Path) -> None:
     points[7] = np.nan
     colors = np.random.default_rng(1).integers(0, 255, (200, 3), np.uint8)
     write_cloud(tmp_path / "lidar.ply", PointCloud(points, colors))
-    scene = load_scene(folder, Reading(tmp_path / "work", init_points=tmp_path / "lidar.ply"))
+    scene = load_scene(folder, ReadOptions(tmp_path / "work", init_points=tmp_path / "lidar.ply"))
     keep = np.arange(200) != 7
     np.testing.assert_array_equal(scene.points, points[keep])
     np.testing.assert_array_equal(scene.point_colors, colors[keep])
@@ -129,5 +130,5 @@ def test_bad_masks_and_clouds_are_one_line(tmp_path: Path, what: str, words: str
     write_cloud(points, PointCloud(np.array([[0.0, y, z]])))
     source = folder / "rgb" if what == "photos" else folder
     with pytest.raises(InputError, match=words) as caught:
-        load_scene(source, Reading(tmp_path / "w", masks=masks, init_points=points))
+        load_scene(source, ReadOptions(tmp_path / "w", masks=masks, init_points=points))
     assert "\n" not in str(caught.value)

@@ -21,8 +21,9 @@ from perception.photos import decode as photos_module
 from perception.photos.decode import photo_size, read_photo, why_left_out
 from perception.photos.folder import choose_photos, list_photos, view_name
 from perception.photos.lens import load_pycolmap
-from perception.photos.reading import Reading, fit_lens
-from perception.sfm.features import build_features
+from perception.photos.views import fit_lens
+from perception.sfm.database import build_features
+from perception.sfm.options import ReadOptions
 from perception.types import Lens
 from support.aimed import look_at
 from support.progress import Told
@@ -78,7 +79,7 @@ def test_any_file_name_keeps_its_matches(tmp_path: Path) -> None:
     assert {safe_name(name, "test") for name in chosen.names} == set(chosen.names)
     expected = {"#first.png", "line%0Aend.png", "blank and tab%09.png", "latin%E9.png", "%41.png", "plain.png"}
     assert set(chosen.names) == expected
-    store = build_features(chosen.photos, [None] * len(NAMES), tmp_path / "work", 0, Told())
+    store = build_features(chosen.photos, [None] * len(NAMES), ReadOptions(tmp_path / "work"))
     db = load_pycolmap().Database.open(store.database)
     pairs, geometries = db.read_two_view_geometries()
     matched = {
@@ -108,7 +109,7 @@ def test_a_broken_photo_is_left_out_and_told(tmp_path: Path) -> None:
     assert chosen.names == ["0.jpg", "1.jpg", "3.jpg"]
     assert [entry["name"] for entry in chosen.left_out] == ["2.jpg"] and "damaged" in chosen.left_out[0]["why"]
     assert any(note.startswith("warning: 1 of 4 photos cannot be read") for note in chosen.notes)
-    with pytest.raises(InputError, match=r"2\.jpg: the photo is truncated"):
+    with pytest.raises(InputError, match=r"2\.jpg: the picture is damaged"):
         choose_photos(tmp_path, True, Told())
 
 
@@ -193,7 +194,7 @@ def test_turned_photos_are_staged_with_their_very_pixels(tmp_path: Path) -> None
     save(tmp_path / "3.png", 3)
     photos = list_photos(tmp_path)
     told = Told()
-    store = build_features(photos, [None] * 4, tmp_path / "work", 0, told)
+    store = build_features(photos, [None] * 4, ReadOptions(tmp_path / "work", progress=told))
     for photo, name in zip(photos, store.names, strict=True):
         np.testing.assert_array_equal(np.asarray(Image.open(store.image_root / name)), read_photo(photo))
     assert [update[1:] for update in told.updates if "turning" in update[0]] == [(1, 3), (2, 3), (3, 3)]
@@ -233,7 +234,7 @@ def test_heic_without_its_reader_names_the_line_that_installs_it(
     for index in range(3):
         (tmp_path / f"{index}.jpg").unlink()
     with pytest.raises(InputError, match=r'pip install "\.\[heic\]"'):
-        load_scene(tmp_path, Reading(tmp_path / "work"))
+        load_scene(tmp_path, ReadOptions(tmp_path / "work"))
 
 
 @pytest.mark.parametrize("name", ["../outside.png", "/outside.png", "a/../../outside.png"])
@@ -248,7 +249,7 @@ def test_a_colmap_image_name_that_leaves_the_folder_is_refused(tmp_path: Path, n
     (sparse / "images.txt").write_text(f"1 1 0 0 0 0 0 3 1 {path}\n\n2 1 0 0 0 1 0 3 1 a/x.png\n\n")
     (sparse / "points3D.txt").write_text("")
     with pytest.raises(InputError, match="outside"):
-        load_scene(tmp_path / "scene", Reading(tmp_path / "work"))
+        load_scene(tmp_path / "scene", ReadOptions(tmp_path / "work"))
 
 
 def test_transforms_names_stay_below_the_folder_that_holds_all_photos(tmp_path: Path) -> None:
@@ -260,7 +261,7 @@ def test_transforms_names_stay_below_the_folder_that_holds_all_photos(tmp_path: 
         frames.append({"file_path": str(Path(place).relative_to("scene")), "transform_matrix": pose.tolist()})
     file = tmp_path / "scene" / "transforms.json"
     file.write_text(json.dumps({"fl_x": 100, "w": 160, "h": 120, "frames": frames}))
-    scene = load_scene(file, Reading(tmp_path / "work"))
+    scene = load_scene(file, ReadOptions(tmp_path / "work"))
     assert sorted(view.name for view in scene.views) == ["outside/b.png", "scene/a.png", "scene/x/c.png"]
 
 
@@ -272,11 +273,11 @@ def test_damaged_photos_with_given_poses_are_left_out(tmp_path: Path) -> None:
         frames.append({"file_path": f"{index}.png", "transform_matrix": pose.tolist()})
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 100, "w": 160, "h": 120, "frames": frames}))
     (tmp_path / "1.png").write_bytes((tmp_path / "1.png").read_bytes()[:900])
-    scene = load_scene(tmp_path, Reading(tmp_path / "work"))
+    scene = load_scene(tmp_path, ReadOptions(tmp_path / "work"))
     assert [view.name for view in scene.views] == ["0.png", "2.png"]
     assert [entry["name"] for entry in scene.report["left_out"]] == ["1.png"]
-    with pytest.raises(InputError, match=r"1\.png: the photo is truncated"):
-        load_scene(tmp_path, Reading(tmp_path / "strict", strict=True))
+    with pytest.raises(InputError, match=r"1\.png: the picture is damaged"):
+        load_scene(tmp_path, ReadOptions(tmp_path / "strict", strict=True))
 
 
 def test_a_fifo_is_no_photo(tmp_path: Path) -> None:

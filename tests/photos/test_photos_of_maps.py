@@ -32,7 +32,7 @@ def shown(path: Path) -> tuple[int, ...] | None:
     """The colour of the best photo of the map's one instance; None when there is none."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PhotosMoved)
-        crop = best_crop(perception.load_map(path), 0)
+        crop = best_crop(perception.load_map(path), 0, photos=Path("/"))
     return None if crop is None else tuple(int(x) for x in np.median(crop.reshape(-1, 3), axis=0))
 
 
@@ -81,7 +81,7 @@ def test_what_is_missing_is_told_once(path: Path) -> None:
     shutil.rmtree(path.parent / "photos")
     gmap = perception.load_map(path)
     with pytest.warns(PhotosMoved, match=r"00000\.png: the photo is missing.*perception relink") as told:
-        assert best_crop(gmap, 0) is None and best_crop(gmap, 0) is None
+        assert best_crop(gmap, 0, 64, Path("/")) is None and best_crop(gmap, 0, 64, Path("/")) is None
     assert len(told) == 1
 
 

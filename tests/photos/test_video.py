@@ -13,9 +13,9 @@ from PIL import Image
 from perception.errors import InputError
 from perception.inputs.load import load_scene
 from perception.photos.folder import list_photos
-from perception.photos.reading import Reading
 from perception.photos.video import frame_size, video_frames
 from perception.pipeline.checkpoint import frames_folder, working
+from perception.sfm.options import ReadOptions
 from support.progress import Told
 from support.videos import turn_video, write_video
 
@@ -62,12 +62,12 @@ def test_files_that_are_no_video(tmp_path: Path) -> None:
     file.write_bytes(b"no video at all" * 50)
     for _ in range(2):
         with pytest.raises(InputError, match=r"v\.mp4: not a readable video"):
-            load_scene(file, Reading(tmp_path / "work", frames=tmp_path / "v.frames"))
+            load_scene(file, ReadOptions(tmp_path / "work", frames=tmp_path / "v.frames"))
         assert not (tmp_path / "v.frames").exists()
     write_video(file, pan(30))
     (tmp_path / "v.frames").mkdir()
     with pytest.raises(InputError, match=r"v\.frames: exists already"):
-        load_scene(file, Reading(tmp_path / "work", frames=tmp_path / "v.frames"))
+        load_scene(file, ReadOptions(tmp_path / "work", frames=tmp_path / "v.frames"))
 
 
 def test_a_video_that_cannot_be_posed_leaves_no_frames(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_a_video_that_cannot_be_posed_leaves_no_frames(tmp_path: Path) -> None:
     noise = [rng.integers(0, 255, (120, 160, 3), dtype=np.uint8) for _ in range(20)]
     video = write_video(tmp_path / "v.mp4", noise)
     with pytest.raises(InputError, match="could be registered"):
-        load_scene(video, Reading(tmp_path / "work", frames=tmp_path / "v.frames"))
+        load_scene(video, ReadOptions(tmp_path / "work", frames=tmp_path / "v.frames"))
     assert not (tmp_path / "v.frames").exists()
 
 

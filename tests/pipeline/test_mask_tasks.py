@@ -11,6 +11,7 @@ pytest.importorskip("perception._core")
 from perception.config import load_config
 from perception.pipeline import optimise
 from perception.pipeline.mapping import build_map
+from perception.tasks.engine import LOCAL
 from support.elsewhere import Elsewhere
 from support.onnx_files import FLOAT, SAM_DECODER, write_onnx
 
@@ -39,7 +40,7 @@ def test_masks_are_those_made_here(
     engine = Elsewhere()
     here, there = (
         build_map(small_scene / "transforms.json", tmp_path / f"{name}.gsmap", config, engine=where)
-        for name, where in (("here", None), ("there", engine))
+        for name, where in (("here", LOCAL), ("there", engine))
     )
     assert engine.asked == [3]  # 10 training photos of 12
     assert here.info["masks"]["masks"] > 0

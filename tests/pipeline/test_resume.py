@@ -24,7 +24,6 @@ from perception.errors import InputError
 from perception.gaussians import train
 from perception.gaussians.views import psnr
 from perception.map.write import read_map
-from perception.photos.reading import Reading
 from perception.pipeline import checkpoint, mapping
 from perception.pipeline.checkpoint import (
     BEFORE_MASKS,
@@ -36,6 +35,7 @@ from perception.pipeline.checkpoint import (
 )
 from perception.pipeline.mapping import build_map
 from perception.pipeline.record import finite
+from perception.sfm.options import ReadOptions
 from perception.types import Scene
 from support.interrupts import interrupt_at
 from support.progress import Told
@@ -166,12 +166,12 @@ def test_a_finished_map_that_tells_no_input_files_is_kept_and_refused(small_scen
 
 
 def test_changed_frames_of_a_video_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def load_scene(source: Path, how: Reading) -> Any:
+    def load_scene(source: Path, options: ReadOptions) -> Any:
         """Frames are written and poses found, then the run is stopped."""
-        assert how.frames is not None
-        how.frames.mkdir(exist_ok=True)
-        (how.frames / "frames.json").write_text("{}")
-        (how.frames / "0.jpg").write_bytes(b"x")
+        assert options.frames is not None
+        options.frames.mkdir(exist_ok=True)
+        (options.frames / "frames.json").write_text("{}")
+        (options.frames / "0.jpg").write_bytes(b"x")
         return Scene([], np.zeros((0, 3)), np.zeros((0, 3), np.uint8), report={})
 
     def stop(*_: object) -> None:

@@ -12,8 +12,7 @@ from PIL import Image
 from perception.map.write import read_map, write_map
 from perception.photos.view_json import StoredView
 from perception.query import load_map
-from perception.query.crops import best_crop
-from perception.query.requests import UnknownInstance
+from perception.query.crops import PhotoOutside, best_crop, photos_outside
 from support.query_maps import encoders, write_map_of
 
 
@@ -35,11 +34,12 @@ def picture(file: Path) -> Path:
     return file
 
 
-def shown(path: Path, inside: Path | None) -> bool:
-    """Whether the photo is read; UnknownInstance says that it may not be."""
+def shown(path: Path, photos: Path | None = None) -> bool:
+    """Whether the photo is read; PhotoOutside says that it may not be."""
     try:
-        return best_crop(load_map(path, encoders=encoders), 0, inside=inside) is not None
-    except UnknownInstance:
+        return best_crop(load_map(path, encoders=encoders), 0, photos=photos) is not None
+    except PhotoOutside:
+        assert photos_outside(load_map(path), photos)
         return False
 
 
@@ -49,7 +49,7 @@ def test_the_best_photo_is_cut_around_its_box(tmp_path: Path) -> None:
     photo[40:60, 100:130] = (255, 0, 0)
     Image.fromarray(photo).save(tmp_path / "p.png")
     gmap = load_map(write_photo_map(tmp_path / "a.gsmap", str(tmp_path / "p.png")), encoders=encoders)
-    crop = best_crop(gmap, 0, 64)
+    crop = best_crop(gmap, 0, 64, tmp_path)
     assert crop is not None
     picture = crop.astype(int)
     height, width = picture.shape[:2]
@@ -59,7 +59,7 @@ def test_the_best_photo_is_cut_around_its_box(tmp_path: Path) -> None:
     assert abs(rows.mean() - height / 2) < 2 and abs(columns.mean() - width / 2) < 2
     assert 0.3 < red.mean() < 0.9
     (tmp_path / "p.png").unlink()
-    assert best_crop(gmap, 0, 64) is None
+    assert best_crop(gmap, 0, 64, tmp_path) is None
 
 
 def test_a_received_map_cannot_have_a_private_file_shown(tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_a_received_map_cannot_have_a_private_file_shown(tmp_path: Path) -> None
     path = write_photo_map(tmp_path / "a.gsmap", str(private))
     assert not shown(path, path)
     assert not shown(path, picture(tmp_path / "photos/other.png").parent)
-    assert shown(path, private.parent) and shown(path, tmp_path) and shown(path, None)
+    assert shown(path, private.parent) and shown(path, tmp_path) and not shown(path)
     other = write_photo_map(tmp_path / "b.gsmap", "gone.png", "../private/secret.png")
     assert not shown(other, other)
 
@@ -76,15 +76,17 @@ def test_photos_below_the_map_are_shown_and_links_out_of_it_are_not(tmp_path: Pa
     private = picture(tmp_path / "private/secret.png")
     path = write_photo_map(tmp_path / "a.gsmap", str(tmp_path / "a.gsmap/photos/p.png"))
     picture(path / "photos/p.png")
-    assert shown(path, path)
+    assert shown(path) and photos_outside(load_map(path)) is None
+    (tmp_path / "link.gsmap").symlink_to(path)
+    assert shown(tmp_path / "link.gsmap")
     (path / "photos/p.png").unlink()
     (path / "photos/p.png").symlink_to(private)
-    assert not shown(path, path)
+    assert not shown(path) and shown(path, private.parent)
     other = write_photo_map(tmp_path / "b.gsmap", f"{tmp_path}/b.gsmap/../private/secret.png")
     assert not shown(other, other)
 
 
-@pytest.mark.parametrize("photo", ["/dev/zero", "\0", "a" * 5000, "", "/proc/self/environ", "~/.ssh/id_rsa"])
+@pytest.mark.parametrize("photo", ["/dev/zero", "a" * 5000, "", "/proc/self/environ", "~/.ssh/id_rsa"])
 def test_what_is_no_photo_is_not_found(tmp_path: Path, photo: str) -> None:
     assert not shown(write_photo_map(tmp_path / "a.gsmap", photo), Path("/"))
 

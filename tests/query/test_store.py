@@ -316,7 +316,7 @@ def test_the_commands(maps: list[Path], tmp_path: Path, monkeypatch: pytest.Monk
         more = {"map": hit["map"], "map_id": load_map(hit["map"]).map_id}
         assert hit == {**same, **more, "frame": alone["frame"], "metric": alone["metric"]}
     assert main(["query", store, "grandma's cup"]) == 0
-    assert f"points  in {maps[2]}" in capsys.readouterr().out
+    assert f" in {maps[2]}" in capsys.readouterr().out
     for words in (
         ["query", store, "mug", "--min-score", "0", "--points", "x.ply"],
         ["info", store],

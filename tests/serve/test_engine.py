@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import json
+import random
 import shutil
 import subprocess
 import sys
@@ -9,12 +12,14 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from perception.errors import InputError
-from perception.map.write import set_labels
+from perception.io.atomic import atomic_file
+from perception.map.write import read_map, set_labels, write_map
 from perception.query import QueryMap, Where, load_map
 from perception.query.requests import AnswerTimeout, EngineBusy, EngineClosed, Request
 from perception.serve.engine import QueryEngine
@@ -201,6 +206,54 @@ def test_a_map_deleted_or_spoilt_while_served_is_told_and_the_old_one_answers(pa
         shutil.rmtree(path)
         shutil.copytree(spare, path)
         _until(lambda: engine.health()["status"] == "ok")
+
+
+ODD: tuple[Any, ...] = (None, 3, -1, 1e308, True, "MUG", [], ["MUG"], [[]], {}, {"id": 1}, [{"text": 5, "score": 1}])
+
+
+def test_no_value_in_instances_json_ends_the_watcher(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Whatever stands there: it is taken over, or told in health and in the log; the mended file is taken over."""
+    gmap = read_map(path)
+    gmap.info["instances"] = {"texts": "test"}
+    write_map(path, gmap)
+    file, rng = path / "instances.json", random.Random(0)
+    good = json.loads(file.read_text())
+
+    def put(value: Any) -> None:
+        with atomic_file(file) as aside:
+            aside.write_text(json.dumps(value))
+
+    refused = 0
+    with engine_of(path, watch=0.01) as engine:
+        for turn in range(25):
+            before, spoilt = engine.current.map_id, copy.deepcopy(good)
+            keys = [*spoilt["instances"][0], "texts", "texts", "parts", "hidden"]
+            spoilt["instances"][rng.randrange(3)][rng.choice(keys)] = rng.choice(ODD)
+            spoilt["turn"] = turn
+            caplog.clear()
+            put(spoilt)
+            _until(lambda before=before: engine.health()["problem"] or engine.current.map_id != before)
+            if engine.health()["problem"]:
+                refused += 1
+                assert engine.health()["status"] == "degraded" and "\n" not in engine.health()["problem"]
+                assert engine.current.map_id == before and caplog.records
+                with pytest.raises(InputError):
+                    engine.reload()
+            put({**good, "mended": turn})
+            _until(lambda: json.loads(file.read_text()) and engine.current.map_id == load_map(path).map_id)
+            _until(lambda: engine.health()["status"] == "ok")
+            assert engine.ask("mug").hits[0].instance_id == 0
+    assert 5 < refused < 25
+
+
+def test_a_listener_that_fails_is_told_and_the_next_map_is_taken_over(path: Path) -> None:
+    with engine_of(path, watch=None) as engine:
+        engine.on_reload(lambda gmap: gmap.position(2))
+        write_map_of(path, ["one", "two"], gaussians=200)
+        assert engine.reload() and len(engine.current.instances) == 2
+        assert "not all of the map can be served (UnknownInstance" in engine.health()["problem"]
+        write_map_of(path, gaussians=200)
+        assert engine.reload() and engine.health()["status"] == "ok"
 
 
 def test_files_cut_in_place_while_served_do_not_end_the_process(path: Path) -> None:

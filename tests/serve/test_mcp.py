@@ -43,7 +43,8 @@ HEAD = (
     "import sys; from pathlib import Path; from support.query_maps import encoders; import perception.serve.mcp as m\n"
 )
 STDIO = HEAD + "from perception import cli\nserve = m.serve_stdio\n"
-STDIO += "m.serve_stdio = lambda path: serve(path, encoders)\nsys.exit(cli.main(['mcp', sys.argv[1]]))\n"
+STDIO += "m.serve_stdio = lambda path, photos: serve(path, encoders, photos)\n"
+STDIO += "sys.exit(cli.main(['mcp', *sys.argv[1:]]))\n"
 HTTP = HEAD + "from perception.serve.server import ServeSettings\n"
 HTTP += "m.serve_http(Path(sys.argv[1]), ServeSettings(port=0, token=sys.argv[2] or None, timeout=60), encoders)\n"
 RED = 4
@@ -82,10 +83,10 @@ def photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def stdio(path: Path) -> StdioServerParameters:
+def stdio(path: Path, *options: str) -> StdioServerParameters:
     import os
 
-    return StdioServerParameters(command=sys.executable, args=["-c", STDIO, str(path)], env=dict(os.environ))
+    return StdioServerParameters(command=sys.executable, args=["-c", STDIO, str(path), *options], env=dict(os.environ))
 
 
 def ended(client: Client, work: Callable[[Client], Awaitable[Any]]) -> Any:
@@ -191,7 +192,7 @@ def test_every_tool_over_stdio_and_a_map_replaced_under_it(tmp_path: Path, photo
         shutil.rmtree(path)
         assert (await told(client, "find", text="teapot"))["hits"][0]["instance_id"] == 103
 
-    ended(Client(stdio(path)), session)
+    ended(Client(stdio(path, "--photos", str(photo.parent))), session)
 
 
 def spoken(path: Path) -> subprocess.Popen[bytes]:
@@ -393,15 +394,22 @@ def test_where_to_stand_is_before_the_middle_of_a_long_side(tmp_path: Path) -> N
         ended(Client(make_server(engine, None)), session)
 
 
-def test_a_photo_outside_of_the_map_is_not_sent_to_other_machines(tmp_path: Path, photo: Path) -> None:
+def test_a_photo_outside_of_the_map_is_sent_only_where_the_user_allows_it(
+    tmp_path: Path, photo: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = write_seen_map(tmp_path / "a.gsmap", photo)
 
     async def session(client: Client) -> Any:
-        return (await client.call_tool("describe", {"id": RED})).structured_content["picture"]
+        answer = (await client.call_tool("describe", {"id": RED})).structured_content
+        return answer["picture"], "--photos" in (answer["note"] or "")
 
     with QueryEngine(path, watch=None, encoders=encoders) as engine:
-        assert ended(Client(make_server(engine, path)), session) == "render"
-        assert ended(Client(make_server(engine, photo.parent)), session) == "photo"
+        for other in (None, tmp_path):
+            assert ended(Client(make_server(engine, other)), session) == ("render", True)
+        assert len(caplog.records) == 2
+        assert ended(Client(make_server(engine, photo.parent)), session) == ("photo", False)
+    assert ended(Client(stdio(path)), session) == ("render", True)
+    assert main(["mcp", str(path), "--photos", str(photo)]) == 2  # a file
 
 
 def test_a_defect_is_logged_and_not_shown(

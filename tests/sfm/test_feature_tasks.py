@@ -14,10 +14,10 @@ import pytest
 pytest.importorskip("pycolmap")
 from perception.errors import InputError
 from perception.sfm import feature_tasks
-from perception.sfm.features import build_features
+from perception.sfm.database import build_features
+from perception.sfm.options import ReadOptions
 from perception.tasks.folder import TASK
 from support.elsewhere import Elsewhere
-from support.progress import Told
 
 TABLES = ("cameras", "images", "keypoints", "descriptors", "matches", "two_view_geometries")
 
@@ -52,8 +52,8 @@ def test_the_database_is_that_of_one_process(
     cv2.imwrite(str(tmp_path / "mask.png"), half)
     masks = [tmp_path / "mask.png" if number in (1, 8) else None for number in range(len(photos))]
     engine, lenses = Elsewhere(), [None] * len(photos)
-    here = build_features(photos, lenses, tmp_path / "here", 3, Told(), masks)
-    there = build_features(photos, lenses, tmp_path / "there", 3, Told(), masks, engine=engine)
+    here = build_features(photos, lenses, ReadOptions(tmp_path / "here", 3), masks)
+    there = build_features(photos, lenses, ReadOptions(tmp_path / "there", 3, engine=engine), masks)
     wanted = rows(here.database)
     assert len(wanted["cameras"]) == 2 and len(wanted["keypoints"]) == 24 and len(wanted["matches"]) > 40
     assert rows(there.database) == wanted
@@ -75,9 +75,10 @@ def test_an_interrupted_run_makes_no_task_twice(
 
     monkeypatch.setattr(feature_tasks, "extract", counted)
     lenses = [None] * len(photos)
+    options = ReadOptions(tmp_path / "work", engine=Elsewhere())
     with pytest.raises(KeyboardInterrupt):
-        build_features(photos, lenses, tmp_path / "work", 0, Told(), engine=Elsewhere())
-    store = build_features(photos, lenses, tmp_path / "work", 0, Told(), engine=Elsewhere())
+        build_features(photos, lenses, options)
+    store = build_features(photos, lenses, options)
     assert len(begun) == 4  # three sets of photos, one of them begun twice
     assert len(rows(store.database)["keypoints"]) == 24
 
@@ -90,4 +91,4 @@ def test_a_worker_of_another_version_is_refused(photos: list[Path], tmp_path: Pa
             return super().run(task, items, *rest)
 
     with pytest.raises(InputError, match=r"this worker has pycolmap .*, the run 0\..*; install the same"):
-        build_features(photos, [None] * len(photos), tmp_path / "work", 0, Told(), engine=Older())
+        build_features(photos, [None] * len(photos), ReadOptions(tmp_path / "work", engine=Older()))

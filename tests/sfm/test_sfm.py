@@ -15,11 +15,10 @@ from scipy.spatial.transform import Rotation
 from perception.geometry import align_similarity, inverse_se3
 from perception.inputs.load import load_scene
 from perception.photos.lens import load_pycolmap
-from perception.photos.reading import Reading
-from perception.sfm import features
-from perception.sfm import incremental as incremental_sfm
-from perception.sfm.features import build_features
-from perception.sfm.incremental import Pair
+from perception.sfm import consistency, features
+from perception.sfm.consistency import Pair
+from perception.sfm.database import build_features
+from perception.sfm.options import ReadOptions
 from support.aimed import look_at
 from support.progress import Told
 
@@ -71,7 +70,7 @@ def corner(tmp_path_factory):
 def run(corner, tmp_path_factory):
     told = Told()
     workdir = tmp_path_factory.mktemp("work")
-    return load_scene(corner[0], Reading(workdir, progress=told)), told.updates, workdir
+    return load_scene(corner[0], ReadOptions(workdir, progress=told)), told.updates, workdir
 
 
 def errors(scene, truth):
@@ -104,7 +103,7 @@ def test_poses_are_the_true_ones(corner, run):
 def test_finished_work_is_used_again(corner, run):
     scene, _, workdir = run
     told = Told()
-    again = load_scene(corner[0], Reading(workdir, progress=told))
+    again = load_scene(corner[0], ReadOptions(workdir, progress=told))
     assert {stage for stage, *_ in told.updates} == {"poses: photos"}  # looked at again, nothing else
     for a, b in zip(scene.views, again.views, strict=True):
         np.testing.assert_array_equal(a.camera_from_world, b.camera_from_world)
@@ -117,7 +116,7 @@ def test_known_intrinsics_are_kept(corner, tmp_path):
         f"camera_matrix: {{data: [{FOCAL}, 0, {WIDTH / 2 - 0.5}, 0, {FOCAL}, {HEIGHT / 2 - 0.5}, 0, 0, 1]}}\n"
         "distortion_coefficients: {data: [0, 0, 0, 0, 0]}\n"
     )
-    scene = load_scene(corner[0], Reading(tmp_path / "work", camera=camera))
+    scene = load_scene(corner[0], ReadOptions(tmp_path / "work", camera=camera))
     assert len(scene.views) == VIEWS
     assert scene.views[0].K.tolist() == [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
     center, turned = errors(scene, corner[1])
@@ -125,7 +124,7 @@ def test_known_intrinsics_are_kept(corner, tmp_path):
 
 
 def test_a_seed_repeats(corner, run, tmp_path):
-    again = load_scene(corner[0], Reading(tmp_path))
+    again = load_scene(corner[0], ReadOptions(tmp_path))
     for a, b in zip(run[0].views, again.views, strict=True):
         np.testing.assert_array_equal(a.camera_from_world, b.camera_from_world)
 
@@ -141,7 +140,7 @@ def test_one_thread_trains_the_index_of_descriptors(corner, tmp_path, monkeypatc
 
     monkeypatch.setattr(pycolmap, "match_image_pairs", watched)
     photos = sorted(corner[0].iterdir())[:2]
-    store = build_features(photos, [None, None], tmp_path, 0, Told())
+    store = build_features(photos, [None, None], ReadOptions(tmp_path))
     assert threads == [1]
     with closing(sqlite3.connect(store.database)) as tables:
         ((found, verified),) = tables.execute("SELECT m.rows, g.rows FROM matches m, two_view_geometries g")
@@ -153,12 +152,12 @@ def test_a_wrecked_model_raises_a_warning(run, wrecked):
     pycolmap = load_pycolmap()
     (store,) = run[2].glob("features-*")
     model = pycolmap.Reconstruction(store / "model")
-    assert incremental_sfm.model_warnings([model], store / "database.db", VIEWS) == []
+    assert consistency.model_warnings([model], store / "database.db", VIEWS) == []
     half_turn = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(np.diag([-1.0, -1.0, 1.0])), np.zeros(3))
     for image in sorted(model.images.values(), key=lambda image: image.name)[-wrecked:]:
         frame = model.frames[image.frame_id]
         frame.rig_from_world = pycolmap.Rigid3d((frame.rig_from_world.matrix() @ matrix_4x4(half_turn))[:3])
-    warnings = incremental_sfm.model_warnings([model], store / "database.db", VIEWS)
+    warnings = consistency.model_warnings([model], store / "database.db", VIEWS)
     assert len(warnings) == 1 and "folded" in warnings[0]
 
 
@@ -168,10 +167,10 @@ def matrix_4x4(transform):
 
 def test_contradictions_count_when_stronger_than_every_chain():
     chain = [Pair(0, 1, 100, 1.0), Pair(1, 2, 60, 0.9)]
-    assert incremental_sfm.stronger_contradictions([*chain, Pair(0, 2, 50, 0.0)]) == []
-    assert incremental_sfm.stronger_contradictions([*chain, Pair(0, 2, 70, 0.1)]) == [Pair(0, 2, 70, 0.1)]
-    assert incremental_sfm.stronger_contradictions([*chain, Pair(0, 2, 60, 0.1)]) == []  # equally strong
-    assert incremental_sfm.outvoted_photos([*chain, Pair(0, 2, 70, 0.1)]) == {2}
+    assert consistency.stronger_contradictions([*chain, Pair(0, 2, 50, 0.0)]) == []
+    assert consistency.stronger_contradictions([*chain, Pair(0, 2, 70, 0.1)]) == [Pair(0, 2, 70, 0.1)]
+    assert consistency.stronger_contradictions([*chain, Pair(0, 2, 60, 0.1)]) == []  # equally strong
+    assert consistency.outvoted_photos([*chain, Pair(0, 2, 70, 0.1)]) == {2}
 
 
 @pytest.mark.parametrize(
@@ -179,7 +178,7 @@ def test_contradictions_count_when_stronger_than_every_chain():
 )
 def test_a_few_strong_contradictions_are_enough_also_in_a_large_place(count, wrong, told):
     chain = [Pair(i, i + 1, 100, 1.0) for i in range(count - wrong)]
-    assert incremental_sfm.is_contradicted([*chain, *(Pair(i, i + 50, 200, 0.0) for i in range(wrong))]) is told
+    assert consistency.is_contradicted([*chain, *(Pair(i, i + 50, 200, 0.0) for i in range(wrong))]) is told
 
 
 def test_photos_with_few_features_are_upsampled(corner, tmp_path, monkeypatch):
@@ -210,7 +209,7 @@ def test_equal_posters_do_not_fold_the_tabletop(tmp_path):
         name = Path(frame["file_path"]).name
         (tmp_path / "photos" / name).symlink_to(root / "images" / name)
         truth[name] = inverse_se3(np.array(frame["transform_matrix"]) @ np.diag([1.0, -1, -1, 1]))
-    scene = load_scene(tmp_path / "photos", Reading(tmp_path / "work"))
+    scene = load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work"))
     assert len(scene.views) == 36 and not scene.report["warnings"]
     center, turned = errors(scene, truth)
     assert center < 0.08 and turned < 1.5
@@ -225,7 +224,7 @@ def test_two_places_are_told_apart(tmp_path):
     for place, most in (("fox_480", 24), ("tabletop_a", 16)):
         for photo in sorted((Path(data) / place / "images").iterdir())[:most]:
             (tmp_path / "photos" / f"{place}-{photo.name}").symlink_to(photo)
-    scene = load_scene(tmp_path / "photos", Reading(tmp_path / "work"))
+    scene = load_scene(tmp_path / "photos", ReadOptions(tmp_path / "work"))
     assert scene.report["models"] == [24, 16]
     assert any("2 unconnected models (24, 16); the largest is mapped" in told for told in scene.report["warnings"])
     assert {view.name.partition("-")[0] for view in scene.views} == {"fox_480"}

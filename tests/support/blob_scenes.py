@@ -40,7 +40,7 @@ def make_scene(
     import torch
 
     from perception.gaussians.model import from_points
-    from perception.gaussians.train import TrainingView
+    from perception.gaussians.views import TrainingView
     from perception.instances.silhouettes import render_silhouettes
 
     rng = np.random.default_rng(seed)

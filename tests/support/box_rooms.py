@@ -9,6 +9,7 @@ import numpy as np
 
 from perception.boxes import oriented_box
 from perception.export.depth_views import DepthView
+from perception.frame.gravity import Gravity
 from perception.query import QueryMap
 from perception.types import View
 from support.aimed import look_at
@@ -99,6 +100,7 @@ def map_of(
             "id": i,
             "label": None,
             "score": 1.0,
+            "num_gaussians": len(own),
             "centroid": own.mean(axis=0).tolist(),
             "obb": oriented_box(own).to_json(),
         }
@@ -115,7 +117,12 @@ def map_of(
         instance_ids=owner,
         membership=np.ones(count, np.float32),
         instances=instances,
-        info={"metric": True, "frame": "home", "gravity": {"direction": (-move[:3, 2]).tolist()}, **info},
+        info={
+            "metric": True,
+            "frame": "home",
+            "gravity": Gravity(-move[:3, 2], 1.0, "truth").to_json(),
+            **info,
+        },
         views=[View("a.jpg", Path("a.jpg"), np.eye(3), 64, 48, look_at(eye, eye + move[:3, 0], move[:3, 2]))],
         path=Path("room.gsmap"),
     )

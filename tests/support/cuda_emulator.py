@@ -17,10 +17,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from perception.gaussians import rasterize as cpu
-from perception.gaussians.cuda import rasterize as on_device
-from perception.gaussians.cuda.compile import KernelOptions
-from perception.gaussians.cuda.launch import Kernels
+from perception.rasterizer import cpu
+from perception.rasterizer import device as on_device
+from perception.rasterizer.cuda.compile import KernelOptions
+from perception.rasterizer.cuda.launch import Kernels
 from support.rasterizer import grads_and_images, scene
 
 CSRC = Path(__file__).resolve().parents[2] / "csrc"
@@ -67,22 +67,21 @@ def build(options: KernelOptions, edit: tuple[str, str] | None) -> ctypes.CDLL:
     return library
 
 
-_fill, _libraries, _memory = on_device._filled, list[ctypes.CDLL](), dict[int, int]()
+_address, _libraries, _memory = on_device._address, list[ctypes.CDLL](), dict[int, int]()
 
 
-def _fill_and_tell(structure, *values):
+def _address_and_tell(tensor):
     """Tells the emulators which memory the kernels may use: that of every tensor whose address they are given."""
-    for value in values:
-        if isinstance(value, torch.Tensor) and value.untyped_storage().nbytes():
-            begin, size = value.untyped_storage().data_ptr(), value.untyped_storage().nbytes()
-            _memory.pop(begin, None)
-            _memory[begin] = size  # the latest last
-            for library in _libraries:
-                library.emulator_memory(ctypes.c_uint64(begin), ctypes.c_uint64(size))
-    return _fill(structure, *values)
+    begin, size = tensor.untyped_storage().data_ptr(), tensor.untyped_storage().nbytes()
+    if size:
+        _memory.pop(begin, None)
+        _memory[begin] = size  # the latest last
+        for library in _libraries:
+            library.emulator_memory(ctypes.c_uint64(begin), ctypes.c_uint64(size))
+    return _address(tensor)
 
 
-on_device._filled = _fill_and_tell
+on_device._address = _address_and_tell
 
 
 def emulated(lanes: int = IN_ORDER, edit: tuple[str, str] | None = None) -> KernelsFor:

@@ -9,11 +9,13 @@ import pytest
 import torch
 
 import perception
-from perception.gaussians import rasterize as module
-from perception.gaussians.rasterize import simd_levels
+from perception.rasterizer import cpu
+from perception.rasterizer.cpu import simd_levels
+from perception.rasterizer.types import Inputs
 from support import reference_rasterizer as reference
 
 IMAGES = ("colors", "alphas", "depths", "features", "feature_variance")
+EVERY_GRADIENT = ("means", "quats", "scales", "opacities", "colors", "features", "viewmats", "mean2d")
 GIVEN = ("means", "quats", "scales", "opacities", "colors", "features", "viewmats", "background")
 
 
@@ -26,14 +28,12 @@ def every_simd_level(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
 
     The quick part of the suite runs the first, which is the widest.
     """
-    forward = module.rasterize_forward
+    forward = cpu.rasterize_forward
 
-    def at_level(inputs, background, settings):
-        return forward(
-            inputs, background, replace(settings, simd=request.param) if settings.simd == "auto" else settings
-        )
+    def at_level(inputs, settings):
+        return forward(inputs, replace(settings, simd=request.param) if settings.simd == "auto" else settings)
 
-    monkeypatch.setattr(module, "rasterize_forward", at_level)
+    monkeypatch.setattr(cpu, "rasterize_forward", at_level)
     yield request.param
 
 
@@ -65,6 +65,11 @@ def scene(n=60, width=37, height=29, dims=5, cameras=2, sh_degree=None, dtype=to
     }
     inputs = {name: None if t is None else t.to(dtype) for name, t in inputs.items()}
     return {**inputs, "width": width, "height": height, "sh_degree": sh_degree}
+
+
+def passed(inputs):
+    """A scene as both passes take it."""
+    return Inputs(**{name: inputs.get(name) for name in (*GIVEN, "Ks")})
 
 
 def leaves(inputs, skip=("Ks",)):

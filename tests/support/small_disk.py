@@ -19,9 +19,9 @@ import torch
 from perception.edit.editor import Editor
 from perception.errors import InputError
 from perception.export.export_map import ExportOptions, export_map
-from perception.inputs.load import save_scene
 from perception.map.write import read_map, set_labels, verify_map, write_map
 from perception.masks.label_files import write_labels
+from perception.photos.scene_file import save_scene
 from perception.pipeline.checkpoint import save_checkpoint
 from perception.types import Scene
 

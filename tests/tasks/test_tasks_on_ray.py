@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from pathlib import Path
 
 import pytest
 
@@ -32,3 +33,45 @@ def test_a_task_has_a_machine_of_its_own_or_a_core(monkeypatch: pytest.MonkeyPat
             assert engine.run(given, ["a", "b"], "task", shown, each_core=True) == [1.0, 1.0]
         finally:
             cluster.shutdown()
+
+
+@pytest.mark.slow
+def test_a_cluster_started_here_hears_nobody_else_and_imports_nothing_of_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The kernel tells what the cluster's processes listen to; a module lies where everybody may write."""
+
+    def seen(_: str) -> tuple[list[str], list[str], bool]:  # runs in the worker, which cannot import this module
+        import sys
+        from pathlib import Path
+
+        def session(pid: str) -> int:
+            return int(Path("/proc", pid, "stat").read_text().rpartition(")")[2].split()[3])
+
+        sockets, own = set(), session("self")
+        for folder in Path("/proc").glob("[0-9]*"):
+            try:
+                if session(folder.name) == own:
+                    sockets |= {str(file.readlink()) for file in (folder / "fd").iterdir()}
+            except OSError:  # a process or file that is gone
+                continue
+        lines = [line.split() for name in ("tcp", "tcp6") for line in Path("/proc/net", name).read_text().splitlines()]
+        heard = [line[1] for line in lines if line[3] == "0A" and f"socket:[{line[9]}]" in sockets]
+        shared = [path for path in sys.path if Path(path).is_dir() and Path(path).stat().st_mode & 0o022]
+        try:
+            import everybodys  # type: ignore[import-not-found] # noqa: F401
+        except ImportError:
+            return heard, shared, False
+        return heard, shared, True
+
+    with tempfile.TemporaryDirectory() as shared:  # the path of a socket may have 107 characters
+        Path(shared).chmod(0o1777)
+        Path(shared, "everybodys.py").touch()
+        with monkeypatch.context() as here:
+            here.chdir(shared)
+            here.setenv("TMPDIR", shared)
+            here.setattr(tempfile, "tempdir", None)
+            heard, writable, imported = Engine("ray").run(seen, ["a"], "task", Progress(quiet=True))[0]
+            assert Path.cwd() == Path(shared).resolve()
+    assert len(heard) > 3 and {line.rpartition(":")[0][-8:] for line in heard} == {"0100007F"}
+    assert (writable, imported) == ([], False)

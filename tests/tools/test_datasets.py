@@ -145,7 +145,7 @@ def test_published_rules_apply_to_cosines(
 
 
 def test_a_made_scene_is_a_truth_scene(ovs_run: Path, small_scene: Path, tmp_path: Path) -> None:
-    """tests/score on the generator's truth and a map in its frame."""
+    """tools/score on the generator's truth and a map in its frame."""
     scene, gmap = str(small_scene / "truth"), str(ovs_run / "maps" / "table.gsmap")
     instances.main([scene, gmap, "-o", str(tmp_path)])
     found = json.loads((tmp_path / "instances.json").read_text())

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import socket
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +13,7 @@ import pytest
 import torch
 
 from perception.errors import InputError
+from perception.io.atomic import atomic_file
 from perception.map.write import write_map
 from perception.viewer.picking import covariances, pick
 from perception.viewer.session import HIGHLIGHT, MODES, highlight, paint
@@ -20,7 +24,7 @@ from support.viewer_maps import free_port, small_map
 def test_picking_agrees_with_the_rasterizer() -> None:
     """The instance with the largest rendered weight at a pixel is the one its ray picks."""
     from perception.gaussians.model import Gaussians
-    from perception.gaussians.rasterize import rasterize
+    from perception.rasterizer.rasterize import rasterize
 
     gmap = small_map()
     names = ("means", "quats", "log_scales", "opacity_logits", "sh", "features")
@@ -84,6 +88,53 @@ def test_highlight_dims_the_rest() -> None:
     near = np.abs(lit.astype(int) - HIGHLIGHT).sum(axis=1)
     assert near[gmap.instance_ids == 1].max() < near[gmap.instance_ids != 1].min()
     np.testing.assert_array_equal(highlight(colors, gmap.instance_ids, []), colors)
+
+
+@pytest.mark.slow
+def test_no_value_in_instances_json_ends_the_watcher(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whatever stands there, also what only the page cannot draw: the file that comes after it is shown."""
+    pytest.importorskip("viser")
+    from perception.viewer import Viewer, app
+
+    monkeypatch.setattr(app, "WATCH", 0.05)
+    path = tmp_path / "m.gsmap"
+    write_map(path, small_map())
+    good = json.loads((path / "instances.json").read_text())
+
+    def put(**changed: object) -> None:
+        entries = [{**good["instances"][0], **changed}, *good["instances"][1:]]
+        with atomic_file(path / "instances.json") as aside:
+            aside.write_text(json.dumps({**good, "instances": entries}))
+
+    def until(reached: Callable[[], bool]) -> None:
+        end = time.monotonic() + 60
+        while not reached():
+            assert time.monotonic() < end
+            time.sleep(0.02)
+
+    viewer = Viewer(path, port=free_port())
+    try:
+        viewer.session.select(0)
+        odd = (
+            {"texts": ["MUG"]},
+            {"parts": 3},
+            {"parts": [5]},
+            {"id": 2**70},
+            {"id": 1},
+            {"obb": None},
+            {"score": "x"},
+        )
+        for turn, wrong in enumerate(odd):
+            caplog.clear()
+            put(**wrong)
+            until(lambda: bool(viewer._problem) or bool(caplog.records) or not viewer.session.editor.outdated)
+            put(label=f"mended {turn}")
+            until(lambda turn=turn: viewer.session.editor.instances[0].get("label") == f"mended {turn}")
+            until(lambda: not viewer._problem)
+    finally:
+        viewer.stop()
 
 
 def test_a_port_in_use_is_told(tmp_path: Path) -> None:

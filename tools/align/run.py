@@ -1,4 +1,4 @@
-"""Random scans of a scene with exact truth, aligned to a map of it: right, refused and wrong ones.
+"""Aligns random scans of a scene with exact truth to a map of it: right, refused and wrong ones.
 
     python tools align.run room.gsmap scenes/room --cases 50 [--plain] [--metric]
 

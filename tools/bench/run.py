@@ -1,4 +1,6 @@
-"""The benches of public data sets, from the download to the table: python tools bench.run NAME DIR -o WORK
+"""Runs the bench of a public data set, from the download to the table.
+
+python tools bench.run NAME DIR -o WORK
 
 NAME: lerf-mask, lerf-ovs or scannetpp; NAME --help lists the options.
 """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -80,8 +81,26 @@ def _images(cameras: int, size: tuple[int, int], dims: int, dtype: Any) -> dict[
     return {
         "colors": guarded((*image, 3), dtype), "alphas": guarded(image, dtype), "depths": guarded(image, dtype),
         "features": guarded((*image, dims), dtype) if dims else None,
-        "variance": guarded((*image, dims), dtype) if dims else None,
+        "feature_variance": guarded((*image, dims), dtype) if dims else None,
     }  # fmt: skip
+
+
+def _forward(suffix: str, inputs: Any, visible: Any, radii: Any, simd: Any, **images: Any) -> Any:
+    out = getattr(_core, f"RasterizerImages_{suffix}")(**images)
+    return getattr(_core, f"rasterize_forward_{suffix}")(inputs, out, visible, radii, simd)
+
+
+def _backward(suffix: str, inputs: Any, frames: Any, stored: Any, **arrays: Any) -> None:
+    """Arrays of the images' gradients begin with g_, those of the inputs' with d_."""
+
+    def made(struct: str, prefix: str) -> Any:
+        named = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+        return getattr(_core, f"Rasterizer{struct}_{suffix}")(**named)
+
+    rendered = {name: array for name, array in arrays.items() if name[:2] not in ("g_", "d_")}
+    images = getattr(_core, f"RasterizerImages_{suffix}")(**rendered)
+    run = getattr(_core, f"rasterize_backward_{suffix}")
+    run(inputs, frames, images, made("Cotangents", "g_"), made("Gradients", "d_"), stored)
 
 
 def _rasterize(dice: Dice, spoil: Callable[[dict[str, Any]], None]) -> list[Call]:
@@ -101,7 +120,7 @@ def _rasterize(dice: Dice, spoil: Callable[[dict[str, Any]], None]) -> list[Call
     forward = {"inputs": inputs, **images, "visible": visible, "radii": radii, "simd": simd}
     if where == 1:
         spoil(forward)
-    frames = _called(getattr(_core, f"rasterize_forward_{suffix}"), forward)
+    frames = _called(partial(_forward, suffix), forward)
     if where == 2:  # other inputs than the frames were made of
         cameras, n = dice.pick((cameras, 1, 2)), dice.pick((n, 2, 5, 40))
         dims, size, degree = dice.pick((dims, 1, 6)), dice.pick((size, (5, 5), (130, 130))), dice.pick((degree, -1, 2))
@@ -116,7 +135,7 @@ def _rasterize(dice: Dice, spoil: Callable[[dict[str, Any]], None]) -> list[Call
     backward = {"inputs": inputs, "frames": frames, **images, **grads, **wanted, "stored": bool(dice.below(2))}
     if where == 3:
         spoil(backward)
-    _called(getattr(_core, f"rasterize_backward_{suffix}"), backward)
+    _called(partial(_backward, suffix), backward)
     return []
 
 
@@ -135,7 +154,7 @@ def _photometric(dice: Dice) -> Call:
 def _assign(dice: Dice) -> Call:
     labels = np.array([0, 1, 1, 5, 1 << 21, 0, 7], np.int32)[: 1 + dice.below(7)]
     slots = guarded(labels.shape, np.int32)
-    return _core.training.assign, {"labels": labels, "fraction": dice.pick((1.0, 0.5)), "seed": 3, "slots": slots}
+    return _core.training.assign, {"labels": labels, "slots": slots}
 
 
 def _prototypes(dice: Dice) -> Call:
@@ -164,9 +183,8 @@ def _separation(dice: Dice) -> Call:
 def _add_statistics(dice: Dice) -> Call:
     n = dice.pick((5, 1, 0))
     return _core.training.add_statistics, {
-        "mean2d": normal(dice, (n, 2), np.float32), "radii": normal(dice, (n,), np.float32),
-        "visible": np.ones(n, np.uint8), **{name: guarded((n,), np.float32) for name in ("gradient", "seen", "radius")},
-        "gradient_scale": 2.0, "radius_scale": 0.5,
+        "mean2d": normal(dice, (n, 2), np.float32), "visible": np.ones(n, np.uint8),
+        "gradient": guarded((n,), np.float32), "seen": guarded((n,), np.float32), "scale": 2.0,
     }  # fmt: skip
 
 
@@ -379,7 +397,7 @@ class CoreTarget:
         make, arguments = _scene(Dice(b""), np.float32, 1, 3, 0, size, -1)
         inputs = make(**arguments | {"threads": 256})
         seen = {"visible": np.zeros((1, 3), np.uint8), "radii": np.zeros((1, 3), np.float32)}
-        _core.rasterize_forward_f32(inputs=inputs, **_images(1, size, 0, np.float32), **seen, simd="auto")
+        _forward("f32", inputs=inputs, **_images(1, size, 0, np.float32), **seen, simd="auto")
 
     def seeds(self) -> list[bytes]:
         """Every function with nothing spoiled."""

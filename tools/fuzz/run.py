@@ -1,4 +1,6 @@
-"""Fuzzes one reader, a server or the compiled module: python tools fuzz.run TARGET [--runs N] (--list names them).
+"""Fuzzes one reader, a server or the compiled module.
+
+python tools fuzz.run TARGET [--runs N]        # --list names the targets
 
 Coverage-guided by atheris where it is installed (pip install atheris), else seeded mutation of the same seeds. A defect
 is everything but a clean refusal: another exception, a signal, a hang, or memory beyond --memory. Its input is kept.
@@ -27,10 +29,17 @@ HANG = 20
 
 def _targets() -> dict[str, Callable[[], Any]]:
     from fuzz.core import CoreTarget
-    from fuzz.served import HttpTarget, ViewerTarget, served_map
+    from fuzz.map_json import MapJson
+    from fuzz.served import HttpTarget, PromptTarget, ViewerTarget, served_map
     from fuzz.targets import TARGETS
 
-    served = {"http": HttpTarget, "served-map": served_map, "viewer": ViewerTarget}
+    served = {
+        "http": HttpTarget,
+        "served-map": served_map,
+        "viewer": ViewerTarget,
+        "prompt": PromptTarget,
+        "map-json": MapJson,
+    }
     return {"core": CoreTarget, **TARGETS, **served}
 
 
@@ -77,11 +86,13 @@ class Session:
         self.target, self.folder, self.keep_going = target, folder, keep_going
         self.runs = self.read = 0
         self.started = time.perf_counter()
+        self.longest = 0.0
         self.defects: set[str] = set()
 
     def one(self, data: bytes) -> None:
         """Runs one input; a new defect is told and its input written, and raised unless we keep going."""
         self.runs += 1
+        began = time.perf_counter()
         try:
             self.read += bool(self.target.run(data))
         except Exception as error:
@@ -96,12 +107,15 @@ class Session:
                 print(f"DEFECT {key}: {shown}\n  input kept in {file}", file=sys.stderr, flush=True)
             if not self.keep_going:
                 raise
+        finally:
+            self.longest = max(self.longest, time.perf_counter() - began)
 
     def summary(self) -> str:
         seconds = time.perf_counter() - self.started
         return (
             f"{self.runs} inputs in {seconds:.0f} s ({self.runs / seconds:.0f}/s), {self.read} read, "
-            f"{self.runs - self.read} refused, {len(self.defects)} defects"
+            f"{self.runs - self.read} refused, {len(self.defects)} defects, "
+            f"the longest took {1e3 * self.longest:.0f} ms"
         )
 
 

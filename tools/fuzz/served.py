@@ -127,6 +127,49 @@ class HttpTarget:
         return bool(status == 200)
 
 
+class PromptTarget:
+    """A prompt, asked on every way there is (`support.query_paths`) and over HTTP: answered, or refused in one line."""
+
+    decides = False
+    memory = 1024
+    words = (
+        " on ", " in ", " next to ", " left of ", " that says ", " with the words ", " labelled ", " reads ", " and ",
+        "a", "mug", "red ", "tomato ", "grandma's drum", '"', "\xe9", ",", " ", "\t", "{", '{"text":',
+        '"want":"points"',
+    )  # fmt: skip
+
+    def __init__(self) -> None:
+        from support.query_paths import query_paths
+
+        self._folder = TemporaryDirectory(prefix="fuzz-")
+        self._http, self._paths = HttpTarget(), query_paths(Path(self._folder.name))
+
+    def seeds(self) -> list[bytes]:
+        """Prompts of every kind, and some that are long."""
+        prompts = [
+            "red mug",
+            "the mug on the lamp next to the drum",
+            'the book that says "OAT MILK"',
+            "tea with the words A B",
+        ]
+        long = ["a" * 333 + "," * 667, "a on " * 199, '"' + "a" * 990, "x says " * 140, "mug " * 240]
+        return [prompt.encode() for prompt in (*prompts, *long, "Mug İn the box cloſe to 책")]
+
+    def run(self, data: bytes) -> bool:
+        """True when it was answered."""
+        text, refused = data.decode("utf-8", "replace")[:1100], 0
+        for ask in self._paths.values():
+            try:
+                ask(text)
+            except InputError as error:
+                refused += 1
+                if "\n" in str(error):
+                    raise AssertionError(f"the message has more than one line: {error}") from error
+        body = json.dumps({"text": text})
+        head = "POST /query\nhost: localhost\ncontent-type: application/json\n\n"
+        return self._http.run((head + body).encode()) and not refused
+
+
 def _no_number(name: str) -> Any:
     raise AssertionError(f"{name} in an answer")
 

@@ -251,7 +251,7 @@ def _png(width: int = 8, height: int = 6, mode: str = "RGB") -> bytes:
 
 def _colmap(binary: bool) -> Target:
     from perception.inputs.colmap import read_workspace
-    from perception.photos.reading import Reading
+    from perception.sfm.options import ReadOptions
 
     _without_photos()
     old = _colmap_binary() if binary else _colmap_text()
@@ -262,7 +262,7 @@ def _colmap(binary: bool) -> Target:
     variants = [(name, same, content) for name, content in files.items()]
 
     def read(folder: Path, name: str) -> None:
-        scene = read_workspace(folder / name[:3], Reading(folder / "work"))
+        scene = read_workspace(folder / name[:3], ReadOptions(folder / "work"))
         assert scene.views and all(np.isfinite(view.camera_from_world).all() for view in scene.views)
         assert np.isfinite(scene.points).all()
 
@@ -293,7 +293,7 @@ def _with_rigs(model: dict[str, bytes], binary: bool) -> dict[str, bytes]:
 
 def _transforms() -> Target:
     from perception.inputs.transforms import read_frames, read_transforms
-    from perception.photos.reading import Reading
+    from perception.sfm.options import ReadOptions
 
     _without_photos()
     frames = [
@@ -312,7 +312,7 @@ def _transforms() -> Target:
             read_frames(file)
         except InputError as error:
             _refuse_memory_errors(error)
-        scene = read_transforms(file, Reading(folder / "work"))
+        scene = read_transforms(file, ReadOptions(folder / "work"))
         assert all(np.isfinite(v.camera_from_world).all() and np.isfinite(v.K).all() for v in scene.views)
 
     words = [*lens, *angle, "frames", "file_path", "transform_matrix", "NaN", "Infinity", "null", "k1", "k4", "p1"]
@@ -501,8 +501,9 @@ def _small_map() -> dict[str, bytes]:
 
     box = {"center": [0, 0, 0], "rotation": np.eye(3).tolist(), "extent": [1, 1, 1]}
     instances = [
-        {"id": i, "label": None, "score": 0.5, "num_gaussians": 2, "centroid": [0, 0, 0], "obb": box} for i in (0, 1)
+        {"id": i, "label": None, "score": 0.5, "num_gaussians": 2, "centroid": [0, 0, 0], "obb": box} for i in range(4)
     ]
+    instances[1]["parts"] = [{**instances.pop(), "parent": 1} for _ in range(2)]
     n = 4
     gmap = Map(
         *(np.zeros((n, k), np.float32) for k in (3, 4, 3)), np.zeros(n, np.float32), np.zeros((n, 4, 3), np.float32),

@@ -1,6 +1,6 @@
-"""A posed RGB-D scene made harder, as input for `perception map`: the photos of SCENE with one thing changed, in OUT.
+"""Makes a posed RGB-D scene harder: noisy or no depth, noisy poses, a person who walks through, or a ROS bag.
 
-    python tools harder.run scenes/room harder --depth-noise
+    python tools harder.run SCENE OUT --depth-noise
 
 --no-depth     the same photos and poses without depth images
 --depth-noise  depth as a Kinect measures it: shifted lookups, noisy and rounded disparities, holes at steep edges

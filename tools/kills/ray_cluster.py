@@ -1,10 +1,10 @@
-"""Maps on local Ray clusters of 1, 2 and 4 nodes; workers and the driver are killed on the way:
+"""Builds maps on local Ray clusters of 1, 2 and 4 nodes, whose workers and driver are killed on the way.
 
 python tools kills.ray_cluster        # a quarter of an hour on two cores
 
-A row of things with given poses is mapped in blocks, a tabletop from photos alone, with features, matches and places by
-tasks. Every map must be that of the local engine. Of every kind of task a worker must have been killed, and the driver
-while one ran. Nodes are processes of one machine, with one core each.
+A row of things with given poses is mapped in blocks, a tabletop from photos alone, with features, matches and submodels
+by tasks. Every map must be that of the local engine. Of every kind of task a worker must have been killed, and the
+driver while one ran. Nodes are processes of one machine, with one core each.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ OF_SCENE = {
     "row": ["photos.poses=keep", "frame.keep_world=true", "train.block_photos=14", "train.iterations=2000"],
     "tabletop": ["train.iterations=60"],
 }
-TASKS = ("extract_task", "match_task", "place_task", "optimise_block")
+TASKS = ("extract_task", "match_task", "submodel_task", "optimise_block")
 START, EXTRACT, EXTRACTED, MATCH, MATCHED, PLACE, PLACED, BLOCK, DONE = range(9)
 """How far a run is: before the first task; while tasks of a kind run; after them, while the driver works alone."""
 WORKER = {"row": [BLOCK] * 3, "tabletop": [EXTRACT, MATCH, PLACE]}
@@ -50,7 +50,7 @@ def command(name: str, scene: Path, out: Path, *more: str) -> list[str]:
 
 
 def write_tabletop(folder: Path) -> Path:
-    """152 photos: several tasks of features and of matches, and poses place by place."""
+    """152 photos: several tasks of features and of matches, and poses by submodels."""
     make_photos(folder / "photos", views=152, width=160, height=120, light_samples=1)
     shutil.copytree(folder / "truth" / "labels", folder / "labels")
     return folder / "photos"

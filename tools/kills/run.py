@@ -1,9 +1,9 @@
-"""SIGKILL (or SIGTERM) at random moments of mapping, exporting and label editing; afterwards nothing may be lost.
+"""Kills mapping, exporting and label editing at random moments; afterwards nothing may be lost.
 
     python tools kills.run                     # 100 kills of each, about 20 minutes on two cores
     python tools kills.run save upgrade export # in a map's folder that holds photos and notes, too
     python tools kills.run editing --kills 1000 --seed 7
-    python tools kills.run --signal TERM
+    python tools kills.run --signal TERM       # SIGTERM instead of SIGKILL
 
 After every kill the map from before must open with all its checksums, no half-written file may lie under a final name,
 and the same command again (`perception map --resume`) must end with, bit for bit, what the undisturbed run ended with,
@@ -28,12 +28,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-import children
 import numpy as np
-from cases import KEPT, Case, Editing, Exporting, Keeping, Mapping, command
-from children import Moment
+
+from kills import children
+from kills.cases import KEPT, Case, Editing, Exporting, Keeping, Mapping, command
+from kills.children import Moment
 
 NAMES = ("mapping", "exporting", "editing", *KEPT)
 FINAL = 40

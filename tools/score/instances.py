@@ -1,4 +1,6 @@
-"""Maps' instances against their scenes' truth: `python tools score.instances SCENE MAP …`.
+"""Scores the instances of maps against the exact truth of their scenes.
+
+python tools score.instances SCENE MAP …
 
 AP with the map's scores and with constant ones, things and stuff together and apart, and mIoU of rendered masks.
 Reliability: of all instances with 100 points or more, the score, and whether the IoU with a true one exceeds 0.5.

@@ -1,4 +1,6 @@
-"""How well finished maps answer text on scenes with exact truth: `python tools score.queries MAP SCENE …`.
+"""Scores the answers of maps to text prompts, on scenes with exact truth.
+
+python tools score.queries MAP SCENE …
 
 A hit is right when the true object under most of the instance's exported points answers the prompt. Prompts
 are those of scene.json whose objects some photo shows. Absent prompts: 30 things of street, farm, sea and

@@ -1,4 +1,4 @@
-"""Precision and recall of the scene graph's relations on generated scenes, whose placements are known.
+"""Scores the relations of the scene graph on generated scenes, whose placements are known.
 
     python tools score.relations [--scenes 20] [--first 100]
 

@@ -1,4 +1,6 @@
-"""`python tools score.standing [ROOMS] [OBJECTS]`: where_to_stand for random objects of generated rooms.
+"""Scores `where_to_stand` for random objects of generated rooms.
+
+python tools score.standing [ROOMS] [OBJECTS]
 
 Each room is a map of true surface points, a Gaussian each, with true instances. The answers are checked against the
 shapes that the points were drawn from, without the map: the distance of the robot's centre from the convex outline of

@@ -1,4 +1,4 @@
-"""A map as `.spz`: size as a share of the PLY's, and PSNR of what is read back to renders of the map.
+"""Measures the `.spz` of a map: its share of the PLY's size, and PSNR of what is read back.
 
 python tools speed.compressed MAP
 """
@@ -20,7 +20,7 @@ AXES = np.array([1, -1, -1])
 
 def render(gmap: object, arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
     """Pictures from the map's held-out views."""
-    from perception.gaussians.rasterize import rasterize
+    from perception.rasterizer.rasterize import rasterize
 
     names = ("means", "quats", "scales", "opacities", "sh")
     tensors = [torch.from_numpy(np.ascontiguousarray(arrays[name], np.float32)) for name in names]

@@ -1,4 +1,4 @@
-"""What NVRTC makes of the CUDA kernels, without a GPU: instructions, registers of a thread, shared memory of a block.
+"""Compiles the CUDA kernels without a GPU: instructions, registers and shared memory of each.
 
 pip install nvidia-cuda-nvrtc-cu12
 python tools speed.cuda_statics
@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import struct
 
-from perception.gaussians.cuda.compile import KernelOptions, compile_kernels, load_nvrtc, nvrtc_version
+from perception.rasterizer.cuda.compile import KernelOptions, compile_kernels, load_nvrtc, nvrtc_version
 
 ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
 BYTES = 16

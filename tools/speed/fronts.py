@@ -1,4 +1,4 @@
-"""Minutes against quality: the Pareto front over presets, budget, resolution, iterations, harmonics, features.
+"""Measures minutes against quality over presets and settings of `map`, and draws the Pareto front.
 
 python tools speed.fronts SCENE [--set KEY=VALUE] [--only TEXT] [-o OUTPUT]
 

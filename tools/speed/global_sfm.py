@@ -1,6 +1,7 @@
-"""Structure from motion place by place, as `map` uses it for many photos, incremental in one piece, and global
-(pycolmap.global_mapping), from the same matches: seconds, photos with a pose, and the distance of their cameras from
-given ones after alignment.
+"""Compares structure from motion in submodels, in one piece, and global, from the same matches.
+
+In submodels is what `map` does with many photos; global is pycolmap.global_mapping. Printed are seconds, photos with a
+pose, and the distance of their cameras from given ones after alignment.
 
 python tools speed.global_sfm SCENE --first 300
 """
@@ -19,14 +20,14 @@ import pycolmap
 
 from perception.geometry import align_similarity
 from perception.progress import Progress
-from perception.sfm.features import FeatureStore, build_features
+from perception.sfm.database import FeatureStore, build_features
 from perception.sfm.incremental import map_photos
-from perception.sfm.submodels import map_places
-from perception.tasks.engine import Engine
+from perception.sfm.options import ReadOptions
+from perception.sfm.submodels import map_submodels
 
 
-def by_places(store: FeatureStore, count: int) -> Any:
-    found = map_places(store, False, 0, Engine(), Progress(quiet=True))
+def by_submodels(store: FeatureStore, count: int) -> Any:
+    found = map_submodels(store, False, ReadOptions(store.folder))
     assert found is not None, "contradicted"
     return found[0][0]
 
@@ -55,9 +56,9 @@ def main() -> None:
     truth = np.array([frame["transform_matrix"] for frame in frames], float)[:, :3, 3]
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()
-        store = build_features(photos, [None] * len(photos), Path(folder), 0, Progress(quiet=True))
+        store = build_features(photos, [None] * len(photos), ReadOptions(Path(folder)))
         print(f"{len(photos)} photos: features and matches {time.perf_counter() - started:.0f} s", flush=True)
-        for find in (by_places, incremental, globally):
+        for find in (by_submodels, incremental, globally):
             started, begun = time.perf_counter(), time.process_time()
             model = find(store, len(photos))
             seconds, cpu = time.perf_counter() - started, time.process_time() - begun

@@ -1,4 +1,4 @@
-"""Levels of detail of a map: PSNR to renders of all its Gaussians, and time and memory for millions.
+"""Measures the levels of detail of a map: PSNR to renders of all its Gaussians, time and memory for millions.
 
 python tools speed.levels MAP [--millions 5]
 """
@@ -20,7 +20,7 @@ def render(
     """Pictures of Gaussians with covariances from the map's held-out views."""
     from scipy.spatial.transform import Rotation
 
-    from perception.gaussians.rasterize import rasterize
+    from perception.rasterizer.rasterize import rasterize
 
     values, axes = np.linalg.eigh(cov.astype(np.float64))
     axes = axes * np.linalg.det(axes)[:, None, None]

@@ -1,4 +1,6 @@
-"""`python tools speed.mcp_calls MAP [--calls 1000]`: asks `perception mcp MAP` over stdio; a transcript and latencies.
+"""Measures the latency of `perception mcp MAP` over stdio, and prints a transcript.
+
+python tools speed.mcp_calls MAP [--calls 1000]
 
 The calls go round all tools, one at a time, with the instances of the map and, if it answers prompts, their names.
 Transcript: the first call of each tool and of each kind of error. Latencies: of the client, milliseconds.

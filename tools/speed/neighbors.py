@@ -1,4 +1,4 @@
-"""CPU seconds of nearest neighbours in turns: ours, SciPy's, and small_gicp's and pykdtree's where they are installed.
+"""Measures CPU seconds of nearest neighbours: ours, SciPy's, small_gicp's and pykdtree's, in turns.
 
 python tools speed.neighbors [--threads 1]
 """

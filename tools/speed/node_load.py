@@ -1,5 +1,6 @@
-"""`python tools speed.node_load [QUERIES]`: two lifecycle nodes with two maps on one network, one of them restarted
-four times while both answer.
+"""Measures two lifecycle nodes on one network, one of them restarted four times while both answer.
+
+python tools speed.node_load [QUERIES]
 
 Half of the queries go to each node. After 20 and 40 % of the answers the first node is killed, after 60 and 80 % it is
 asked to end; it is started again each time. Prints one JSON object: what `rclpy_load.py` counted, and the resident

@@ -1,4 +1,4 @@
-"""Speed and peak memory of model files of real size with random weights, on this machine.
+"""Measures speed and peak memory of model files of real size with random weights.
 
     python tools speed.run sam PHOTO...           masks, prompts that lie in an earlier mask skipped (the default)
     python tools speed.run sam PHOTO... --full    masks, the full grid of 1,024 prompts

@@ -1,4 +1,4 @@
-"""Where the time of a training step goes, by kind of step and number of threads, on this machine.
+"""Measures the stages of a training step, by kind of step and number of threads.
 
     python tools speed.steps SCENE [--masks labels:FOLDER] [--at 300 1200] [--set KEY=VALUE ...]
 
@@ -58,17 +58,18 @@ def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
     """Medians over the steps of one run, by iteration and kind."""
     from perception import _core
     from perception.config import load_config
-    from perception.gaussians import train
+    from perception.gaussians import schedule, train
     from perception.pipeline.mapping import build_map
+    from perception.rasterizer import cpu
 
     _core.training.set_threads(options.threads)
     frames: list[Any] = []
     steps: list[dict[str, Any]] = []
-    passes, step = train.passes, train.Trainer.step
+    backward, step = cpu.rasterize_backward, train.Trainer.step
 
-    def noted(device: Any) -> Any:
-        forward, backward = passes(device)
-        return forward, lambda *a, **k: (backward(*a, **k), frames.append((a[3].frames, a[3].features is not None)))[0]
+    def noted(inputs: Any, settings: Any, forward: Any, *rest: Any, **more: Any) -> None:
+        backward(inputs, settings, forward, *rest, **more)
+        frames.append((forward.frames, forward.features is not None))
 
     def timed(self: train.Trainer, progress: float) -> float:
         before, start = dict(self.record.profile), time.perf_counter()
@@ -77,13 +78,13 @@ def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
         (frame, features), frames[:] = frames[-1], []
         ms = dict(frame.seconds) | {n: self.record.profile[n] - before.get(n, 0) for n in ("losses", "Adam")}
         ms |= {"other": whole - sum(ms.values()), "all": whole}
-        coarse = features or progress < self.schedule._coarse_until
+        coarse = features or progress < schedule.coarse_until(self)
         kind = "features" if features else "half size" if coarse else "full size"
         pairs = {"pairs": frame.contributing, "evaluated": frame.evaluated, "gaussians": len(self.gaussians)}
         steps.append({"iteration": self.iteration, "kind": kind, "ms": ms, **pairs})
         return loss
 
-    train.passes, train.Trainer.step = noted, timed  # type: ignore[assignment, method-assign]
+    cpu.rasterize_backward, train.Trainer.step = noted, timed  # type: ignore[assignment, method-assign]
     with tempfile.TemporaryDirectory() as folder:
         pairs = [f"masks={options.masks}", "language.encoder=none", *options.set]
         build_map(options.scene, Path(folder) / "a.gsmap", load_config(None, pairs))

@@ -1,4 +1,4 @@
-"""One store of many maps: time to make, open and ask it, peak memory, and its answers against those of the maps.
+"""Measures one store of many maps: time, peak memory, and its answers against those of the maps.
 
     python tools speed.store                                       1,000 maps of 60 instances, about 15 minutes
     python tools speed.store --maps 50 --prompts 20

@@ -1,4 +1,6 @@
-"""Trains the merge model of the built-in masks on rendered worlds: `python tools training.masks WORK`.
+"""Trains the networks of the built-in masks on rendered worlds.
+
+python tools training.masks WORK
 
 Worlds are clutter, rooms, tabletops and patchwork by seed, in sets of six: 24 sets train, two choose the cost and the
 calibration, two are for testing. Each world is read twice, as maps with and without depth images see its surface. A

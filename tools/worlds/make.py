@@ -1,4 +1,4 @@
-"""Writes a made scene with exact truth, or the scene that the package ships for `perception demo`:
+"""Writes a made scene with exact truth, or the scene that the package ships for `perception demo`.
 
 python tools worlds.make tabletop|room FOLDER [--seed N]
 python tools worlds.make shipped perception/demo_scene

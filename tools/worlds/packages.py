@@ -1,4 +1,6 @@
-"""Writes a scene of printed words: python tools worlds.packages FOLDER [SEED] [VIEWS]
+"""Writes a scene of printed words with exact truth.
+
+python tools worlds.packages FOLDER [SEED] [VIEWS]
 
 A table with packages, tins and books that bear words: across, downwards, around a tin, on a spine, partly hidden. Seeds
 select places and turns. The folder then holds what tools/worlds/make.py writes; scene.json has 20 prompts

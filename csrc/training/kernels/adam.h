@@ -46,18 +46,19 @@ void update(const AdamRows<T> &a, int64_t from, int64_t n, const T *__restrict s
 
 constexpr int64_t kBlockElements = 1024;
 
-// Rows [from, to), those selected, one at a time.
+// Rows [from, to), those selected, one at a time. Returns how many were skipped.
 template <class T>
-void update_each(const AdamRows<T> &a, int64_t from, int64_t to, int64_t *updated, int64_t *skipped) {
+int64_t update_each(const AdamRows<T> &a, int64_t from, int64_t to) {
+  int64_t skipped = 0;
   for (int64_t row = from; row < to; ++row) {
     if (a.visible && !a.visible[row]) continue;
     if (!all_finite(a.grad + row * a.width, a.width)) {
-      ++*skipped;
+      ++skipped;
       continue;
     }
     a.uniform ? update<T, 0>(a, row * a.width, a.width) : update<T, 1>(a, row * a.width, a.width);
-    ++*updated;
   }
+  return skipped;
 }
 
 template <class T, int Fixed>  // Fixed > 0: the width at compile time
@@ -81,10 +82,9 @@ void update_selected(const AdamRows<T> &a, int64_t from, int64_t to) {
 }
 
 template <class T>
-int64_t adam(const AdamRows<T> &a, int64_t begin, int64_t end, int64_t *updated) {
+int64_t adam(const AdamRows<T> &a, int64_t begin, int64_t end) {
   const int64_t width = a.width, block = width < kBlockElements ? kBlockElements / width : 1;
   int64_t skipped = 0;
-  *updated = 0;
   for (int64_t from = begin; from < end; from += block) {
     const int64_t to = from + block < end ? from + block : end, rows = to - from;
     int64_t chosen = rows;
@@ -95,14 +95,13 @@ int64_t adam(const AdamRows<T> &a, int64_t begin, int64_t end, int64_t *updated)
     if (chosen == 0) continue;
     const bool whole = a.uniform && (chosen == rows || (width < kBlockElements && 3 * chosen >= rows));
     if (!whole || !all_finite(a.grad + from * width, rows * width)) {
-      update_each(a, from, to, updated, &skipped);
+      skipped += update_each(a, from, to);
       continue;
     }
     if (chosen == rows)
       update<T, 0>(a, from * width, rows * width);
     else
       update_selected(a, from, to);
-    *updated += chosen;
   }
   return skipped;
 }

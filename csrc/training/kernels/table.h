@@ -60,8 +60,8 @@ struct Kernels {
                  int64_t begin, int64_t end, int64_t width, T *out);
   double (*sum)(const T *values, int64_t n);
   double (*sum_squares)(const T *values, int64_t n);
-  // Returns the number of rows skipped for a gradient that is not finite; updated gets the rows updated.
-  int64_t (*adam)(const AdamRows<T> &, int64_t begin, int64_t end, int64_t *updated);
+  // Returns the number of rows skipped for a gradient that is not finite.
+  int64_t (*adam)(const AdamRows<T> &, int64_t begin, int64_t end);
 };
 
 template <class T>

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import yaml
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from perception.config import Settings, settings_from
 from perception.errors import InputError
+from perception.io.documents import read_yaml
 from perception.map.map import Map
 from perception.query import Frame, QueryMap
 
@@ -53,10 +53,7 @@ class FrameFile(Settings):
 
 def read_frame(path: Path) -> FrameFile:
     """The frame file at `path`; InputError, with the line or the setting, when it is not one."""
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: cannot be read as YAML ({' '.join(str(error).split())})") from error
+    values = read_yaml(path, "settings such as 'parent: map'")
     if not isinstance(values, dict):
         raise InputError(f"{path}: found {type(values).__name__}, expected settings such as 'parent: map'")
     read = settings_from(FrameFile, {str(key): (value, str(path)) for key, value in values.items()})

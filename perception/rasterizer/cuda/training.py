@@ -107,8 +107,8 @@ def scale(values: Tensor, factor: float, out: Tensor) -> None:
 def adam(
     param: Tensor, grad: Tensor, first: Tensor, second: Tensor, visible: Tensor | None, rate: np.ndarray,
     step: int, beta1: float, beta2: float, eps: float,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """One Adam step in place on the visible rows of [N, W]; (rows updated, rows skipped for a non-finite gradient)."""
+) -> Tensor:  # fmt: skip
+    """One Adam step in place on the visible rows of [N, W]; the number of rows skipped for a non-finite gradient."""
     finite = grad.isfinite().all(dim=1)
     wanted = torch.ones_like(finite) if visible is None else visible > 0
     rows = (finite & wanted)[:, None]
@@ -117,15 +117,11 @@ def adam(
     rates = torch.from_numpy(rate / (1 - beta1**step)).to(param)
     length = second.sqrt() / (1 - beta2**step) ** 0.5 + eps
     param.sub_(torch.where(rows, rates * first / length, 0.0))
-    return rows.sum(), (wanted & ~finite).sum()
+    return (wanted & ~finite).sum()
 
 
-def add_statistics(
-    mean2d: Tensor, radii: Tensor, visible: Tensor, gradient: Tensor, seen: Tensor, radius: Tensor,
-    gradient_scale: float, radius_scale: float,
-) -> None:  # fmt: skip
-    """Adds one view, where visible: |mean2d| to gradient, 1 to seen; radius becomes the larger one."""
+def add_statistics(mean2d: Tensor, visible: Tensor, gradient: Tensor, seen: Tensor, scale: float) -> None:
+    """Adds one view, where visible: scale |mean2d| to gradient, 1 to seen."""
     here = visible > 0
-    gradient.add_(torch.where(here, gradient_scale * mean2d.norm(dim=1), 0.0))
+    gradient.add_(torch.where(here, scale * mean2d.norm(dim=1), 0.0))
     seen.add_(here.to(seen.dtype))
-    radius.copy_(torch.maximum(radius, torch.where(here, radius_scale * radii, 0.0)))

@@ -12,11 +12,11 @@ import pytest
 
 from perception.config import FrameConfig
 from perception.errors import InputError
-from perception.frame.place import placed_scene
 from perception.frame.recentre import moved_scene
+from perception.frame.world_frame import in_world_frame
 from perception.geometry import camera_centres
 from perception.inputs.transforms import read_transforms
-from perception.photos.reading import Reading
+from perception.sfm.options import ReadOptions
 from perception.types import DepthImage, Scene
 from support.measured_scenes import cameras, random_similarity, room_points
 
@@ -45,10 +45,10 @@ def clicked(scene: Scene) -> str:
 
 def test_photos_get_a_level_frame_and_metres_where_something_tells_them() -> None:
     scene, metres = room("photos")
-    level = placed_scene(scene, FrameConfig())
+    level = in_world_frame(scene, FrameConfig())
     assert not level.metric and "scale" not in level.report and "map_from_input" not in level.report
     np.testing.assert_allclose(level.report["gravity"]["direction"], [0, 0, -1], atol=1e-9)
-    known = placed_scene(scene, FrameConfig(known_length=clicked(scene)))
+    known = in_world_frame(scene, FrameConfig(known_length=clicked(scene)))
     assert known.metric and known.report["scale"]["metres_per_unit"] == 1
     assert (
         0 < known.report["scale"]["standard_error"] < 0.02 and "known length 1.2 m" in known.report["scale"]["source"]
@@ -63,21 +63,21 @@ def test_photos_get_a_level_frame_and_metres_where_something_tells_them() -> Non
         )
         ahead = found.views[0].camera_from_world[2, :3]
         assert ahead[0] > 0.5 and abs(ahead[1]) < 1e-9
-    kept = placed_scene(scene, FrameConfig(keep_world=True, known_length=clicked(scene)))
+    kept = in_world_frame(scene, FrameConfig(keep_world=True, known_length=clicked(scene)))
     assert np.array_equal(kept.points, scene.points) and not kept.metric
     assert kept.report["scale"]["metres_per_unit"] == pytest.approx(metres, rel=1e-3)
 
 
 def test_given_poses_keep_their_world_to_the_last_bit() -> None:
     scene, metres = room("colmap", 1)
-    same = placed_scene(scene, FrameConfig())
+    same = in_world_frame(scene, FrameConfig())
     assert same.points is scene.points and same.views is scene.views and not same.metric
     assert "map_from_input" not in same.report and same.report["gravity"]["standard_error_deg"] < 1
-    scaled = placed_scene(scene, FrameConfig(known_length=clicked(scene)))  # a length is there to have metres
+    scaled = in_world_frame(scene, FrameConfig(known_length=clicked(scene)))  # a length is there to have metres
     assert scaled.metric
     np.testing.assert_allclose(scaled.points, scene.points * metres, rtol=1e-3)
     np.testing.assert_allclose(scaled.report["map_from_input"], np.diag([metres, metres, metres, 1]), rtol=1e-3)
-    turned = placed_scene(scene, FrameConfig(keep_world=False))
+    turned = in_world_frame(scene, FrameConfig(keep_world=False))
     np.testing.assert_allclose(turned.report["gravity"]["direction"], [0, 0, -1], atol=1e-9)
     matrix = np.array(turned.report["map_from_input"])
     np.testing.assert_allclose(scene.points @ matrix[:3, :3].T + matrix[:3, 3], turned.points, atol=1e-9)
@@ -94,15 +94,15 @@ def test_depth_tells_a_metric_world_and_is_converted_in_another(tmp_path: Path) 
         cv2.imwrite(str(tmp_path / "d.png"), np.full((48, 64), 4000, np.uint16))
         views.append(replace(view, camera_from_world=pose, depth=DepthImage(tmp_path / "d.png", 0.001)))
     scene = Scene(views, wall, np.zeros((4000, 3), np.uint8), report={"input": "transforms"})
-    metric = placed_scene(scene, FrameConfig())
+    metric = in_world_frame(scene, FrameConfig())
     assert metric.metric and metric.views is scene.views and "depth images" in metric.report["scale"]["source"]
     halved = moved_scene(scene, np.diag([2.0, 2, 2, 1]))
     halved.views = [replace(v, depth=DepthImage(tmp_path / "d.png", 0.001)) for v in halved.views]
-    other = placed_scene(halved, FrameConfig())
+    other = in_world_frame(halved, FrameConfig())
     assert not other.metric and other.views[0].depth is not None
     assert other.views[0].depth.scale == pytest.approx(0.002, rel=1e-3)
     assert "converted to the unit of the poses" in other.report["warnings"][-1]
-    wrong = placed_scene(replace(halved, metric=True), FrameConfig())
+    wrong = in_world_frame(replace(halved, metric=True), FrameConfig())
     assert wrong.metric and "the input says its unit is the metre, but" in wrong.report["warnings"][-2]
     assert wrong.views[0].depth is not None and wrong.views[0].depth.scale == pytest.approx(0.002, rel=1e-3)
 
@@ -116,12 +116,12 @@ def test_gravity_and_unit_of_a_transforms_json(tmp_path: Path) -> None:
 
     def read(**more: object) -> Scene:
         (tmp_path / "transforms.json").write_text(json.dumps({**base, **more}))
-        return read_transforms(tmp_path / "transforms.json", Reading(tmp_path))
+        return read_transforms(tmp_path / "transforms.json", ReadOptions(tmp_path))
 
     told = read(gravity=[0, -2, 0], gravity_std_deg=0.3, metric=True)
     assert told.metric and told.report["gravity"] == {
         "direction": [0.0, -1.0, 0.0], "source": "transforms.json", "standard_error_deg": 0.3}  # fmt: skip
-    assert placed_scene(told, FrameConfig()).report["gravity"]["source"] == "transforms.json"
+    assert in_world_frame(told, FrameConfig()).report["gravity"]["source"] == "transforms.json"
     assert read(gravity=[0, 0, 1]).report["gravity"]["standard_error_deg"] == 1 and not read().metric
     for wrong in ([0, 0, 0], [1, 2], "down", [0, 0, float("nan")], {"x": 1}):
         with pytest.raises(InputError, match="gravity must be three numbers"):
@@ -132,6 +132,6 @@ def test_a_length_that_cannot_be_used_is_refused() -> None:
     scene, _ = room("photos")
     for text, message in (("0: a 1,2 3,4; b 1,2 3,4", "above 0"), ("1: cup, plate", "before the map exists")):
         with pytest.raises(InputError, match=message):
-            placed_scene(scene, FrameConfig(known_length=text))
+            in_world_frame(scene, FrameConfig(known_length=text))
     with pytest.raises(InputError, match="board: found 'charuco', expected KIND:COLSxROWS:SQUARE"):
-        placed_scene(scene, FrameConfig(board="charuco"))
+        in_world_frame(scene, FrameConfig(board="charuco"))

@@ -25,7 +25,7 @@ SAMPLED = 200  # views whose depth images are read for the planes that tell grav
 STATED = {"metres_per_unit": 1.0, "source": "the input, which states it", "standard_error": None}
 
 
-def placed_scene(scene: Scene, options: FrameConfig, seed: int = 0) -> Scene:
+def in_world_frame(scene: Scene, options: FrameConfig, seed: int = 0) -> Scene:
     """The scene in the map's frame; report["scale"], ["gravity"] and ["map_from_input"] tell how it was found.
 
     A scene whose input has poses keeps its world unless `options.keep_world` is False: only the unit becomes the metre
@@ -65,7 +65,7 @@ def placed_scene(scene: Scene, options: FrameConfig, seed: int = 0) -> Scene:
 def measured_scale(
     views: Sequence[View], points: np.ndarray, options: FrameConfig, seed: int = 0
 ) -> tuple[Measurement | None, list[str]]:
-    """Metres per unit from all sources that posed views offer, and notes. InputError as `placed_scene`."""
+    """Metres per unit from all sources that posed views offer, and notes. InputError as `in_world_frame`."""
     found = [scale_of_depth(views, points, seed)]
     gps, notes = scale_of_gps(views, seed)
     found.append(gps)

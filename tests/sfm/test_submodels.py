@@ -1,4 +1,4 @@
-"""Structure from motion place by place: division against brute force, a walk with exact truth, and equal results."""
+"""Structure from motion by submodels: partition against brute force, a walk with exact truth, and equal results."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from scipy import sparse
 
 from perception.errors import InputError
 from perception.geometry import align_similarity
-from perception.sfm import features
-from perception.sfm import submodels as places
-from perception.sfm.features import FeatureStore
+from perception.sfm import features, merge, partition, submodels
+from perception.sfm.database import FeatureStore
+from perception.sfm.options import ReadOptions
 from perception.tasks import engine as engines
 from perception.tasks.engine import Engine
 from support.aimed import look_at
@@ -40,14 +40,14 @@ def clusters(sizes: list[int], rng: np.random.Generator) -> dict[tuple[int, int]
 
 def test_photos_are_divided_where_few_match() -> None:
     matches = clusters([12, 9, 14], np.random.default_rng(0))
-    assert places.divide(matches, 15) == [list(range(1, 13)), list(range(13, 22)), list(range(22, 36))]
-    assert places.divide(matches, 35) == [list(range(1, 36))]
+    assert partition.divide(matches, 15) == [list(range(1, 13)), list(range(13, 22)), list(range(22, 36))]
+    assert partition.divide(matches, 35) == [list(range(1, 36))]
 
 
-def test_unconnected_photos_are_in_different_places() -> None:
+def test_unconnected_photos_are_in_different_submodels() -> None:
     first = clusters([8], np.random.default_rng(0))
     second = {(i + 20, j + 20): found for (i, j), found in first.items()}
-    assert places.divide({**first, **second}, 100) == [list(range(1, 9)), list(range(21, 29))]
+    assert partition.divide({**first, **second}, 100) == [list(range(1, 9)), list(range(21, 29))]
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -66,17 +66,17 @@ def test_the_cut_is_the_least_along_the_eigenvector(seed: int) -> None:
         across = weights[np.ix_(a, b)].sum()
         costs[k] = across / weights[a].sum() + across / weights[b].sum()
     best = set(order[: min(costs, key=costs.__getitem__)].tolist())
-    upper = set(np.flatnonzero(places._upper_half(sparse.csr_matrix(weights))).tolist())
+    upper = set(np.flatnonzero(partition._upper_half(sparse.csr_matrix(weights))).tolist())
     assert upper in (best, set(range(20)) - best)
 
 
-def test_a_border_leads_into_the_next_place_and_not_into_one_that_looks_alike() -> None:
+def test_an_overlap_leads_into_the_next_submodel_and_not_into_one_that_looks_alike() -> None:
     matches = clusters([30, 30, 30], np.random.default_rng(0))
     matches |= {(i, 60 + i): 40 for i in range(5, 15)}  # the first and the last look alike
-    divided = places.divide(matches, 35)
-    assert [len(place) for place in divided] == [30, 30, 30]
-    first, second, third = places.with_border(divided, matches)
-    assert len(first) == len(third) == 30 + places.BORDER and len(second) == 30 + 2 * places.BORDER
+    divided = partition.divide(matches, 35)
+    assert [len(images) for images in divided] == [30, 30, 30]
+    first, second, third = partition.with_overlap(divided, matches)
+    assert len(first) == len(third) == 30 + partition.OVERLAP and len(second) == 30 + 2 * partition.OVERLAP
     assert max(first) <= 60 and min(third) >= 31 and 31 in first and 60 in third
 
 
@@ -119,19 +119,23 @@ def poses(model: Any) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_a_walk_in_places_is_the_true_one_and_always_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(places, "LARGEST", 18)
-    monkeypatch.setattr(places, "BORDER", 6)
+def test_a_walk_in_submodels_is_the_true_one_and_always_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(partition, "LARGEST", 18)
+    monkeypatch.setattr(partition, "OVERLAP", 6)
     found = []
     for number, (cores, engine) in enumerate([(1, Engine()), (3, Engine()), (1, Elsewhere())]):
         store, truth = walk(tmp_path / str(number), np.random.default_rng(0))
         monkeypatch.setattr(engines, "cores", lambda cores=cores: cores)
         told = Told()
-        models, left_out = places.map_places(store, False, 0, engine, told) or ([], set())
+        models, left_out = submodels.map_submodels(
+            store, False, ReadOptions(tmp_path, progress=told, engine=engine)
+        ) or ([], set())
         assert len(models) == 1 and not left_out
         found.append(poses(models[0]))
         if cores > 1:
-            assert ("poses: places", 4, 4) in told.updates
+            assert ("poses: submodels", 4, 4) in told.updates
     assert engine.asked == [4]  # type: ignore[attr-defined]
     assert found[0] == found[1] == found[2]
     assert len(found[0]) == PHOTOS
@@ -144,27 +148,27 @@ def test_a_walk_in_places_is_the_true_one_and_always_the_same(tmp_path: Path, mo
 
 
 @pytest.mark.slow
-def test_photos_without_a_place_are_added_and_small_repeated_models_are_not_used(
+def test_photos_without_a_submodel_are_added_and_small_repeated_models_are_not_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    divide = places.divide
-    monkeypatch.setattr(places, "LARGEST", 30)
-    monkeypatch.setattr(places, "divide", lambda *given: [[i for i in place if i != 7] for place in divide(*given)])
-    monkeypatch.setattr(places, "with_border", lambda divided, _: [divided[0] + divided[1][:5], *divided[1:]])
+    divide = partition.divide
+    monkeypatch.setattr(partition, "LARGEST", 30)
+    monkeypatch.setattr(partition, "divide", lambda *given: [[i for i in part if i != 7] for part in divide(*given)])
+    monkeypatch.setattr(partition, "with_overlap", lambda divided, _: [divided[0] + divided[1][:5], *divided[1:]])
     store, _ = walk(tmp_path / "walk", np.random.default_rng(0))
-    ((whole, *_), _) = places.map_places(store, False, 0, Engine(), Told()) or ([None], set())
+    ((whole, *_), _) = submodels.map_submodels(store, False, ReadOptions(tmp_path)) or ([None], set())
     assert whole is not None and whole.num_reg_images() == PHOTOS
     small = pycolmap.Reconstruction(whole)
-    places.take_out(small, set(sorted(small.reg_image_ids())[10:]))
-    assert places.needed([small, whole]) == [whole]
+    submodels.take_out(small, set(sorted(small.reg_image_ids())[10:]))
+    assert merge.without_repeats([small, whole]) == [whole]
 
 
 @pytest.mark.slow
 def test_a_contradicted_model_is_not_returned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(places, "is_contradicted", lambda pairs: len(pairs) > 100)
+    monkeypatch.setattr(submodels, "is_contradicted", lambda pairs: len(pairs) > 100)
     store, _ = walk(tmp_path / "walk", np.random.default_rng(0))
     told = Told()
-    assert places.map_places(store, False, 0, Engine(), told) is None
+    assert submodels.map_submodels(store, False, ReadOptions(tmp_path, progress=told)) is None
     assert told.lines[-1].endswith("all photos are mapped in one piece")
 
 

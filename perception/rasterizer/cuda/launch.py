@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, contextmanager
 import torch
 
 from perception.errors import InputError
-from perception.gaussians.cuda.compile import OLDEST_ARCHITECTURE, KernelOptions, cached_kernels
+from perception.rasterizer.cuda.compile import OLDEST_ARCHITECTURE, KernelOptions, cached_kernels
 
 Place = Callable[[], AbstractContextManager[int]]
 THREADS = 256  # of a block, as in kernels.cu

@@ -16,14 +16,15 @@ import torch
 from torch import Tensor
 
 from perception.errors import InputError
-from perception.gaussians.cuda.compile import MAX_FEATURES, KernelOptions
-from perception.gaussians.cuda.launch import THREADS, Kernels, device_kernels
-from perception.gaussians.rasterize import Forward, Settings
+from perception.rasterizer.cuda.compile import MAX_FEATURES, KernelOptions
+from perception.rasterizer.cuda.launch import THREADS, Kernels, device_kernels
+from perception.rasterizer.types import Cotangents, Forward, Gradients, Inputs, Settings
 
 _POINTER = ctypes.c_void_p
 KernelsFor = Callable[[KernelOptions, torch.device], Kernels]
 _TILE, _SPLAT, _MOMENTS = 16, 12, 10  # as in device.h: pixels, numbers of a splat, of a record before its features
-_NAMES = ("means", "quats", "scales", "opacities", "colors", "features", "viewmats", "Ks", "background")
+_OF_GAUSSIANS = ("means", "quats", "scales", "opacities", "colors", "features")
+_OF_CAMERAS = ("viewmats", "Ks", "background")
 _MAX_RECORDS = 1 << 24  # with eight feature channels 1.2 GB of records, and 0.4 GB of lists
 _AT_ONCE = 64
 _NO_LABEL = np.iinfo(np.int32).max
@@ -51,9 +52,17 @@ COTANGENTS = _structure("Cotangents", "colors alphas depths features variance")
 GRADIENTS = _structure("Gradients", "means quats scales opacities colors features camera mean2d")
 
 
-def _filled(structure: Any, *values: Tensor | int | float | None) -> Any:
-    """A struct of the values in its order, or a pointer; a tensor gives its address."""
-    return structure(*[value.data_ptr() if isinstance(value, Tensor) else value for value in values])
+def _filled(structure: Any, **values: Tensor | int | float | None) -> Any:
+    """A struct of values by name; a tensor gives its address."""
+    return structure(**{name: _address(v) if isinstance(v, Tensor) else v for name, v in values.items()})
+
+
+def _pointer(tensor: Tensor) -> Any:
+    return _POINTER(_address(tensor))
+
+
+def _address(tensor: Tensor) -> int:
+    return tensor.data_ptr()
 
 
 @dataclass
@@ -81,12 +90,9 @@ class Frames:
 class _Call:
     """The arguments of one call."""
 
-    def __init__(
-        self, inputs: tuple[Tensor | None, ...], background: Tensor | None, settings: Settings, kernels_for: KernelsFor
-    ):
-        assert inputs[0] is not None  # for the type checker
-        self.inputs, self.background, self.settings, self._kernels_for = inputs, background, settings, kernels_for
-        self.means, features = inputs[0], inputs[5]
+    def __init__(self, inputs: Inputs, settings: Settings, kernels_for: KernelsFor):
+        self.inputs, self.settings, self._kernels_for = inputs, settings, kernels_for
+        self.means, features = inputs.means, inputs.features
         self.n, self.dims = len(self.means), 0 if features is None else features.shape[1]
         self.blocks = (self.n + THREADS - 1) // THREADS
         self.tiles_x, self.tiles_y = ((size + _TILE - 1) // _TILE for size in (settings.width, settings.height))
@@ -100,16 +106,19 @@ class _Call:
         return self._kernels_for(options, self.means.device)
 
     def scene(self, camera: int, begin: int = 0) -> Any:
-        means, quats, scales, opacities, colors, features, viewmats, ks = self.inputs
-        assert colors is not None and viewmats is not None and ks is not None  # for the type checker
-        s = self.settings
+        of, s = self.inputs, self.settings
         return _filled(
             SCENES[self.means.dtype],
-            means, quats, scales, opacities, colors, None if features is None else features[:, begin:],
-            viewmats[camera], ks[camera], None if self.background is None else self.background[camera],
-            self.n, s.sh_degree, colors.shape[1] if s.sh_degree >= 0 else 0, self.dims, s.width, s.height,
-            s.near_plane, s.eps2d,
-        )  # fmt: skip
+            **{name: getattr(of, name) for name in _OF_GAUSSIANS if name != "features"},
+            **{name: getattr(s, name) for name in ("sh_degree", "width", "height", "near_plane", "eps2d")},
+            features=None if of.features is None else of.features[:, begin:],
+            viewmat=of.viewmats[camera],
+            K=of.Ks[camera],
+            background=None if of.background is None else of.background[camera],
+            n=self.n,
+            sh_stride=of.colors.shape[1] if s.sh_degree >= 0 else 0,
+            dims=self.dims,
+        )
 
     def project(self, camera: int, radii: Tensor) -> list[_Strip]:
         """Projects all Gaussians and lists those of every tile. InputError names a value that is not finite."""
@@ -117,16 +126,17 @@ class _Call:
         splats, boxes = new((self.n, _SPLAT)), new((self.n, 4), dtype=torch.int32)
         depths = self.means.new_full((self.n,), torch.inf)
         first_bad = self.means.new_full((1,), self.n, dtype=torch.int32)
-        projection = _filled(PROJECTION, splats, boxes, depths, radii, first_bad)
+        projection = _filled(PROJECTION, splats=splats, boxes=boxes, depths=depths, radii=radii, first_bad=first_bad)
         self.kernels(0).launch("project_kernel", self.blocks, self.scene(camera), projection)
         front_to_back = torch.sort(depths, stable=True).indices.to(torch.int32)
-        return self._strips((splats, boxes, front_to_back), first_bad, 0, self.tiles_y)
+        view = {"splats": splats, "boxes": boxes, "front_to_back": front_to_back}
+        return self._strips(view, first_bad, 0, self.tiles_y)
 
-    def _strips(self, view: tuple[Tensor, ...], first_bad: Tensor, first: int, end: int) -> list[_Strip]:
+    def _strips(self, view: dict[str, Tensor], first_bad: Tensor, first: int, end: int) -> list[_Strip]:
         """The lists of tile rows [first, end), in halves while they have too many pairs."""
-        kernels, numbers = self.kernels(0), (self.n, first, end, self.tiles_x)
-        counts = self.means.new_empty((self.n,), dtype=torch.int32)
-        kernels.launch("count_kernel", self.blocks, _filled(STRIP, *view, None, *numbers), _filled(_POINTER, counts))
+        kernels, counts = self.kernels(0), self.means.new_empty((self.n,), dtype=torch.int32)
+        strip = _filled(STRIP, **view, n=self.n, first_row=first, end_row=end, tiles_x=self.tiles_x)
+        kernels.launch("count_kernel", self.blocks, strip, _pointer(counts))
         ends = counts.cumsum(0)
         total, bad = torch.cat([ends[-1:], first_bad]).tolist() if self.n else (0, 0)  # waits for the device
         if bad < self.n:
@@ -136,20 +146,21 @@ class _Call:
             halves = (first, middle), (middle, end)
             return [strip for half in halves for strip in self._strips(view, first_bad, *half)]
         tiles = self.means.new_empty((total,), dtype=torch.int32)
-        ids, strip = torch.empty_like(tiles), _filled(STRIP, *view, ends, *numbers)
-        kernels.launch("emit_kernel", self.blocks, strip, _filled(_POINTER, tiles), _filled(_POINTER, ids))
+        ids, strip.ends = torch.empty_like(tiles), _address(ends)
+        kernels.launch("emit_kernel", self.blocks, strip, _pointer(tiles), _pointer(ids))
         count = (end - first) * self.tiles_x
         if count < 1 << 15:
             tiles = tiles.to(torch.int16)  # half the passes of a radix sort
         tiles, slots = torch.sort(tiles, stable=True)
         starts = torch.searchsorted(tiles, torch.arange(count + 1, dtype=tiles.dtype, device=tiles.device))
-        lists = (ids[slots], slots, starts)
-        return [_Strip(count, strip, _filled(LISTS, *lists), slots, (*view, ends, *lists))]
+        lists = {"ids": ids[slots], "slots": slots, "starts": starts}
+        kept = (*view.values(), ends, *lists.values())
+        return [_Strip(count, strip, _filled(LISTS, **lists), slots, kept)]
 
     def _refuse(self, index: int) -> None:
         """InputError for Gaussian `index`, or for a camera with -1."""
-        arguments = list(zip(_NAMES, (*self.inputs, self.background), strict=True))
-        for name, tensor in arguments[6:] if index < 0 else arguments[:6]:
+        for name in _OF_CAMERAS if index < 0 else _OF_GAUSSIANS:
+            tensor = getattr(self.inputs, name)
             if tensor is None:
                 continue
             wrong = (~tensor.isfinite().view(len(tensor), tensor[0].numel()).all(1)).nonzero()[:, 0].tolist()
@@ -157,93 +168,88 @@ class _Call:
                 raise InputError(f"rasterize: {name}[{wrong[0]}] is not finite")
 
 
-def _of(camera: int, begin: int, images: tuple[Tensor | None, ...]) -> list[Tensor | None]:
-    """One camera's colours, alphas, depths (which belong to the first slice), features and variance."""
-    mine = [None if image is None else image[camera] for image in images]
-    return [*(mine[:3] if begin == 0 else [None] * 3), *(None if i is None else i[..., begin:] for i in mine[3:])]
+def _images(structure: Any, of: Forward | Cotangents, camera: int, begin: int, **more: Tensor | None) -> Any:
+    """The struct of one camera's images, or of their gradients. All but the features belong to the first slice."""
+
+    def first(image: Tensor | None) -> Tensor | None:
+        return None if image is None or begin else image[camera]
+
+    def channels(image: Tensor | None) -> Tensor | None:
+        return None if image is None else image[camera][..., begin:]
+
+    own = {"colors": first(of.colors), "alphas": first(of.alphas), "depths": first(of.depths)}
+    own |= {"features": channels(of.features), "variance": channels(of.feature_variance)}
+    return _filled(structure, **own | more)
 
 
-def rasterize_forward(
-    inputs: tuple[Tensor | None, ...],
-    background: Tensor | None,
-    settings: Settings,
-    kernels_for: KernelsFor = device_kernels,
-) -> Forward:
-    """As `perception.gaussians.rasterize.rasterize_forward`, on the tensors' device."""
-    call, out = _Call(inputs, background, settings, kernels_for), Forward.empty(inputs, settings)
+def rasterize_forward(inputs: Inputs, settings: Settings, kernels_for: KernelsFor = device_kernels) -> Forward:
+    """As `rasterizer.cpu.rasterize_forward`, on the tensors' device."""
+    call, out = _Call(inputs, settings, kernels_for), Forward.empty(inputs, settings)
     out.frames = Frames([call.project(c, radii) for c, radii in enumerate(out.radii)], out.visible, kernels_for)
-    images = (out.colors, out.alphas, out.depths, out.features, out.feature_variance)
     for camera, strips in enumerate(out.frames.views):
         for begin in call.slices:
             kernels, scene = call.kernels(begin), call.scene(camera, begin)
-            written = _filled(IMAGES, *_of(camera, begin, images), out.visible[camera] if begin == 0 else None)
+            written = _images(IMAGES, out, camera, begin, visible=out.visible[camera] if begin == 0 else None)
             for strip in strips:
                 kernels.launch("forward_kernel", strip.tiles, scene, strip.range, strip.lists, written)
     return out
 
 
 def rasterize_backward(
-    inputs: tuple[Tensor | None, ...],
-    background: Tensor | None,
+    inputs: Inputs,
     settings: Settings,
     forward: Forward,
-    cotangents: tuple[Tensor | None, ...],
-    wanted: tuple[bool, ...],
-    stored: list[Tensor | None] | None = None,
-) -> list[Tensor | None]:
-    """As `perception.gaussians.rasterize.rasterize_backward`, on the tensors' device; `stored` is written whole."""
+    cotangents: Cotangents,
+    gradients: Gradients,
+    stored: bool = False,
+) -> None:
+    """As `rasterizer.cpu.rasterize_backward`, on the tensors' device; with `stored`, `gradients` are written whole."""
     frames: Frames = forward.frames
-    call, count = _Call(inputs, background, settings, frames.kernels_for), len(frames.views)
-    mean2d = stored[7] if stored else None
-    mean2d = call.means.new_zeros((count, call.n, 2)) if mean2d is None else mean2d.zero_()
+    call, count = _Call(inputs, settings, frames.kernels_for), len(frames.views)
+    given = {name: getattr(gradients, name) for name in Gradients.NAMES}
     if stored:
-        grads = [None if buffer is None else buffer.zero_() for buffer in stored[:7]]
-    else:
-        grads = [
-            torch.zeros_like(t, memory_format=torch.contiguous_format) if t is not None and w else None
-            for t, w in zip(inputs[:7], wanted, strict=True)
-        ]
-    features, viewmats = grads[5:]
+        for gradient in given.values():
+            if gradient is not None:
+                gradient.zero_()
+    features, viewmats, mean2d = (given.pop(name) for name in ("features", "viewmats", "mean2d"))
     cameras = None if viewmats is None else call.means.new_zeros((count, call.n, 12))
-    rendered = forward.features
-    if rendered is None and call.dims:  # the forward pass had no features: these are zeros, wanted for their gradient
-        rendered = call.means.new_zeros((*forward.alphas.shape, call.dims))
-    images = (forward.colors, forward.alphas, forward.depths, rendered, forward.feature_variance)
-    given = tuple(None if g is None else g.contiguous() for g in cotangents)
+    if forward.features is None and call.dims:  # rendered without features, which are zeros, wanted for their gradient
+        forward = replace(forward, features=call.means.new_zeros((*forward.alphas.shape, call.dims)))
     for camera, strips in enumerate(frames.views):
-        visible, of_camera = frames.visible[camera], None if cameras is None else cameras[camera]
+        visible = frames.visible[camera]
         for begin in call.slices:
             kernels, scene = call.kernels(begin), call.scene(camera, begin)
-            colors, _, *others = _of(camera, begin, images)
-            read = _filled(IMAGES, colors, forward.alphas[camera], *others, visible)
-            cotangent = _filled(COTANGENTS, *_of(camera, begin, given))
-            of_features = None if features is None else features[:, begin:]
-            added = _filled(GRADIENTS, *grads[:5], of_features, of_camera, mean2d[camera])
+            read = _images(IMAGES, forward, camera, begin, alphas=forward.alphas[camera], visible=visible)
+            cotangent = _images(COTANGENTS, cotangents, camera, begin)
+            added = _filled(
+                GRADIENTS,
+                **given,
+                features=None if features is None else features[:, begin:],
+                camera=None if cameras is None else cameras[camera],
+                mean2d=None if mean2d is None else mean2d[camera],
+            )
             width = _MOMENTS + min(call.dims - begin, MAX_FEATURES)
             for strip in strips:
                 records = call.means.new_zeros((len(strip.slots), width))
-                at = _filled(_POINTER, records)
+                at = _pointer(records)
                 kernels.launch("backward_kernel", strip.tiles, scene, strip.range, strip.lists, read, cotangent, at)
-                kernels.launch("reduce_kernel", call.blocks, scene, strip.range, _filled(_POINTER, visible), at, added)
+                kernels.launch("reduce_kernel", call.blocks, scene, strip.range, _pointer(visible), at, added)
     if cameras is not None and viewmats is not None:
         total = cameras.sum(1, dtype=torch.float64).to(cameras.dtype)
         viewmats[:, :3, :3] += total[:, :9].reshape(-1, 3, 3)
         viewmats[:, :3, 3] += total[:, 9:]
-    if stored:  # with respect to logarithms and logits
-        for gradient, value, slope in zip(grads[2:4], inputs[2:4], (lambda s: s, lambda o: o * (1 - o)), strict=True):
-            if gradient is not None and value is not None:
-                gradient.mul_(slope(value))
-    return [*grads, None if [index for index, w in enumerate(wanted) if w] == [5] else mean2d]
+    if stored and gradients.scales is not None:  # with respect to logarithms
+        gradients.scales.mul_(inputs.scales)
+    if stored and gradients.opacities is not None:  # with respect to logits
+        gradients.opacities.mul_(inputs.opacities * (1 - inputs.opacities))
 
 
-def label_images(
-    inputs: tuple[Tensor | None, ...], labels: np.ndarray, least: float, settings: Settings
-) -> tuple[np.ndarray, np.ndarray]:
-    """As `perception.gaussians.rasterize.label_images`: the weights of _AT_ONCE labels are rendered as features."""
-    viewmats = inputs[6]
-    assert viewmats is not None  # for the type checker
+def label_images(inputs: Inputs, labels: np.ndarray, least: float, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
+    """As `rasterizer.cpu.label_images`: the weights of _AT_ONCE labels are rendered as features."""
+    viewmats = inputs.viewmats
     settings = replace(settings, variance=False, depth=False)
-    visible = rasterize_forward((*inputs[:5], None, *inputs[6:]), None, settings).visible[0].cpu().numpy().view(bool)
+    plain = rasterize_forward(replace(inputs, features=None, background=None), settings)
+    visible = plain.visible[0].cpu().numpy().view(bool)
     images = []
     for row in labels:
         names = torch.from_numpy(np.unique(row[visible & (row >= 0)])).to(viewmats.device)
@@ -252,7 +258,7 @@ def label_images(
         image = torch.full_like(best, -1, dtype=torch.int32)
         for some in names.split(_AT_ONCE) if len(names) else ():
             features = (of[:, None] == some).to(best.dtype)
-            weights = rasterize_forward((*inputs[:5], features, *inputs[6:]), None, settings).features
+            weights = rasterize_forward(replace(inputs, features=features, background=None), settings).features
             assert weights is not None  # for the type checker
             most = weights[0].amax(dim=2)
             first = torch.where(weights[0] == most[..., None], some, _NO_LABEL).amin(dim=2)  # of equal ones the smaller

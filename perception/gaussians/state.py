@@ -1,0 +1,199 @@
+"""The state of a training: the Gaussians with their optimiser, the views, and all that a checkpoint holds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from perception.config import MapConfig
+from perception.gaussians.densify import Statistics
+from perception.gaussians.early_stopping import EarlyStopping
+from perception.gaussians.losses import LabelAssignment, assign_labels
+from perception.gaussians.model import STORED, Gaussians
+from perception.gaussians.optimiser import SparseAdam
+from perception.gaussians.rates import learning_rates
+from perception.gaussians.size import sized
+from perception.gaussians.views import TrainingView, scene_extent
+from perception.progress import timed
+from perception.rasterizer.types import Gradients
+
+
+@dataclass
+class TrainRecord:
+    """JSON-able. profile: wall-clock seconds by part.
+
+    pairs: (Gaussian, pixel) pairs of all training steps that contributed.
+    """
+
+    curve: list[dict[str, float]] = field(default_factory=list)
+    decisions: list[str] = field(default_factory=list)
+    profile: dict[str, float] = field(default_factory=dict)
+    pairs: int = 0
+    seconds: float = 0.0
+    iterations: int = 0
+    skipped_gradients: int = 0
+
+    @staticmethod
+    def joined(records: Sequence[TrainRecord]) -> TrainRecord:
+        """The record of a model that was trained in blocks: sums, and the decisions of each; it has no curve."""
+        whole = TrainRecord()
+        for number, record in enumerate(records, start=1):
+            whole.decisions += [f"block {number}: {told}" for told in record.decisions]
+            whole.profile = {part: whole.profile.get(part, 0.0) + s for part, s in record.profile.items()}
+            for name in ("pairs", "seconds", "iterations", "skipped_gradients"):
+                setattr(whole, name, getattr(whole, name) + getattr(record, name))
+        return whole
+
+    def timed(self, part: str) -> AbstractContextManager[None]:
+        """Adds the wall-clock seconds of its block to `part` of the profile. A nested block counts in both parts."""
+        return timed(self.profile, part)
+
+
+class TrainingState:
+    """What the steps of a training and its schedule change; `state` exports it for a checkpoint, `load` restores it.
+
+    gaussians, views, held_out: on the CPU. Gaussians, optimiser and training views are then kept on `device`. box:
+    [2, 3] corners of the space that matters, in which most Gaussians are added; None: all.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        views: list[TrainingView],
+        config: MapConfig,
+        held_out: list[TrainingView],
+        device: torch.device | None = None,
+        box: np.ndarray | None = None,
+    ):
+        self.config = sized(config, len(views))
+        self.device = device or torch.device("cpu")
+        self.held_out = held_out
+        self.box = None if box is None else torch.tensor(box, dtype=torch.float32, device=self.device)
+        self.extent = scene_extent(views)
+        self.record = TrainRecord()
+        train = self.config.train
+        self.stopping = EarlyStopping(train.exchange_db, degree_decided=train.sh_degree == 0)
+        self.iteration = 0
+        self.complete = False  # finished, unless a longer training is requested
+        self.skipped = 0.0  # share of training progress skipped by early stopping
+        self.initial_count = len(gaussians)
+        self.gaussians = gaussians.to(self.device)
+        self.reset_statistics()
+        self.optimiser = SparseAdam(self.gaussians.named(), self.rates(0.0))
+        self._sync()
+        self.show(views)
+        self._since: float | None = None  # time.monotonic() at the start of `running`, None outside
+
+    # ---------------------------------------------------------------- progress
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of training, including those before a resume, without the time between two calls of `run`."""
+        return self.record.seconds + (0.0 if self._since is None else time.monotonic() - self._since)
+
+    @property
+    def progress(self) -> float:
+        share = self.iteration / self.config.train.iterations + self.skipped
+        limit = self.config.train.time_limit
+        return min(1.0, share if limit is None else max(share, self.elapsed / limit))
+
+    @property
+    def expected_iterations(self) -> int:
+        """Estimate of the total number of iterations of the run."""
+        share = self.iteration / self.config.train.iterations + self.skipped
+        if self.progress > share:  # the time limit determines progress
+            return max(self.iteration, round(self.iteration / max(self.progress, 1e-6)))
+        return round(self.iteration + (1 - self.progress) * self.config.train.iterations)
+
+    # ------------------------------------------------------------------- views
+
+    def show(self, views: list[TrainingView]) -> None:
+        """Sets the training views: the same photos as before, possibly with labels added."""
+        self.views, self.coarse = views, [view.halved().stored() for view in views]
+        self.long_side = max(max(view.photo.shape[:2]) for view in views)
+        self.has_labels = any(view.labels is not None and bool((view.labels > 0).any()) for view in views)
+        self._placed: dict[tuple[str, int], TrainingView] = {}  # those seen so far, on the device
+        self._assigned: dict[str, LabelAssignment] = {}  # of the views seen so far
+
+    def placed(self, view: TrainingView) -> TrainingView:
+        """The view on the device, where it stays."""
+        if self.device.type == "cpu":
+            return view
+        key = view.name, len(view.photo)
+        if key not in self._placed:
+            self._placed[key] = view.to(self.device)
+        return self._placed[key]
+
+    def assigned(self, view: TrainingView) -> LabelAssignment | None:
+        """The labels of the view on the device, where they stay; None if it has none."""
+        if view.labels is not None and view.name not in self._assigned:
+            self._assigned[view.name] = assign_labels(view.labels, view.keep).to(self.device)
+        return self._assigned.get(view.name)
+
+    # ------------------------------------------------------------------- model
+
+    def rates(self, progress: float) -> dict[str, float | torch.Tensor]:
+        """Learning rates of the Gaussians' tensors at `progress`."""
+        return learning_rates(progress, self.extent, self.gaussians.sh.shape[1], self.config.train.iterations)
+
+    def keep(self, rows: torch.Tensor) -> None:
+        """Keeps the Gaussians that `rows` [M] int64 selects, with their Adam moments."""
+        self.optimiser.keep(rows)
+        self._sync()
+
+    def append(self, born: Gaussians) -> None:
+        """Adds Gaussians with zero Adam moments."""
+        self.optimiser.append(born.named())
+        self._sync()
+
+    def set_degree(self, degree: int) -> None:
+        """Truncates the spherical harmonics to `degree`, or adds zero coefficients up to it."""
+        self.optimiser.resize("sh", (degree + 1) ** 2)
+        self._sync()
+
+    def reset_statistics(self) -> None:
+        """Begins the sums for the next densification."""
+        self.statistics = Statistics.zeros(len(self.gaussians), self.device)
+
+    def _sync(self) -> None:
+        """Makes `gaussians` share the optimiser's tensors, which are replaced when rows are added or removed.
+
+        The gradients' memory is kept from step to step: rows that a step does not see hold old values, not read.
+        """
+        self.gaussians = Gaussians(**self.optimiser.params)
+        zeros = {name: torch.zeros_like(self.optimiser.params[stored]) for name, stored in STORED.items()}
+        self.gradients = Gradients(**zeros, mean2d=self.gaussians.means.new_zeros(1, len(self.gaussians), 2))
+
+    # -------------------------------------------------------------- checkpoint
+
+    def state(self, copy: bool = True) -> dict[str, Any]:
+        """All values needed to resume, for a checkpoint; without `copy` they are those of now until the next step."""
+        return {
+            "iteration": self.iteration,
+            "initial_count": self.initial_count,
+            "optimiser": self.optimiser.state_dict(copy),
+            "statistics": {"gradient": self.statistics.gradient.cpu(), "seen": self.statistics.seen.cpu()},
+            "record": asdict(self.record) | {"seconds": self.elapsed, "iterations": self.iteration},
+            "stopping": asdict(self.stopping),
+            "skipped": self.skipped,
+            "complete": self.complete,
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Restores the result of `state`."""
+        self.gaussians = Gaussians(**state["optimiser"]["params"]).to(self.device)
+        self.optimiser = SparseAdam(self.gaussians.named(), self.rates(0.0))
+        self.optimiser.load_state_dict(state["optimiser"])
+        self._sync()
+        gradient, seen = (state["statistics"][name].to(self.device) for name in ("gradient", "seen"))
+        self.statistics = Statistics(gradient, seen)
+        self.record = TrainRecord(**state["record"])
+        self.iteration, self.initial_count = state["iteration"], state["initial_count"]
+        self.stopping = EarlyStopping(**state["stopping"])
+        self.skipped, self.complete = state["skipped"], state["complete"]

@@ -1,0 +1,144 @@
+"""The readers of inputs, in the order in which they are tried: a new kind of input is a new line of READERS."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from perception.errors import InputError
+from perception.inputs import recordings
+from perception.inputs.colmap import is_workspace, model_files, read_workspace
+from perception.inputs.layouts import is_recording, open_recording, refuse_depth_without_poses, text_files
+from perception.inputs.transforms import is_transforms, listed_files, listed_photos, read_transforms, transforms_file
+from perception.photos import video
+from perception.photos.decode import photo_size
+from perception.photos.folder import VIDEO_SUFFIXES, list_photos
+from perception.sfm.options import ReadOptions
+from perception.sfm.reconstruct import reconstruct
+from perception.types import Scene
+
+SENSOR_SIZE = (640, 480)
+"""Width and height taken for the frames of a recording whose first cannot be read."""
+
+
+@dataclass(frozen=True)
+class PhotoSizes:
+    """(width, height) of every photo of an input; what: their number as text; depth: photos have depth images."""
+
+    sizes: list[tuple[int, int]]
+    what: str
+    depth: bool = False
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A kind of input. recognises: whether a path is one, from names alone. sizes: of its photos, from their headers.
+
+    files: all that the scene may come from. read: the Scene. poses, cameras: whether the input brings poses, and the
+    intrinsics of its photos.
+    """
+
+    recognises: Callable[[Path], bool]
+    sizes: Callable[[Path], PhotoSizes]
+    files: Callable[[Path], list[Path]]
+    read: Callable[[Path, ReadOptions], Scene]
+    poses: bool
+    cameras: bool
+
+
+def _sizes(photos: Sequence[Path], depth: bool = False) -> PhotoSizes:
+    """Sizes of the photos that can be read."""
+    sizes = [size for size in map(_size, photos) if size is not None]
+    return PhotoSizes(sizes, f"{len(sizes)} photos", depth)
+
+
+def _size(photo: Path) -> tuple[int, int] | None:
+    try:
+        return photo_size(photo)
+    except InputError:
+        return None
+
+
+def _is_video(source: Path) -> bool:
+    return source.suffix.lower() in VIDEO_SUFFIXES and source.is_file()
+
+
+def _video_sizes(source: Path) -> PhotoSizes:
+    return PhotoSizes([video.frame_size(source)] * video.MOST_FRAMES, f"at most {video.MOST_FRAMES} frames")
+
+
+def _read_video(source: Path, options: ReadOptions) -> Scene:
+    folder = options.frames or options.workdir / "frames"
+    new = not folder.exists()
+    record = video.video_frames(source, folder, options.progress)
+    try:
+        scene = reconstruct(folder, options)
+    except InputError:
+        if new:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+    taken = f"{record['chosen']} of {record['frames']} frames of {source.name}"
+    scene.report["notes"].insert(0, f"{folder}: {taken}; they are the map's photos, keep them")
+    return scene
+
+
+def _recording_sizes(source: Path) -> PhotoSizes:
+    frames = open_recording(source).frames
+    taken = min(len(frames), recordings.MOST_FRAMES)
+    sizes = [_size(frames[0].photo) or SENSOR_SIZE] * taken if frames else []
+    return PhotoSizes(sizes, f"at most {taken} of {len(frames)} frames", bool(frames and frames[0].depth))
+
+
+def _recording_files(source: Path) -> list[Path]:
+    images = [image for frame in open_recording(source).frames for image in (frame.photo, frame.depth)]
+    return [*text_files(source), *(image for image in images if image is not None)]
+
+
+def _read_recording(source: Path, options: ReadOptions) -> Scene:
+    return recordings.recorded_scene(open_recording(source), options)
+
+
+def _read_photos(source: Path, options: ReadOptions) -> Scene:
+    refuse_depth_without_poses(source)
+    return reconstruct(source, options)
+
+
+READERS = (
+    Reader(_is_video, _video_sizes, lambda source: [source], _read_video, poses=False, cameras=False),
+    Reader(
+        is_workspace,
+        lambda source: _sizes(list_photos(source / "images")),
+        lambda source: [*list_photos(source / "images"), *model_files(source)],
+        read_workspace,
+        poses=True,
+        cameras=True,
+    ),
+    Reader(
+        is_transforms,
+        lambda source: _sizes(*listed_photos(transforms_file(source))),
+        lambda source: listed_files(transforms_file(source)),
+        lambda source, options: read_transforms(transforms_file(source), options),
+        poses=True,
+        cameras=True,
+    ),
+    Reader(is_recording, _recording_sizes, _recording_files, _read_recording, poses=True, cameras=False),
+    Reader(
+        Path.is_dir, lambda source: _sizes(list_photos(source)), list_photos, _read_photos, poses=False, cameras=False
+    ),
+)
+EXPECTED = (
+    "a folder of photos, a video, a COLMAP workspace, a transforms.json or an RGB-D recording (TUM, ScanNet, 7-Scenes, "
+    "3DMatch, Redwood)"
+)
+
+
+def reader_of(source: Path) -> Reader:
+    """The first reader that recognises `source`. InputError where none does."""
+    if not source.exists():
+        raise InputError(f"{source}: no such file or folder; expected {EXPECTED}")
+    for reader in READERS:
+        if reader.recognises(source):
+            return reader
+    raise InputError(f"{source}: expected {EXPECTED}")

@@ -1,0 +1,38 @@
+"""The cloud to start training from (`--init-points`): read, and checked against the views."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from perception.errors import InputError
+from perception.io.cloud import read_cloud
+from perception.sfm.options import Cloud
+from perception.types import Scene
+
+GREY = 128
+FEW_SEEN = 0.01
+"""Share of the points in some photo's view below which a warning is given."""
+
+
+def start_points(path: Path) -> Cloud:
+    """The finite points of a cloud or mesh file with their colours, grey without. InputError when there are none."""
+    cloud = read_cloud(path)
+    finite = np.isfinite(cloud.points).all(axis=1)
+    if not finite.any():
+        raise InputError(f"{path}: none of the {len(finite)} points has finite coordinates")
+    colors = np.full((len(finite), 3), GREY, np.uint8) if cloud.colors is None else cloud.colors
+    return np.asarray(cloud.points[finite], dtype=np.float64), colors[finite]
+
+
+def check_seen(scene: Scene, path: Path) -> None:
+    """InputError when no view sees a point of the scene; adds a warning when few are seen. path: of the cloud."""
+    seen = np.zeros(len(scene.points), bool)
+    for view in scene.views:
+        x, y, z = view.K @ (view.camera_from_world[:3, :3] @ scene.points.T + view.camera_from_world[:3, 3:])
+        seen |= (z > 0) & (x >= 0) & (x < view.width * z) & (y >= 0) & (y < view.height * z)
+    if not seen.any():
+        raise InputError(f"{path}: no photo sees any of its {len(seen)} points; expected frame and unit of the poses")
+    if seen.mean() < FEW_SEEN:
+        scene.report["warnings"].append(f"{path}: only {seen.mean():.2%} of its points lie in the view of some photo")

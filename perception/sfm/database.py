@@ -1,0 +1,108 @@
+"""The COLMAP database of a set of photos: features and verified matches, made once and kept."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perception.io.atomic import atomic_directory, recover
+from perception.photos.ignore_masks import stage_masks
+from perception.photos.lens import load_pycolmap
+from perception.sfm import features, pairs
+from perception.sfm.feature_tasks import FeatureTasks
+from perception.sfm.options import ReadOptions
+from perception.sfm.staging import stage_photos
+from perception.types import Lens
+
+POSED_PARTNERS = 12
+"""With given poses no model has to be found: each photo is matched with this many photos at most, the best pairs."""
+
+
+class FeatureStore:
+    """A folder with the COLMAP `database.db` and `photos/`, which holds the photos under numbered names (see staging).
+    names[i] is the name of the i-th photo in both."""
+
+    def __init__(self, folder: Path, names: list[str], facts: dict[str, Any], photos: Path | None = None) -> None:
+        self.folder, self.image_root, self.names, self.facts = folder, photos or folder / "photos", names, facts
+
+    @property
+    def database(self) -> Path:
+        return self.folder / "database.db"
+
+
+def verified_matches(database: Path) -> dict[tuple[int, int], np.ndarray]:
+    """Verified matches [M, 2] of each pair of image ids, in order of the ids."""
+    pycolmap = load_pycolmap()
+    with pycolmap.Database.open(database) as db:
+        keys, geometries = db.read_two_view_geometries()
+    keyed = zip(map(pycolmap.pair_id_to_image_pair, keys), geometries, strict=True)
+    return {pair: geometry.inlier_matches for pair, geometry in sorted(keyed, key=lambda item: item[0])}
+
+
+def build_features(
+    photos: list[Path],
+    lenses: list[Lens | None],
+    options: ReadOptions,
+    masks: list[Path | None] | None = None,
+    posed: bool = False,
+) -> FeatureStore:
+    """Extracts and matches features, unless the workdir holds the result of the same photos, lenses, seed and options.
+
+    lenses: known intrinsics per photo, or None to let structure from motion find them. Photos share one camera when
+    size, EXIF camera and known lens agree. masks: of pixels without features, per photo (see `ignore_masks`).
+    posed: the poses are known, so fewer pairs are matched (POSED_PARTNERS).
+    """
+    seed, progress = options.seed, options.progress
+    masks = masks if masks and any(masks) else None
+    most = POSED_PARTNERS if posed else len(photos)
+    key = _key(photos, lenses, (seed, most), masks)
+    folder, tasks = options.workdir / f"features-{key}", None
+    if options.engine.kind != "local":
+        tasks = FeatureTasks(options.workdir / f"feature-tasks-{key}", options.engine, progress)
+    recover(folder)
+    if not (folder / "facts.json").exists():
+        with atomic_directory(folder) as new:
+            load_pycolmap().set_random_seed(seed)
+            started = time.perf_counter()
+            names = stage_photos(new / "photos", photos, progress)
+            if masks is not None:
+                stage_masks(new / "masks", photos, names, masks)
+            database = new / "database.db"
+            groups = features.import_photos(database, new / "photos", photos, names, lenses)
+            if tasks is None:
+                features.extract(database, new / "photos", groups, progress)
+            else:
+                tasks.extract(database, photos, masks)
+            extracted = time.perf_counter()
+            chosen = [(names[i], names[j]) for i, j in pairs.select_pairs(database, names, most, progress)]
+            if tasks is None:
+                features.match(database, chosen, seed, progress)
+            else:
+                tasks.match(database, chosen, seed)
+            seconds = {"features": extracted - started, "matching": time.perf_counter() - extracted}
+            possible = len(names) * (len(names) - 1) // 2
+            made = {"names": names, "pairs_matched": len(chosen), "pairs_possible": possible, "seconds": seconds}
+            (new / "facts.json").write_text(json.dumps(made))
+    if tasks is not None:
+        shutil.rmtree(tasks.folder, ignore_errors=True)
+    facts = json.loads((folder / "facts.json").read_text())
+    return FeatureStore(folder, facts.pop("names"), facts)
+
+
+def _key(
+    photos: list[Path], lenses: list[Lens | None], search: tuple[int, int], masks: list[Path | None] | None
+) -> str:
+    paths = [*photos, *(mask for mask in masks or () if mask is not None)]
+    files = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
+    extraction = (features.MAX_IMAGE_SIDE, features.MAX_FEATURES, features.MIN_FEATURES, features.PEAK_THRESHOLD)
+    constants: list[float] = [pairs.EXHAUSTIVE_BELOW, pairs.NEIGHBORS, pairs.COARSE_FEATURES, pairs.COARSE_MIN_MATCHES]
+    constants += [pairs.COARSE_RATIO, pairs.PARTNERS, features.MIN_INLIERS]
+    if len(photos) > pairs.RETRIEVED_ABOVE:
+        constants += [pairs.RETRIEVED_ABOVE, pairs.RETRIEVED, pairs.WORDS]
+    return hashlib.sha256(repr((files, lenses, extraction, constants, search)).encode()).hexdigest()[:12]
