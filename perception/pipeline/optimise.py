@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
@@ -41,7 +42,8 @@ PHOTOS_A_TASK = 8
 @dataclass
 class Run:
     """What every stage of a run needs. source: the input; work: its folder of intermediate results; masks: the folder
-    of label images; engine: where tasks run; seconds: of each stage so far."""
+    of label images; engine: where tasks run; seconds: of each stage so far; inputs: the files that the map is made from
+    (see `pipeline.changes`); started: monotonic time."""
 
     source: Path
     config: MapConfig
@@ -51,6 +53,8 @@ class Run:
     progress: Progress
     engine: Engine = field(default_factory=Engine)
     seconds: dict[str, float] = field(default_factory=dict)
+    inputs: dict[str, dict[str, str]] = field(default_factory=dict)
+    started: float = field(default_factory=time.monotonic)
 
     def __post_init__(self) -> None:
         self._arrays = DiskArrays(self.work, image_memory(self.config, memory_limit()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import asdict
 from typing import Any
 
@@ -33,10 +34,10 @@ def finite(value: Any) -> Any:
 
 
 def run_record(
-    run: Run, scene: Scene, optimised: Optimised, instances: dict[str, Any], quality: dict[str, Any], seconds: float
+    run: Run, scene: Scene, optimised: Optimised, instances: dict[str, Any], quality: dict[str, Any]
 ) -> dict[str, Any]:
-    """The facts of map.json but for its views and files. instances: report of grouping and description; seconds: of
-    the run in all."""
+    """The facts of map.json but for its views and files. instances: report of grouping and description."""
+    seconds = {**run.seconds, "total": time.monotonic() - run.started}
     facts = {
         "frame": scene.frame,
         "metric": scene.metric,
@@ -52,10 +53,10 @@ def run_record(
         "training": asdict(optimised.record),
         "instances": instances,
         "quality": quality,
-        "seconds": {name: round(s, 2) for name, s in (*run.seconds.items(), ("total", seconds))},
+        "seconds": {name: round(value, 2) for name, value in seconds.items()},
         "peak_memory_mib": peak_memory_mib(),
     }
-    return facts | ({"blocks": optimised.blocks} if optimised.blocks else {})
+    return facts | ({"blocks": optimised.blocks} if optimised.blocks else {}) | {"inputs": run.inputs}
 
 
 def scored(run: Run, optimised: Optimised, metric: bool) -> tuple[Gaussians, dict[str, Any]]:
